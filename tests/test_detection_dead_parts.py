@@ -11,7 +11,7 @@ import pytest
 from startrack.catalog import load_catalog
 from startrack.chain import pipeline
 from startrack.detection import find_damage
-from startrack.detection.unusable import find_dead_parts
+from startrack.detection.damage import find_dead_parts
 from startrack.output import result_dict
 
 HEIGHT, WIDTH = 700, 900

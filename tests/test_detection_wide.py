@@ -44,7 +44,7 @@ def test_binned_frames_keep_flux_and_noise() -> None:
     dead = np.zeros(image.shape, dtype=bool)
     dead[11, 20] = True
     flat = np.ones_like(image)
-    small = bin_frame(Frame(image, 50 * flat, np.sqrt(50) * flat, dead, SourceNoise()), 4)
+    small = bin_frame(Frame(image, 50 * flat, np.sqrt(50) * flat, dead, SourceNoise(per_unit=0.0)), 4)
     assert small.shape == (50, 75)
     assert small.image[3, 5] == pytest.approx(image[12:16, 20:24].sum())
     assert np.std(small.image - small.background) == pytest.approx(float(small.noise[0, 0]), rel=0.05)
@@ -68,7 +68,7 @@ def test_bright_pixels_are_those_of_stars_not_hot_ones() -> None:
         image[y - 1 : y + 2, x - 1 : x + 2] += 15
         image[y, x] += 20
     image[70, 70] = 200.0
-    frame = Frame(image, np.zeros_like(image), np.ones_like(image), None, SourceNoise())
+    frame = Frame(image, np.zeros_like(image), np.ones_like(image), None, SourceNoise(per_unit=0.0))
     assert sorted(map(tuple, bright_pixels(frame, 8.0, 10, 1).tolist())) == sorted(positions)
 
 

@@ -19,7 +19,7 @@ from startrack.chain import Located, are_unchanged, input_hashes, pipeline
 from startrack.cli.main import main
 from startrack.core.types import BadInput, Bools, Exposure
 from startrack.detection import Detector
-from startrack.detection.unusable import fill_masked
+from startrack.detection.damage import fill_masked
 from startrack.exposure import (
     combine_masks,
     mask_of,

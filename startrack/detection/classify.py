@@ -33,7 +33,7 @@ SATURATED_MISFIT = 0.2  # largest misfit of a star measured by its wings, which 
 EDGE_DIRECTIONS = 8  # directions of straight edges or lines that are fitted
 LARGEST_SIGMA_PX = 2.0  # of the position
 WIDTH_FACTORS = (1.15, 1.3, 1.5)  # widths of a saturated star's wings over the width of the PSF
-POOR_CHI2_PER_DOF = 2.0  # of a saturated star with the PSF's own width; below it no wider one is tried
+POOR_CHI2_PER_DOF = BAD_FIT_CHI2_PER_DOF / 2  # of a saturated star: no wider wings are tried below
 # Within this radius of a source this much brighter the threshold is so much higher.
 WING_SIGMAS, WING_BRIGHTER, WING_HEIGHT = 3.0, 2.0, 1.4
 

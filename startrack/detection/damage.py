@@ -1,25 +1,36 @@
-"""Whether the noise of an exposure is that of a sensor: clipping, filtering and coarse steps show in its pixels."""
+"""Pixels that are not what the sensor saw: dead parts, masked pixels, and noise that processing changed.
+
+A dead part is a rectangle that holds one value in a frame that is noisy elsewhere. Clipping, filtering and coarse steps
+show in the noise.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
+from startrack.core.kernels import njit
 from startrack.core.statistics import NORMAL_BY_MEDIAN
-from startrack.core.types import Array, Exposure, Ints
-from startrack.detection.background import BLOCK_PX
-from startrack.detection.unusable import MOST_EQUAL, find_dead_parts
+from startrack.core.types import Array, Bools, Exposure, Ints, TooFewStars
+from startrack.detection.background import BLOCK_PX, CLIPPED_SIGMA, MIN_NOISE_STEPS, Image, smallest_step
 
+PROBE_PX, STRIDE_PX = 8, 64  # of the tiles that are looked at first: dead parts of 72 px and more hold one
+MOST_EQUAL = 0.8  # of the tiles: with more of one value the noise is removed
+MIN_SIDE_PX = PROBE_PX + 1  # of a rectangle of noise no 81 pixels are equal
+MIN_PART = 0.004  # of the image; smaller constant blocks occur behind JPEG compression
+MIN_FILLED = 0.95  # of the rectangle about a part: saturated stars and dark ground are no rectangles
+MIN_GOOD_PX = BLOCK_PX**2 // 4  # of a block: a quarter gives its level to an eighth of the noise
 TILES = 16  # of BLOCK_PX across the image, and the least number of tiles that tell: 65,536 pixels, 2 ms
 CLIPPED_PART = 0.01  # of the pixels that hold the lowest value; a sensor's noise: below 0.001
 CORRELATION = 0.15  # of neighbouring pixels; at most 0.0 in rendered frames, 0.09 in a real one, 0.36 behind filters
 FILTERED_CORRELATION = 2 * CORRELATION  # from here on the image itself is filtered, not noise added to the sensor's
 COARSE_STEPS = 0.5  # noise in steps of the values below which rounding rules
-LOWEST_SIGMAS, HIGHEST_SIGMAS = 2.5, 1.0  # of the noise, for the correlation
+HIGHEST_SIGMAS = 1.0  # of the noise, for the correlation; the lowest is CLIPPED_SIGMA
 FAR_PX = 7  # farther than any filter's kernel reaches
 FEW_STARS_PERCENTILE = 25.0  # of the tiles' correlations
 ORIGINAL = "give the frame as the sensor recorded it"
@@ -106,7 +117,7 @@ def _neighbour_correlation(tiles: NDArray[np.float32], middle: Array, sigma: Arr
 
     Stars, on one side of the noise, are clipped; what pixels seven apart share (slopes) is taken out.
     """
-    z = np.clip((tiles - middle[:, None, None]) / sigma[:, None, None], -LOWEST_SIGMAS, HIGHEST_SIGMAS)
+    z = np.clip((tiles - middle[:, None, None]) / sigma[:, None, None], -CLIPPED_SIGMA, HIGHEST_SIGMAS)
     z -= z.mean(axis=(1, 2), keepdims=True)
     near, far = (
         0.5 * ((z[:, :, d:] * z[:, :, :-d]).mean(axis=(1, 2)) + (z[:, d:] * z[:, :-d]).mean(axis=(1, 2)))
@@ -114,3 +125,84 @@ def _neighbour_correlation(tiles: NDArray[np.float32], middle: Array, sigma: Arr
     )
     found = (near - far) / np.maximum(np.mean(np.square(z), axis=(1, 2)) - far, 1e-9)
     return float(np.percentile(found, FEW_STARS_PERCENTILE))
+
+
+def find_dead_parts(pixels_adu: NDArray[np.float32]) -> Bools | None:
+    """The pixels (H, W) in rectangles of one value, below the highest one, of a frame that is noisy elsewhere.
+
+    None where there are none.
+    """
+    corners = np.lib.stride_tricks.sliding_window_view(pixels_adu, (PROBE_PX, PROBE_PX))[::STRIDE_PX, ::STRIDE_PX]
+    tiles = corners.reshape(-1, PROBE_PX**2)
+    equal = np.ptp(tiles, axis=1) == 0
+    if not equal.any() or equal.mean() > MOST_EQUAL:
+        return None
+    # A calm sky has one value too.
+    if np.median(tiles[~equal].std(axis=1)) < MIN_NOISE_STEPS * smallest_step(pixels_adu):
+        return None
+    here = pixels_adu[:-1, :-1]
+    same = ((here == pixels_adu[:-1, 1:]) & (here == pixels_adu[1:, :-1])).view(np.uint8)
+    squares = cv2.morphologyEx(same, cv2.MORPH_OPEN, np.ones((MIN_SIDE_PX, MIN_SIDE_PX), np.uint8))
+    count, _, stats, _ = cv2.connectedComponentsWithStats(squares, connectivity=4)
+    found = np.zeros(pixels_adu.shape, dtype=bool)
+    for left, top, width, height, area in stats[1:count].tolist():
+        is_part = area >= MIN_FILLED * width * height and width * height >= MIN_PART * pixels_adu.size
+        if is_part and pixels_adu[top, left] < pixels_adu.max():
+            found[top : top + height + 1, left : left + width + 1] = True  # a pixel is compared with the next ones
+    return found if found.any() else None
+
+
+def fill_masked(image: Image, masked: Bools) -> Image:
+    """The image (H, W) with each masked pixel replaced by a good one of its block, or of the nearest good block.
+
+    Level and noise beside the masked pixels are then those of the good ones: the background needs no mask.
+    Raises TooFewStars (no_stars) where no block has enough good pixels.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    shape = tuple(-(-length // BLOCK_PX) for length in image.shape)
+    good = np.empty(shape, dtype=np.int64)
+    _count_good(masked, good)
+    poor = good < MIN_GOOD_PX
+    if poor.all():
+        raise TooFewStars("the mask leaves too few pixels of the frame")
+    source = distance_transform_edt(poor, return_distances=False, return_indices=True)
+    filled = np.array(image)
+    _fill_from_blocks(filled, masked, good, source.astype(np.int64))
+    return filled
+
+
+@njit(cache=True, nogil=True)
+def _count_good(masked, good) -> None:  # type: ignore[no-untyped-def]
+    """Fill good (rows, columns) with the number of pixels of each block that are not masked."""
+    good[:] = 0
+    for y in range(masked.shape[0]):
+        row = y // BLOCK_PX
+        for x in range(masked.shape[1]):
+            good[row, x // BLOCK_PX] += not masked[y, x]
+
+
+@njit(cache=True, nogil=True)
+def _fill_from_blocks(image, masked, good, source) -> None:  # type: ignore[no-untyped-def]
+    """Replace masked pixels of the image by those of the block `source` (2, rows, columns), one after another."""
+    height, width = image.shape
+    values = np.empty(BLOCK_PX * BLOCK_PX, image.dtype)
+    for row in range(good.shape[0]):
+        bottom = min((row + 1) * BLOCK_PX, height)
+        for column in range(good.shape[1]):
+            right = min((column + 1) * BLOCK_PX, width)
+            if good[row, column] == (bottom - row * BLOCK_PX) * (right - column * BLOCK_PX):
+                continue
+            top, left = source[0, row, column] * BLOCK_PX, source[1, row, column] * BLOCK_PX
+            count = 0
+            for y in range(top, min(top + BLOCK_PX, height)):
+                for x in range(left, min(left + BLOCK_PX, width)):
+                    if not masked[y, x]:
+                        values[count] = image[y, x]
+                        count += 1
+            next_value = 0
+            for y in range(row * BLOCK_PX, bottom):
+                for x in range(column * BLOCK_PX, right):
+                    if masked[y, x]:
+                        image[y, x] = values[next_value]
+                        next_value = (next_value + 1) % count

@@ -16,13 +16,13 @@ from startrack.detection.fit import (
     fit_points,
     measure_source_noise,
 )  # fmt: skip
-from startrack.detection.frame import Frame, Pixels, SourceNoise, radius_for
+from startrack.detection.frame import RESIDUAL_FRACTION, Frame, Pixels, SourceNoise, radius_for
 from startrack.detection.peaks import Peaks
 from startrack.psf import pixel_profile_single
 
 CROWDED_ROUNDS = 3  # of subtracting neighbours and fitting again
 NEIGHBOUR_SIGMA = 0.1  # of a pixel's noise: a neighbour's signal above this is subtracted
-NEIGHBOUR_ERROR = np.float32(0.1)  # relative error of that signal: neighbours' fits, and the PSF's wings
+NEIGHBOUR_ERROR = np.float32(RESIDUAL_FRACTION)  # relative error of that signal: fits, and the PSF's wings
 BATCH_PIXELS = 2_000_000  # of neighbours' stamps at a time
 
 

@@ -21,6 +21,7 @@ from startrack.detection.classify import (
     select_brightest_per_position,
     select_stars,
 )  # fmt: skip
+from startrack.detection.damage import fill_masked, find_dead_parts
 from startrack.detection.deblend import Fitted, fit_all, paint_sources
 from startrack.detection.fit import PointFits, unbin_fits
 from startrack.detection.frame import (
@@ -36,7 +37,6 @@ from startrack.detection.frame import (
 from startrack.detection.peaks import Peaks, find_peaks, unbin_peaks
 from startrack.detection.psf_width import WIDTH_TOLERANCE, guess_psf_width, measure_psf_width
 from startrack.detection.streaks import are_elongated, find_streaks
-from startrack.detection.unusable import fill_masked, find_dead_parts
 from startrack.exposure import combine_masks, touch_masked
 
 UNKNOWN_WIDTH_PX = 1.2  # first guess where the camera file does not state the width

@@ -11,7 +11,6 @@ from startrack.detection.frame import MODEL_ERROR, Pixels, SourceNoise
 from startrack.psf import pixel_profile
 
 ROUNDS, ROUNDS_AGAIN = 3, 2  # iterations of a first fit, and of a repeated one
-ALL_USABLE = np.zeros((0, 0, 0), dtype=np.bool_)
 BRIGHT_STAR_SNR = 15.0  # of stars that show what the frame's stars are like
 MIN_NOISE_STARS, MAX_NOISE_STARS = 20, 120
 FAINT_FRACTION = 0.3  # of the pixel's variance: pixels with less signal are left out
@@ -78,7 +77,7 @@ def fit_points(
 
     n = len(stamps.data)
     offset, values, covariance = np.empty((n, 2)), np.empty((n, 8)), np.empty((n, 4, 4))
-    usable = ALL_USABLE if stamps.usable is None else stamps.usable
+    usable = np.zeros((0, 0, 0), dtype=np.bool_) if stamps.usable is None else stamps.usable
     fit_stamps(
         stamps.data, stamps.variance, usable, start_xy_px - stamps.centres, sigma_px, source_noise.per_unit,
         source_noise.model_error, rounds, stamps.surround, offset, values, covariance,

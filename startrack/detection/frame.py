@@ -25,7 +25,7 @@ MODEL_ERROR = 0.03  # of a star's signal: difference between real PSFs and the G
 class SourceNoise:
     """Variance that a source's own signal s adds to a pixel: per_unit s + (model_error s)^2."""
 
-    per_unit: float = 0.0  # photon noise: 1 for electrons, 1 / gain for ADU, 0 where it is not known
+    per_unit: float  # photon noise: 1 for electrons, 1 / gain for ADU, 0 where it is not known
     model_error: float = MODEL_ERROR
 
 

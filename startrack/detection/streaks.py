@@ -17,7 +17,8 @@ MIN_AREA_PX, MAX_AREA_PX = 12, 20_000
 MIN_STREAKS = 6  # streaks of similar direction and length
 LONG_PX, SLENDER = 4.5, 2.5  # shortest streak, and its length over its width
 SAME_DIRECTION, SAME_LENGTH = np.cos(np.radians(15.0)), 0.3
-ELONGATION_RADIUS_PX, ELONGATION_PEAKS, ELONGATION_SIGMAS, ELONGATION_PX2, ELONGATION_RATIO = 7, 100, 4.0, 2.2, 2.2
+ELONGATION_RADIUS_PX, ELONGATION_PEAKS, ELONGATION_SIGMAS = 7, 100, 4.0
+ELONGATION = 2.2  # variance along a source [px^2], and over that across it
 IN_LINE_FRACTION = 0.45
 STREAKED_FRACTION = 0.6  # of the bright blobs
 
@@ -58,8 +59,8 @@ def are_elongated(frame: Frame, centres: Ints) -> bool:
     total = np.maximum(signal.sum(axis=(1, 2)), 1e-9)
     xx, xy, yy = (np.sum(signal * q, axis=(1, 2)) / total for q in (x * x, x * y, y * y))
     trace, spread = xx + yy, np.hypot(xx - yy, 2.0 * xy)
-    long = (trace + spread) > ELONGATION_RATIO * (trace - spread + 0.2)
-    return bool(np.mean(long & (trace + spread > 2.0 * ELONGATION_PX2)) > 0.5)
+    long = (trace + spread) > ELONGATION * (trace - spread + 0.2)
+    return bool(np.mean(long & (trace + spread > 2.0 * ELONGATION)) > 0.5)
 
 
 def find_streaks(frame: Frame) -> Streaks | None:

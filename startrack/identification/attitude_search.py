@@ -6,7 +6,8 @@ All arrays are small and the number of numpy calls is kept low: a typical search
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -17,7 +18,7 @@ from startrack.estimation.adjust import CHI2_2DOF_MEDIAN, OUTLIER_CHI2, SMALLEST
 from startrack.estimation.false_alarm import PATTERN_MATCHES, expected_false_alarms
 from startrack.estimation.match import CandidatePairs, PhotometricScale, upper_median
 from startrack.frames import wahba
-from startrack.identification.index import CatalogPatterns, Neighbours, PixelScale, pixel_scale_of
+from startrack.identification.index import CatalogPatterns, Neighbours, PixelScale
 from startrack.identification.triangles import PatternIndex, sides_of_few, triangles
 
 PREFIXES = (0, 7, 10, 14, 20, 28)  # number of brightest detections that form triangles, round by round
@@ -43,6 +44,33 @@ MAX_DRIFT_PX = 0.7  # change of the attitude up to which the neighbours remain v
 
 
 @dataclass(frozen=True)
+class Sources:
+    """Detections inside the image circle of a camera, brightest first, and the stars that they may be."""
+
+    centroids: Centroids
+    rays_cam: Array  # (n, 3)
+    camera: Camera
+    scale: PixelScale
+    patterns: CatalogPatterns
+
+    @cached_property
+    def variance_px2(self) -> Array:
+        """Variance (n,) of a position, the mean of both axes."""
+        covariance = self.centroids.covariance_px2
+        return 0.5 * (covariance[:, 0, 0] + covariance[:, 1, 1])
+
+    @property
+    def neighbour_radius_rad(self) -> float:
+        """Distance from a detection within which stars are looked up at a rough attitude."""
+        return (max(GATE_PX, BLEND_SIGMAS * self.centroids.psf_sigma_px) + 1.0) * self.scale.largest_rad_per_px
+
+    def mirror_image(self) -> Sources:
+        """The same detections seen by the mirror-image camera."""
+        camera = replace(self.camera, mirrored=not self.camera.mirrored)
+        return replace(self, camera=camera, rays_cam=camera.unproject(self.centroids.xy_px))
+
+
+@dataclass(frozen=True)
 class AttitudeHypothesis:
     """A rough attitude with the pairs that coincide."""
 
@@ -52,16 +80,15 @@ class AttitudeHypothesis:
     near: Neighbours | None  # all stars near the detections, where they were looked up
 
 
-@dataclass
 class AttitudeSearch:
     """Hypotheses of the attitude, in order of likelihood."""
 
-    rays_cam: Array  # (n, 3) of the detections inside the image circle, brightest first
-    patterns: CatalogPatterns
-    scale: PixelScale
-    neighbour_radius_rad: float  # stars this near a detection matter
-    tried: int = 0  # matching triangles so far
-    mirrored: list[tuple[Array, Array, int, float]] = field(default_factory=list)  # matches of the other handedness
+    def __init__(self, sources: Sources) -> None:
+        self.sources, self.rays_cam, self.patterns, self.scale = (
+            sources, sources.rays_cam, sources.patterns, sources.scale,
+        )  # fmt: skip
+        self.tried = 0  # matching triangles so far
+        self.mirrored: list[tuple[Array, Array, int, float]] = []  # matches of the other handedness
 
     def hypotheses(self, tolerance_px: float, rough_px: float) -> Iterator[AttitudeHypothesis]:
         """Attitudes that are unlikely by chance.
@@ -146,7 +173,7 @@ class AttitudeSearch:
         for R in self._supported_attitudes(
             cam, icrs, some[max(first - WINDOW_RANKS, 0) : first + PRETESTED], radius, depth
         ):
-            near = self.patterns.neighbours(some @ R, self.neighbour_radius_rad, depth)
+            near = self.patterns.neighbours(some @ R, self.sources.neighbour_radius_rad, depth)
             hit = near.chord < radius
             hits = min(int(np.count_nonzero(hit)), len(some))
             if hits < MIN_MATCHES:
@@ -185,73 +212,61 @@ class AttitudeMatch:
     visible_v_mag: Array  # of the stars in the image circle that are bright enough to be detected
 
 
-@dataclass(frozen=True)
-class AttitudeRefiner:
-    """Refinement by position and brightness: AttitudeHypothesis -> AttitudeMatch."""
+def refine_attitude(sources: Sources, hypothesis: AttitudeHypothesis) -> AttitudeMatch | None:
+    """Match all stars by position and brightness, starting from the bright ones that coincide.
 
-    camera: Camera
-    centroids: Centroids
-    rays_cam: Array  # (n, 3)
-    variance_px2: Array  # (n,) per axis
-    patterns: CatalogPatterns
-
-    def __call__(self, hypothesis: AttitudeHypothesis) -> AttitudeMatch | None:
-        """Match all stars, starting from the bright ones that coincide; None where too few agree."""
-        d, stars, scale = self.centroids, self.patterns.stars, pixel_scale_of(self.camera)
-        R = wahba(self.rays_cam[hypothesis.detection], stars.rays_icrs[hypothesis.star])
-        photometry = PhotometricScale.from_matches(
-            d.flux_e, d.saturated, stars.v_mag[hypothesis.star], hypothesis.detection
-        )
-        limit, complete = np.searchsorted(stars.v_mag, [photometry.limit_mag, photometry.complete_mag]).tolist()
-        near = hypothesis.near
-        drift_px = np.abs(hypothesis.R_cam_icrs - R).max() / scale.axis_rad_per_px
-        if near is None or near.depth < limit or drift_px > MAX_DRIFT_PX:
-            radius_rad = neighbour_radius_px(d.psf_sigma_px) * scale.largest_rad_per_px
-            near = self.patterns.neighbours(self.rays_cam @ R, radius_rad, limit)
-        detection, star = near.ray, near.star
-        rays_icrs, v_mag = stars.rays_icrs[star], stars.v_mag[star]
-        v_sigma_mag = stars.v_sigma_mag[star] + d.brightness_sigma_mag
-        xy_px = d.xy_px[detection]
-        for _ in range(ROUNDS):
-            px, inside = self.camera.project(rays_icrs @ R.T)
-            off = px - xy_px
-            distance = np.sqrt(np.einsum("ni,ni->n", off, off))
-            distance[~inside | (distance > GATE_PX)] = np.inf
-            pairs = CandidatePairs(detection, star, distance, v_mag, v_sigma_mag, photometry)
-            matched = pairs.one_to_one_pairs
-            if len(matched) < MIN_MATCHES:
-                return None
-            agree, variance = self._select_inliers(pairs, matched)
-            used = matched[agree]
-            if len(used) < MIN_MATCHES:
-                return None
-            refined = wahba(self.rays_cam[detection[used]] / variance[agree][:, None], rays_icrs[used])
-            if np.abs(refined - R).max() / scale.axis_rad_per_px < SETTLED_PX:
-                break
-            R = refined
-        visible = stars.rays_icrs[:complete] @ R[2] > np.cos(self.camera.max_angle_rad)
-        squared, misfit = np.square(pairs.distance_px[matched]), pairs.brightness_misfit[matched]
-        inlier = squared < np.maximum(INLIER_PX**2, OUTLIER_CHI2 * self.variance_px2[detection[matched]])
-        # Position and brightness may not both be at the edge of what is allowed.
-        named = inlier & agree & (squared / (OUTLIER_CHI2 * variance) + misfit * misfit < 1.0)
-        return AttitudeMatch(refined, pairs, matched, named, inlier, variance, stars.v_mag[:complete][visible])
-
-    def _select_inliers(self, pairs: CandidatePairs, which: Ints) -> tuple[Bools, Array]:
-        """Which of the pairs are no outliers, and their variance per axis [px^2], the common error added.
-
-        The common error is estimated as in `extra_variance_px2`, but in closed form: for one variance per star.
-        """
-        distance = pairs.distance_px[which]
-        stated = self.variance_px2[pairs.detection[which]]
-        first = distance < FIRST_GATE_PX
-        if not first.any():
-            return first, stated
-        squared = np.square(distance)
-        extra = upper_median(squared[first]) / CHI2_2DOF_MEDIAN - upper_median(stated[first])
-        variance = stated + max(extra, SMALLEST_EXTRA_PX2)
-        return first & (squared < OUTLIER_CHI2 * variance), variance
+    None where too few agree.
+    """
+    d, stars, scale = sources.centroids, sources.patterns.stars, sources.scale
+    R = wahba(sources.rays_cam[hypothesis.detection], stars.rays_icrs[hypothesis.star])
+    photometry = PhotometricScale.from_matches(
+        d.flux_e, d.saturated, stars.v_mag[hypothesis.star], hypothesis.detection
+    )
+    limit, complete = np.searchsorted(stars.v_mag, [photometry.limit_mag, photometry.complete_mag]).tolist()
+    near = hypothesis.near
+    drift_px = np.abs(hypothesis.R_cam_icrs - R).max() / scale.axis_rad_per_px
+    if near is None or near.depth < limit or drift_px > MAX_DRIFT_PX:
+        near = sources.patterns.neighbours(sources.rays_cam @ R, sources.neighbour_radius_rad, limit)
+    detection, star = near.ray, near.star
+    rays_icrs, v_mag = stars.rays_icrs[star], stars.v_mag[star]
+    v_sigma_mag = stars.v_sigma_mag[star] + d.brightness_sigma_mag
+    xy_px = d.xy_px[detection]
+    for _ in range(ROUNDS):
+        px, inside = sources.camera.project(rays_icrs @ R.T)
+        off = px - xy_px
+        distance = np.sqrt(np.einsum("ni,ni->n", off, off))
+        distance[~inside | (distance > GATE_PX)] = np.inf
+        pairs = CandidatePairs(detection, star, distance, v_mag, v_sigma_mag, photometry)
+        matched = pairs.one_to_one_pairs
+        if len(matched) < MIN_MATCHES:
+            return None
+        agree, variance = _select_inliers(pairs, matched, sources.variance_px2)
+        used = matched[agree]
+        if len(used) < MIN_MATCHES:
+            return None
+        refined = wahba(sources.rays_cam[detection[used]] / variance[agree][:, None], rays_icrs[used])
+        if np.abs(refined - R).max() / scale.axis_rad_per_px < SETTLED_PX:
+            break
+        R = refined
+    visible = stars.rays_icrs[:complete] @ R[2] > np.cos(sources.camera.max_angle_rad)
+    squared, misfit = np.square(pairs.distance_px[matched]), pairs.brightness_misfit[matched]
+    inlier = squared < np.maximum(INLIER_PX**2, OUTLIER_CHI2 * sources.variance_px2[detection[matched]])
+    # Position and brightness may not both be at the edge of what is allowed.
+    named = inlier & agree & (squared / (OUTLIER_CHI2 * variance) + misfit * misfit < 1.0)
+    return AttitudeMatch(refined, pairs, matched, named, inlier, variance, stars.v_mag[:complete][visible])
 
 
-def neighbour_radius_px(psf_sigma_px: float) -> float:
-    """Distance from a detection within which stars are looked up at a rough attitude."""
-    return max(GATE_PX, BLEND_SIGMAS * psf_sigma_px) + 1.0
+def _select_inliers(pairs: CandidatePairs, which: Ints, variance_px2: Array) -> tuple[Bools, Array]:
+    """Which of the pairs are no outliers, and their variance per axis [px^2], the common error added.
+
+    The common error is estimated as in `extra_variance_px2`, but in closed form: for one variance per star.
+    """
+    distance = pairs.distance_px[which]
+    stated = variance_px2[pairs.detection[which]]
+    first = distance < FIRST_GATE_PX
+    if not first.any():
+        return first, stated
+    squared = np.square(distance)
+    extra = upper_median(squared[first]) / CHI2_2DOF_MEDIAN - upper_median(stated[first])
+    variance = stated + max(extra, SMALLEST_EXTRA_PX2)
+    return first & (squared < OUTLIER_CHI2 * variance), variance

@@ -55,7 +55,7 @@ def guess_lenses(size_px: tuple[int, int], fov_rad: float, shapes: tuple[float, 
 
 
 def guess_fisheyes(size_px: tuple[int, int], fov_rad: float, circle: ImageCircle | None) -> list[LensGuess]:
-    """Fisheye lenses, likelier ones first: as large as the visible `circle` or somewhat larger, or by the frame alone."""
+    """Fisheye lenses, likelier ones first: as large as the visible `circle` or somewhat larger, or by the frame."""
     width, height = size_px
     if circle is not None:
         centre_px, circles_px = circle.centre_px, [c * circle.radius_px for c in SEEN_CIRCLES]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.core.types import Array, Bools, Centroids, Identification, Ints, NotIdentified, Stars
+from startrack.core.types import Centroids, Identification, NotIdentified, Stars
 from startrack.estimation.false_alarm import (
     CAP_RADIUS_RAD,
     coincidence_probability,
@@ -26,11 +26,11 @@ from startrack.identification.attitude_search import (
     MIN_MATCHES,
     AttitudeHypothesis,
     AttitudeMatch,
-    AttitudeRefiner,
     AttitudeSearch,
-    neighbour_radius_px,
+    Sources,
+    refine_attitude,
 )  # fmt: skip
-from startrack.identification.index import CatalogPatterns, PixelScale, patterns_of, pixel_scale_of
+from startrack.identification.index import patterns_of, pixel_scale_of
 
 MAX_FALSE_ALARM = 1e-9  # probability that chance gives an accepted identification
 SMALLEST_RADIUS_PX = 0.5
@@ -59,22 +59,24 @@ class Identifier:
         Raises NotIdentified; its reason is "mirrored" where only the mirror image of the frame can be identified.
         """
         scale = pixel_scale_of(camera)
-        patterns = patterns_of(stars, scale.field_sr)
         rays_cam = camera.unproject(centroids.xy_px)
         inside = np.flatnonzero(rays_cam[:, 2] >= np.cos(camera.max_angle_rad))
         if len(inside) < MIN_MATCHES:
             raise NotIdentified(_describe_few(len(inside), len(centroids), camera), detected=len(inside))
-        frame = _Frame(centroids, inside, rays_cam[inside], patterns, camera, scale)
-        search = AttitudeSearch(
-            frame.rays_cam, patterns, scale, neighbour_radius_px(centroids.psf_sigma_px) * scale.largest_rad_per_px
-        )
+        is_whole = len(inside) == len(centroids)
+        some = centroids if is_whole else centroids.take(inside)
+        sources = Sources(some, rays_cam[inside], camera, scale, patterns_of(stars, scale.field_sr))
+        search = AttitudeSearch(sources)
         tolerance_px, rough_px = self.tolerances_px
-        tolerance_px = min(max(tolerance_px, TOLERANCE_SIGMAS * upper_median(frame.variance_px2) ** 0.5), rough_px)
-        found, refusal = self._find_accepted(search.hypotheses(tolerance_px, rough_px), frame, search)
+        tolerance_px = min(max(tolerance_px, TOLERANCE_SIGMAS * upper_median(sources.variance_px2) ** 0.5), rough_px)
+        found, refusal = self._find_accepted(search.hypotheses(tolerance_px, rough_px), sources, search)
         if found is not None:
-            return found
+            if is_whole:
+                return found
+            outside = int(np.count_nonzero(np.delete(centroids.snr, inside) > SIGNIFICANT_SNR))
+            return replace(found, detection=inside[found.detection], unexplained=found.unexplained + outside)
         lenient = replace(self, whole_field=False)
-        if lenient._find_accepted(search.mirrored_hypotheses(), frame.mirror_frame(), search)[0] is not None:
+        if lenient._find_accepted(search.mirrored_hypotheses(), sources.mirror_image(), search)[0] is not None:
             raise NotIdentified(
                 "the image is a mirror image, compared with the camera file: flip the image, or set mirrored = "
                 f"{str(not camera.mirrored).lower()} in the camera file",
@@ -88,26 +90,25 @@ class Identifier:
         )
 
     def _find_accepted(
-        self, hypotheses: Iterable[AttitudeHypothesis], frame: _Frame, search: AttitudeSearch
+        self, hypotheses: Iterable[AttitudeHypothesis], sources: Sources, search: AttitudeSearch
     ) -> tuple[Identification | None, str]:
         """The first hypothesis that is accepted, or why the last one was not."""
         refusal = "no triangle of detections matches one of the catalogue"
-        refine = AttitudeRefiner(frame.camera, frame.centroids, frame.rays_cam, frame.variance_px2, frame.patterns)
         for refined, hypothesis in enumerate(hypotheses):
             if refined == MAX_REFINED:
                 break
-            match = refine(hypothesis)
+            match = refine_attitude(sources, hypothesis)
             if match is None:
                 continue
             try:
-                return self._accept_match(match, frame, search.tried), ""
+                return self._accept_match(match, sources, search.tried), ""
             except _WrongCamera:
                 raise
             except NotIdentified as cause:
                 refusal = str(cause)
         return None, refusal
 
-    def _accept_match(self, match: AttitudeMatch, frame: _Frame, tried: int) -> Identification:
+    def _accept_match(self, match: AttitudeMatch, sources: Sources, tried: int) -> Identification:
         """The identification of a match; NotIdentified if chance might explain it, or if the camera file is wrong."""
         pairs = match.pairs
         distance = pairs.distance_px[match.matched]
@@ -115,57 +116,42 @@ class Identifier:
         if len(named_distance) < MIN_MATCHES:
             raise NotIdentified(f"only {len(named_distance)} stars match", matched=len(named_distance))
         rms_px = float(np.sqrt(0.5 * (named_distance @ named_distance) / len(named_distance)))
-        radius_px = min(FIRST_GATE_PX, max(3.0 * rms_px, SMALLEST_RADIUS_PX))
+        radius_px = min(FIRST_GATE_PX, max(TOLERANCE_SIGMAS * rms_px, SMALLEST_RADIUS_PX))
         hits = int(np.count_nonzero(distance < radius_px))
-        log_p = self._log_p_value(match, hits, radius_px, frame) + log_trials(tried)
+        log_p = self._log_p_value(match, hits, radius_px, sources) + log_trials(tried)
         if log_p > np.log(self.max_false_alarm):
             raise NotIdentified(f"the {hits} stars that match might do so by chance", matched=hits)
         if self.whole_field:
-            _check_camera(match.inlier[pairs.detection[match.matched] < BRIGHT_DETECTIONS])
+            # A camera that fits only a part of the field biases the attitude: by 0.8 degrees for 1 % of focal length.
+            bright = match.inlier[pairs.detection[match.matched] < BRIGHT_DETECTIONS]
+            inliers, near = int(np.count_nonzero(bright)), len(bright)
+            if inliers < INLIER_FRACTION * near - 3.0 * np.sqrt(INLIER_FRACTION * (1 - INLIER_FRACTION) * near):
+                raise _WrongCamera(
+                    f"only {inliers} of {near} bright stars lie within {INLIER_PX:g} px of where the camera file puts "
+                    f"them, the others up to {GATE_PX:g} px off: it is not the calibration of this lens",
+                    matched=inliers,
+                )
         named = pairs.select_unambiguous(
-            match.matched[match.named], match.variance_px2[match.named], BLEND_SIGMAS * frame.centroids.psf_sigma_px
+            match.matched[match.named], match.variance_px2[match.named], BLEND_SIGMAS * sources.centroids.psf_sigma_px
         )
         return Identification(
-            detection=frame.inside[pairs.detection[named]],
+            detection=pairs.detection[named],
             star=pairs.star[named],
             R_cam_icrs=match.R_cam_icrs,
             false_alarm_probability=probability(log_p),
-            unexplained=pairs.count_unexplained(frame.centroids.snr, INLIER_PX) + frame.significant_outside,
+            unexplained=pairs.count_unexplained(sources.centroids.snr, INLIER_PX),
         )
 
-    def _log_p_value(self, match: AttitudeMatch, hits: int, radius_px: float, frame: _Frame) -> float:
+    def _log_p_value(self, match: AttitudeMatch, hits: int, radius_px: float, sources: Sources) -> float:
         """Log-probability that chance gives as many hits at one attitude."""
-        radius_rad = radius_px * frame.scale.axis_rad_per_px
-        predicted = max(int(len(match.visible_v_mag) * frame.scale.frame_fraction), hits)
-        density = density_per_sr(frame.rays_cam, min(LOCAL_FRACTION * frame.scale.diameter_rad, CAP_RADIUS_RAD))
+        radius_rad = radius_px * sources.scale.axis_rad_per_px
+        predicted = max(int(len(match.visible_v_mag) * sources.scale.frame_fraction), hits)
+        density = density_per_sr(sources.rays_cam, min(LOCAL_FRACTION * sources.scale.diameter_rad, CAP_RADIUS_RAD))
         agreement = 1.0
-        if np.isfinite(frame.centroids.brightness_sigma_mag):
+        if np.isfinite(sources.centroids.brightness_sigma_mag):
             agreement = brightness_agreement(match.visible_v_mag, match.pairs.scale.measured_mag, DIMMED_MAG)
         each = agreement * coincidence_probability(density * np.pi * radius_rad**2)
         return float(log_p_value(hits, predicted, each))
-
-
-class _Frame:
-    """The detections inside the image circle, with their rays and the camera."""
-
-    def __init__(
-        self, centroids: Centroids, inside: Ints, rays_cam: Array, patterns: CatalogPatterns, camera: Camera,
-        scale: PixelScale,
-    ) -> None:  # fmt: skip
-        all_inside = len(inside) == len(centroids)
-        self.centroids = centroids if all_inside else centroids.take(inside)
-        self.significant_outside = 0
-        if not all_inside:
-            self.significant_outside = int(np.count_nonzero(np.delete(centroids.snr, inside) > SIGNIFICANT_SNR))
-        self.inside, self.rays_cam, self.patterns, self.camera, self.scale = inside, rays_cam, patterns, camera, scale
-        covariance = self.centroids.covariance_px2
-        self.variance_px2 = 0.5 * (covariance[:, 0, 0] + covariance[:, 1, 1])  # mean of both axes
-
-    def mirror_frame(self) -> _Frame:
-        """The same detections seen by the mirror-image camera."""
-        camera = replace(self.camera, mirrored=not self.camera.mirrored)
-        rays_cam = camera.unproject(self.centroids.xy_px)
-        return _Frame(self.centroids, np.arange(len(rays_cam)), rays_cam, self.patterns, camera, self.scale)
 
 
 def _describe_few(inside: int, given: int, camera: Camera) -> str:
@@ -181,17 +167,3 @@ def _describe_few(inside: int, given: int, camera: Camera) -> str:
 
 class _WrongCamera(NotIdentified):
     """The attitude is found, but the camera file is not the calibration of this lens."""
-
-
-def _check_camera(inlier: Bools) -> None:
-    """Raise if many bright stars lie within GATE_PX of their predicted pixel, but not within INLIER_PX (n,).
-
-    Such a camera file fits only a part of the field and biases the attitude: by 0.8 degrees for 1 % of focal length.
-    """
-    inliers, near = int(np.count_nonzero(inlier)), len(inlier)
-    if inliers < INLIER_FRACTION * near - 3.0 * np.sqrt(INLIER_FRACTION * (1 - INLIER_FRACTION) * near):
-        raise _WrongCamera(
-            f"only {inliers} of {near} bright stars lie within {INLIER_PX:g} px of where the camera file puts "
-            f"them, the others up to {GATE_PX:g} px off: it is not the calibration of this lens",
-            matched=inliers,
-        )

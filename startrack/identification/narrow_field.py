@@ -18,7 +18,7 @@ from startrack.estimation.false_alarm import (
 )  # fmt: skip
 from startrack.estimation.match import CandidatePairs, PhotometricScale, match_nearest
 from startrack.identification.attitude_search import GATE_PX, INLIER_PX
-from startrack.identification.hypotheses import HypothesisSearch, Window
+from startrack.identification.hypotheses import SAME_VIEW_RAD, HypothesisSearch, Window
 from startrack.identification.index import PerObject
 from startrack.identification.lens_guesses import PINHOLE, guess_lenses
 from startrack.identification.pinhole_view import PinholeView
@@ -38,7 +38,6 @@ from startrack.identification.verify_unknown_lens import (
 STARS_IN_FIELD, SIDE_OF_FIELD = 24, 0.4  # pattern stars; longest side of their triangles over the field's diameter
 # Ranks of brightness whose triangles vote together.
 ROUNDS = tuple(Window(first, first, end) for first, end in ((0, 10), (0, 16), (8, 22), (0, 22), (20, 34)))
-SAME_ATTITUDE_RAD = 0.02
 # Detections, stars for each, the gate (part of the frame's width, but at least pixels), and the largest log p-value
 # bound of the matches in the inner half of the gate.
 STAGES = ((60, 1.5, 0.010, 6.0, -4.0), (120, 1.5, 0.005, 4.0, -8.0), (400, 2.0, 0.0, 2.5, -10.0))
@@ -93,10 +92,10 @@ class NarrowField:
                 continue
             for found in self.search.voted_hypotheses(patterns, guess, window):
                 R, camera = found.R_cam_icrs, found.camera
-                if any(np.trace(other.T @ R) > 3.0 - SAME_ATTITUDE_RAD**2 for other in seen):
+                if any(np.trace(other.T @ R) > 3.0 - SAME_VIEW_RAD**2 for other in seen):
                     continue
                 seen.append(R)
-                lens = self._grow(PinholeView(R, camera.focal_px[0], camera.mirrored, camera.size_px))
+                lens = self._grow(PinholeView(R, camera.focal_px[0], camera.mirrored, camera.size_px, 0.0))
                 if lens is not None:
                     yield lens
 

@@ -29,7 +29,7 @@ class PinholeView:
     focal_px: float
     mirrored: bool
     size_px: tuple[int, int]
-    distortion: float = 0.0  # of the radius [focal lengths] per cube of the angle off the axis, beyond the tangent
+    distortion: float  # of the radius [focal lengths] per cube of the angle off the axis, beyond the tangent
 
     @property
     def centre_px(self) -> Array:

@@ -26,7 +26,7 @@ LEAST_PART = 0.03  # of them, to the identified stars: second exposures of 30 to
 LEAST_STARS = 8  # of a second field
 FAINTER_MAG = 1.0  # predicted stars fainter than the faintest identified one explain sources, too
 MOST_SOURCES = 150  # brightest ones that are identified
-LEAST_TURN_PX = 3.0  # of the stars: below it both images of a star are one source
+LEAST_TURN_PX = 2 * INLIER_PX  # of the stars: below it both images of a star are one source
 LEAST_RATIO = 0.35  # of the light of the fainter field to that of the other one
 LEAST_INTERLEAVED = 0.25  # of the second field beside stars of the first: second exposures 0.39 to 1, strips to 0.15
 

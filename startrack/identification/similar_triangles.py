@@ -22,7 +22,7 @@ STARS_OF_HEMISPHERE = 200  # pattern stars of the whole sky for a lens with half
 MAX_PATTERN_STARS = 25_000
 SIDE_OF_HEMISPHERE_RAD = np.radians(45.0)
 NEAR_OF_HEMISPHERE_RAD = np.radians(1.5)
-NARROWEST_NEAR_RAD = np.radians(0.15)
+NARROWEST_NEAR_RAD = NEAR_OF_HEMISPHERE_RAD / 10
 MAX_DETECTIONS = 100  # of which patterns are made
 
 

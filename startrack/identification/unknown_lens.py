@@ -14,6 +14,7 @@ from startrack.core.types import Array, Centroids, Identification, Ints, NotIden
 from startrack.estimation.adjust import HUBER_WITH_CUT, Scheme, State, adjust
 from startrack.estimation.false_alarm import probability
 from startrack.estimation.normal_equations import observations_of_image
+from startrack.identification.attitude_search import MIN_MATCHES
 from startrack.identification.hypotheses import HypothesisSearch, Window, remove_clumps
 from startrack.identification.lens_guesses import (
     MIDDLE_SHAPES,
@@ -33,11 +34,11 @@ from startrack.identification.similar_triangles import (
     patterns_for,
     wide_sizes,
 )  # fmt: skip
-from startrack.identification.verify_unknown_lens import VerifiedLens, verify
+from startrack.identification.verify_unknown_lens import FITTED_BEYOND_1, VerifiedLens, verify
 
 WIDE_FIELD_RAD = np.radians(100.0)  # from here up, `fov_rad` is the angle of the image circle
 NARROW_FIELD_RAD = np.radians(40.0)  # up to here all lenses are nearly pinholes
-MIN_WIDE, MIN_NARROW = 12, 7  # matches
+MIN_WIDE, MIN_NARROW = 2 * MIN_MATCHES, MIN_MATCHES + 1  # of a lens with many unknowns, and with its focal length alone
 WINDOWS = (  # the brightest; those after them, as hot pixels may be brighter than stars; and more of all
     Window(0, 0, 16), Window(0, 16, 26), Window(26, 26, 46), Window(0, 26, 40), Window(46, 46, 70), Window(0, 40, 60),
 )  # fmt: skip
@@ -50,7 +51,6 @@ LOG_FALSE_ALARM = float(np.log(MAX_FALSE_ALARM))
 MAX_TRIED = 600_000  # patterns; a search without an answer ends here, after some seconds
 MAX_TRIED_IN_CIRCLE = 250_000  # where the image circle is seen: real photographs take 1000 to 110,000
 MAX_TRIED_BEYOND = 100_000  # further patterns without the image circle, in case the disc found is not it
-FIELD_MARGIN = 1.3  # of a narrow field: its focal length and centre are not known
 CLUMP_FRACTION = 0.01  # of the frame: detections used for patterns are no closer
 CIRCLE_EDGE = 1.01  # of the disc's radius: detections beyond it are no stars
 FIELD_STEPS_PER_E = 4.0  # indexes are made for fields a fourth part of a factor e apart
@@ -201,7 +201,7 @@ class _Search:
     def _stars_around(self, axis_icrs: Array) -> Ints:
         """Indices of the stars that a camera that is not wide may see."""
         corner = np.arctan(np.tan(self.fov_rad / 2) * np.hypot(*self.size_px) / self.size_px[0])
-        return np.flatnonzero(self.stars.rays_icrs @ axis_icrs > np.cos(corner * FIELD_MARGIN))
+        return np.flatnonzero(self.stars.rays_icrs @ axis_icrs > np.cos(corner * FITTED_BEYOND_1))
 
     def _field_sr(self) -> float:
         """Solid angle of the frame, or of the image circle."""

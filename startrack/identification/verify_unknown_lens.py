@@ -47,8 +47,7 @@ ORDERS = ((150, 4), (60, 3), (25, 2), (0, 1))  # coefficients of the polynomial 
 MIN_FOR_CENTRE = 30
 FITTED_BEYOND_1 = 1.3  # of half the field of view: up to here a fitted lens may have stars
 WIDEST_PSF_PX = 1.5  # for blends
-BLEND_FLUX_RATIO = 0.25  # a neighbour with more than this part of a star's flux makes the match ambiguous
-BLEND_MAG = float(-2.5 * np.log10(BLEND_FLUX_RATIO))
+BLEND_MAG = float(-2.5 * np.log10(0.25))  # a neighbour with more than this part of a star's flux makes it ambiguous
 SCALE_STARS, SCALE_MATCHES = 5000, 200  # brightest stars predicted, and matches used, for the photometric scale
 UNEXPLAINED_MARGIN_MAG = 2.0  # fainter stars than this below a detection do not explain it
 

@@ -23,8 +23,7 @@ from startrack.detection import Detector
 from startrack.estimation.attitude import AttitudeFit, solve_attitude
 from startrack.exposure import NO_TIME, are_fractions
 from startrack.frames import Site, observer_velocity_m_s
-from startrack.identification import Identifier
-from startrack.identification.second_field import check_single_field
+from startrack.identification import Identifier, check_single_field
 
 if TYPE_CHECKING:
     from startrack.catalog import StarCatalog

@@ -15,7 +15,7 @@ from startrack.detection.fit import (
     concatenate_fits,
     fit_points,
     measure_source_noise,
-)  # fmt: skip
+)
 from startrack.detection.frame import RESIDUAL_FRACTION, Frame, Pixels, SourceNoise, radius_for
 from startrack.detection.peaks import Peaks
 from startrack.psf import pixel_profile_single

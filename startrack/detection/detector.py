@@ -20,7 +20,7 @@ from startrack.detection.classify import (
     reject_wing_misfits,
     select_brightest_per_position,
     select_stars,
-)  # fmt: skip
+)
 from startrack.detection.damage import fill_masked, find_dead_parts
 from startrack.detection.deblend import Fitted, fit_all, paint_sources
 from startrack.detection.fit import PointFits, unbin_fits
@@ -33,7 +33,7 @@ from startrack.detection.frame import (
     mask_or_none,
     radius_for,
     recorded_step,
-)  # fmt: skip
+)
 from startrack.detection.peaks import Peaks, find_peaks, unbin_peaks
 from startrack.detection.psf_width import WIDTH_TOLERANCE, guess_psf_width, measure_psf_width
 from startrack.detection.streaks import are_elongated, find_streaks

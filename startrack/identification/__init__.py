@@ -2,9 +2,10 @@
 
 from startrack.identification.centroids import IdentifiedCentroids, identify_centroids
 from startrack.identification.lost_in_space import Identifier
+from startrack.identification.second_field import check_single_field
 from startrack.identification.unknown_lens import WIDE_FIELD_RAD, UnknownLensSolution, identify_unknown_lens
 
 __all__ = [
-    "WIDE_FIELD_RAD", "IdentifiedCentroids", "Identifier", "UnknownLensSolution", "identify_centroids",
-    "identify_unknown_lens",
+    "WIDE_FIELD_RAD", "IdentifiedCentroids", "Identifier", "UnknownLensSolution", "check_single_field",
+    "identify_centroids", "identify_unknown_lens",
 ]  # fmt: skip

@@ -23,7 +23,7 @@ from startrack.identification.triangles import (
     PatternIndex,
     build_index,
     build_pairs,
-)  # fmt: skip
+)
 
 SHALLOWEST_TREE = 1000  # brightest stars in the smallest tree; each next one holds twice as many
 NEIGHBOURS_OF_RAY = 10  # looked up at once; more only in clusters

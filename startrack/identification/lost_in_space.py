@@ -29,7 +29,7 @@ from startrack.identification.attitude_search import (
     AttitudeSearch,
     Sources,
     refine_attitude,
-)  # fmt: skip
+)
 from startrack.identification.index import patterns_of, pixel_scale_of
 
 MAX_FALSE_ALARM = 1e-9  # probability that chance gives an accepted identification

@@ -15,7 +15,7 @@ from startrack.estimation.false_alarm import (
     density_per_px2,
     log_p_value_bound,
     log_trials,
-)  # fmt: skip
+)
 from startrack.estimation.match import CandidatePairs, PhotometricScale, match_nearest
 from startrack.identification.attitude_search import GATE_PX, INLIER_PX
 from startrack.identification.hypotheses import SAME_VIEW_RAD, HypothesisSearch, Window
@@ -33,7 +33,7 @@ from startrack.identification.verify_unknown_lens import (
     coincidence_radius_px,
     significance,
     trusted_radius,
-)  # fmt: skip
+)
 
 STARS_IN_FIELD, SIDE_OF_FIELD = 24, 0.4  # pattern stars; longest side of their triangles over the field's diameter
 # Ranks of brightness whose triangles vote together.

@@ -23,7 +23,7 @@ from startrack.identification.lens_guesses import (
     guess_fisheyes,
     guess_lenses,
     image_circle,
-)  # fmt: skip
+)
 from startrack.identification.lost_in_space import MAX_FALSE_ALARM
 from startrack.identification.narrow_field import NarrowField
 from startrack.identification.region_growing import WIDE_STAGES, GrowthStage, grow, prior_of
@@ -33,7 +33,7 @@ from startrack.identification.similar_triangles import (
     narrow_sizes,
     patterns_for,
     wide_sizes,
-)  # fmt: skip
+)
 from startrack.identification.verify_unknown_lens import FITTED_BEYOND_1, VerifiedLens, verify
 
 WIDE_FIELD_RAD = np.radians(100.0)  # from here up, `fov_rad` is the angle of the image circle

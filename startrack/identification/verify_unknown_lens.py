@@ -14,7 +14,7 @@ from startrack.estimation.false_alarm import (
     density_per_sr,
     log_p_value,
     log_trials,
-)  # fmt: skip
+)
 from startrack.estimation.match import (
     BRIGHTER_MAG,
     DEPTH_BELOW_THRESHOLD_MAG,
@@ -33,7 +33,7 @@ from startrack.identification.region_growing import (
     fit_camera,
     match_in_view,
     with_file_lens,
-)  # fmt: skip
+)
 
 FITS = ((4.0, 200), (2.5, 500), (1.8, 3000))  # gate [px] and number of brightest detections
 FIRST_BRIGHTNESS_GATE_PX = 2.0  # of the matches by brightness; the last one is INLIER_PX

@@ -91,8 +91,7 @@ def _true_positions(found: Sequence[Found], folder: str | None) -> dict[str, tup
     if folder is None:
         return {}
     root = existing_folder(folder, "truth")
-    positions = {one.stem: _true_position(root, one) for one in found}
-    return {stem: position for stem, position in positions.items() if position is not None}
+    return {one.stem: position for one in found if (position := _true_position(root, one)) is not None}
 
 
 def _true_position(folder: Path, one: Found) -> tuple[float, float] | None:

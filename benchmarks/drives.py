@@ -22,9 +22,8 @@ from _drive_frames import Course, draw_course, frames_by_evidence, frames_by_pix
 from _map_draws import draw_ground
 from _results import table, write_section
 
-from startrack.applications.tracking.at_rest import positions_at_rest
 from startrack.applications.tracking.contradictions import smooth_robustly
-from startrack.applications.tracking.online import filter_positions
+from startrack.applications.tracking.filtered_positions import filter_positions, positions_at_rest
 from startrack.applications.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.types import Array
 from startrack.estimation.observations import FrameEstimate, Observations, Steps

@@ -19,7 +19,7 @@ from _drive_frames import frames_by_evidence
 from _results import table, write_section
 from drives import Case, course_of, odometry
 
-from startrack.applications.tracking.online import filter_positions
+from startrack.applications.tracking.filtered_positions import filter_positions
 from startrack.estimation.observations import Observations
 from startrack.estimation.smoother import smooth
 

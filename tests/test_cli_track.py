@@ -17,7 +17,7 @@ from jsonschema import Draft202012Validator
 
 import startrack
 from startrack.applications.tracking import TRACK, read_odometry
-from startrack.applications.tracking.frame_store import decode_frame, encode_frame
+from startrack.applications.tracking.observed_frame import decode_frame, encode_frame
 from startrack.camera import load_camera, save_camera
 from startrack.cli.main import main
 from startrack.estimation.smoother import radius_holding

@@ -21,11 +21,11 @@ from startrack.applications.prediction import (
     Predictor,
     Status,
     area_cells,
-    evenly_spaced,
+    cells_of_draws,
     path_points,
-    predicted,
     share_within,
-    summarized,
+    summarize_cells,
+    times_between,
 )
 from startrack.camera import load_camera
 from startrack.cli.main import main
@@ -189,7 +189,7 @@ def draws_of(status, radius, covariance):
 def test_refused_draws_count_and_a_place_without_positions_has_no_radius():
     nan = np.nan
     status = [[OK, OK, REFUSED], [REFUSED, AMBIGUOUS, REFUSED], [OK, AMBIGUOUS, REFUSED]]
-    cells = predicted(draws_of(status, [[3.0, 9.0, nan], [nan] * 3, [4.0, nan, nan]], [[9.0, 0.0], [0.0, 4.0]]))
+    cells = cells_of_draws(draws_of(status, [[3.0, 9.0, nan], [nan] * 3, [4.0, nan, nan]], [[9.0, 0.0], [0.0, 4.0]]))
     assert cells["radius95_m"] == pytest.approx([9.0, nan, nan], nan_ok=True)
     assert cells["p_ok"] == pytest.approx([2 / 3, 0, 1 / 3])
     assert cells["p_ambiguous"] == pytest.approx([0, 1 / 3, 1 / 3])
@@ -197,8 +197,8 @@ def test_refused_draws_count_and_a_place_without_positions_has_no_radius():
     assert cells["sigma_major_m"] == pytest.approx([3.0, nan, 3.0], nan_ok=True)
     assert cells["sigma_minor_m"] == pytest.approx([2.0, nan, 2.0], nan_ok=True)
     assert cells["azimuth_deg"][[0, 2]] == pytest.approx(90.0)
-    assert summarized(cells)["share_below_10_m"] == pytest.approx(1 / 3)
-    assert summarized(cells)["median_radius95_m"] is None
+    assert summarize_cells(cells)["share_below_10_m"] == pytest.approx(1 / 3)
+    assert summarize_cells(cells)["median_radius95_m"] is None
     assert share_within(cells, 9.0) == pytest.approx(1 / 3)
 
 
@@ -211,21 +211,21 @@ def test_the_ratio_is_that_of_the_errors_of_the_draws_to_the_stated(factor):
     draws = draws_of(np.full((400, 10), OK), np.ones((400, 10)), np.broadcast_to(covariance, (400, 10, 2, 2)))
     draws["offset_m"] = factor * sigma_m[:, None, None] * rng.normal(size=(400, 10, 2)) * [2.0, 1.0]
     draws["status"][7], draws["offset_m"][7], draws["covariance_m2"][7] = REFUSED, np.nan, np.nan
-    cells = predicted(draws)
-    assert summarized(cells)["error_ratio"] == pytest.approx(factor, rel=0.05)
+    cells = cells_of_draws(draws)
+    assert summarize_cells(cells)["error_ratio"] == pytest.approx(factor, rel=0.05)
     assert np.delete(cells["sigma_major_m"], 7) == pytest.approx(2.0 * np.delete(sigma_m, 7))
 
 
 def test_without_a_position_there_is_no_ratio():
-    cells = predicted(draws_of([[REFUSED, AMBIGUOUS]], [[np.nan, np.nan]], np.eye(2)))
-    assert summarized(cells)["error_ratio"] is None
+    cells = cells_of_draws(draws_of([[REFUSED, AMBIGUOUS]], [[np.nan, np.nan]], np.eye(2)))
+    assert summarize_cells(cells)["error_ratio"] is None
 
 
 def test_the_azimuth_is_that_of_the_long_axis():
     """Long towards the north-east by 30 degrees from north."""
     along = np.array([np.sin(np.radians(30)), np.cos(np.radians(30))])
     covariance = 25.0 * np.outer(along, along) + np.eye(2)
-    cells = predicted(draws_of([[OK]], [[5.0]], covariance))
+    cells = cells_of_draws(draws_of([[OK]], [[5.0]], covariance))
     assert cells["azimuth_deg"] == pytest.approx([30.0])
     assert cells["sigma_major_m"] == pytest.approx([np.sqrt(26.0)])
 
@@ -254,9 +254,9 @@ def test_a_terrain_on_the_earth_has_no_map_projection():
 
 
 def test_times_are_the_middles_of_equal_parts():
-    times = evenly_spaced(WHEN, WHEN + timedelta(hours=4), 4)
+    times = times_between(WHEN, WHEN + timedelta(hours=4), 4)
     assert [time - WHEN for time in times] == [timedelta(minutes=60 * k + 30) for k in range(4)]
-    assert evenly_spaced(WHEN, WHEN, 3) == (WHEN,) * 3
+    assert times_between(WHEN, WHEN, 3) == (WHEN,) * 3
 
 
 def test_limiting_magnitude_is_the_inverse_of_the_exposure():

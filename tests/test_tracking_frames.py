@@ -8,11 +8,16 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 
-from startrack.applications.tracking.at_rest import positions_at_rest
+from startrack.applications.tracking.filtered_positions import positions_at_rest
 from startrack.applications.tracking.frame_estimate import MIN_NOISE_SHARE, clipped_noise, estimate_frame
 from startrack.applications.tracking.frame_model import balanced_moments
-from startrack.applications.tracking.frame_store import decode_frame, encode_frame
-from startrack.applications.tracking.observed_frame import ObservedFrame, observe_again, observe_frame
+from startrack.applications.tracking.observed_frame import (
+    ObservedFrame,
+    decode_frame,
+    encode_frame,
+    observe_again,
+    observe_frame,
+)
 from startrack.applications.tracking.track_errors import BIAS, CLOCK, DEPTH, EDGE, TrackErrors
 from startrack.core.types import BadInput, Clock, Evidence, ImageErrors, ShownError
 from startrack.estimation.observations import Observations, Steps

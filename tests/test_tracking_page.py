@@ -12,7 +12,7 @@ import pytest
 from html_helpers import DESKTOP, PHONE, Window
 from synthetic_track import NASTY, odometry_alone, synthetic_track
 
-from startrack.applications.tracking.page import track_page
+from startrack.applications.tracking.write import track_page
 from startrack.estimation.smoother import radius_holding
 from startrack.output import png_bytes
 

@@ -7,7 +7,7 @@ import pytest
 from tracking_helpers import HEIGHT_SIGMA_M, STEP_SIGMA_M, Drive, mean_nees, shifted, simulate_drive, with_slips
 
 from startrack.applications.tracking.contradictions import smooth_robustly
-from startrack.applications.tracking.online import OnlineTrack, filter_positions
+from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions
 from startrack.estimation import filter as tracking_filter
 from startrack.estimation.filter import TrackFilter
 from startrack.estimation.observations import Observations, Steps

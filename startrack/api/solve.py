@@ -97,13 +97,14 @@ def track(
             first refused image where none has a single position.
     """
     settings = chain.settings_input(settings) or Settings()
-    session = TrackSession(settings=settings, stated_camera=camera, stated_terrain=terrain)
+    session = TrackSession(
+        settings=settings, stated_camera=camera, stated_terrain=terrain, odometry_sigma=odometry_sigma,
+        odometry_floor_m=odometry_floor_m,
+    )  # fmt: skip
     for image in images:
         session.add_exposure(chain.exposure_input(image, None))
     moves = odometry if odometry is None or isinstance(odometry, Odometry) else read_odometry(odometry)
-    return session.estimate(
-        moves, odometry_sigma=odometry_sigma, odometry_floor_m=odometry_floor_m, at_rest=at_rest
-    )  # fmt: skip
+    return session.estimate(moves, at_rest=at_rest)
 
 
 def identify(

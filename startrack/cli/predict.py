@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
         return EXIT_STOPPED
     if args.odometry_sigma is not None:
         floor_m = ODOMETRY_FLOOR_M if args.odometry_floor is None else args.odometry_floor
-        report = report.between(OdometryErrors(args.odometry_sigma, floor_m))
+        report = report.with_odometry(OdometryErrors(args.odometry_sigma, floor_m))
     files = write_report(report, out, plots=not args.no_plots)
     if args.json:
         print(json.dumps(report.record))
@@ -99,7 +99,7 @@ def _check_flags(args: argparse.Namespace) -> None:
 
 def _conditions(args: argparse.Namespace) -> Conditions:
     """Raises BadInput: no_time, no_calibration, bad_calibration, bad_terrain."""
-    from startrack.applications.prediction import Conditions, evenly_spaced
+    from startrack.applications.prediction import Conditions, times_between
     from startrack.frames import parse_utc
 
     first, slash, last = args.time.partition("/")
@@ -107,7 +107,7 @@ def _conditions(args: argparse.Namespace) -> Conditions:
     return Conditions(
         camera=absolute_reference(args.camera),
         terrain=absolute_reference(args.terrain),
-        times_utc=evenly_spaced(start, parse_utc(last) if slash else start, args.draws),
+        times_utc=times_between(start, parse_utc(last) if slash else start, args.draws),
         exposure_s=args.exposures[0] if args.exposures else args.exposure,
         sky_v_mag_arcsec2=args.sky,
         seed=args.seed,

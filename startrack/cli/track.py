@@ -25,7 +25,8 @@ def run(args: argparse.Namespace) -> int:
 
     _check_folder(args)
     store, settings = FrameStore(Path(args.dir) / STORE), Settings(evidence_sources=args.evidence)
-    track = TrackRun(args, TrackSession(store=store, settings=settings, facts=flag_facts(args)))
+    errors = {"odometry_sigma": args.odometry_sigma, "odometry_floor_m": args.odometry_floor}
+    track = TrackRun(args, TrackSession(store=store, settings=settings, facts=flag_facts(args), **errors))
     if args.follow:
         track.follow()
     else:

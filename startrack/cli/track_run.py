@@ -75,7 +75,6 @@ class TrackRun:
         self._is_old, self._write_s = False, 0.0  # the files; what writing them took
         self._printed = 0  # lines at rest
         self._shown: set[str] = set()  # facts whose gross error an image showed
-        self._errors = {"odometry_sigma": args.odometry_sigma, "odometry_floor_m": args.odometry_floor}
         self._moves: OdometryFile | None = None
         if args.odometry is not None:
             self._moves = OdometryFile(args.odometry, args.odometry_topic, bool(args.follow))
@@ -169,7 +168,7 @@ class TrackRun:
             before, self._printed = self._printed, len(self.session.frames)
             records = frame_records(self._estimate())[before:]
         else:
-            newest = self.session.newest(self._odometry(), **self._errors)
+            newest = self.session.newest(self._odometry())
             records = [record for track in newest for record in frame_records(track)]
         self._print_records(records, "filtered_")
         return bool(records)
@@ -231,7 +230,7 @@ class TrackRun:
 
     def _estimate(self, growing: bool = False) -> Track:
         at_rest = self.args.at_rest
-        return self.session.estimate(self._odometry(), **self._errors, at_rest=at_rest, covered_only=growing)
+        return self.session.estimate(self._odometry(), at_rest=at_rest, covered_only=growing)
 
     def _odometry(self) -> Odometry | None:
         return None if self._moves is None else self._moves.read()
@@ -245,7 +244,7 @@ class TrackRun:
             odometry = {"file": Path(args.odometry).name, "sigma": args.odometry_sigma, "floor_m": args.odometry_floor}
         if pictures and not args.no_plots:
             if odometry is not None and not args.at_rest:
-                moves_m = self.session.odometry_positions_m(track, self._odometry(), **self._errors)
+                moves_m = self.session.odometry_positions_m(track, self._odometry())
             picture = png_bytes(draw_track(track, moves_m))
             title = f"Track of {Path(args.frames[0]).resolve().name}"
             page = track_page(track, picture, title=title, odometry_m=moves_m)

@@ -1,1 +1,1 @@
-"""Statistics of directions: attitude, least squares, matches of detections and stars, chance."""
+"""Statistics: attitude, least squares, matches of detections and stars, chance, filter and smoother of tracks."""

@@ -22,6 +22,7 @@ from startrack.applications.batch.store import (
 )
 from startrack.chain import MISSING, are_unchanged, content_sha256, input_hashes, job_sha256
 from startrack.core.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput
+from startrack.core.files import FULL_DISK
 from startrack.core.runner import Died, Runner, RunStopped
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
 Record = dict[str, Any]
 ImageDone = tuple[Record, bool]  # the record, and whether it was there already
-DISK_ERRORS = {errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.EFBIG, errno.EIO}
+DISK_ERRORS = FULL_DISK | {errno.EROFS}
 
 
 @dataclass(frozen=True)
@@ -70,9 +71,10 @@ def locate_image(task: Task) -> ImageDone:
         key = _key(task, sha256)
         before = None if task.overwrite else _valid_record(task, key)
         return (before, True) if before is not None else (_locate_and_write(task, sha256, key), False)
-    except Exception as cause:  # noqa: BLE001 - an internal error of one image is counted and recorded; the others go on
+    except Exception as cause:
         if isinstance(cause, BadInput):  # not of the image, which would be a record: the results cannot be written
-            _stop_if_disk_is_full(cause)
+            if isinstance(cause.__cause__, OSError) and cause.__cause__.errno in DISK_ERRORS:
+                raise RunStopped(str(cause)) from cause
             return write_failure(task, str(cause), cause.reason), False
         return write_failure(task, f"internal error: {type(cause).__name__}: {cause}"), False
 
@@ -88,12 +90,9 @@ def valid_stored_record(task: Task) -> dict[str, Any] | None:
 
 def write_failure(task: Task, message: str, reason: str = INTERNAL_ERROR) -> dict[str, Any]:
     """Write and return the record of an image that failed: without a job hash, so that the next run repeats it."""
-    from startrack.output import refused_dict, write_json
+    from startrack.output import write_json
 
-    record = {
-        **refused_dict(task.name, reason, message),
-        **_unread_provenance(content_sha256(task.path, task.bag_image)),
-    }
+    record = _unread_record(task, reason, message, content_sha256(task.path, task.bag_image))
     record |= {"image": text_of_name(task.name), JOB: None}
     with suppress(BadInput):  # the record is returned all the same
         if not is_solved(stored_record(task.result)):
@@ -165,12 +164,12 @@ def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str
     from startrack.chain import Inputs, Refused, Settings, locate_exposure
     from startrack.core.types import PositionPrior
     from startrack.localization import require_localizer
-    from startrack.output import refused_dict, result_dict
+    from startrack.output import result_dict
 
     try:
         exposure = read_task(task)
     except BadInput as cause:
-        return {**refused_dict(task.name, cause.reason, str(cause)), **_unread_provenance(sha256)}, {}
+        return _unread_record(task, cause.reason, str(cause), sha256), {}
     # Before the files are read, so that a change in between is noticed.
     mask = exposure.mask if isinstance(exposure.mask, str) else None
     inputs = input_hashes(task.path, [exposure.camera], exposure.terrain, mask)
@@ -184,12 +183,10 @@ def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str
         return result_dict(Refused(reason=cause.reason, message=str(cause), reached=Inputs(exposure=exposure))), inputs
 
 
-def _unread_provenance(sha256: str) -> dict[str, Any]:
-    """The provenance of an image that could not be decoded, or its sidecar not be read: the file's hash."""
+def _unread_record(task: Task, reason: str, message: str, sha256: str) -> dict[str, Any]:
+    """The record of an image that could not be decoded, or its sidecar not be read: with the hash of its file."""
+    from startrack.output import refused_dict
+
     unknown = dict.fromkeys(("camera", "terrain", "catalog", "time_utc", "exposure_s"))
-    return {} if sha256 == MISSING else {"provenance": {"version": __version__, "image_sha256": sha256, **unknown}}
-
-
-def _stop_if_disk_is_full(cause: BadInput) -> None:
-    if isinstance(cause.__cause__, OSError) and cause.__cause__.errno in DISK_ERRORS:
-        raise RunStopped(str(cause)) from cause
+    provenance = {"version": __version__, "image_sha256": sha256, **unknown}
+    return refused_dict(task.name, reason, message) | ({} if sha256 == MISSING else {"provenance": provenance})

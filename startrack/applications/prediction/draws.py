@@ -190,7 +190,7 @@ def draw_store(out: Path, *, draws: int, jobs: int, progress: Progress, cluster:
     )
 
 
-def evenly_spaced(first: datetime, last: datetime, count: int) -> tuple[datetime, ...]:
+def times_between(first: datetime, last: datetime, count: int) -> tuple[datetime, ...]:
     """The middles of `count` equal parts of a time. Raises BadInput (no_time) if `last` is before `first`."""
     if last < first:
         raise BadInput("no_time", f"the end {last.isoformat()} is before the start {first.isoformat()}")
@@ -198,7 +198,7 @@ def evenly_spaced(first: datetime, last: datetime, count: int) -> tuple[datetime
     return tuple(first + (k + 0.5) * step for k in range(count))
 
 
-def joined(chunks: Iterable[Chunk]) -> Chunk:
+def join_chunks(chunks: Iterable[Chunk]) -> Chunk:
     """The `chunks` of places as arrays over places (k, n, ...)."""
     rows = list(chunks)
     return {key: np.stack([row[key] for row in rows]) for key in rows[0]}

@@ -100,7 +100,7 @@ SUMMARY_QUANTITIES = (
 )  # fmt: skip
 
 
-def summarized(cells: Cells) -> dict[str, Any]:
+def summarize_cells(cells: Cells) -> dict[str, Any]:
     """The summary of the places in `cells`, by the keys of the schema."""
     return record_from(SUMMARY_QUANTITIES, cells)
 

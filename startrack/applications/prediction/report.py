@@ -18,10 +18,10 @@ from startrack.applications.prediction.quantities import (
     SMOOTHED,
     Cells,
     median_or_none,
-    summarized,
+    summarize_cells,
 )
 from startrack.applications.prediction.run import variant_record
-from startrack.applications.prediction.statistics import with_odometry
+from startrack.applications.prediction.statistics import add_odometry
 from startrack.core.errors import BadOutput, length_text
 from startrack.frames import format_utc
 from startrack.terrain import Terrain, load_terrain
@@ -66,10 +66,10 @@ class Report:
         variants = [variant_record(other, found) for other, found in others.items()]
         return replace(self, conditions=conditions, cells=cells, variants=variants, depth=depth)
 
-    def between(self, odometry: OdometryErrors) -> Report:
+    def with_odometry(self, odometry: OdometryErrors) -> Report:
         """The report of a path with odometry between its images."""
         points_m = self.points.position_m
-        cells = with_odometry(points_m, self.cells, sigma_1=odometry.sigma_1, floor_m=odometry.floor_m)
+        cells = add_odometry(points_m, self.cells, sigma_1=odometry.sigma_1, floor_m=odometry.floor_m)
         return replace(self, cells=cells, odometry=odometry)
 
     @property
@@ -103,7 +103,7 @@ class Report:
             medians = {f"median_{name}": median_or_none(self.cells[name]) for name in (FILTERED, SMOOTHED)}
             more["odometry"] = {"sigma": self.odometry.sigma_1, "floor_m": self.odometry.floor_m, **medians}
         provenance = {"version": __version__, "inputs": dict(self.inputs)}
-        return {**self.settings, "summary": summarized(self.cells), **more, "provenance": provenance}
+        return {**self.settings, "summary": summarize_cells(self.cells), **more, "provenance": provenance}
 
     def check_folder(self, out: Path, *, overwrite: bool) -> None:
         """Raise BadOutput if `out` holds a prediction of other places, cameras or times and not `overwrite`."""
@@ -119,7 +119,7 @@ class Report:
 
     def lines(self) -> list[str]:
         """The summary in words."""
-        found, what = summarized(self.cells), "area" if self.points.kind == "area" else "path"
+        found, what = summarize_cells(self.cells), "area" if self.points.kind == "area" else "path"
         radius = _median_text(found["median_radius95_m"])
         shares = ", ".join(f"{100 * found[f'share_below_{bound}_m']:.0f} % below {bound} m" for bound in SHARES_M)
         lines = [

@@ -16,13 +16,13 @@ from startrack.applications.prediction.draws import (
     Place,
     Predictor,
     Task,
-    evenly_spaced,
-    joined,
+    join_chunks,
     predictor_of,
+    times_between,
 )
 from startrack.applications.prediction.places import area_cells, default_spacing_m
-from startrack.applications.prediction.quantities import Cells, summarized
-from startrack.applications.prediction.statistics import predicted, share_within
+from startrack.applications.prediction.quantities import Cells, summarize_cells
+from startrack.applications.prediction.statistics import cells_of_draws, share_within
 from startrack.camera import Camera, load_camera
 from startrack.core.chunk_store import ChunkStore
 from startrack.core.types import Array
@@ -53,7 +53,7 @@ class Predictions:
         if self.overwrite and conditions not in self._new:
             self.store.discard(tasks)
         self._new.add(conditions)
-        return predicted(joined(self.store.chunks(what, tasks)))
+        return cells_of_draws(join_chunks(self.store.chunks(what, tasks)))
 
     def depth(self, conditions: Conditions, target_m: float) -> tuple[Conditions, dict[str, Any]]:
         """The shortest exposure whose radius is at most `target_m` at nine of ten places; and the record of the search.
@@ -99,7 +99,7 @@ def variant_record(conditions: Conditions, cells: Cells) -> dict[str, Any]:
         "camera": predictor.camera.name,
         "exposure_s": predictor.exposure_s,
         "limiting_v_mag": predictor.limiting_v_mag,
-        "summary": summarized(cells),
+        "summary": summarize_cells(cells),
     }
 
 
@@ -115,7 +115,7 @@ class Prediction:
     @property
     def summary(self) -> dict[str, Any]:
         """As in predict.json."""
-        return summarized(self.cells)
+        return summarize_cells(self.cells)
 
 
 def predict_positions(
@@ -138,7 +138,7 @@ def predict_positions(
         places = [Place(k, float(east), float(north)) for k, (east, north) in enumerate(points)]
     if draws < 1:
         raise ValueError(f"draws={draws}: at least one is needed")
-    times = evenly_spaced(*times_utc, draws)
+    times = times_between(*times_utc, draws)
     predictor = Predictor(camera, terrain, Conditions(camera.name, terrain.name, times, **conditions))
-    found = predicted(joined(predictor.draw(place) for place in places))
+    found = cells_of_draws(join_chunks(predictor.draw(place) for place in places))
     return Prediction(points, found, predictor.exposure_s, predictor.limiting_v_mag)

@@ -13,7 +13,7 @@ from startrack.estimation.observations import FrameEstimate, Observations, Steps
 from startrack.estimation.smoother import radius_holding, smooth
 
 
-def predicted(draws: Chunk) -> Cells:
+def cells_of_draws(draws: Chunk) -> Cells:
     """The quantities of places (k,) from their draws (k, n, ...)."""
     status = draws["status"]
     located = (status == Status.OK) & np.isfinite(draws["covariance_m2"]).all(axis=(2, 3))
@@ -52,7 +52,7 @@ def share_within(cells: Cells, radius95_m: float) -> float:
     return float(np.mean(cells["radius95_m"] <= radius95_m))
 
 
-def with_odometry(position_m: Array, cells: Cells, *, sigma_1: float, floor_m: float) -> Cells:
+def add_odometry(position_m: Array, cells: Cells, *, sigma_1: float, floor_m: float) -> Cells:
     """The `cells` at points (k, 2) along a path with the 95 % radii by the images and odometry together.
 
     Each point has one image with its predicted ellipse; of those without a radius the odometry alone counts. Moves err

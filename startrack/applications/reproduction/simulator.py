@@ -10,6 +10,7 @@ Source: Kua 2008, sections 3.2.1 and 3.2.2. No pixels: stars are identified and 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 
@@ -20,13 +21,20 @@ from startrack.terrain import Cylinder
 DIAMETER_M, DEPTH_M = 20_000.0, 2_000.0  # Shackleton as the thesis has it (section 3.3)
 MAGNITUDE = 6.0
 ASPECT_RATIO = DIAMETER_M / DEPTH_M
-STARS, POSITIONS, MISTAKES = 1, 2, 3  # streams of random numbers
 EDGE_POINTS = 360  # of the drawn crater edge (section 3.2.1)
 STEP_M = 5.0  # of the traverse through the middle of the crater (section 3.2.2)
 GRID_POINTS = 161  # a side; odd, so that the position itself is a point of the first grid and the cell is not missed
 FIRST_HALF_M = 20.0
 MARGIN, REFINEMENTS = 1.05, 2  # of the grid
 SHACKLETON = Site(body="moon", latitude_rad=float(np.radians(-89.66)), longitude_rad=float(np.radians(129.78)))
+
+
+class Stream(IntEnum):
+    """Of random numbers."""
+
+    STARS = 1
+    POSITIONS = 2
+    MISTAKES = 3
 
 
 def star_count(magnitude: float) -> int:
@@ -58,7 +66,7 @@ class Sky:
     @classmethod
     def draw(cls, seed: int, sky: int, magnitude: float = MAGNITUDE) -> Sky:
         """phi = 2 pi r1, theta = arcsin r2, r1 and r2 uniform over [0, 1]: eq. 3.9 and 3.10."""
-        r1, r2 = _draw_uniform([seed, STARS, sky], (star_count(magnitude), 2)).T
+        r1, r2 = _draw_uniform([seed, Stream.STARS, sky], (star_count(magnitude), 2)).T
         return cls(2 * np.pi * r1, np.arcsin(r2))
 
     def __len__(self) -> int:
@@ -77,7 +85,7 @@ def directions(azimuth_rad: Array) -> Array:
 
 def draw_positions(seed: int, sky: int, start: int, stop: int, radius_m: float = DIAMETER_M / 2) -> Array:
     """Positions number start to stop - 1 (n, 2) [m] of a sky, uniform over the crater's floor."""
-    r1, r2 = _draw_uniform([seed, POSITIONS, sky], (stop, 2))[start:].T
+    r1, r2 = _draw_uniform([seed, Stream.POSITIONS, sky], (stop, 2))[start:].T
     return radius_m * np.sqrt(r1)[:, None] * directions(2 * np.pi * r2)
 
 
@@ -101,12 +109,12 @@ def crater_edge(cylinder: Cylinder, position_m: Array) -> tuple[Array, Array]:
 class Mistakes:
     """The error rates of a list of stars, which the evidence assumes too."""
 
-    missed: float = 1e-6  # probability for a visible star; 1e-6: none, as in the thesis
-    false: float = 1e-6  # for a hidden star
+    missed: float  # probability for a visible star
+    false: float  # for a hidden star
 
     def draw_list(self, in_sight: Bools, seed: int, sky: int, number: int) -> Bools:
         """Draw the list of position `number`: which stars (n,) are on it."""
-        r = _draw_uniform([seed, MISTAKES, sky, number], (len(in_sight),))
+        r = _draw_uniform([seed, Stream.MISTAKES, sky, number], (len(in_sight),))
         return np.where(in_sight, r >= self.missed, r < self.false)
 
     def evidence(self, sky: Sky, listed: Bools) -> Evidence:
@@ -121,7 +129,7 @@ class Mistakes:
         )
 
 
-PERFECT = Mistakes()
+PERFECT = Mistakes(missed=1e-6, false=1e-6)  # none, as in the thesis
 
 
 def cell_centroid(points_m: Array, position_m: Array, radius_m: float) -> Array:

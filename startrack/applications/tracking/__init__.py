@@ -1,10 +1,8 @@
 """Many exposures: tracks of a camera at rest or on a drive; odometry from text and ROS bags."""
 
 from startrack.applications.tracking.follow import follow_images
-from startrack.applications.tracking.frame_store import FrameStore
-from startrack.applications.tracking.observed_frame import ObservedFrame, observe_frame
+from startrack.applications.tracking.observed_frame import FrameStore, ObservedFrame, observe_frame
 from startrack.applications.tracking.odometry import Odometry, read_odometry
-from startrack.applications.tracking.page import track_page
 from startrack.applications.tracking.picture import draw_track
 from startrack.applications.tracking.quantities import FRAME_QUANTITIES, TRACK, frame_records
 from startrack.applications.tracking.session import TrackSession
@@ -18,7 +16,7 @@ from startrack.applications.tracking.track import (
     estimate_track,
 )
 from startrack.applications.tracking.track_errors import TrackErrors
-from startrack.applications.tracking.write import track_record, write_track
+from startrack.applications.tracking.write import track_page, track_record, write_track
 from startrack.exposure import read_bag_exposures
 
 __all__ = [

@@ -71,12 +71,9 @@ def smooth_robustly(
 def step_doubt(found: Smoothed, steps: Steps) -> Array:
     """(n - 1,) logarithm of the odds that each move slipped; -inf where it is not known."""
     known = np.isfinite(steps.sigma_m)
-    variance = np.where(known, np.square(np.where(known, steps.sigma_m, 1.0)), 1.0)[:, None, None] * np.eye(2)
-    return np.where(
-        known,
-        gross_log_odds(found.step_residual_m, found.step_variance_m2 + variance, SLIP_PROBABILITY, SLIP_SIGMA_M),
-        -np.inf,
-    )
+    variance = found.step_variance_m2 + np.square(np.where(known, steps.sigma_m, 1.0))[:, None, None] * np.eye(2)
+    odds = gross_log_odds(found.step_residual_m, variance, SLIP_SIGMA_M**2 * np.eye(2), SLIP_PROBABILITY)
+    return np.where(known, odds, -np.inf)
 
 
 def _improve_slips(found: Smoothed, steps: Steps, slipped: Bools) -> Bools:
@@ -116,11 +113,10 @@ def _gain(found: Smoothed, steps: Steps, slipped: Bools, here: int, there: int) 
     return prior + float(log_normal(residual, without + np.diag(then)) - log_normal(residual, without + np.diag(now)))
 
 
-def gross_log_odds(residual: Array, covariance: Array, probability: float, sigma_m: float) -> Array:
-    """(n,) logarithm of the odds that residuals (n, 2) have a gross error, beside their covariances (n, 2, 2)."""
-    wide = covariance + sigma_m**2 * np.eye(2)
+def gross_log_odds(residual: Array, covariance: Array, gross: Array, probability: float) -> Array:
+    """(...) logarithm of the odds that residuals (..., p) have a gross error, whose covariance is `gross` (p, p)."""
     odds = np.log(probability) - np.log1p(-probability)
-    return np.asarray(odds + log_normal(residual, wide) - log_normal(residual, covariance))
+    return np.asarray(odds + log_normal(residual, covariance + gross) - log_normal(residual, covariance))
 
 
 def log_normal(residual: Array, covariance: Array) -> Array:
@@ -167,10 +163,7 @@ def wrong_log_odds(residual: Array, covariance: Array, estimate: FrameEstimate, 
     wrong, part = wrong_covariance(estimate), slice(0 if placed else 2, None)
     if not placed and estimate.parameters == 2:
         return -np.inf
-    right = covariance[part, part]
-    odds = np.log(WRONG_PROBABILITY) - np.log1p(-WRONG_PROBABILITY)
-    wide = log_normal(residual[part], right + wrong[part, part])
-    return float(odds + wide - log_normal(residual[part], right))
+    return float(gross_log_odds(residual[part], covariance[part, part], wrong[part, part], WRONG_PROBABILITY))
 
 
 def wrong_covariance(estimate: FrameEstimate) -> Array:

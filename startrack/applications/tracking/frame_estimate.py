@@ -43,7 +43,7 @@ def estimate_frame(
     reference, spread = position_m, covariance_m2
     for _ in range(MAX_NEIGHBOURHOODS):
         half = max(REACH_SIGMAS * _widest(spread) + MARGIN_M, LEAST_HALF_M)
-        models = [FrameModel.near(evidence, terrain, errors, reference, half)]
+        models = [FrameModel.of_evidence(evidence, terrain, errors, reference, half)]
         found = sample_together(models, reference, spread)
         mean, covariance = moments(found.points, found.share)
         if np.abs(mean[:2] - reference).max() + 3.0 * _widest(covariance[:2, :2]) < half:
@@ -79,32 +79,20 @@ def observe_together(models: Sequence[FrameModel], found: WeightedPoints) -> Fra
         mean, covariance - by_evidence + noise + shared_by_posts, np.eye(len(mean)) - covariance @ prior, noise, post,
         by_post,
     )  # fmt: skip
-    seen = np.any([model.rise_rad.any(axis=0) for model in models], axis=0)
-    return _turned(_without(estimate, 2 + np.flatnonzero(~seen)), models[0].errors)
+    # Without sampling noise in the parameters that the evidence does not depend on.
+    seen = np.append([True, True], np.any([model.rise_rad.any(axis=0) for model in models], axis=0))
+    estimate = _transform(estimate, np.diag(seen * 1.0), np.diag(seen * 1.0), np.diag(~seen * 1.0))
+    # With the position after the turn of the clock's error.
+    to = np.eye(len(mean))
+    to[:2, 2:] = models[0].errors.turn_m(estimate.mean[:2])
+    return _transform(estimate, to, np.asarray(np.linalg.inv(to)), np.zeros_like(to)) if to[:2, 2:].any() else estimate
 
 
-def _turned(estimate: FrameEstimate, errors: TrackErrors) -> FrameEstimate:
-    """The estimate with the position after the turn of the clock's error, see `TrackErrors.turn_m`."""
-    to = np.eye(estimate.parameters)
-    to[:2, 2:] = errors.turn_m(estimate.mean[:2])
-    if not to[:2, 2:].any():
-        return estimate
+def _transform(estimate: FrameEstimate, to: Array, back: Array, own: Array) -> FrameEstimate:
+    """The estimate of the parameters after the linear map `to` with the inverse `back`, with `own` noise (p, p)."""
     return replace(
-        estimate, mean=to @ estimate.mean, covariance=to @ estimate.covariance @ to.T,
-        response=to @ estimate.response @ np.linalg.inv(to), noise=to @ estimate.noise @ to.T,
-        by_post=to @ estimate.by_post,
-    )  # fmt: skip
-
-
-def _without(estimate: FrameEstimate, unseen: Ints) -> FrameEstimate:
-    """The estimate without sampling noise in the parameters (u,) that the evidence does not depend on."""
-    if not len(unseen):
-        return estimate
-    seen = ~np.isin(np.arange(estimate.parameters), unseen)
-    both, own = np.outer(seen, seen), np.diag(np.where(seen, 0.0, 1.0))
-    return replace(
-        estimate, mean=estimate.mean * seen, covariance=estimate.covariance * both + own,
-        response=estimate.response * both, noise=estimate.noise * both + own, by_post=estimate.by_post * seen[:, None],
+        estimate, mean=to @ estimate.mean, covariance=to @ estimate.covariance @ to.T + own,
+        response=to @ estimate.response @ back, noise=to @ estimate.noise @ to.T + own, by_post=to @ estimate.by_post,
     )  # fmt: skip
 
 

@@ -31,7 +31,9 @@ class FrameModel:
     errors: TrackErrors
 
     @classmethod
-    def near(cls, evidence: Evidence, terrain: Terrain, errors: TrackErrors, reference_m: Array, half_m: float) -> Self:
+    def of_evidence(
+        cls, evidence: Evidence, terrain: Terrain, errors: TrackErrors, reference_m: Array, half_m: float
+    ) -> Self:
         """Of `evidence` with its errors of the image, for positions within `half_m` of a reference (2,)."""
         image = errors.of_image(evidence.image_errors)
         model = SkylineModel(terrain, evidence, reference_m, half_m, errors.listed, image_errors=image)

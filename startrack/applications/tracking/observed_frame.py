@@ -1,16 +1,25 @@
-"""From the result of one image to what a track needs of it: a few numbers and rows, without the image."""
+"""From the result of one image to what a track needs of it: a few numbers and rows, without the image.
+
+They are kept as files: a track that was stopped goes on without locating its images again.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import io
+import json
+from dataclasses import asdict, dataclass, fields, replace
 from datetime import datetime
+from pathlib import Path
+from typing import Any, TypeVar
+from zipfile import BadZipFile
 
 import numpy as np
 
 from startrack.applications.tracking.frame_estimate import estimate_frame
 from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.chain import Located, Measured, Outcome, Refused, last_value
-from startrack.core.types import Array, Evidence, Fix, ShownError
+from startrack.core.files import write_atomically
+from startrack.core.types import Array, Clock, Evidence, Fix, ImageErrors, ShownError
 from startrack.estimation.observations import FrameEstimate
 from startrack.estimation.smoother import SIGMAS_95
 from startrack.evidence.sky_levels import SECTORS
@@ -19,7 +28,10 @@ from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD
 from startrack.localization.summary import camera_at
 from startrack.terrain import Terrain
 
+FORMAT = "startrack.observed-frame/3"
+ROWS = ("azimuth_rad", "elevation_rad", "llr", "edge_sigma_rad", "extended_nats")
 MODE_SIGMA_M = 10.0  # of a mode whose circle is not known
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +43,7 @@ class ImageFix:
     radius95_m: float
     radius999_m: float
     at_time_m: Array  # (2,) if the stated time is right
-    weight: float = 1.0  # probability of the position
+    weight: float  # probability of the position
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +116,7 @@ def _image_fixes(fix: Fix, terrain: Terrain) -> tuple[ImageFix, ...]:
     """The position of a `fix` by one image, or each of several."""
     if not fix.ambiguous:
         position, at = np.asarray(fix.position_enu_m), np.asarray(fix.at_time_m)
-        return (ImageFix(position, np.asarray(fix.covariance_m2), fix.radius95_m, fix.radius999_m, at),)
+        return (ImageFix(position, np.asarray(fix.covariance_m2), fix.radius95_m, fix.radius999_m, at, 1.0),)
     found = []
     for mode in fix.modes:
         at = np.array([mode.east_m, mode.north_m])
@@ -131,3 +143,72 @@ def _informative_rows(rows: Evidence, terrain: Terrain, position_m: Array) -> Ev
     kept = (np.abs(rows.llr) > MIN_ROW_NATS) | (rows.extended_nats > MIN_ROW_NATS)
     kept &= np.asarray(terrain.is_informative(rows.azimuth_rad, rows.elevation_rad))
     return rows.take(kept & (above > LOW_RAD) & (above < HIGH_RAD))
+
+
+class FrameStore:
+    """The frames in a folder, by the hash of all that decides them."""
+
+    def __init__(self, folder: Path) -> None:
+        """`folder` need not exist yet."""
+        self.folder = folder
+
+    def read(self, key: str) -> ObservedFrame | None:
+        """The frame stored under `key`; None if there is none, or its file is damaged."""
+        try:
+            return decode_frame(self._path(key).read_bytes())
+        except (OSError, ValueError, KeyError, BadZipFile):
+            return None
+
+    def write(self, key: str, frame: ObservedFrame) -> None:
+        """Store the `frame` under `key`, complete or not at all. Raises BadInput if that is impossible."""
+        write_atomically(self._path(key), encode_frame(frame), overwrite=True)
+
+    def _path(self, key: str) -> Path:
+        return self.folder / f"{key}.npz"
+
+
+def encode_frame(frame: ObservedFrame) -> bytes:
+    """The `frame` as a NumPy archive, without pickled objects."""
+    arrays: dict[str, Array] = {} if frame.R_body_enu is None else {"R_body_enu": frame.R_body_enu}
+    parts: dict[str, Any] = {f"mode{number}": mode for number, mode in enumerate(frame.modes)}
+    parts |= {f"fix{number}": fix for number, fix in enumerate(frame.fixes)}
+    if frame.evidence is not None:
+        arrays |= {f"evidence.{name}": np.asarray(getattr(frame.evidence, name)) for name in ROWS}
+        parts |= {"clock": frame.evidence.clock, "errors": frame.evidence.image_errors}
+    for prefix, part in parts.items():
+        if part is not None:  # a dataclass of numbers and arrays
+            arrays |= {f"{prefix}.{f.name}": np.asarray(getattr(part, f.name)) for f in fields(part)}
+    head = {
+        "format": FORMAT, "name": frame.name, "time_utc": frame.time_utc.isoformat(), "modes": len(frame.modes),
+        "fixes": len(frame.fixes), "shown": [asdict(one) for one in frame.shown], "reason": frame.reason,
+        "message": frame.message,
+    }  # fmt: skip
+    file = io.BytesIO()
+    np.savez(file, head=np.array(json.dumps(head)), **arrays)  # type: ignore[arg-type]
+    return file.getvalue()
+
+
+def decode_frame(data: bytes) -> ObservedFrame:
+    """The frame in the archive `data`. Raises ValueError, KeyError or BadZipFile for another file."""
+    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+        arrays: dict[str, Any] = dict(archive)
+    head = json.loads(str(arrays["head"]))
+    if head["format"] != FORMAT:
+        raise ValueError(f"format {head['format']}, expected {FORMAT}")
+    rows = None
+    if "evidence.llr" in arrays:
+        clock = _value(Clock, "clock", arrays) if "clock.turn_rad_s" in arrays else None
+        errors = _value(ImageErrors, "errors", arrays) if "errors.covariance" in arrays else None
+        rows = Evidence(clock=clock, image_errors=errors, **{name: arrays[f"evidence.{name}"] for name in ROWS})
+    return ObservedFrame(
+        head["name"], datetime.fromisoformat(head["time_utc"]), arrays.get("R_body_enu"),
+        tuple(_value(FrameEstimate, f"mode{number}", arrays) for number in range(head["modes"])), rows,
+        tuple(_value(ImageFix, f"fix{number}", arrays) for number in range(head["fixes"])),
+        tuple(ShownError(**one) for one in head["shown"]), head["reason"], head["message"],
+    )  # fmt: skip
+
+
+def _value(kind: type[T], prefix: str, arrays: dict[str, Any]) -> T:
+    """The dataclass that `encode_frame` took apart."""
+    values = {f.name: arrays[f"{prefix}.{f.name}"] for f in fields(kind)}  # type: ignore[arg-type]
+    return kind(**{name: one if one.ndim else float(one) for name, one in values.items()})

@@ -11,10 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from startrack.applications.tracking.frame_store import FrameStore
-from startrack.applications.tracking.observed_frame import ObservedFrame, facts_of, observe_again, observe_frame
+from startrack.applications.tracking.filtered_positions import RECENT_FRAMES, OnlineTrack
+from startrack.applications.tracking.observed_frame import (
+    FrameStore,
+    ObservedFrame,
+    facts_of,
+    observe_again,
+    observe_frame,
+)
 from startrack.applications.tracking.odometry import SPAN_TOLERANCE_S, Odometry
-from startrack.applications.tracking.online import RECENT_FRAMES, OnlineTrack
 from startrack.applications.tracking.track import (
     ODOMETRY_FLOOR_M,
     ODOMETRY_SIGMA,
@@ -32,6 +37,7 @@ from startrack.exposure import NO_TIME
 if TYPE_CHECKING:
     from startrack.camera import Camera
     from startrack.core.types import Array, Exposure
+    from startrack.estimation.observations import Steps
     from startrack.terrain import Terrain
 
 
@@ -48,6 +54,8 @@ class TrackSession:
     facts: dict[str, Any] = field(default_factory=dict)  # from flags, by the parameters of `read_exposure`
     stated_camera: str | Camera | None = None  # of all images; None: that which each names
     stated_terrain: str | Terrain | None = None  # the same
+    odometry_sigma: float = ODOMETRY_SIGMA  # of a move on each horizontal axis, relative to its length
+    odometry_floor_m: float = ODOMETRY_FLOOR_M  # beside that
     frames: list[ObservedFrame] = field(default_factory=list)  # in the order of time
     terrain: Terrain | None = None
     camera: Camera | None = None
@@ -92,19 +100,12 @@ class TrackSession:
         return frame if frame.facts == together.gross else observe_again(frame, together, terrain)
 
     def estimate(
-        self,
-        odometry: Odometry | None = None,
-        *,
-        odometry_sigma: float = ODOMETRY_SIGMA,
-        odometry_floor_m: float = ODOMETRY_FLOOR_M,
-        at_rest: bool = False,
-        covered_only: bool = False,
-    ) -> Track:
-        """The track of the frames so far.
+        self, odometry: Odometry | None = None, *, at_rest: bool = False, covered_only: bool = False
+    ) -> Track:  # fmt: skip
+        """The track of the frames so far; `odometry` and `at_rest` are those of `estimate_track`.
 
-        `odometry`, `odometry_sigma`, `odometry_floor_m` [m] and `at_rest` are those of `estimate_track`. With
-        `covered_only`, frames after the last pose of the odometry wait for it. Raises BadInput where there is no frame,
-        or none has a position, and as `estimate_track`.
+        With `covered_only`, frames after the last pose of the odometry wait for it. Raises BadInput where there is no
+        frame, or none has a position, and as `estimate_track`.
         """
         frames: Sequence[ObservedFrame] = self.frames
         if covered_only:
@@ -116,19 +117,16 @@ class TrackSession:
             reason = "insufficient_geometry" if refused is None else refused.reason
             raise BadInput(reason, f"none of {len(frames)} images has a single position")
         return estimate_track(
-            frames, self.terrain, self.shared, odometry=odometry, odometry_sigma=odometry_sigma,
-            odometry_floor_m=odometry_floor_m, at_rest=at_rest,
+            frames, self.terrain, self.shared, odometry=odometry, odometry_sigma=self.odometry_sigma,
+            odometry_floor_m=self.odometry_floor_m, at_rest=at_rest,
         )  # fmt: skip
 
-    def odometry_positions_m(
-        self, track: Track, odometry: Odometry | None, *, odometry_sigma: float, odometry_floor_m: float
-    ) -> Array:
-        """Positions (n, 2) [m] of the frames of a `track` by odometry alone, from the first smoothed position.
+    def odometry_positions_m(self, track: Track, odometry: Odometry | None) -> Array:
+        """Positions (n, 2) [m] of the frames of a `track` by `odometry` alone, from the first smoothed position.
 
-        `odometry`, `odometry_sigma` and `odometry_floor_m` [m] are those of `estimate`. Not a number where no move is
-        known.
+        Not a number where no move is known.
         """
-        steps = odometry_steps(self.frames[: len(track.frames)], odometry, odometry_sigma, odometry_floor_m)
+        steps = self._steps(self.frames[: len(track.frames)], odometry)
         move_m = np.where(np.isfinite(steps.sigma_m)[:, None], steps.move_m, np.nan)
         first_m = track.smoothed.position_enu_m[:1, :2]
         return np.concatenate([first_m, first_m + np.cumsum(move_m, axis=0)])
@@ -138,11 +136,10 @@ class TrackSession:
         """Whether frames were not filtered yet."""
         return self._filtered != self.frames
 
-    def newest(self, odometry: Odometry | None, *, odometry_sigma: float, odometry_floor_m: float) -> Iterator[Track]:
-        """Each frame that was not filtered yet and that the odometry reaches, by the frames before it: one track each.
+    def newest(self, odometry: Odometry | None) -> Iterator[Track]:
+        """Each frame that was not filtered yet and that the `odometry` reaches, by the frames before it: a track each.
 
-        `odometry`, `odometry_sigma`, `odometry_floor_m` [m] and the exceptions are those of `estimate`. If a frame
-        comes late, all frames after it are filtered anew.
+        If a frame comes late, all frames after it are filtered anew. Raises as `estimate`.
         """
         if self.terrain is None or self.shared is None:
             return
@@ -153,11 +150,14 @@ class TrackSession:
             if not _is_reached(self.frames[k], odometry):
                 return
             recent = self.frames[max(k - RECENT_FRAMES, 0) : k + 1]
-            steps = odometry_steps(recent, odometry, odometry_sigma, odometry_floor_m)
+            steps = self._steps(recent, odometry)
             move, sigma = (steps.move_m[-1], float(steps.sigma_m[-1])) if k else (np.zeros(2), 0.0)
             self._online.add(self.frames[k].modes, move, sigma)
             self._filtered.append(self.frames[k])
             yield track_of_newest(self.frames[k], self._online, self.terrain)
+
+    def _steps(self, frames: Sequence[ObservedFrame], odometry: Odometry | None) -> Steps:
+        return odometry_steps(frames, odometry, self.odometry_sigma, self.odometry_floor_m)
 
     def _check_time(self, exposure: Exposure) -> None:
         """Raise BadInput for a second image of one time: its evidence would count twice."""

@@ -9,11 +9,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from startrack.applications.tracking.at_rest import positions_at_rest
 from startrack.applications.tracking.contradictions import RobustTrack, smooth_robustly
+from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions, positions_at_rest
 from startrack.applications.tracking.observed_frame import ImageFix, ObservedFrame
 from startrack.applications.tracking.odometry import Odometry, odometry_steps
-from startrack.applications.tracking.online import OnlineTrack, filter_positions
 from startrack.applications.tracking.track_errors import BIAS, CLOCK, DEPTH, TrackErrors
 from startrack.core.types import Array, BadInput, Bools, ClockError, Ints
 from startrack.estimation.observations import UNKNOWN_M

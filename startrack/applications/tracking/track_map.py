@@ -35,7 +35,6 @@ Legend = list[tuple[str, Colour, str]]  # kind of the mark, its colour, words
 ODOMETRY, REFUSED, LEFT_OUT, SLIP = YELLOW, REDDISH_PURPLE, REDDISH_PURPLE, YELLOW
 SEEN_PX = 14.0  # half of the longer axis that the median ellipse has at least
 SMALLEST_HALF_M = 0.05
-TRACK_PX = 12.0  # half of the room that the track takes
 REST_WIDEST = 25.0  # the map of a camera at rest, in half axes of the last ellipse
 
 
@@ -47,7 +46,7 @@ def draw_track_map(canvas: Canvas, box: Box, track: Track, odometry_m: Array | N
     north = box[2] - 30.0, box[1] + 26.0
     canvas.reserve(box_around(north, 40.0))
     for place in () if track.at_rest else view.canvas_px(known_points(track.smoothed.position_enu_m[:, :2])):
-        canvas.reserve(box_around(place, TRACK_PX))  # heights of contours keep clear of it
+        canvas.reserve(box_around(place, 0.75 * CAPTION_SIZE))  # heights of contours keep clear of it
     step_m = None
     if track.terrain.rim_radius_m is None:
         size = window.size[1], window.size[0]

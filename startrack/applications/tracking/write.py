@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Sequence
 from datetime import UTC
 from pathlib import Path
@@ -12,11 +13,28 @@ import numpy as np
 from startrack import __version__
 from startrack.applications.tracking.quantities import FORMAT, FRAME_QUANTITIES, STATUSES, frame_records
 from startrack.applications.tracking.track import CrestHeights, Track, Trajectory
+from startrack.applications.tracking.track_map import known_points, track_extent
 from startrack.core.files import write_atomically
+from startrack.core.types import Array
 from startrack.frames import R_from_quat_xyzw, tum_line
-from startrack.output import Column, ecsv_text, feature, geojson_text, json_text, quantity_columns
+from startrack.output import (
+    Column,
+    ecsv_text,
+    feature,
+    filled_frame,
+    geojson_text,
+    ground_map,
+    json_text,
+    quantity_columns,
+)
 
 FILES = ("track.tum", "track.filtered.tum", "track.ecsv", "track.geojson", "track.json", "track.crests.ecsv")
+HERE = Path(__file__).parent
+SCRIPTS = ("basics.js", "view.js", "input.js", "map.js")  # of the page of results
+RELIEF_MARGIN = 1.35  # of the map, beyond its edge where the window is wide
+LEFT_OUT = ("_body_enu",)  # quantities that the page does not show
+ACCURATE = ("latitude_deg", "longitude_deg")
+DECIMALS = 4
 
 
 def track_record(track: Track, odometry: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -107,3 +125,39 @@ def track_geojson(track: Track, records: Sequence[dict[str, Any]]) -> str:
     points = [feature("Point", place, one) for place, one in zip(places, known, strict=True)]
     site = track.terrain.site
     return geojson_text([*([line] if len(places) > 1 else []), *points], "" if site is None else site.body)
+
+
+def track_page(track: Track, picture_png: bytes, *, title: str, odometry_m: Array | None = None) -> str:
+    """The page as text: HTML with its style, scripts and data.
+
+    Args:
+        track: with n frames.
+        picture_png: the picture of the track, as a file.
+        title: of the page, plain text.
+        odometry_m: positions (n, 2) in enu by odometry alone; None: not known.
+    """
+    centre_m, half_m = track_extent(track, odometry_m)
+    head = {
+        "columns": [],
+        "title": title,
+        "at_rest": track.at_rest,
+        "frames": _frame_columns(track),
+        "odometry": None if odometry_m is None else np.round(known_points(odometry_m), 3).tolist(),
+        "terrain": track.terrain.name,
+        "terrains": {track.terrain.name: ground_map(track.terrain, centre_m, RELIEF_MARGIN * half_m)},
+        "world": [centre_m[0] - half_m, centre_m[1] - half_m, centre_m[0] + half_m, centre_m[1] + half_m],
+        "picture": f"data:image/png;base64,{base64.b64encode(picture_png).decode('ascii')}",
+    }
+    style, script = ((HERE / name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
+    return filled_frame(f"{title} · startrack", {"results": head}, SCRIPTS, style=style, script=script)
+
+
+def _frame_columns(track: Track) -> dict[str, list[Any]]:
+    """The quantities of all frames by their keys."""
+    records = frame_records(track)
+    keys = [q.key for q in FRAME_QUANTITIES if not q.key.endswith(LEFT_OUT)]
+    return {key: [_rounded(record[key], 8 if key in ACCURATE else DECIMALS) for record in records] for key in keys}
+
+
+def _rounded(value: Any, decimals: int) -> Any:
+    return round(value, decimals) if isinstance(value, float) else value

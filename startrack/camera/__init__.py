@@ -9,11 +9,10 @@ from startrack.camera.camera import (
     with_covariance,
     with_update,
 )
-from startrack.camera.convert import camera_from_foreign_text, decentring_rms_px, foreign_text
 from startrack.camera.io import SENSOR, camera_from_dict, camera_keys, camera_text, camera_to_dict, save_camera
 from startrack.camera.lens import Lens
 from startrack.camera.lenses import KannalaBrandt, Pinhole, default_lens, lens_kinds
-from startrack.camera.load import load_camera
+from startrack.camera.load import camera_from_foreign_text, decentring_rms_px, foreign_text, load_camera
 from startrack.camera.optics import MIN_THROUGHPUT_1, Decentring, Sensor
 
 __all__ = [

@@ -1,21 +1,35 @@
-"""A camera by the name of a shipped file or by the path of a file: ours, or one of another program."""
+"""A camera by the name or the path of a file, and cameras from and to the files of other programs.
+
+Other programs share our axes (x right, y down, z along the boresight) and our radial polynomial; none of them has
+mirrored images, image circles, calibrated angles, sensors or covariances.
+"""
 
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from startrack.camera.camera import Camera
-from startrack.camera.convert import camera_from_foreign_text
-from startrack.camera.formats import find_program
+from startrack.camera.camera import Camera, cap_grid
+from startrack.camera.formats import FOREIGN_FORMATS, Intrinsics, find_program
 from startrack.camera.io import camera_from_dict
-from startrack.core.files import FOREIGN_CAMERA_SUFFIXES, parse_toml, printable, read_text, resolve_named
-from startrack.core.types import BadInput
+from startrack.camera.optics import Decentring
+from startrack.core.files import (
+    FOREIGN_CAMERA_SUFFIXES,
+    MAX_CAUSE_CHARS,
+    parse_toml,
+    printable,
+    read_text,
+    resolve_named,
+)
+from startrack.core.types import Array, BadInput
 
 LOG = logging.getLogger(__name__)
+SMALL_ANGLE_DEG = 1e-3  # of an image circle within any lens
 
 
 def load_camera(name_or_path: str | Path) -> Camera:
@@ -46,3 +60,97 @@ def _log_angle(path: str, program: str, angle_deg: float) -> None:
         "no angle (startrack calibrate convert --from %s --calibrated-angle DEG sets one)",
         path, angle_deg, program,
     )  # fmt: skip
+
+
+def foreign_text(camera: Camera, program: str) -> str:
+    """The camera as text of a file of `program`, a key of FOREIGN_FORMATS.
+
+    Raises BadInput bad_calibration for a mirrored camera, and if the format cannot hold the lens.
+    """
+    if camera.mirrored:
+        raise BadInput(
+            "bad_calibration",
+            "the camera is mirrored, which no other program's format can express: flip the images left to right and "
+            "calibrate those",
+        )
+    distortion = camera.lens.opencv_coefficients
+    if distortion is None:
+        raise BadInput("bad_calibration", f"no other program's format has the {camera.lens.model} lens")
+    model, coefficients = distortion
+    fx, fy, cx, cy = (float(v) for v in (*camera.focal_px, *camera.centre_px))
+    return FOREIGN_FORMATS[program].write(
+        Intrinsics(
+            name=camera.name, size_px=camera.size_px, focal_px=(fx, fy), centre_px=(cx, cy),
+            k=None if model == "pinhole" else coefficients, decentring=camera.decentring,
+            R_body_cam=camera.R_body_cam,
+        )
+    )  # fmt: skip
+
+
+def camera_from_foreign_text(text: str, program: str, name: str, calibrated_angle_rad: float | None = None) -> Camera:
+    """The camera of the `text` of a file of `program`, called `name` unless the file names it.
+
+    No such file states up to which angle off the axis [rad] the lens was calibrated: None takes the angle at the edge
+    of the frame that is nearest to the centre. Raises BadInput bad_calibration.
+    """
+    refusal = f"not a camera file of {FOREIGN_FORMATS[program].title} that can be used"
+    try:
+        camera = _camera(FOREIGN_FORMATS[program].read(text), name)
+        angle = _nearest_edge_rad(camera) if calibrated_angle_rad is None else calibrated_angle_rad
+        return replace(camera, calibrated_angle_rad=min(angle, camera.max_angle_rad))
+    except BadInput as error:
+        raise BadInput("bad_calibration", f"{refusal}: {error}") from error
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
+        cause = f"{error} is missing" if isinstance(error, KeyError) else error
+        raise BadInput("bad_calibration", f"{refusal}: {' '.join(str(cause)[:MAX_CAUSE_CHARS].split())}") from error
+
+
+def _camera(numbers: Intrinsics, name: str) -> Camera:
+    """A camera whose image circle ends at the frame's farthest corner, or where the radius stops rising.
+
+    Raises BadInput bad_calibration for numbers beyond the limits of our own camera files.
+    """
+    keys: dict[str, Any] = {
+        "name": numbers.name or name, "model": "pinhole" if numbers.k is None else "kannala_brandt",
+        "size_px": numbers.size_px, "focal_px": numbers.focal_px, "centre_px": numbers.centre_px,
+        "max_angle_deg": SMALL_ANGLE_DEG,
+    }  # fmt: skip
+    if numbers.k and any(numbers.k):
+        keys["k"] = numbers.k
+    if numbers.decentring:
+        keys["decentring"] = numbers.decentring.p1, numbers.decentring.p2
+    camera = camera_from_dict(keys)  # the limits are checked here
+    if numbers.R_body_cam is not None:
+        camera = replace(camera, R_body_cam=numbers.R_body_cam)
+    corners = np.stack(np.meshgrid(*_frame_edges(camera)), axis=-1)
+    edge = float(np.max(camera.angle_rad(corners)))
+    return replace(camera, max_angle_rad=edge, calibrated_angle_rad=edge)
+
+
+def _frame_edges(camera: Camera) -> Array:
+    """Left and right, and top and bottom, edge (2, 2) of the frame [px]."""
+    return np.array([[-0.5, n - 0.5] for n in camera.size_px])
+
+
+def _nearest_edge_rad(camera: Camera) -> float:
+    """The angle off the axis [rad] of the point of the frame's edge that is nearest to the centre.
+
+    Raises BadInput bad_calibration if the centre is outside the frame.
+    """
+    (cx, cy), (x, y) = camera.centre_px, _frame_edges(camera)
+    if not (x[0] < cx < x[1] and y[0] < cy < y[1]):
+        raise BadInput(
+            "bad_calibration",
+            "the centre is outside the frame: give the angle up to which the lens is calibrated, --calibrated-angle",
+        )
+    return float(np.min(camera.angle_rad(np.array([[x[0], cy], [x[1], cy], [cx, y[0]], [cx, y[1]]]))))
+
+
+def decentring_rms_px(camera: Camera) -> float:
+    """RMS difference [px] over the calibrated cap to the camera without decentring, the best rotation removed."""
+    grid = cap_grid(camera.calibrated_angle_rad)
+    centred = replace(camera, decentring=Decentring())
+    difference = (camera.project(grid)[0] - centred.project(grid)[0]).reshape(-1)
+    rotation = centred.jacobian_px_per_rad(grid).reshape(-1, 3)
+    rest = difference - rotation @ np.linalg.lstsq(rotation, difference, rcond=None)[0]
+    return float(np.sqrt(np.mean(np.sum(rest.reshape(-1, 2) ** 2, axis=1))))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -91,9 +90,9 @@ class Crater(Terrain):
         """Height of the rim above the camera [m], that of the middle of a tilted one."""
         return self.depth_m - self.camera_height_m
 
-    @abstractmethod
-    def is_within(self, points_m: Array) -> Bools:
-        """Whether the wall surrounds the points (..., 2)."""
+    def rim_m(self, points_m: Array) -> tuple[Array | float, Array | float]:
+        """Radius and height above the floor (...), (...) [m] of the rim on the side of the points (..., 2)."""
+        return self.radius_m, self.depth_m
 
     def ground_m(self, points_m: Array) -> Array:
         """Zero: the floor is the plane z = 0."""
@@ -101,7 +100,9 @@ class Crater(Terrain):
 
     def allowed(self, points_m: Array) -> Bools:
         """Whether the points (..., 2) are on the floor and within reach."""
-        return self.is_within(points_m) & super().allowed(points_m)
+        points = np.asarray(points_m)
+        away = np.hypot(points[..., 0], points[..., 1])
+        return np.asarray((away < self.rim_m(points)[0]) & (away <= self.reach_m))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,12 +146,11 @@ class DeformedCrater(Crater):
         far = distance_to_circle(points, azimuths_rad, self.radii_m[1])
         for _ in range(HALVINGS if np.any(far > near) else 0):
             middle = 0.5 * (near + far)
-            within = self.is_within(_ahead(points, middle, azimuths_rad))
+            within = self._is_within(_ahead(points, middle, azimuths_rad))
             near, far = np.where(within, middle, near), np.where(within, far, middle)
-        return np.where(self.is_within(points), 0.5 * (near + far), 0.0)
+        return np.where(self._is_within(points), 0.5 * (near + far), 0.0)
 
-    def is_within(self, points_m: Array) -> Bools:
-        """Whether the wall surrounds the points (..., 2)."""
+    def _is_within(self, points_m: Array) -> Bools:
         return np.asarray(np.hypot(points_m[..., 0], points_m[..., 1]) < self.rim_m(points_m)[0])
 
     def horizon_bounds_rad(

@@ -10,7 +10,7 @@ import numpy as np
 
 from startrack.core.declaration import Flag, Number
 from startrack.core.kernels import njit
-from startrack.core.types import Array, BadInput, Bools
+from startrack.core.types import Array, BadInput
 from startrack.terrain.crater import (
     Crater,
     DeformedCrater,
@@ -99,10 +99,6 @@ class Cylinder(Crater):
         """Bounds of the horizon over boxes [rad], from circles grown and shrunk by the half diagonal."""
         nearest, farthest = distance_bounds(centres_m, half_m, azimuths_rad, azimuth_half_rad, *self.radii_m)
         return np.arctan2(self.wall_m, farthest), np.arctan2(self.wall_m, nearest)
-
-    def is_within(self, points_m: Array) -> Bools:
-        """Whether the wall surrounds the points (..., 2)."""
-        return np.asarray(np.hypot(points_m[..., 0], points_m[..., 1]) < self.radius_m)
 
     @property
     def shape_errors(self) -> tuple[ShapeError, ...]:  # type: ignore[override]

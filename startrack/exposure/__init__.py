@@ -7,7 +7,7 @@ dark frame and flat field; `facts.py` finds the other facts, in flags, the sidec
 A file that cannot be used raises `startrack.core.errors.BadInput` and no other exception.
 """
 
-from startrack.exposure.bag import is_bag
+from startrack.exposure.bag import BAG_SUFFIXES, ODOMETRY_TYPES, is_bag, read_messages
 from startrack.exposure.bag_images import (
     BagImage,
     choose_bag_image,
@@ -27,6 +27,7 @@ from startrack.exposure.correction import (
 )
 from startrack.exposure.decoding import are_fractions, decode_bytes
 from startrack.exposure.facts import NO_TIME, Facts, check_time_sigma_s, with_facts
+from startrack.exposure.png import insert_png_chunks, png_chunks
 from startrack.exposure.read import exposure_of, exposure_of_decoded, read_exposure
 from startrack.exposure.sidecar import (
     IMAGE_KEYS,
@@ -41,9 +42,10 @@ from startrack.exposure.sidecar import (
 from startrack.exposure.write import write_exposure, write_sidecar
 
 __all__ = [
-    "IMAGE_KEYS", "NO_TIME", "PACKING_SUFFIXES", "PICTURE_SUFFIXES", "RAW_SUFFIXES", "SIDECAR", "BagImage", "Facts",
-    "Sidecar", "are_fractions", "check_time_sigma_s", "choose_bag_image", "combine_masks", "correct_exposure",
-    "decode_bytes", "exposure_of", "exposure_of_decoded", "is_bag", "list_bag_images", "mask_of",
-    "read_bag_exposures", "read_bag_image", "read_dark", "read_exposure", "read_flat", "read_mask", "sidecar_of",
-    "split_bag_path", "stem", "touch_masked", "with_facts", "write_exposure", "write_sidecar",
+    "BAG_SUFFIXES", "IMAGE_KEYS", "NO_TIME", "ODOMETRY_TYPES", "PACKING_SUFFIXES", "PICTURE_SUFFIXES", "RAW_SUFFIXES",
+    "SIDECAR", "BagImage", "Facts", "Sidecar", "are_fractions", "check_time_sigma_s", "choose_bag_image",
+    "combine_masks", "correct_exposure", "decode_bytes", "exposure_of", "exposure_of_decoded", "insert_png_chunks",
+    "is_bag", "list_bag_images", "mask_of", "png_chunks", "read_bag_exposures", "read_bag_image", "read_dark",
+    "read_exposure", "read_flat", "read_mask", "read_messages", "sidecar_of", "split_bag_path", "stem", "touch_masked",
+    "with_facts", "write_exposure", "write_sidecar",
 ]  # fmt: skip

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
@@ -46,7 +46,7 @@ def decode(raw: bytes) -> Decoded:
     width = height = depth = channels = 0
     interlaced = False
     picture: list[memoryview] = []
-    for kind, body in chunks(raw):
+    for kind, body in png_chunks(raw):
         if kind == b"IHDR":
             width, height, depth, channels, interlaced = _check_ihdr(body)
         elif kind == b"IDAT":
@@ -75,10 +75,15 @@ def decode(raw: bytes) -> Decoded:
 
 def add_text(png: bytes, texts: Mapping[str, str]) -> bytes:
     """The PNG file with one text chunk per entry, before its picture data."""
-    return png[:IHDR_END] + b"".join(_text_chunk(k, v) for k, v in texts.items()) + png[IHDR_END:]
+    return insert_png_chunks(png, [_text_chunk(keyword, text) for keyword, text in texts.items()])
 
 
-def chunks(raw: bytes) -> Iterator[tuple[bytes, memoryview]]:
+def insert_png_chunks(png: bytes, added: Iterable[tuple[bytes, bytes]]) -> bytes:
+    """The PNG file with chunks, pairs of kind and body, before its picture data."""
+    return png[:IHDR_END] + b"".join(chunk(*one) for one in added) + png[IHDR_END:]
+
+
+def png_chunks(raw: bytes) -> Iterator[tuple[bytes, memoryview]]:
     """(kind, body) of each chunk up to IEND, lengths and checksums verified."""
     view = memoryview(raw)
     at = len(SIGNATURE)
@@ -130,12 +135,10 @@ def _read_text(kind: bytes, body: bytes, header: dict[str, str]) -> None:
     header[key] = rest[:MAX_FACT_BYTES].decode(encoding)
 
 
-def _text_chunk(keyword: str, text: str) -> bytes:
+def _text_chunk(keyword: str, text: str) -> tuple[bytes, bytes]:
     if text.isascii():
-        kind, body = b"tEXt", keyword.encode("ascii") + b"\0" + text.encode("ascii")
-    else:
-        kind, body = b"iTXt", keyword.encode("ascii") + b"\0\0\0\0\0" + text.encode("utf-8")
-    return chunk(kind, body)
+        return b"tEXt", keyword.encode("ascii") + b"\0" + text.encode("ascii")
+    return b"iTXt", keyword.encode("ascii") + b"\0\0\0\0\0" + text.encode("utf-8")
 
 
 def chunk(kind: bytes, body: bytes) -> bytes:

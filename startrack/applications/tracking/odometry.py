@@ -14,7 +14,7 @@ from startrack.core.errors import BadInput
 from startrack.core.files import MAX_CAUSE_CHARS, FilePath, printable, read_text
 from startrack.core.types import Array, Value, array
 from startrack.estimation.observations import Steps
-from startrack.exposure.bag import BAG_SUFFIXES, ODOMETRY_TYPES, is_bag, read_messages
+from startrack.exposure import BAG_SUFFIXES, ODOMETRY_TYPES, is_bag, read_messages
 from startrack.frames import format_utc
 
 if TYPE_CHECKING:

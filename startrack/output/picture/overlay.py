@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from startrack.chain import Detected, Identified, Inputs, Located, Measured, Oriented
 from startrack.core.errors import BadInput
 from startrack.core.types import Array, Bools
-from startrack.exposure.png import IHDR_END, chunk, chunks
+from startrack.exposure import insert_png_chunks, png_chunks
 from startrack.frames import azel_from_rays, heading_pitch_roll_from_R_body_enu, rays_from_azel
 from startrack.output.picture.canvas import encoded_bytes
 from startrack.output.values import R_body_enu, skyline_position_m
@@ -185,14 +185,13 @@ def add_layers(png: bytes, layers: Layers) -> bytes:
     """The PNG file with the layers before its picture data."""
     jpeg = encoded_bytes(".jpg", layers.bare[:, :, ::-1], cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
     text = json.dumps(layers.overlay, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    parts = chunk(PICTURE, jpeg) + chunk(OVERLAY, zlib.compress(text.encode("utf-8")))
-    return png[:IHDR_END] + parts + png[IHDR_END:]
+    return insert_png_chunks(png, [(PICTURE, jpeg), (OVERLAY, zlib.compress(text.encode("utf-8")))])
 
 
 def layers_of(png: bytes) -> Layers | None:
     """The layers of a PNG file; None where it has none, or is damaged."""
     try:
-        found = {kind: body for kind, body in chunks(png) if kind in (PICTURE, OVERLAY)}
+        found = {kind: body for kind, body in png_chunks(png) if kind in (PICTURE, OVERLAY)}
     except BadInput:  # the page shows what there is
         return None
     if len(found) < 2:

@@ -27,9 +27,13 @@ SMALLEST_DAMPING, FIRST_DAMPING, MAX_DAMPING = 1e-12, 1e-6, 1e6
 SMALLEST_RISE_RAD = 0.2  # angle up to which the radius of a valid lens must increase
 
 
-class Adjustable(Protocol):
-    """Interface of the unknowns of `adjust`: State, or a state of boards or of a narrow field."""
+class CameraState(Protocol):
+    """A dataclass of the unknowns of `adjust` with a camera: State, or a state of boards or of a narrow field."""
 
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def camera(self) -> Camera: ...
     @property
     def rotations(self) -> Array: ...  # (images, 3, 3)
     @property
@@ -38,15 +42,6 @@ class Adjustable(Protocol):
     def residual_px(self, points: Observations, rays_cam: Array) -> Array: ...
     def terms(self, points: Observations, rays_cam: Array, free: tuple[str, ...]) -> Terms: ...
     def step(self, free: tuple[str, ...], lens: Array, poses: Array) -> Any: ...
-
-
-class CameraState(Adjustable, Protocol):
-    """An adjustable dataclass with a camera."""
-
-    __dataclass_fields__: ClassVar[dict[str, Any]]
-
-    @property
-    def camera(self) -> Camera: ...
 
 
 @dataclass(frozen=True, kw_only=True)

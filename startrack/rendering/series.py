@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from enum import IntEnum
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,8 +29,6 @@ from startrack.terrain import Terrain
 
 if TYPE_CHECKING:
     from startrack.catalog import StarCatalog
-
-T = TypeVar("T")
 
 EXPOSURE_V_MAG, EXPOSURE_SNR = 6.0, 5.0  # magnitude and SNR on the axis that define the default exposure
 RANDOM_TIMES = datetime(2024, 1, 1, tzinfo=UTC), datetime(2034, 1, 1, tzinfo=UTC)
@@ -191,13 +189,10 @@ class Series:
         position = _random_position(self.terrain, rng)
         heading, direction = rng.uniform(0, 2 * np.pi, 2)
         tilt = self.max_tilt_rad * np.sqrt(rng.random())
-        return (
-            _value_or_draw(self.time_utc, time),
-            np.array([_value_or_draw(self.east_m, position[0]), _value_or_draw(self.north_m, position[1])]),
-            _value_or_draw(self.heading_rad, heading),
-            _value_or_draw(self.pitch_rad, tilt * np.cos(direction)),
-            _value_or_draw(self.roll_rad, tilt * np.sin(direction)),
-        )
+        given = (self.time_utc, self.east_m, self.north_m, self.heading_rad, self.pitch_rad, self.roll_rad)
+        drawn = (time, *position, heading, tilt * np.cos(direction), tilt * np.sin(direction))
+        pose: list[Any] = [by_seed if one is None else one for one, by_seed in zip(given, drawn, strict=True)]
+        return pose[0], np.array(pose[1:3]), *pose[3:]
 
     def draw_sky(self, time: datetime) -> tuple[Stars, Array]:
         """Apparent stars, first those of the catalogue, then the random ones, and their magnitude errors (n,).
@@ -255,7 +250,3 @@ def _time_after(start: datetime, seconds: float) -> datetime:
         return start + timedelta(seconds=seconds)
     except OverflowError as cause:
         raise BadInput("no_time", f"{seconds:g} s after {start} is beyond the calendar") from cause
-
-
-def _value_or_draw(value: T | None, drawn: T) -> T:
-    return drawn if value is None else value

@@ -6,7 +6,9 @@ from startrack.output.html.details import ground_map
 from startrack.output.html.rows import Found, result_at, results_under
 from startrack.output.html.write import filled_frame, page_text, write_page
 from startrack.output.picture.annotate import annotate, draw_legend_sample
+from startrack.output.picture.axes import nice_step
 from startrack.output.picture.canvas import (
+    CAPTION_SIZE,
     DIM_INK,
     FAINT_INK,
     GRID,
@@ -25,7 +27,6 @@ from startrack.output.picture.canvas import (
     wrap_text,
 )
 from startrack.output.picture.maps import (
-    CAPTION_SIZE,
     MapView,
     distance_text,
     draw_distances,
@@ -34,7 +35,6 @@ from startrack.output.picture.maps import (
     draw_overview,
     ellipse_m,
     map_view,
-    nice_step,
     relief_picture,
 )
 from startrack.output.picture.panorama import horizon_picture, skyline_picture

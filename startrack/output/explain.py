@@ -21,8 +21,7 @@ STAR_GROWTH = 0.6  # the number of stars grows with this power of the exposure: 
 ENOUGH_STARS = 30  # point sources with which nearly every image is identified
 GAINS_PART = 0.8  # a fact is named where the circle with it stated is smaller by this factor
 LEAST_HIDDEN_RAD = np.radians(15.0)  # of the skyline out of view
-SECTORS = 240
-MIDDLES_RAD = (np.arange(SECTORS) + 0.5) * 2 * np.pi / SECTORS
+AZIMUTHS_RAD = np.radians(np.arange(0.75, 360.0, 1.5))
 
 
 def explain(outcome: Outcome) -> list[str]:
@@ -118,14 +117,14 @@ def _longer_exposure(measured: Measured) -> str:
 def _deciding_stars(measured: Measured, longer: float) -> int:
     """Usable stars near the skyline that an exposure longer by a factor shows, by the noise of the background."""
     light, skyline_rad = measured.light, _skyline(measured)
-    above = light.elevation_rad - np.interp(light.azimuth_rad, MIDDLES_RAD, skyline_rad, period=2 * np.pi)
+    above = light.elevation_rad - np.interp(light.azimuth_rad, AZIMUTHS_RAD, skyline_rad, period=2 * np.pi)
     decides = light.expected_e * np.sqrt(longer) > DECIDABLE_SNR * light.sigma_e
     return int(np.count_nonzero(light.usable & decides & (np.abs(above) < NEAR_SKYLINE_RAD)))
 
 
 def _more_skyline(measured: Measured) -> Iterator[str]:
     """Azimuths in which the skyline is not in view, or blocked."""
-    rays_cam = rays_from_azel(MIDDLES_RAD, _skyline(measured)) @ measured.R_cam_enu.T
+    rays_cam = rays_from_azel(AZIMUTHS_RAD, _skyline(measured)) @ measured.R_cam_enu.T
     xy_px, inside = measured.camera.project(rays_cam)
     known = inside & (measured.camera.angle_rad(xy_px) <= measured.camera.calibrated_angle_rad)
     hidden = Blocked(np.where(known, 0.0, 1.0))
@@ -136,9 +135,9 @@ def _more_skyline(measured: Measured) -> Iterator[str]:
 
 
 def _skyline(measured: Measured) -> Array:
-    """Elevation (SECTORS,) of the map's skyline at the position, or in the middle of the search area without one."""
+    """Elevation (n,) of the map's skyline at the position, or in the middle of the search area without one."""
     position_m = measured.position_at_time_m if isinstance(measured, Located) else np.zeros(2)
-    return np.asarray(measured.terrain.horizon_rad(position_m[None], MIDDLES_RAD)).ravel()
+    return np.asarray(measured.terrain.horizon_rad(position_m[None], AZIMUTHS_RAD)).ravel()
 
 
 def _doubtful(measured: Measured) -> Iterator[str]:

@@ -22,7 +22,7 @@ from startrack.frames import Site, aberrate, format_utc, observer_velocity_m_s, 
 
 Card = bool | int | float | str
 SIP_ORDER = 4
-GRID = 40  # points across the frame at which the field is sampled
+FIELD_POINTS = 40  # points across the frame at which the field is sampled
 
 
 def wcs_bytes(value: Oriented) -> bytes | None:
@@ -142,7 +142,7 @@ def _R_cam_catalog(value: Oriented) -> Array:
 
 def _grid(camera: Camera) -> Array:
     """Pixels (n, 2) over the frame, inside the image circle."""
-    x, y = np.meshgrid(*(np.linspace(0.0, side - 1.0, GRID) for side in camera.size_px))
+    x, y = np.meshgrid(*(np.linspace(0.0, side - 1.0, FIELD_POINTS) for side in camera.size_px))
     px = np.stack([x.ravel(), y.ravel()], axis=-1)
     return px[camera.angle_rad(px) <= camera.max_angle_rad]
 

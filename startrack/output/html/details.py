@@ -24,20 +24,12 @@ MARGIN = 1.03  # beyond the map, for its edge
 BRIGHTEST = 215.0
 
 
-class TerrainsByName:
-    """Terrains by the names that results give them, each loaded once; None where its file is not here."""
-
-    def __init__(self) -> None:
-        self._known: dict[str, Terrain | None] = {}
-
-    def terrain(self, name: str) -> Terrain | None:
-        """The terrain of a name or path."""
-        if name not in self._known:
-            try:
-                self._known[name] = load_terrain(name)
-            except BadInput:  # the page needs only the results: it states what is missing
-                self._known[name] = None
-        return self._known[name]
+def load_or_none(name: str) -> Terrain | None:
+    """The terrain of a name or path; None where its file is not here."""
+    try:
+        return load_terrain(name)
+    except BadInput:  # the page needs only the results: it states what is missing
+        return None
 
 
 def horizon_from(terrain: Terrain, east_m: float, north_m: float) -> Horizon:

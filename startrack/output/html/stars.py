@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import csv
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,6 @@ from startrack.catalog import proper_name_designations
 from startrack.core.types import Array, Bools, Evidence
 from startrack.localization.sector_likelihood import Sectors
 
-Columns = dict[str, list[Any]]
 Horizon = Callable[[Array], Array]  # azimuths (n,) to elevations (n,) [rad]
 # name on the page, column of NAME.stars.ecsv, decimals (None: a text)
 STAR_COLUMNS: tuple[tuple[str, str, int | None], ...] = (
@@ -25,6 +25,12 @@ STAR_COLUMNS: tuple[tuple[str, str, int | None], ...] = (
     ("ev", "evidence", 2), ("status", "status", None), ("cause", "cause", None),
 )  # fmt: skip
 DIRECTION_COLUMNS = ("azimuth_deg", "elevation_deg", "evidence")
+PAGE_SECTORS = 72  # of 5 degrees: wide enough for some stars near the skyline, narrow enough to show a boulder
+NEAR_RAD = np.radians(3.0)  # to either side of the skyline
+COARSE_AZIMUTHS = 10 * PAGE_SECTORS + 1
+COARSE_ERROR_RAD = NEAR_RAD / 3  # a ridge between two coarse azimuths: nearer stars get their own horizon
+SURE_LLR = 4.0  # of stars that decide; of weaker ones some level skyline always fits the noise better
+CONTRADICTED_NATS = -3.0  # of one sector
 
 
 @dataclass(frozen=True)
@@ -37,8 +43,7 @@ class MeasuredStars:
     status: NDArray[np.str_]  # (n,)
 
 
-@dataclass(frozen=True)
-class StarTable:
+class StarTable(NamedTuple):
     """What a page needs of a star table."""
 
     shown: dict[str, Any]  # the brightest stars as columns, designations of named ones, how many have each status
@@ -49,28 +54,25 @@ def star_table_of(path: Path, most: int) -> StarTable | None:
     """The star table at `path`, its `most` brightest stars to be shown; None where there is none."""
     if not path.is_file():
         return None
-    kept: Columns = {name: [] for name, _, _ in STAR_COLUMNS}
-    counts: dict[str, int] = {}
-    measured: list[tuple[str, str, str, str]] = []
-    total, unit = 0, "e"
     with path.open(encoding="utf-8", newline="") as file:
-        head, rows = read_ecsv(file)
-        if any("'expected_e'" in line and "unit: adu" in line for line in head):
-            unit = "ADU"
-        for row in rows:
-            total += 1
-            status = row.get("status", "")
-            counts[status] = counts.get(status, 0) + 1
-            if row.get("evidence"):
-                azimuth, elevation, llr = (row[name] for name in DIRECTION_COLUMNS)
-                measured.append((azimuth, elevation, llr, status))
-            if total <= most:
-                for name, column, decimals in STAR_COLUMNS:
-                    kept[name].append(_text_or_number(row.get(column) or "", decimals))
-    designations = {name: known for name in kept["name"] if (known := proper_name_designations().get(name))}
-    columns = _drop_empty_columns(kept)
-    shown = {"total": total, "counts": counts, "unit": unit, "columns": columns, "designations": designations}
-    return StarTable(shown, _measured_stars(measured))
+        head, found = read_ecsv(file)
+        rows = list(found)
+    columns = {
+        name: [_text_or_number(row.get(column) or "", decimals) for row in rows[:most]]
+        for name, column, decimals in STAR_COLUMNS
+    }
+    names = proper_name_designations()
+    shown = {
+        "total": len(rows),
+        "counts": dict(Counter(row.get("status", "") for row in rows)),
+        "unit": "ADU" if any("'expected_e'" in line and "unit: adu" in line for line in head) else "e",
+        "columns": {key: values for key, values in columns.items() if any(one not in (None, "") for one in values)},
+        "designations": {name: known for name in columns["name"] if (known := names.get(name))},
+    }
+    measured = [row for row in rows if row.get("evidence")]
+    azimuth, elevation, llr = (np.array([float(row[name]) for row in measured]) for name in DIRECTION_COLUMNS)
+    status = np.array([row.get("status", "") for row in measured], dtype=np.str_)
+    return StarTable(shown, MeasuredStars(np.radians(azimuth), np.radians(elevation), llr, status))
 
 
 def read_ecsv(file: Any) -> tuple[list[str], Iterator[dict[str, str]]]:
@@ -84,12 +86,6 @@ def read_ecsv(file: Any) -> tuple[list[str], Iterator[dict[str, str]]]:
     return head, iter(())
 
 
-def _measured_stars(rows: list[tuple[str, str, str, str]]) -> MeasuredStars:
-    numbers = np.array([row[:3] for row in rows], dtype=np.float64).reshape(-1, 3)
-    status = np.array([row[3] for row in rows], dtype=np.str_)
-    return MeasuredStars(np.radians(numbers[:, 0]), np.radians(numbers[:, 1]), numbers[:, 2], status)
-
-
 def _text_or_number(text: str, decimals: int | None) -> Any:
     if decimals is None:
         return text
@@ -100,22 +96,8 @@ def _text_or_number(text: str, decimals: int | None) -> Any:
     return int(number) if decimals == 0 or number == int(number) else number
 
 
-def _drop_empty_columns(columns: Columns) -> Columns:
-    """The columns without the empty ones."""
-    return {name: values for name, values in columns.items() if any(value not in (None, "") for value in values)}
-
-
-SECTORS = 72  # of 5 degrees: wide enough for some stars near the skyline, narrow enough to show a boulder
-NEAR_RAD = np.radians(3.0)  # to either side of the skyline
-COARSE_AZIMUTHS = 721
-COARSE_ERROR_RAD = np.radians(1.0)  # a ridge between two coarse azimuths: nearer stars get their own horizon
-NATS_DECIMALS = 2
-SURE_LLR = 4.0  # of stars that decide; of weaker ones some level skyline always fits the noise better
-CONTRADICTED_NATS = -3.0  # of one sector
-
-
 def sectors_of(stars: MeasuredStars, horizon: Horizon) -> dict[str, Any] | None:
-    """What the `stars` near the `horizon` show in SECTORS sectors from north through east; None without stars.
+    """What the `stars` near the `horizon` show in PAGE_SECTORS sectors from north through east; None without stars.
 
     `near_deg`: how near. `above` and `below` the horizon: numbers of stars there that are `seen` and `hidden`.
     `supports` and `opposes`: sums of |evidence| [nats] of near stars that agree with the horizon and that do not.
@@ -127,17 +109,17 @@ def sectors_of(stars: MeasuredStars, horizon: Horizon) -> dict[str, Any] | None:
     near = np.abs(above_rad) < NEAR_RAD  # False where it is not known
     if not near.any():
         return None
-    sector = (stars.azimuth_rad / (2 * np.pi) * SECTORS).astype(int) % SECTORS
+    sector = (stars.azimuth_rad / (2 * np.pi) * PAGE_SECTORS).astype(int) % PAGE_SECTORS
     above, agrees = above_rad > 0, (above_rad > 0) == (stars.llr > 0)
 
     def count(side: Bools, status: str) -> list[int]:
         chosen = near & side & (stars.status == status)
-        return [int(number) for number in np.bincount(sector[chosen], minlength=SECTORS)]
+        return [int(number) for number in np.bincount(sector[chosen], minlength=PAGE_SECTORS)]
 
     def total(chosen: Bools) -> list[float]:
         chosen = near & chosen
         weights = np.abs(stars.llr[chosen])
-        return _rounded(np.bincount(sector[chosen], weights=weights, minlength=SECTORS).astype(np.float64))
+        return _rounded(np.bincount(sector[chosen], weights=weights, minlength=PAGE_SECTORS).astype(np.float64))
 
     sure = np.isfinite(above_rad) & (np.abs(stars.llr) > SURE_LLR)
     return {
@@ -161,18 +143,18 @@ def _heights_rad(stars: MeasuredStars, horizon: Horizon) -> Array:
 
 
 def _nats_by_sector(azimuth_rad: Array, above_rad: Array, llr: Array) -> Array:
-    """Log-likelihood (SECTORS,) of the horizon beside the best shifted one; nan where a sector has no row.
+    """Log-likelihood (PAGE_SECTORS,) of the horizon beside the best shifted one; nan where a sector has no row.
 
     Elevations are counted from the horizon, so that the best level skyline of a sector is the horizon shifted.
     """
     evidence = Evidence(azimuth_rad=azimuth_rad, elevation_rad=np.clip(above_rad, -np.pi / 2, np.pi / 2), llr=llr)
-    sectors = Sectors(evidence, SECTORS, epsilon=0.0)
+    sectors = Sectors(evidence, PAGE_SECTORS, epsilon=0.0)
     visible = np.where(above_rad > 0, llr, 0.0)
-    sums = np.bincount(sectors.sector, weights=visible, minlength=SECTORS).astype(np.float64)
-    occupied = np.bincount(sectors.sector, minlength=SECTORS) > 0
+    sums = np.bincount(sectors.sector, weights=visible, minlength=PAGE_SECTORS).astype(np.float64)
+    occupied = np.bincount(sectors.sector, minlength=PAGE_SECTORS) > 0
     return np.where(occupied, sectors.by_sector(sums), np.nan)
 
 
 def _rounded(values: Array) -> list[Any]:
     """Values for JSON, None for nan."""
-    return [round(value, NATS_DECIMALS) + 0.0 if np.isfinite(value) else None for value in values.tolist()]
+    return [round(value, 2) + 0.0 if np.isfinite(value) else None for value in values.tolist()]

@@ -14,10 +14,10 @@ from startrack.core.errors import Reason
 from startrack.core.files import write_atomically
 from startrack.output.html.details import (
     Horizon,
-    TerrainsByName,
     ground_map,
     horizon_from,
     horizon_line,
+    load_or_none,
     picture_of,
     skyline_of,
 )
@@ -35,6 +35,7 @@ from startrack.output.html.rows import (
     section_of,
 )
 from startrack.output.html.stars import sectors_of, star_table_of
+from startrack.terrain import Terrain
 
 HERE = Path(__file__).parent
 STYLES = ("page.css",)
@@ -86,7 +87,9 @@ def page_text(
         single: whether the page is about one image, without a list.
         base: the folder of the results, relative to the page.
     """
-    real, terrains = real or {}, TerrainsByName()
+    real = real or {}
+    names = sorted({name for one in found if (name := _terrain_name(one.record))})
+    terrains = {name: terrain for name in names if (terrain := load_or_none(name)) is not None}
     detailed = images_with_details(found, images)
     rows = [row_of(one, real.get(one.stem), k in detailed) for k, one in enumerate(found)]
     size = LARGE if len(detailed) <= FEW else SMALL
@@ -100,7 +103,7 @@ def page_text(
         "unread": list(unread),
         "errors": errors_of(rows),
         "words": {one.value: (one.meaning, one.advice) for one in Reason if one in {row[3] for row in rows}},
-        "terrains": _terrains(found, terrains),
+        "terrains": {name: ground_map(terrain) for name, terrain in terrains.items()},
     }
     title = f"{found[0].record['image']} · startrack" if head["single"] else f"{len(found):,} images · startrack"
     data = {"results": head, **{f"detail-{k}": detail for k, detail in details.items()}}
@@ -137,7 +140,7 @@ def _relative_url(folder: Path, seen_from: Path) -> str:
         return folder.absolute().as_uri()
 
 
-def _detail(found: Found, terrains: TerrainsByName, size: tuple[int, int, int]) -> dict[str, Any]:
+def _detail(found: Found, terrains: Mapping[str, Terrain], size: tuple[int, int, int]) -> dict[str, Any]:
     record = found.record
     longest_px, most_stars, azimuths = size
     table = star_table_of(found.companion(".stars.ecsv"), most_stars)
@@ -161,23 +164,16 @@ def _detail(found: Found, terrains: TerrainsByName, size: tuple[int, int, int]) 
     }
 
 
-def _horizon(record: dict[str, Any], terrains: TerrainsByName) -> Horizon | None:
+def _horizon(record: dict[str, Any], terrains: Mapping[str, Terrain]) -> Horizon | None:
     """Horizon at the position, or at the likeliest one; None without a position or without the terrain's file."""
     modes = record.get("modes")
     position = section_of(record, "position") or (modes[0] if isinstance(modes, list) and modes else {})
     east, north = number_of(position, "east_m"), number_of(position, "north_m")
     name = _terrain_name(record)
-    terrain = terrains.terrain(name) if name and east is not None and record["status"] != "refused" else None
+    terrain = terrains.get(name) if name and record["status"] != "refused" else None
     if terrain is None or east is None or north is None:
         return None
     return horizon_from(terrain, east, north)
-
-
-def _terrains(found: Sequence[Found], terrains: TerrainsByName) -> dict[str, Any]:
-    """The maps of all terrains that results name and that are here."""
-    names = sorted({name for one in found if (name := _terrain_name(one.record))})
-    known = {name: terrains.terrain(name) for name in names}
-    return {name: ground_map(terrain) for name, terrain in known.items() if terrain is not None}
 
 
 def _terrain_name(record: dict[str, Any]) -> str | None:

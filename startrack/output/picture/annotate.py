@@ -20,6 +20,7 @@ from startrack.output.picture.canvas import (
     POSITION,
     SKYLINE,
     STATUS,
+    TEXT_PX,
     TRUTH,
     Box,
     Canvas,
@@ -44,11 +45,11 @@ from startrack.output.values import mode_text, modes_record
 
 PANEL_WIDTH, PANEL_HEIGHT = 620, 1160
 MARGIN = 28
-FACT_SIZE, FACT_STEP = 20.0, 32
-LEGEND_STEP = 27
-VALUE_AT = 150  # from the left margin
+FACT_SIZE = 20.0
+FACT_STEP, LEGEND_STEP = 1.6 * FACT_SIZE, round(1.6 * TEXT_PX)
+VALUE_AT = 7.5 * FACT_SIZE  # from the left margin
 OVERVIEW_PART = 0.58  # of the height left for maps
-LOWEST_FIGURE_PX = 120
+LOWEST_FIGURE_PX = 6 * FACT_SIZE
 MAX_MODES = 4
 
 
@@ -72,19 +73,19 @@ def draw_panel(canvas: Canvas, left: int, outcome: Outcome, truth_enu_m: tuple[f
     for row, (kind, colour, text) in enumerate(legend):
         y = legend_top + 14 + LEGEND_STEP * (row + 1)
         draw_legend_sample(canvas, left + 12, y - 6, kind, colour)
-        canvas.text((left + 36, y), text, 17.0, DIM_INK)
+        canvas.text((left + 36, y), text, TEXT_PX, DIM_INK)
 
 
 def _draw_header(canvas: Canvas, left: float, right: float, outcome: Outcome) -> float:
     """Name of the image, status, and the message of a result that is not ok; returns where the next thing may stand."""
     status = outcome.status.upper()
-    badge = text_width(status, 20.0) + 28
+    badge = text_width(status, FACT_SIZE) + MARGIN
     canvas.rectangle((right - badge, MARGIN, right, MARGIN + 36), STATUS[outcome.status])
-    canvas.text((right - badge / 2, MARGIN + 18), status, 20.0, (255, 255, 255), "mm")
+    canvas.text((right - badge / 2, MARGIN + 18), status, FACT_SIZE, (255, 255, 255), "mm")
     name = _shorten_text(image_name(outcome.exposure), 27.0, right - left - badge - 20)
     canvas.text((left, MARGIN + 28), name, 27.0, INK)
     y = float(MARGIN + 36 + 28)
-    canvas.text((left, y), _shorten_text(_inputs_text(last_value(outcome)), 17.0, right - left), 17.0, DIM_INK)
+    canvas.text((left, y), _shorten_text(_inputs_text(last_value(outcome)), TEXT_PX, right - left), TEXT_PX, DIM_INK)
     y += 18
     if outcome.status == "ok":
         return y
@@ -92,9 +93,9 @@ def _draw_header(canvas: Canvas, left: float, right: float, outcome: Outcome) ->
     reason = (outcome.reason or "").replace("_", " ")
     canvas.text((left, y + 14), reason, 22.0, STATUS[outcome.status])
     y += 26
-    for line in wrap_text(outcome.message, 20.0, right - left)[:8]:
+    for line in wrap_text(outcome.message, FACT_SIZE, right - left)[:8]:
         y += 28
-        canvas.text((left, y - 6), line, 20.0, INK)
+        canvas.text((left, y - 6), line, FACT_SIZE, INK)
     return y + 16
 
 

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from startrack.camera import Camera
 from startrack.chain import Detected, Inputs
+from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Bools
 from startrack.output.picture.canvas import PAPER, SKY_BRIGHT, SKY_DARK, STARLIGHT, WALL
 
@@ -27,8 +28,7 @@ WALL_SHADE = 0.75  # how far the wall's colour replaces the sky's
 SPIKE_SIGMAS = 8.0
 SPIKE_NEIGHBOUR = 0.3  # a star's neighbouring pixel has more of its light where the PSF is MIN_PSF_PX or wider
 MIN_PSF_PX = 0.7
-RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=np.uint8)
-MADE_OF_NOISE = 0.6745  # median of the absolute value of a standard normal variable
+NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=np.uint8)
 
 
 @dataclass(frozen=True)
@@ -96,9 +96,7 @@ def _background_and_light(value: Inputs, size: tuple[int, int], inside: Bools) -
     levels = np.clip((image - np.float32(low)) * np.float32(1 / step) + np.float32(0.5), 0, 255).astype(np.uint8)
     smooth = cv2.medianBlur(levels, STAR_PX).astype(np.float32) * np.float32(step) + np.float32(low)
     light = image - smooth
-    noise = max(
-        float(np.median(np.abs(light[::SAMPLE, ::SAMPLE][known]))) / MADE_OF_NOISE if known.any() else 0.0, 1e-6
-    )
+    noise = max(robust_sigma(light[::SAMPLE, ::SAMPLE][known], 0.0) if known.any() else 0.0, 1e-6)
     light = np.arcsinh(np.maximum(light * np.float32(1 / noise) - np.float32(CALM_SNR), 0) / np.float32(KNEE_SNR))
     light = np.minimum(light / np.float32(np.arcsinh(GLARE_SNR / KNEE_SNR)), 1)
     dark, bright = np.percentile(smooth[::SAMPLE, ::SAMPLE][known] if known.any() else smooth, [2, 98])
@@ -112,10 +110,10 @@ def remove_hot_pixels(pixels_adu: Image, psf_sigma_px: float) -> Image:
     if psf_sigma_px < MIN_PSF_PX:
         return pixels_adu
     middle = np.asarray(cv2.medianBlur(pixels_adu, 3), dtype=np.float32)
-    noise = float(np.median(np.abs((pixels_adu - middle)[::SAMPLE, ::SAMPLE]))) / MADE_OF_NOISE
+    noise = robust_sigma((pixels_adu - middle)[::SAMPLE, ::SAMPLE], 0.0)
     # Seen from the darkest pixel about: within a wide star the median is the star's own light.
     darkest = cv2.erode(pixels_adu, np.ones((5, 5), np.uint8))
-    excess, beside = pixels_adu - darkest, cv2.dilate(pixels_adu, RING) - darkest
+    excess, beside = pixels_adu - darkest, cv2.dilate(pixels_adu, NEIGHBOURS) - darkest
     lone = (excess > SPIKE_SIGMAS * max(noise, 1e-6)) & (beside < SPIKE_NEIGHBOUR * excess)
     return np.asarray(np.where(lone, middle, pixels_adu), dtype=np.float32)
 

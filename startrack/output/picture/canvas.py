@@ -36,14 +36,14 @@ MEASURED = INK  # small dots on the line of the skyline
 DIM_INK: Colour = (151, 163, 180)
 FAINT_INK: Colour = (74, 86, 104)
 GRID: Colour = (44, 53, 68)
-DETECTION: Colour = (150, 160, 176)
+DETECTION = DIM_INK
 PAPER: Colour = (13, 17, 25)  # around the picture
 SKY_DARK: Colour = (14, 20, 33)
 SKY_BRIGHT: Colour = (34, 48, 78)
 WALL: Colour = (19, 17, 18)
 STARLIGHT: Colour = (255, 253, 248)
 PANEL: Colour = (19, 25, 36)
-MAP: Colour = (11, 15, 23)
+MAP = PAPER
 FLOOR: Colour = (27, 36, 51)
 
 STATUS: dict[str, Colour] = {"ok": BLUISH_GREEN, "ambiguous": ORANGE, "refused": VERMILLION}
@@ -55,6 +55,7 @@ def mix_colours(a: Colour, b: Colour, part_of_b: float) -> Colour:
     return r, g, blue
 
 
+TITLE_PX, TEXT_PX, CAPTION_SIZE = 22.0, 17.0, 16.0  # sizes of writing
 SHIFT_BITS = 4  # OpenCV takes sub-pixel places as integers of 1/16 px
 EDGE_PX = 0.4  # added by OpenCV's smoothing to the edge of an area
 FARTHEST_PX = 30_000.0  # beyond any picture, within OpenCV's range
@@ -137,15 +138,13 @@ class Canvas:
 
     def cross(self, centre: ArrayLike, half: float, colour: Colour, width: int = 1) -> None:
         """An x of the given half size."""
-        x, y = (float(c) for c in np.asarray(centre, dtype=float))
-        self.line([(x - half, y - half), (x + half, y + half)], colour, width)
-        self.line([(x - half, y + half), (x + half, y - half)], colour, width)
+        for across in ((half, half), (half, -half)):
+            self.line(np.asarray(centre, dtype=float) + np.outer((-1.0, 1.0), across), colour, width)
 
     def plus(self, centre: ArrayLike, half: float, colour: Colour, width: int = 1) -> None:
         """A + of the given half size."""
-        x, y = (float(c) for c in np.asarray(centre, dtype=float))
-        self.line([(x - half, y), (x + half, y)], colour, width)
-        self.line([(x, y - half), (x, y + half)], colour, width)
+        for across in ((half, 0.0), (0.0, half)):
+            self.line(np.asarray(centre, dtype=float) + np.outer((-1.0, 1.0), across), colour, width)
 
     def rectangle(self, box: Box, colour: Colour, width: int = -1) -> None:
         """A box; filled where `width` is negative."""
@@ -179,14 +178,16 @@ class Canvas:
         ]  # fmt: skip
         for left, base in sides:
             box = left - 2, base - rise, left + width + 2, base + fall
-            if _inside(box, within) and self.is_free(box):
+            inside = box[0] >= within[0] and box[1] >= within[1] and box[2] <= within[2] and box[3] <= within[3]
+            if inside and self.is_free(box):
                 self.text((left, base), text, size, colour, halo=True)
                 return True
         return False
 
     def is_free(self, box: Box) -> bool:
         """Whether no text and nothing kept free overlaps the box."""
-        return not any(_boxes_overlap(box, taken) for taken in self._occupied)
+        left, top, right, bottom = box
+        return not any(left < x1 and x0 < right and top < y1 and y0 < bottom for x0, y0, x1, y1 in self._occupied)
 
     def reserve(self, box: Box) -> None:
         """Keep labels away from a box."""
@@ -253,18 +254,9 @@ def _font(size: float) -> FreeTypeFont:
     return font
 
 
-@lru_cache(maxsize=32)
 def _height(size: float) -> tuple[float, float]:
     """Rise above and fall below the line of writing [px]."""
     return 0.74 * size, 0.22 * size
-
-
-def _inside(box: Box, outer: Box) -> bool:
-    return box[0] >= outer[0] and box[1] >= outer[1] and box[2] <= outer[2] and box[3] <= outer[3]
-
-
-def _boxes_overlap(a: Box, b: Box) -> bool:
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
 def png_bytes(picture: NDArray[np.uint8]) -> bytes:

@@ -10,7 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from startrack.core.errors import length_text
 from startrack.core.types import Array, Fix
 from startrack.estimation.attitude import AttitudeFit
+from startrack.output.picture.axes import nice_step
 from startrack.output.picture.canvas import (
+    CAPTION_SIZE,
     DIM_INK,
     FAINT_INK,
     FLOOR,
@@ -19,6 +21,7 @@ from startrack.output.picture.canvas import (
     INK,
     MAP,
     POSITION,
+    TEXT_PX,
     TRUTH,
     Box,
     Canvas,
@@ -28,8 +31,10 @@ from startrack.output.picture.canvas import (
 from startrack.output.picture.relief import draw_contours, draw_relief, ground_of_view
 from startrack.terrain import Terrain
 
+WIDEST_RMS = 4.5  # residuals beyond this many rms are outliers and would squeeze the rest
 CIRCLE_RAD = np.linspace(0.0, 2 * np.pi, 181)
-CAPTION_SIZE = 16.0
+SIZE_PX, LEFT_PX, BELOW_PX = 900, 56.0, 52.0  # of the picture of a terrain's map, and beside it, for its scales
+SEARCH_MARGIN = 1.07  # of a map, in radii of the search area
 
 
 @dataclass(frozen=True)
@@ -68,7 +73,7 @@ def draw_overview(
 ) -> MapView:
     """The search area (dashed), the rim of a cylinder or the shape of the ground, and the position or positions."""
     rim = terrain.rim_radius_m or 0.0
-    view = map_view(box, (0.0, 0.0), 1.07 * max(min(terrain.search_radius_m, terrain.reach_m), rim))
+    view = map_view(box, (0.0, 0.0), SEARCH_MARGIN * max(min(terrain.search_radius_m, terrain.reach_m), rim))
     window = canvas.window(box)
     draw_ground(window, view, terrain)
     if truth is not None:
@@ -142,12 +147,6 @@ def draw_leaders(canvas: Canvas, overview: MapView, zoom: MapView) -> None:
         canvas.line(np.array([start, corner]), FAINT_INK)
 
 
-def nice_step(length: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is no longer than the length."""
-    power = 10.0 ** np.floor(np.log10(length))
-    return float(max(m for m in (1.0, 2.0, 5.0) if m * power <= length * (1 + 1e-9)) * power)
-
-
 def distance_text(metres: float) -> str:
     """A scale bar's length in words."""
     return f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m" if metres >= 0.1 else f"{100 * metres:g} cm"
@@ -193,9 +192,6 @@ def draw_frame(canvas: Canvas, view: MapView, caption: str) -> None:
     canvas.text((x + length / 2, y - 10), distance_text(length_m), CAPTION_SIZE, INK, "ms", halo=True)
 
 
-WIDEST_RMS = 4.5  # residuals beyond this many rms are outliers and would squeeze the rest
-
-
 def draw_residuals(canvas: Canvas, box: Box, fit: AttitudeFit) -> None:
     """Measured minus predicted pixels of the stars that the attitude rests on, with rings to read them by."""
     left, top, right, bottom = box
@@ -216,11 +212,6 @@ def draw_residuals(canvas: Canvas, box: Box, fit: AttitudeFit) -> None:
     canvas.text(
         middle + 2 * step * scale * np.array([0.707, -0.707]), f"{2 * step:g} px", CAPTION_SIZE, INK, "mm", halo=True
     )
-
-
-SIZE_PX = 900
-LEFT_PX, BELOW_PX = 56.0, 52.0  # beside the map, for its scales
-TEXT_PX = 17.0
 
 
 def relief_picture(terrain: Terrain, position_m: tuple[float, float] | None = None) -> NDArray[np.uint8]:

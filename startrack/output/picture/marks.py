@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from startrack.chain import Detected, Identified, Inputs, Located, Measured
 from startrack.core.types import Array, Ints
 from startrack.frames import azel_from_rays
-from startrack.output.picture.backdrop import View
+from startrack.output.picture.backdrop import SAMPLE, View
 from startrack.output.picture.canvas import (
     BODY,
     DETECTION,
@@ -19,13 +19,16 @@ from startrack.output.picture.canvas import (
     IDENTIFIED,
     INK,
     MEASURED,
+    SKY_DARK,
     SKYLINE,
+    TEXT_PX,
     Canvas,
     box_around,
     mix_colours,
 )
 from startrack.output.picture.overlay import (
     AZIMUTHS_RAD,
+    COMPASS,
     LETTER_DEG,
     TICK_DEG,
     bodies_in_frame,
@@ -44,10 +47,9 @@ MAX_CIRCLES = 4000
 MAX_CROSSES = 150  # of hidden stars, the brightest: more would hide the picture
 MAX_NAMES = 20
 MAX_HIDDEN_NAMES = 8
-NAME_SIZE = 19.0
+NAME_SIZE = TEXT_PX + 2.0
 FAINT_RING = 0.6  # how far the ring of the faintest detection fades into the sky
-BACKDROP = (12, 17, 28)
-BRIGHT_SNR = 300.0
+BRIGHTEST_SNR = 300.0
 
 
 def draw_detections(canvas: Canvas, view: View, value: Inputs) -> None:
@@ -58,7 +60,7 @@ def draw_detections(canvas: Canvas, view: View, value: Inputs) -> None:
     identified = np.zeros(len(found), dtype=bool)
     if isinstance(value, Identified):
         identified[value.identification.detection] = True
-    strength = np.clip(np.log(np.maximum(found.snr, 5.0) / 5.0) / np.log(BRIGHT_SNR / 5.0), 0, 1)
+    strength = np.clip(np.log(np.maximum(found.snr, 5.0) / 5.0) / np.log(BRIGHTEST_SNR / 5.0), 0, 1)
     places = view.canvas_px(found.xy_px)
     # The bright ones last, on top; the faint ones dim, so that a thousand of them do not drown the stars.
     shown = identified | other_sources(value)
@@ -67,7 +69,7 @@ def draw_detections(canvas: Canvas, view: View, value: Inputs) -> None:
             continue
         colour = IDENTIFIED if identified[k] else DETECTION
         faint = FAINT_RING * (1.0 - float(strength[k]))
-        canvas.circle(places[k], 4.5 + 5.5 * float(strength[k]), mix_colours(colour, BACKDROP, faint))
+        canvas.circle(places[k], 4.5 + 5.5 * float(strength[k]), mix_colours(colour, SKY_DARK, faint))
 
 
 def draw_hidden(canvas: Canvas, view: View, value: Inputs) -> None:
@@ -76,14 +78,14 @@ def draw_hidden(canvas: Canvas, view: View, value: Inputs) -> None:
     places = view.canvas_px(xy_px[:MAX_CROSSES])
     for rank, place in enumerate(places):
         weight = 1.0 - rank / max(len(places), 1)
-        colour = mix_colours(HIDDEN, BACKDROP, 0.35 * (1.0 - weight))
+        colour = mix_colours(HIDDEN, SKY_DARK, 0.35 * (1.0 - weight))
         canvas.cross(place, 3.5 + 3.0 * weight, colour, 2 if weight > 0.8 else 1)
 
 
 def draw_bodies(canvas: Canvas, view: View, value: Inputs) -> None:
     """A ring and the name at each planet, moon or sun in the frame; stars beside it are not evidence."""
     for body in bodies_in_frame(value):
-        colour = mix_colours(BODY, BACKDROP, 0.4) if body.hidden else BODY
+        colour = mix_colours(BODY, SKY_DARK, 0.4) if body.hidden else BODY
         at = view.canvas_px(body.xy_px)
         canvas.circle(at, 6.0 if body.hidden else 9.0, colour, 2)
         text, size = (f"{body.name} (hidden)", 0.85 * NAME_SIZE) if body.hidden else (body.name, NAME_SIZE)
@@ -102,7 +104,7 @@ def name_stars(canvas: Canvas, view: View, value: Inputs) -> None:
     for place, name in seen:
         canvas.label(view.canvas_px(place), name, NAME_SIZE, INK, 13.0, view.box)
     for place, name in hidden:
-        canvas.label(view.canvas_px(place), name, 0.9 * NAME_SIZE, mix_colours(HIDDEN, BACKDROP, 0.15), 11.0, view.box)
+        canvas.label(view.canvas_px(place), name, 0.9 * NAME_SIZE, mix_colours(HIDDEN, SKY_DARK, 0.15), 11.0, view.box)
 
 
 def _hidden_stars(value: Inputs) -> tuple[Ints, Array]:
@@ -118,9 +120,7 @@ def _names_at(value: Identified, star: Ints, xy_px: Array, most: int) -> list[tu
     return [(place, name) for place, name in zip(xy_px, first, strict=False) if name][:most]
 
 
-WALL_STEP = 4  # the wall's mask is reckoned at every fourth pixel and interpolated
 EDGE_RAD = 0.003  # width of its edge
-COMPASS = {0: "N", 90: "E", 180: "S", 270: "W"}
 LETTER_SIZE = 30.0
 SHORT_TICK_DEG = 1.2
 
@@ -129,7 +129,7 @@ def wall_mask(value: Inputs, size: tuple[int, int]) -> NDArray[np.float32] | Non
     """1 below the skyline of the fix and 0 above it, (H, W) of a picture of the size (W, H); None without a fix."""
     if not isinstance(value, Located):
         return None
-    cells = [np.arange(0.5, -(-n // WALL_STEP)) * n / -(-n // WALL_STEP) for n in size]
+    cells = [np.arange(0.5, -(-n // SAMPLE)) * n / -(-n // SAMPLE) for n in size]
     scale = np.array(value.camera.size_px) / size
     xy_px = np.stack(np.meshgrid(*cells), axis=-1) * scale - 0.5
     azimuth, elevation = azel_from_rays(value.camera.unproject(xy_px) @ value.R_cam_enu)
@@ -188,7 +188,7 @@ def _draw_nose(canvas: Canvas, view: View, value: Measured) -> None:
     across = np.array([-along[1], along[0]])
     canvas.area([tip, base + 12.0 * across, base + 5.0 * along, base - 12.0 * across], INK)
     canvas.reserve(box_around(0.5 * (tip + base), 20.0))
-    canvas.text(name, "forward", 17.0, INK, "mm", halo=True)
+    canvas.text(name, "forward", TEXT_PX, INK, "mm", halo=True)
 
 
 def _canvas_at(view: View, value: Measured, azimuth_rad: float, elevation_deg: float) -> Array:

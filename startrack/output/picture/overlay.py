@@ -16,6 +16,7 @@ from startrack.core.errors import BadInput
 from startrack.core.types import Array, Bools
 from startrack.exposure import insert_png_chunks, png_chunks
 from startrack.frames import azel_from_rays, heading_pitch_roll_from_R_body_enu, rays_from_azel
+from startrack.output.picture.axes import known_runs
 from startrack.output.picture.canvas import encoded_bytes
 from startrack.output.values import R_body_enu, skyline_position_m
 
@@ -23,8 +24,8 @@ AZIMUTHS_RAD = np.linspace(0.0, 2 * np.pi, 1441)
 DIMMEST_HIDDEN_V_MAG = 3.0  # a fainter planet behind the wall is not missed
 HIGHEST_COMPASS_DEG = 60.0
 TICKS_DEG = range(0, 360, 10)
+COMPASS = {0: "N", 90: "E", 180: "S", 270: "W"}
 TICK_DEG, LETTER_DEG = 2.2, 5.0  # above the foot of a tick of the compass
-DECIMALS = 1  # of a pixel
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def skyline_stretches_px(value: Inputs) -> list[Array]:
     if not isinstance(value, Located):
         return []
     xy_px, imaged = project_azel(value, AZIMUTHS_RAD, horizon_at_fix(value))
-    return [xy_px[start:stop] for start, stop in _runs(imaged) if stop - start > 1]
+    return [xy_px[run] for run in known_runs(imaged)]
 
 
 def measured_skyline_px(value: Inputs) -> Array:
@@ -160,13 +161,7 @@ def _is_below_skyline(value: Inputs, ray_icrs: Array) -> bool:
 
 
 def _pairs(xy_px: Array) -> list[Any]:
-    return np.round(xy_px, DECIMALS).tolist()
-
-
-def _runs(mask: Bools) -> list[tuple[int, int]]:
-    """Start and end of each stretch of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+    return np.round(xy_px, 1).tolist()
 
 
 PICTURE, OVERLAY = b"stPX", b"stOV"  # a JPEG; compressed JSON

@@ -10,33 +10,34 @@ from numpy.typing import NDArray
 from startrack.chain import Located
 from startrack.core.types import Array, MeasuredSkyline
 from startrack.evidence import Skyline
+from startrack.output.picture.axes import GAP_PX, Axes, known_runs, nice_step
 from startrack.output.picture.canvas import (
+    CAPTION_SIZE,
     DIM_INK,
     FAINT_INK,
     FLOOR,
-    GRID,
     HIDDEN,
     IDENTIFIED,
     INK,
     MAP,
     MEASURED,
     SKYLINE,
-    Box,
+    TEXT_PX,
     Canvas,
     Colour,
     mix_colours,
     text_width,
 )
-from startrack.output.picture.maps import nice_step
+from startrack.output.picture.maps import LEFT_PX
+from startrack.output.picture.overlay import COMPASS
 from startrack.output.record import image_name
 from startrack.output.tables import half_range_rad, status_of
 from startrack.terrain import Terrain
 
 WIDTH_PX, HEIGHT_PX, ENLARGED_PX = 1440, 420, 300
-MARGIN_PX, ABOVE_PX, BELOW_PX, RIGHT_PX = 56.0, 34.0, 40.0, 16.0  # about a plot
-TEXT_PX, LEGEND_PX = 17.0, 15.0
+ABOVE_PX, RIGHT_PX = 2 * TEXT_PX, CAPTION_SIZE  # about a plot
+LEGEND_PX = CAPTION_SIZE - 1.0
 AZIMUTHS_RAD = np.radians(np.linspace(0.0, 360.0, 3601))
-COMPASS = {0: "N", 90: "E", 180: "S", 270: "W"}
 MAX_STARS = 1500  # the brightest
 BANDS = {source: mix_colours(colour, MAP, 0.7) for source, colour in
          (("sky light", MEASURED), ("stars", IDENTIFIED), ("both", SKYLINE))}  # fmt: skip
@@ -45,51 +46,29 @@ LEGEND = {"seen": "seen star", "hidden": "hidden star", "sky light": "skyline by
 
 
 @dataclass(frozen=True)
-class Plot:
-    """Axes on a canvas: azimuth from north to north to the right, elevations from `low` to `high` [deg] upwards."""
+class Plot(Axes):
+    """Axes of azimuth from north to north to the right, and of elevations upwards [rad]."""
 
-    canvas: Canvas
-    box: Box
-    low: float
-    high: float
-    step: float
-
-    def canvas_px(self, azimuth_rad: Array | float, elevation_rad: Array | float) -> Array:
-        """Places (..., 2) on the canvas."""
-        left, top, right, bottom = self.box
-        x = left + np.asarray(azimuth_rad) / (2 * np.pi) * (right - left)
-        y = bottom - (np.degrees(elevation_rad) - self.low) / (self.high - self.low) * (bottom - top)
-        return np.stack(np.broadcast_arrays(x, y), axis=-1)
-
-    @property
-    def window(self) -> Canvas:
-        """The canvas, with shapes clipped to the box."""
-        return self.canvas.window(self.box)
-
-    def draw_scales(self) -> None:
-        """Lines at even elevations, ticks and names of azimuths, the frame."""
-        left, _, right, bottom = self.box
-        decimals = max(0, -int(np.floor(np.log10(self.step) + 1e-9)))
-        for count in range(round(self.low / self.step), round(self.high / self.step) + 1):
-            _, y = self.canvas_px(0.0, np.radians(count * self.step)).tolist()
-            self.canvas.line([(left, y), (right, y)], GRID if count else FAINT_INK)
-            self.canvas.text((left - 8, y), f"{count * self.step:.{decimals}f}°", TEXT_PX, DIM_INK, "rm")
-        for azimuth in range(0, 361, 30):
-            x, _ = self.canvas_px(np.radians(azimuth), 0.0).tolist()
-            self.canvas.line([(x, bottom), (x, bottom + 6.0)], DIM_INK)
-            self.canvas.text((x, bottom + 10), COMPASS.get(azimuth % 360, f"{azimuth}°"), TEXT_PX, DIM_INK, "mt")
+    def draw_scales(self, step: float) -> None:
+        """Lines at even elevations, `step` [deg] apart, ticks and names of azimuths, the frame."""
+        decimals = max(0, -int(np.floor(np.log10(step) + 1e-9)))
+        low, high = (round(float(end) / step) for end in np.degrees(self.y))
+        elevations = np.arange(low, high + 1) * step
+        self.draw_rows(np.radians(elevations), [f"{one:.{decimals}f}°" for one in elevations], FAINT_INK)
+        azimuths = range(0, 361, 30)
+        self.draw_columns(np.radians(azimuths), [COMPASS.get(one % 360, f"{one}°") for one in azimuths], 6.0)
         self.canvas.rectangle(self.box, FAINT_INK, 1)
 
     def draw_ground(self, azimuth_rad: Array, elevation_rad: Array) -> None:
         """The ground below elevations (n,) at ascending azimuths (n,), where they are known."""
-        for run in _runs(np.isfinite(elevation_rad)):
+        for run in known_runs(np.isfinite(elevation_rad)):
             at = azimuth_rad[run]
-            low = self.canvas_px(np.array([at[-1], at[0]]), np.radians(self.low))
+            low = self.canvas_px(np.array([at[-1], at[0]]), self.y[0])
             self.window.area(np.concatenate([self.canvas_px(at, elevation_rad[run]), low]), FLOOR)
 
     def draw_line(self, azimuth_rad: Array, elevation_rad: Array, sigma_rad: Array | None = None) -> None:
         """A skyline (n,) at ascending azimuths (n,), where it is known; `sigma_rad` (n,) as two thin lines."""
-        for run in _runs(np.isfinite(elevation_rad)):
+        for run in known_runs(np.isfinite(elevation_rad)):
             at, top = azimuth_rad[run], elevation_rad[run]
             if sigma_rad is not None:
                 for shift in (-sigma_rad[run], sigma_rad[run]):
@@ -141,7 +120,7 @@ def located_picture(value: Located, skyline: MeasuredSkyline) -> NDArray[np.uint
     azimuth_rad, elevation_rad, status = light.azimuth_rad[decided], light.elevation_rad[decided], status[decided]
     title = f"{image_name(value.exposure)}: horizon of {value.terrain.name} at the position found, skyline of the image"
     plot = _draw_horizon(canvas, title, AZIMUTHS_RAD, horizon(AZIMUTHS_RAD))
-    near = np.flatnonzero(elevation_rad < np.radians(plot.high))[:MAX_STARS]
+    near = np.flatnonzero(elevation_rad < plot.y[1])[:MAX_STARS]
     plot.draw_marks(azimuth_rad[near], elevation_rad[near], status[near])
     plot.draw_line(AZIMUTHS_RAD, horizon(AZIMUTHS_RAD))
     plot.draw_marks(skyline.azimuth_rad, skyline.elevation_rad, skyline.source)
@@ -149,7 +128,7 @@ def located_picture(value: Located, skyline: MeasuredSkyline) -> NDArray[np.uint
     raised_rad = skyline.elevation_rad - horizon(skyline.azimuth_rad)
     plot = _draw_enlarged(canvas, raised_rad, skyline)
     above_rad = elevation_rad - horizon(azimuth_rad)
-    near = np.flatnonzero(np.abs(above_rad) < np.radians(plot.high))[:MAX_STARS]
+    near = np.flatnonzero(np.abs(above_rad) < plot.y[1])[:MAX_STARS]
     plot.draw_marks(azimuth_rad[near], above_rad[near], status[near])
     plot.draw_marks(skyline.azimuth_rad, raised_rad, skyline.source)
     _draw_legend(canvas, HEIGHT_PX + ABOVE_PX / 2, [kind for kind in LEGEND if kind in {*status, *skyline.source}])
@@ -162,9 +141,9 @@ def _draw_horizon(canvas: Canvas, title: str, azimuth_rad: Array, elevation_rad:
     low, high = min(float(known.min(initial=0.0)), 0.0), float(known.max(initial=0.0))
     step = nice_step(max(high - low, 2.0) / 3)
     low, high = np.floor(low / step) * step, np.ceil((high + 0.3 * step) / step) * step
-    plot = _draw_plot(canvas, 0, title, low, high, step)
+    plot = _draw_plot(canvas, 0, title, low, high)
     plot.draw_ground(azimuth_rad, elevation_rad)
-    plot.draw_scales()
+    plot.draw_scales(step)
     return plot
 
 
@@ -173,21 +152,21 @@ def _draw_enlarged(canvas: Canvas, raised_rad: Array, skyline: MeasuredSkyline) 
     half = np.degrees(half_range_rad(raised_rad, skyline.sigma_rad))
     step = nice_step(half / 2)
     half = np.ceil(half / step - 1e-9) * step
-    plot = _draw_plot(canvas, HEIGHT_PX, "enlarged: height above that horizon", -half, half, step)
+    plot = _draw_plot(canvas, HEIGHT_PX, "enlarged: height above that horizon", -half, half)
     plot.draw_ground(np.array([0.0, 2 * np.pi]), np.zeros(2))
     plot.draw_bands(raised_rad, skyline)
-    plot.draw_scales()
+    plot.draw_scales(step)
     plot.draw_line(np.array([0.0, 2 * np.pi]), np.zeros(2))
     return plot
 
 
-def _draw_plot(canvas: Canvas, top: float, title: str, low: float, high: float, step: float) -> Plot:
-    """An empty plot from `top` on, with its title."""
+def _draw_plot(canvas: Canvas, top: float, title: str, low: float, high: float) -> Plot:
+    """An empty plot from `top` on, of elevations from `low` to `high` [deg], with its title."""
     height = HEIGHT_PX if top == 0 else ENLARGED_PX
-    box = (MARGIN_PX, top + ABOVE_PX, WIDTH_PX - RIGHT_PX, top + height - BELOW_PX)
+    box = (LEFT_PX, top + ABOVE_PX, WIDTH_PX - RIGHT_PX, top + height - 5 * GAP_PX)
     canvas.rectangle(box, MAP)
     canvas.text((box[0], top + 9.0), title, TEXT_PX, INK, "lt")
-    return Plot(canvas, box, low, high, step)
+    return Plot(canvas, box, (0.0, 2 * np.pi), (np.radians(low), np.radians(high)))
 
 
 def _draw_mark(canvas: Canvas, place: Array, kind: str) -> None:
@@ -222,9 +201,3 @@ def _draw_legend(canvas: Canvas, y: float, kinds: list[str]) -> None:
         canvas.text((x, y), LEGEND[kind], LEGEND_PX, DIM_INK, "lm")
         _draw_mark(canvas, np.array([x - 11.0, y]), kind)
         x -= 36.0
-
-
-def _runs(known: NDArray[np.bool_]) -> list[slice]:
-    """Stretches of at least two known points."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
-    return [slice(first, last) for first, last in edges.reshape(-1, 2) if last - first > 1]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from startrack.core.types import Array, Bools
-from startrack.output.picture.canvas import DIM_INK, FLOOR, INK, MAP, SHIFT_BITS, Canvas, box_around
+from startrack.output.picture.canvas import CAPTION_SIZE, DIM_INK, FLOOR, INK, MAP, SHIFT_BITS, Canvas, box_around
 
 if TYPE_CHECKING:
     from startrack.output.picture.maps import MapView
@@ -21,9 +21,9 @@ GENTLE_SLOPE = 0.02  # gentler ground looks flat
 RELIEF_LIGHT = 3.0  # slopes that face the light, as a multiple of the floor's colour
 MAX_LEVELS = 12.0
 CONTOUR_WEIGHT = 0.45
-LABEL_SIZE = 14.0
+LABEL_SIZE = CAPTION_SIZE - 2.0
 LABELLED_PX = 90  # shorter contours get no label, those of twice the length and more two
-TRIED = 60  # places along a contour
+LABEL_TRIES = 60  # places along a contour
 
 
 def ground_of_view(view: MapView, terrain: Terrain, shape: tuple[int, int]) -> tuple[Image, Bools]:
@@ -96,7 +96,7 @@ def _label_contour(canvas: Canvas, view: MapView, line: Array, text: str) -> Non
     """Write a height on its contour (n, 2) on the canvas, once or twice, where there is room."""
     left, top, right, bottom = view.box
     length_px = float(np.hypot(*np.diff(line, axis=0).T).sum())
-    at = line[:: max(1, len(line) // TRIED)]
+    at = line[:: max(1, len(line) // LABEL_TRIES)]
     half_px = 0.36 * LABEL_SIZE * len(text) + 8.0
     at = at[(np.abs(at - view.middle) < np.array([right - left, bottom - top]) / 2 - half_px - 6.0).all(axis=1)]
     for _ in range(min(2, int(length_px / LABELLED_PX))):

@@ -15,7 +15,7 @@ from startrack.applications.tracking.frame_estimate import estimate_frame
 from startrack.catalog import load_catalog
 from startrack.chain import Located, Settings, locate
 from startrack.core.types import Array, Evidence
-from startrack.evidence.likelihood_ratio import visibility_llr
+from startrack.evidence.star_evidence import visibility_llr
 from startrack.frames import R_enu_icrs, azel_from_rays, observer_velocity_m_s
 from startrack.rendering import Series, render
 from startrack.terrain import HeightMap, Terrain

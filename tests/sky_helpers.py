@@ -8,8 +8,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from startrack.core.types import Array
-from startrack.evidence.sky_levels import SECTORS
-from startrack.evidence.sky_pixels import BAND_PX, SkyPixels
+from startrack.evidence import BAND_PX, SECTORS
+from startrack.evidence.sky_pixels import SkyPixels
 
 EDGE_PX = 1.04  # a PSF of 1 px, and the pixel
 PX_PER_RAD = 652.0

@@ -15,8 +15,8 @@ from star_painter import cramer_rao, paint
 
 from startrack.core.types import Body, Detections, Identification, Stars
 from startrack.evidence import FluxScale, StarEvidence, StarPhotometry, flux_scale
-from startrack.evidence.likelihood_ratio import CAP, visibility_llr
 from startrack.evidence.photometry import Photometry, Sources, half_width, measure
+from startrack.evidence.star_evidence import CAP, visibility_llr
 from startrack.frames import azel_from_rays
 
 SIZE, VARIANCE, READ_NOISE = 1024, 100.0, 2.5

@@ -13,11 +13,10 @@ from sky_helpers import EDGE_PX, ELEVATION_RAD, GROUND_E, NOISE_E, PX_PER_RAD, l
 
 from startrack.core.kernels import normal_cdf
 from startrack.core.types import Array
-from startrack.evidence import Skyline
-from startrack.evidence.sky_checks import sectors_with_step
+from startrack.evidence import BAND_PX, Skyline
 from startrack.evidence.sky_levels import GROUND, LEVEL_SECTORS, SECTORS, SKY, SkyLevels, measure_levels, sector_of
-from startrack.evidence.sky_light import HEIGHT_PX, LEVELS, MIDDLES_RAD, SkyLight, measure_sky_light, sum_cells
-from startrack.evidence.sky_pixels import BAND_PX, SkyPixels, pixels_near_skyline, scale_across
+from startrack.evidence.sky_light import CELL_PX, LEVELS, MIDDLES_RAD, SkyLight, measure_sky_light, sectors_with_step
+from startrack.evidence.sky_pixels import SkyPixels, pixels_near_skyline, scale_across
 from startrack.frames import rays_from_azel
 
 STEPS_E = (7.0, 90.0)
@@ -159,7 +158,7 @@ def test_cells_have_the_likelihood_of_their_pixels() -> None:
     levels, shifts = sky.levels, np.array([-1.5, -0.5, 0.0, 0.7, 1.5])
     by_pixels, by_cells = np.zeros(5), np.zeros(5)
     for s in range(0, SECTORS, 8):
-        inside = (sector == s) & (np.abs(pixels.height_px) < 0.5 * LEVELS * HEIGHT_PX)
+        inside = (sector == s) & (np.abs(pixels.height_px) < 0.5 * LEVELS * CELL_PX)
         h, light = pixels.height_px[inside], pixels.light_e[inside]
         ground, full = levels.level_e[:, s, None] + levels.slope_e[:, s, None] * h
         here = ndtr(h / EDGE_PX)
@@ -177,17 +176,16 @@ def test_cells_have_the_likelihood_of_their_pixels() -> None:
 def test_rows_of_evidence() -> None:
     sky = sky_of(paint_pixels(np.random.default_rng(10), 90.0))
     chosen = (np.arange(SECTORS) % 3 == 0) & (np.arange(SECTORS) < 120)
-    raised_px = 0.5 * np.cos(MIDDLES_RAD)
-    rows = sky.evidence(chosen, raised_px, 2.0)
+    rows = sky.evidence(chosen)
     sector = sector_of(rows.azimuth_rad)
     assert np.array_equal(np.unique(sector), np.flatnonzero(chosen))
     assert len(rows) == LEVELS * np.count_nonzero(chosen)
     assert rows.edge_sigma_rad == pytest.approx(np.full(len(rows), sky.edge_px / PX_PER_RAD))
     height_px = (rows.elevation_rad - ELEVATION_RAD) * PX_PER_RAD
-    assert height_px == pytest.approx((sky.height_px - raised_px[:, None])[chosen].ravel())
-    # The variance of the shift by these rows is that of the sector with its levels, times the factor.
+    assert height_px == pytest.approx(sky.height_px[chosen].ravel())
+    # The variance of the shift by these rows is that of the sector with its levels.
     wider = sky.extended_nats[chosen].sum(axis=1) / np.bincount(sector, rows.extended_nats, SECTORS)[chosen]
-    assert wider == pytest.approx(2.0 * (sky.variance_px2 / np.square(sky.shift_sigma_px))[chosen])
+    assert wider == pytest.approx((sky.variance_px2 / np.square(sky.shift_sigma_px))[chosen])
     assert rows.llr / rows.extended_nats == pytest.approx((sky.llr / sky.extended_nats)[chosen].ravel())
 
 
@@ -198,7 +196,8 @@ def test_another_predicted_skyline_moves_the_shifts() -> None:
     def raised(azimuth_rad: Array) -> Array:
         return level_horizon(azimuth_rad) + wave_px(azimuth_rad) / PX_PER_RAD
 
-    above = sum_cells(pixels.above(raised), sky.levels, raised)
+    height = (pixels.elevation_rad - raised(pixels.azimuth_rad)) * pixels.px_per_rad
+    above = measure_sky_light(replace(pixels, height_px=height), raised)
     sigma = np.sqrt(np.median(sky.variance_px2))
     assert np.abs(above.shift_px - (sky.shift_px - wave_px(MIDDLES_RAD))).max() < 1.5 * sigma
     assert np.abs(above.shift_px).mean() < sigma < 0.4 * np.abs(sky.shift_px).mean()

@@ -13,7 +13,7 @@ from sky_helpers import EDGE_PX, PX_PER_RAD
 
 from startrack.core.types import Array, Evidence, ImageErrors, NotLocated
 from startrack.evidence.sky_levels import SECTORS
-from startrack.evidence.sky_light import HEIGHT_PX, LEVELS, MIDDLES_RAD
+from startrack.evidence.sky_light import CELL_PX, LEVELS, MIDDLES_RAD
 from startrack.evidence.star_offsets import offset_terms
 from startrack.localization import ExactPosterior
 from startrack.localization.likelihood import PositionLikelihood
@@ -32,7 +32,7 @@ def sky_rows(
 
     `map_rad` is the sigma of an error of the horizon in each sector.
     """
-    height = (np.arange(LEVELS) - LEVELS // 2) * HEIGHT_PX / PX_PER_RAD
+    height = (np.arange(LEVELS) - LEVELS // 2) * CELL_PX / PX_PER_RAD
     predicted = CRATER.horizon_rad(predicted_m[None], MIDDLES_RAD)
     true = CRATER.horizon_rad(position_m[None], MIDDLES_RAD) + map_rad * rng.normal(size=SECTORS)
     elevation = predicted[:, None] + height
@@ -131,7 +131,7 @@ def position_slopes() -> Array:
 def expected_covariance(nats: float) -> Array:
     """Of a position by cells of the sky's light."""
     slopes = position_slopes() * PX_PER_RAD
-    return np.linalg.inv(slopes.T @ slopes * nats * 0.28 / EDGE_PX / HEIGHT_PX)
+    return np.linalg.inv(slopes.T @ slopes * nats * 0.28 / EDGE_PX / CELL_PX)
 
 
 @pytest.mark.parametrize("nats", [60.0, pytest.param(1500.0, marks=pytest.mark.slow)])
@@ -155,7 +155,7 @@ def image_errors(rng: np.random.Generator, part: float) -> ImageErrors:
     covariance = part**2 * 1e-3 * (mix @ mix.T + 5 * np.eye(5))
     return ImageErrors(
         raised_rad=offset_terms(MIDDLES_RAD) / PX_PER_RAD, mean=np.zeros(5), covariance=covariance,
-        variance_rad2=np.full(SECTORS, EDGE_PX * HEIGHT_PX / (60.0 * 0.28) / PX_PER_RAD**2),
+        variance_rad2=np.full(SECTORS, EDGE_PX * CELL_PX / (60.0 * 0.28) / PX_PER_RAD**2),
     )  # fmt: skip
 
 

@@ -17,7 +17,6 @@ from startrack.api.solution import Solution
 from startrack.camera import Camera, load_camera
 from startrack.catalog import StarCatalog, load_catalog
 from startrack.chain import Inputs, Located, Refused, Settings, pipeline
-from startrack.chain.sky_refinement import raised_by_image
 from startrack.core.errors import Reason
 from startrack.core.types import Exposure
 from startrack.evidence.sky_light import MIDDLES_RAD
@@ -141,10 +140,10 @@ def test_the_measured_skyline_is_the_true_one(bright: Frame, by_source: dict[str
 
 def test_the_sky_stops_where_the_skyline_is(bright: Frame, by_source: dict[str, Located]) -> None:
     """The heights of the sectors scatter as their pixels' noise lets them, and are right on average."""
-    sky, used = by_source["sky"].sky_light, by_source["sky"].sky_used
-    assert sky is not None and used is not None
+    sky, used, errors = by_source["sky"].sky_light, by_source["sky"].sky_used, by_source["sky"].image_errors
+    assert sky is not None and used is not None and errors is not None
     true = CRATER.horizon_rad(bright.truth.position_enu_m[None, :2], MIDDLES_RAD)
-    off = sky.shift_px - (true + raised_by_image(by_source["sky"]) - sky.elevation_rad) * sky.px_per_rad
+    off = sky.shift_px - (true + errors.raised_rad @ errors.mean - sky.elevation_rad) * sky.px_per_rad
     assert 0.7 < np.mean(np.square(off / sky.shift_sigma_px)[used]) < 1.8
     assert abs(np.mean(off[used])) < 0.03
 
@@ -215,7 +214,7 @@ def test_the_skyline_is_measured_once(
     def fail(located: Located) -> None:
         raise AssertionError("the skyline is measured again")
 
-    monkeypatch.setattr("startrack.chain.skyline.measured_skyline", fail)
+    monkeypatch.setattr("startrack.chain.sky_refinement.measured_skyline", fail)
     monkeypatch.setattr("startrack.chain.pipeline.measured_skyline", fail)
     write_results(by_source["both"], tmp_path / "frame.fix.json")
     assert Solution(by_source["both"]).skyline is not None

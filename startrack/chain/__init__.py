@@ -15,10 +15,9 @@ from startrack.chain.inputs import (
     terrain_input,
     time_input,
 )
-from startrack.chain.measurement import COMPLETE_V_MAG
+from startrack.chain.measurement import CERTAIN_PROBABILITY, COMPLETE_V_MAG, locate_rays
 from startrack.chain.orientation import stars_at
-from startrack.chain.pipeline import detect, identify, identify_blind, locate, locate_exposure
-from startrack.chain.run import with_timing
+from startrack.chain.pipeline import detect, identify, identify_blind, locate, locate_exposure, with_timing
 from startrack.chain.sky_refinement import EDGE_SIGMA_PX
 from startrack.chain.stages import (
     STAGES,
@@ -35,47 +34,12 @@ from startrack.chain.stages import (
     StarRays,
     last_value,
 )
-from startrack.chain.star_fix import locate_rays
 
 __all__ = [
-    "COMPLETE_V_MAG",
-    "EDGE_SIGMA_PX",
-    "MISSING",
-    "STAGES",
-    "Detected",
-    "Identified",
-    "Image",
-    "Inputs",
-    "Located",
-    "Measured",
-    "Oriented",
-    "Outcome",
-    "Refused",
-    "Settings",
-    "StarFix",
-    "StarRays",
-    "Time",
-    "angle_rad",
-    "are_unchanged",
-    "camera_input",
-    "content_sha256",
-    "detect",
-    "duration_s",
-    "exposure_input",
-    "field_of_view_rad",
-    "identify",
-    "identify_blind",
-    "input_hashes",
-    "is_list_of_centroids",
-    "job_sha256",
-    "last_value",
-    "load_camera_input",
-    "locate",
-    "locate_exposure",
-    "locate_rays",
-    "settings_input",
-    "stars_at",
-    "terrain_input",
-    "time_input",
-    "with_timing",
-]
+    "CERTAIN_PROBABILITY", "COMPLETE_V_MAG", "EDGE_SIGMA_PX", "MISSING", "STAGES", "Detected", "Identified",
+    "Image", "Inputs", "Located", "Measured", "Oriented", "Outcome", "Refused", "Settings", "StarFix", "StarRays",
+    "Time", "angle_rad", "are_unchanged", "camera_input", "content_sha256", "detect", "duration_s",
+    "exposure_input", "field_of_view_rad", "identify", "identify_blind", "input_hashes", "is_list_of_centroids",
+    "job_sha256", "last_value", "load_camera_input", "locate", "locate_exposure", "locate_rays", "settings_input",
+    "stars_at", "terrain_input", "time_input", "with_timing",
+]  # fmt: skip

@@ -1,19 +1,23 @@
-"""Photometry of the catalogue stars in one image: add faint stars if needed, measure, remeasure near the skyline."""
+"""The stars of one image, measured, and the position that they show; the same position for simulated stars."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
 from startrack.catalog import has_deep_catalog, hipparcos_rows_in_deep, load_catalog, load_deep_catalog
-from startrack.chain.stages import Located, Measured, Oriented, Settings, extend
-from startrack.core.types import Array, BadInput, Detections, Ints, Stars
+from startrack.chain.stages import Located, Measured, Oriented, Settings, StarFix, StarRays, extend
+from startrack.core.types import Array, BadInput, Detections, Evidence, Ints, Stars
 from startrack.evidence import (
+    BAND_PX,
+    SURE_SIGMAS,
     Skyline,
     SkyStep,
     StarEvidence,
     StarPhotometry,
+    filtered_noise_e,
     flux_scale,
     height_above_px,
     measure_noise,
@@ -22,20 +26,18 @@ from startrack.evidence import (
     reliable_azimuths,
     subtract_sky_step,
 )  # fmt: skip
-from startrack.evidence.star_evidence import filtered_noise_e
 from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
-from startrack.localization import clock_at
+from startrack.localization import DEFAULT_LOCALIZER, Localizer, clock_at, clock_matters, require_localizer
 from startrack.terrain import Terrain
 
-REMEASURED_PX = 12.0  # stars this near the skyline are measured again
-NEIGHBOURS_PX = 10.0  # and with them the stars up to this distance from them, whose PSFs overlap theirs
+NEIGHBOURS_PX = 10.0  # of stars that are measured again: up to this distance from them the PSFs overlap
 UNDECIDED_PX = 2.0  # farther from the skyline than this, the fix decides which stars are visible
 CERTAIN_PROBABILITY = 0.99  # of being visible, or hidden, for the stars that the fix decides
-HIGH_RAD = np.radians(45.0)  # no skyline is as high, except beside a wall
-LEAST_PART = 0.5  # of the light of the stars that only the deep catalogue has
-SURE_SIGMAS = 5.0
+OPEN_SKY_RAD = np.radians(45.0)  # no skyline is as high, except beside a wall
+DEEP_PART = 0.5  # of the light of the stars that only the deep catalogue has
 NO_DEEP_STARS = "the image does not show the faint stars of {}: only Hipparcos is used"
 COMPLETE_V_MAG = 6.5  # frames with 5 sigma at this magnitude show many stars that Hipparcos lacks
+F = TypeVar("F", bound=StarFix)
 
 
 def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -> Measured:
@@ -84,7 +86,7 @@ def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
         return oriented
     found, when = oriented.identification, oriented.exposure.time_utc
     scale = flux_scale(oriented.detections, oriented.camera, oriented.stars, found)
-    limiting_mag = scale.zero_mag - 2.5 * np.log10(5.0 * filtered_noise_e(oriented.detections))
+    limiting_mag = scale.zero_mag - 2.5 * np.log10(SURE_SIGMAS * filtered_noise_e(oriented.detections))
     if when is None or limiting_mag < COMPLETE_V_MAG or not has_deep_catalog():
         return oriented
     deep = load_deep_catalog()
@@ -101,21 +103,23 @@ def _shows_deep_stars(light: StarPhotometry, stars: Stars) -> bool:
 
     Synthetic images of Hipparcos alone do not: every one of these stars would then be evidence of a wall.
     """
-    high = light.usable & (stars.hip[light.star] == 0) & (light.elevation_rad > HIGH_RAD)
+    high = light.usable & (stars.hip[light.star] == 0) & (light.elevation_rad > OPEN_SKY_RAD)
     if not high.any():
         return True
     expected, weight = light.expected_e[high], 1.0 / np.square(light.sigma_e[high])
     information = float(weight @ np.square(expected))
     part = float((weight * expected) @ light.flux_e[high]) / information
-    return part + SURE_SIGMAS / np.sqrt(information) > LEAST_PART
+    return part + SURE_SIGMAS / np.sqrt(information) > DEEP_PART
 
 
 def sky_step_at(located: Located) -> SkyStep | None:
     """The step of the sky brightness at the terrain's skyline seen from the fix of a `located` image.
 
-    None if the image does not contain that skyline, or is damaged so that levels of light cannot be compared.
+    None if the image does not contain that skyline, is damaged so that levels of light cannot be compared, or has no
+    single position with its error.
     """
-    if located.damage is not None and not located.damage.has_levels:
+    has_levels = located.damage is None or located.damage.has_levels
+    if located.fix.ambiguous or located.fix.search == "approximate" or not has_levels:
         return None
     horizon = Skyline.trace(located.position_at_time_m, located.terrain)
     return measure_sky_step(located.detections, located.camera, located.R_cam_enu, horizon)
@@ -135,10 +139,10 @@ def remeasure_near_skyline(measured: Located, step: SkyStep, photometry: StarEvi
     light = measured.light
     azimuth, elevation = light.azimuth_rad, light.elevation_rad
     above_px, is_reliable = height_above_px(azimuth, elevation, camera, R, horizon), reliable(azimuth)
-    wanted = (np.abs(above_px) < REMEASURED_PX) & is_reliable
+    wanted = (np.abs(above_px) < BAND_PX) & is_reliable
     if measured.blocked is not None:
         wanted &= ~measured.blocked.hides(azimuth)
-    around = np.abs(above_px) < REMEASURED_PX + NEIGHBOURS_PX
+    around = np.abs(above_px) < BAND_PX + NEIGHBOURS_PX
     # The fix determines the visibility of neighbours better than their faint flux does, except next to the skyline.
     undecided = (np.abs(above_px) < UNDECIDED_PX) | ~is_reliable
     by_fix = np.where(above_px > 0, CERTAIN_PROBABILITY, 1.0 - CERTAIN_PROBABILITY)
@@ -174,3 +178,23 @@ def _photometry(
     light = light if only is None else replace(light, star=only[light.star])
     rays = light.azimuth_rad, light.elevation_rad
     return light if terrain.is_informative(*rays).all() else light.masked(terrain.mask_reason(*rays))
+
+
+def locate_rays(rays: StarRays, localizer: Localizer | None = None) -> StarFix:
+    """The position that explains photometry of stars; `localizer` None: the posterior.
+
+    Raises NotLocated (or another NoSolution of the `localizer`) where the pipeline refuses an image with these `rays`.
+    """
+    return fix_position(rays, StarFix, localizer or require_localizer(DEFAULT_LOCALIZER))
+
+
+def fix_position(rays: StarRays, to: type[F], localizer: Localizer, evidence: Evidence | None = None) -> F:
+    """`rays` under the sky of the time that they show, with the position, as a value of the class `to`.
+
+    `evidence` None: that of the stars.
+    """
+    fix = localizer(rays.evidence() if evidence is None else evidence, rays.terrain)
+    if fix.clock is not None and not rays.terrain.axisymmetric and clock_matters(rays.clock, rays.terrain):
+        later_s = fix.clock.offset_s - rays.clock.offset_s
+        rays = rays.later(later_s, SURE_SIGMAS * fix.clock.sigma_s) if later_s else rays
+    return extend(rays, to, fix=fix)

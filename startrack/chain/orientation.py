@@ -4,19 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import datetime
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.catalog import bodies
-from startrack.chain.stages import (
-    Detected,
-    Identified,
-    Inputs,
-    Oriented,
-    extend,
-)  # fmt: skip
+from startrack.catalog import StarCatalog, bodies
+from startrack.chain.stages import Detected, Identified, Inputs, Oriented, extend
 from startrack.core.compilation import announce_compilation
 from startrack.core.types import Array, BadInput, NotIdentified, Stars, TooFewStars
 from startrack.detection import Detector
@@ -24,9 +17,6 @@ from startrack.estimation.attitude import AttitudeFit, solve_attitude
 from startrack.exposure import NO_TIME, are_fractions
 from startrack.frames import Site, observer_velocity_m_s
 from startrack.identification import Identifier, check_single_field
-
-if TYPE_CHECKING:
-    from startrack.catalog import StarCatalog
 
 LEAST_SHIFT_PX, MOST_SHIFT_PX = 0.1, 8.0  # of the image's centre; a larger one is another camera
 SHIFT_CHI2 = 30.0  # of a shift in two coordinates: one in three million by chance

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from types import MappingProxyType
+from typing import Any, TypeVar
 
 import numpy as np
 
-from startrack.camera import Camera
-from startrack.chain.measurement import measure_evidence, remeasure_near_skyline, sky_step_at
+from startrack.camera import Camera, load_camera
+from startrack.catalog import StarCatalog, load_catalog
+from startrack.chain.measurement import fix_position, measure_evidence, remeasure_near_skyline, sky_step_at
 from startrack.chain.orientation import (
     check_inputs,
     check_one_attitude,
@@ -19,23 +21,21 @@ from startrack.chain.orientation import (
     identify_unknown_lens,
     solve_orientation,
 )  # fmt: skip
-from startrack.chain.run import Run, with_timing
-from startrack.chain.sky_refinement import refine_by_sky_light
-from startrack.chain.skyline import measured_skyline
+from startrack.chain.sky_refinement import measured_skyline, refine_by_sky_light
 from startrack.chain.stages import Detected, Inputs, Located, Oriented, Refused, Settings
-from startrack.chain.star_fix import fix_position
+from startrack.core.errors import Reason
 from startrack.core.types import BadInput, Exposure, NoSolution
 from startrack.detection import find_damage
-from startrack.evidence.double_exposure import check_single_skyline
+from startrack.evidence import check_single_skyline
 from startrack.frames import Site
 from startrack.localization import localizer_name
-from startrack.terrain import Terrain
+from startrack.terrain import Terrain, load_terrain
 
-if TYPE_CHECKING:
-    from startrack.catalog import StarCatalog
-    from startrack.evidence import SkyStep
-
-__all__ = ["Settings", "detect", "identify", "identify_blind", "locate", "locate_exposure"]
+HIDDEN_BY_DAMAGE = {  # reasons that damage of the image causes too
+    Reason.NOT_IDENTIFIED, Reason.INCONSISTENT_EVIDENCE, Reason.INSUFFICIENT_GEOMETRY, Reason.DAMAGED_IMAGE,
+}  # fmt: skip
+T = TypeVar("T", bound=Inputs)
+R = TypeVar("R")
 
 
 def locate(
@@ -63,7 +63,7 @@ def locate(
         measured = run.run_stage("evidence", measure_evidence, oriented, terrain, settings)
         first = replace(measured.evidence(), is_first_look=settings.evidence_sources != "stars")
         located = run.time_stage("locate", fix_position, measured, Located, settings.localizer, first)
-        step = _sky_step(run, located)
+        step = run.time_stage("evidence", sky_step_at, located)
         is_bright = step is not None and step.exceeds_noise
         if is_bright:
             located = run.time_stage("evidence", remeasure_near_skyline, located, step, settings.evidence)
@@ -87,22 +87,11 @@ def _refine(located: Located, is_newer: bool, settings: Settings) -> Located:
     return located
 
 
-def _sky_step(run: Run, located: Located) -> SkyStep | None:
-    """The step of the sky's light at the skyline; None without one, and where the position is not that of the image."""
-    if located.fix.ambiguous or located.fix.search == "approximate":
-        return None
-    return run.time_stage("evidence", sky_step_at, located)
-
-
 def locate_exposure(exposure: Exposure, settings: Settings | None = None) -> Located | Refused:
     """`locate` with the camera and the terrain that `exposure` names, and `settings`; stage `read` is reading them.
 
     Raises BadInput (no_calibration, bad_calibration, bad_terrain) where one is not named or cannot be used.
     """
-    from startrack.camera import load_camera
-    from startrack.catalog import load_catalog
-    from startrack.terrain import load_terrain
-
     start = clock.perf_counter()
     if exposure.camera is None:
         raise BadInput("no_calibration", "no camera file is known: give -c FILE or a sidecar with camera")
@@ -159,3 +148,48 @@ def detect(exposure: Exposure, camera: Camera | None, settings: Settings | None 
         )
     except (BadInput, NoSolution) as refusal:
         return run.refuse(refusal)
+
+
+def with_timing(outcome: Any, **more_ms: float) -> Any:
+    """The same outcome with wall times [ms] added to its stages' times."""
+    times = dict(outcome.timing_ms)
+    for stage, ms in more_ms.items():
+        times[stage] = times.get(stage, 0.0) + ms
+    return replace(outcome, timing_ms=MappingProxyType(times))
+
+
+class Run:
+    """One exposure on its way through the stages: the last complete value, and the wall time of each stage."""
+
+    def __init__(self, inputs: Inputs) -> None:
+        self.reached = inputs
+        self._timing_ms: dict[str, float] = {}
+
+    def time_stage(self, stage: str, function: Callable[..., R], *args: Any) -> R:
+        """The result of `function(*args)`, its time added to that of the `stage`."""
+        start = clock.perf_counter()
+        try:
+            return function(*args)
+        finally:
+            self._timing_ms[stage] = self._timing_ms.get(stage, 0.0) + 1e3 * (clock.perf_counter() - start)
+
+    def run_stage(self, stage: str, function: Callable[..., T], *args: Any) -> T:
+        """The same as `time_stage`, for a function that returns the next complete value."""
+        value = self.time_stage(stage, function, *args)
+        self.reached = value
+        return value
+
+    def finish(self, value: T) -> T:
+        """The `value` with the times of the stages."""
+        return replace(value, timing_ms=MappingProxyType(self._timing_ms))
+
+    def refuse(self, cause: BadInput | NoSolution) -> Refused:
+        """The refusal for a `cause`, with the last complete value; of a damaged image its damage may be the reason."""
+        damage = self.reached.damage
+        damaged = damage is not None and cause.reason in HIDDEN_BY_DAMAGE
+        return Refused(
+            reason=Reason.DAMAGED_IMAGE if damaged else cause.reason,
+            message=str(cause) if damage is None or not damaged else f"{damage.message} ({cause})",
+            reached=self.reached,
+            timing_ms=MappingProxyType(self._timing_ms),
+        )

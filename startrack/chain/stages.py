@@ -226,9 +226,7 @@ class Located(StarFix, Measured):
     by_stars: bool = True  # whether the stars' rows are in the posterior too
     sky_unused: str = ""  # why the sky's light is not used
     skyline: MeasuredSkyline | None = None  # that the image shows; None: not one position, or not right to its error
-    sky_brightness_mag_arcsec2: float | None = (
-        None  # of the sky beyond the ground at the skyline; None: no step, no zero point
-    )
+    sky_brightness_mag_arcsec2: float | None = None  # beyond that of the ground; None: no step, no zero point
 
     @property
     def position_at_time_m(self) -> Array:

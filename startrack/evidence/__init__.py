@@ -1,31 +1,40 @@
 """Exposure, attitude and catalogue to rays, each with the log-likelihood ratio of sky against ground."""
 
 from startrack.evidence.damaged_response import DamagedResponse, measure_noise, measure_response
-from startrack.evidence.flux_scale import FluxScale, flux_scale
-from startrack.evidence.sky_light import SkyLight
+from startrack.evidence.double_exposure import check_single_skyline
+from startrack.evidence.expected_stars import SURE_SIGMAS, FluxScale, expect_stars, expected_flux_scale, flux_scale
+from startrack.evidence.photometry import Photometry, Sources, half_width, neighbour_profiles, order_by_cell
+from startrack.evidence.photometry_kernel import profiles_of
+from startrack.evidence.sky_levels import SECTORS, sector_of
+from startrack.evidence.sky_light import (
+    CLIP_SHIFT_PX,
+    MIDDLES_RAD,
+    NEEDED_SECTORS,
+    SkyLight,
+    average_shifts,
+    measure_sky_light,
+    sectors_with_step,
+)
+from startrack.evidence.sky_pixels import pixels_near_skyline
 from startrack.evidence.sky_step import (
+    BAND_PX,
+    Horizon,
     Skyline,
     SkyStep,
     height_above_px,
     measure_sky_step,
     reliable_azimuths,
     subtract_sky_step,
-)  # fmt: skip
-from startrack.evidence.star_evidence import StarEvidence, StarPhotometry
+)
+from startrack.evidence.star_evidence import DECIDABLE_SNR, SEEN_LLR, StarEvidence, StarPhotometry, filtered_noise_e
+from startrack.evidence.star_offsets import measure_star_offsets, offset_terms
 
 __all__ = [
-    "DamagedResponse",
-    "FluxScale",
-    "SkyLight",
-    "SkyStep",
-    "Skyline",
-    "StarEvidence",
-    "StarPhotometry",
-    "flux_scale",
-    "height_above_px",
-    "measure_noise",
-    "measure_response",
-    "measure_sky_step",
-    "reliable_azimuths",
+    "BAND_PX", "CLIP_SHIFT_PX", "DECIDABLE_SNR", "MIDDLES_RAD", "NEEDED_SECTORS", "SECTORS", "SEEN_LLR", "SURE_SIGMAS",
+    "DamagedResponse", "FluxScale", "Horizon", "Photometry", "SkyLight", "SkyStep", "Skyline", "Sources",
+    "StarEvidence", "StarPhotometry", "average_shifts", "check_single_skyline", "expect_stars", "expected_flux_scale",
+    "filtered_noise_e", "flux_scale", "half_width", "height_above_px", "measure_noise", "measure_response",
+    "measure_sky_light", "measure_sky_step", "measure_star_offsets", "neighbour_profiles", "offset_terms",
+    "order_by_cell", "pixels_near_skyline", "profiles_of", "reliable_azimuths", "sector_of", "sectors_with_step",
     "subtract_sky_step",
-]
+]  # fmt: skip

@@ -15,18 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.types import Array, Bools, Detections, NoSolution
-from startrack.evidence.likelihood_ratio import visibility_llr
-from startrack.evidence.star_evidence import StarPhotometry
+from startrack.evidence.star_evidence import NOISE_BLOCK_PX, StarPhotometry, visibility_llr
 
-BLOCK_PX, KEPT_PART = 16, 0.95  # side of the blocks of the noise map; part of their pixels without the brightest
+LEFT_OUT_PART = 0.05  # of the brightest pixels in a block of the noise map, of the stars at both ends of a scatter
 SMALLEST_NOISE = 0.2  # of the frame's median: of blocks of nearly one value
-BRIGHT_SNR, NEIGHBOURS = 8.0, 4  # stars that mark the sky and the ground; how many of the nearest must agree
-SEEN_PART = 0.5  # of the expected light
+MARKER_SNR, MARKERS = 8.0, 4  # stars that mark the sky and the ground; how many of the nearest must agree
+SEEN_PART = 0.5  # of the expected light; below half of it, the light of faint stars is lost rather than weakened
 SNR_EDGES = np.array([0.0, 1.0, 1.5, 2.5, 4.0, 7.0, 15.0, 40.0, np.inf])  # groups of stars by expected snr
-MIN_VISIBLE, MIN_HIDDEN, MIN_GROUP = 200, 50, 25
-LOW, HIGH = 2.5, 97.5  # percentiles between which the scatter is taken
-MIN_SCATTER = 0.5  # of the hidden stars', in any group: a group of nearly one value is no Gaussian
-MIN_GAIN = 0.25  # below, the light of faint stars is lost rather than weakened
+MIN_GROUP = 25  # stars in a group of visible ones, and half of the hidden ones
+LEAST_SCATTER = 0.5  # of the hidden stars', in any group: a group of nearly one value is no Gaussian
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +43,7 @@ class DamagedResponse:
         gain, scatter = (np.interp(at, np.log(self.snr), values) for values in (self.gain, self.scatter))
         flux, expected = light.flux_e - self.hidden * light.sigma_e, gain * light.expected_e
         llr = visibility_llr(flux, expected, self.hidden_scatter * noise, scatter * noise)
-        sound = light.usable & (gain > MIN_GAIN)
+        sound = light.usable & (gain > SEEN_PART / 2)
         return replace(
             light, expected_e=expected, flux_e=flux, sigma_e=self.hidden_scatter * light.sigma_e,
             llr=np.where(sound, llr, 0.0),
@@ -57,16 +54,20 @@ def measure_noise(detections: Detections) -> Detections:
     """The `detections` with a noise of the pixels that holds for clipped values too: their spread in blocks."""
     image = detections.image_e - detections.background_e
     height, width = image.shape
-    rows, columns = -(-height // BLOCK_PX), -(-width // BLOCK_PX)
+    rows, columns = -(-height // NOISE_BLOCK_PX), -(-width // NOISE_BLOCK_PX)
     padded = cv2.copyMakeBorder(
-        image, 0, rows * BLOCK_PX - height, 0, columns * BLOCK_PX - width, cv2.BORDER_REFLECT_101
+        image, 0, rows * NOISE_BLOCK_PX - height, 0, columns * NOISE_BLOCK_PX - width, cv2.BORDER_REFLECT_101
     )
-    blocks = padded.reshape(rows, BLOCK_PX, columns, BLOCK_PX).transpose(0, 2, 1, 3).reshape(-1, BLOCK_PX**2)
-    kept = np.sort(blocks, axis=1)[:, : int(KEPT_PART * BLOCK_PX**2)]
+    blocks = (
+        padded.reshape(rows, NOISE_BLOCK_PX, columns, NOISE_BLOCK_PX)
+        .transpose(0, 2, 1, 3)
+        .reshape(-1, NOISE_BLOCK_PX**2)
+    )
+    kept = np.sort(blocks, axis=1)[:, : int((1.0 - LEFT_OUT_PART) * NOISE_BLOCK_PX**2)]
     spread = cv2.medianBlur(kept.std(axis=1).astype(np.float32).reshape(rows, columns), 5)
     usual = float(np.median(spread[spread > 0])) if spread.any() else 1.0
     noise: NDArray[np.float32] = cv2.resize(
-        np.maximum(spread, SMALLEST_NOISE * usual), (columns * BLOCK_PX, rows * BLOCK_PX)
+        np.maximum(spread, SMALLEST_NOISE * usual), (columns * NOISE_BLOCK_PX, rows * NOISE_BLOCK_PX)
     )  # type: ignore[assignment]
     return replace(detections, noise_e=np.ascontiguousarray(noise[:height, :width]))
 
@@ -77,10 +78,10 @@ def measure_response(light: StarPhotometry) -> DamagedResponse:
     noise = light.sigma_e[usable]
     snr, measured = light.expected_e[usable] / noise, light.flux_e[usable] / noise
     visible, hidden = _surely_visible_and_hidden(light.xy_px[usable], snr, measured)
-    if np.count_nonzero(visible) < MIN_VISIBLE:
+    if np.count_nonzero(visible) < MIN_GROUP * (len(SNR_EDGES) - 1):
         raise NoSolution("too few stars show what is left of the light", reason="damaged_image")
     offset, scatter = 0.0, 0.0
-    if np.count_nonzero(hidden) >= MIN_HIDDEN:
+    if np.count_nonzero(hidden) >= 2 * MIN_GROUP:
         offset, scatter = float(np.median(measured[hidden])), _scatter(measured[hidden])
     groups = []
     for low, high in pairwise(SNR_EDGES):
@@ -89,27 +90,27 @@ def measure_response(light: StarPhotometry) -> DamagedResponse:
             typical = float(np.median(snr[one]))
             gain = float(np.median(measured[one] - offset)) / typical
             groups.append((typical, gain, _scatter(measured[one] - offset - gain * snr[one])))
-    if not groups or max(gain for _, gain, _ in groups) < 2 * MIN_GAIN:
+    if not groups or max(gain for _, gain, _ in groups) < SEEN_PART:
         raise NoSolution("the light of the stars is lost", reason="damaged_image")
     typical, gains, scatters = np.array(groups).T
     scatter = scatter or float(scatters[0])
-    return DamagedResponse(typical, gains, np.maximum(scatters, MIN_SCATTER * scatter), offset, scatter)
+    return DamagedResponse(typical, gains, np.maximum(scatters, LEAST_SCATTER * scatter), offset, scatter)
 
 
 def _surely_visible_and_hidden(xy_px: Array, snr: Array, measured: Array) -> tuple[Bools, Bools]:
     """Masks (n,) of the stars whose nearest bright stars are all seen, or all missing."""
     from scipy.spatial import cKDTree
 
-    bright = np.flatnonzero(snr > BRIGHT_SNR)
-    if len(bright) <= NEIGHBOURS:
+    bright = np.flatnonzero(snr > MARKER_SNR)
+    if len(bright) <= MARKERS:
         return np.zeros(len(snr), dtype=bool), np.zeros(len(snr), dtype=bool)
     seen = measured[bright] > SEEN_PART * snr[bright]
-    _, nearest = cKDTree(xy_px[bright]).query(xy_px, NEIGHBOURS + 1)
+    _, nearest = cKDTree(xy_px[bright]).query(xy_px, MARKERS + 1)
     others = bright[nearest] != np.arange(len(snr))[:, None]  # a star is not its own witness
     count = np.count_nonzero(others & seen[nearest], axis=1)
     return count == np.count_nonzero(others, axis=1), count == 0
 
 
 def _scatter(values: Array) -> float:
-    """Standard deviation of values (n,) within the percentiles LOW and HIGH."""
-    return float(np.std(np.clip(values, *np.percentile(values, [LOW, HIGH]))))
+    """Standard deviation of values (n,), those at both ends clipped."""
+    return float(np.std(np.clip(values, *np.percentile(values, [50 * LEFT_OUT_PART, 100 - 50 * LEFT_OUT_PART]))))

@@ -17,29 +17,31 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.core.types import Array, Bools, NotLocated
-from startrack.evidence.dimmed_light import log_likelihoods, measure_scatter
+from startrack.evidence.expected_stars import CLIPPED_SIGMAS
+from startrack.evidence.sky_step import SKYLINE_POINTS, Skyline
 from startrack.evidence.star_evidence import StarPhotometry
 from startrack.terrain import Terrain
 
 PRIOR = 1e-3  # that a frame is a double exposure
-DECISIVE = 1e3  # ratio of the weights, with the prior, from which a frame is refused
-PARTS = np.linspace(0.2, 0.8, 7)  # of the exposure, at the first position; an error of the scale feigns nine tenths
-LIGHT = np.concatenate([[0.0], PARTS, [1.0]])  # of a star: hidden, dimmed and visible
+DECISIVE = 1 / PRIOR  # ratio of the weights, with the prior, from which a frame is refused
+EXPOSURE_PARTS = np.linspace(0.2, 0.8, 7)  # at the first position; an error of the scale feigns nine tenths
+LIGHT = np.concatenate([[0.0], EXPOSURE_PARTS, [1.0]])  # of a star: hidden, dimmed and visible
 LEAST_SNR = 3.0  # of a star whose light shows a part
 SCREENED_RAD = np.radians([0.25, 0.5, 1.0, 2.0, 4.0])  # from the skyline: bands in which dimmed stars are counted first
 SCREENED_SHARES = np.array([0.03, 0.1, 0.3, 0.8])  # of dimmed stars in a band
 SCREENED_NATS = 3.0  # gain of dimmed stars in a band: one clean frame of twenty, moves of one pixel 5 to 70
-WIDEST_RAD = np.radians(6.0)  # from the skyline: stars with which two positions are sought
-AZIMUTHS_RAD = np.linspace(0.0, 2 * np.pi, 720, endpoint=False)  # of the skyline by which stars are chosen
-HIGH_RAD = np.radians(4.0)  # above the skyline: stars there show how far the light of visible stars scatters
-HIGH_SNR, LEAST_HIGH = 6.0, 30
+PAIRED_RAD = np.radians(6.0)  # from the skyline: stars with which two positions are sought
+FAR_ABOVE_RAD = SCREENED_RAD[-1]  # above the skyline: stars there show how far the light of visible stars scatters
+SCATTER_SNR, SCATTER_STARS = 2 * LEAST_SNR, 30
 RADII = 0.0025 * 1.5 ** np.arange(12)  # of the moves tried, in radii of the search area: 25 m to 2.2 km of 10 km
-REACH, NODES_ACROSS = 0.25, 9  # of horizons of a map that are interpolated, and the points at which they are traced
-DIRECTIONS = 24
-STEPS = np.array([64.0, 32.0, 16.0, 8.0, 4.0]) * 1e-4  # of a climb, in radii of the search area
-ROUNDS, STARTS = 6, 3  # climbs: rounds of each step, and their number
-TURNS = np.linspace(0.0, 2 * np.pi, DIRECTIONS, endpoint=False)
-CIRCLE = np.stack([np.sin(TURNS), np.cos(TURNS)], axis=1)  # (DIRECTIONS, 2)
+TRACED_REACH, TRACED_NODES = 0.25, 9  # of a map's horizons that are interpolated; points at which they are traced
+MOVE_DIRECTIONS = 24
+CLIMB_STEPS = np.array([64.0, 32.0, 16.0, 8.0, 4.0]) * 1e-4  # of a climb, in radii of the search area
+CLIMB_ROUNDS, CLIMBS = 6, 3  # of each step of a climb; the number of climbs
+MOVE_AZIMUTHS_RAD = np.linspace(0.0, 2 * np.pi, MOVE_DIRECTIONS, endpoint=False)
+OUTLIERS = 0.02  # least share of stars with any light: variable, blended, beside a defect
+SCATTER_ROUNDS = 4
+CIRCLE = np.stack([np.sin(MOVE_AZIMUTHS_RAD), np.cos(MOVE_AZIMUTHS_RAD)], axis=1)  # (MOVE_DIRECTIONS, 2)
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class DoubleExposure:
     @property
     def log_odds(self) -> float:
         """Log odds of a double exposure: the smaller gain, less the prior and the explanations that were tried."""
-        tried = len(RADII) * DIRECTIONS * len(PARTS)
+        tried = len(RADII) * MOVE_DIRECTIONS * len(EXPOSURE_PARTS)
         return min(self.over_one_nats, self.over_free_nats) + float(np.log(PRIOR / tried))
 
     def __str__(self) -> str:
@@ -75,7 +77,7 @@ class _Rows:
     elevation_rad: Array
     hidden: Array  # (n,)
     visible: Array  # (n,)
-    dimmed: Array  # (n, len(PARTS))
+    dimmed: Array  # (n, len(EXPOSURE_PARTS))
 
     @property
     def free(self) -> Array:
@@ -91,7 +93,7 @@ class _Rows:
         return self.hidden.sum() + above @ (self.visible - self.hidden)
 
     def of_two(self, first: Array, second: Array) -> Array:
-        """Log-likelihoods (m, len(PARTS)) of pairs of skylines, `first` and `second` (m, n)."""
+        """Log-likelihoods (m, len(EXPOSURE_PARTS)) of pairs of skylines, `first` and `second` (m, n)."""
         hidden, other = self.hidden[:, None], self.dimmed[:, ::-1]
         both = self.visible[:, None] - self.dimmed - other + hidden
         return hidden.sum() + first @ (self.dimmed - hidden) + second @ (other - hidden) + (first * second) @ both
@@ -115,11 +117,10 @@ def find_double_exposure(light: StarPhotometry, terrain: Terrain, position_m: Ar
     known = light.usable | (np.array([cause == "blocked" for cause in light.causes])[light.cause_code])
     which = np.flatnonzero(known & (light.expected_e > LEAST_SNR * light.sigma_e) & (light.sigma_e > 0))
     azimuth, elevation = light.azimuth_rad[which], light.elevation_rad[which]
-    skyline_rad = terrain.horizon_rad(position_m[None], AZIMUTHS_RAD)
-    above_rad = elevation - np.interp(azimuth, AZIMUTHS_RAD, skyline_rad, period=2 * np.pi)
+    above_rad = elevation - Skyline.trace(position_m, terrain, SKYLINE_POINTS // 2)(azimuth)
     fluxes = light.expected_e[which], light.flux_e[which], light.sigma_e[which]
-    high = (above_rad > HIGH_RAD) & (fluxes[0] > HIGH_SNR * fluxes[2])
-    if np.count_nonzero(high) < LEAST_HIGH:
+    high = (above_rad > FAR_ABOVE_RAD) & (fluxes[0] > SCATTER_SNR * fluxes[2])
+    if np.count_nonzero(high) < SCATTER_STARS:
         return None
     scatter = measure_scatter(*(values[high] for values in fluxes))
 
@@ -131,9 +132,9 @@ def find_double_exposure(light: StarPhotometry, terrain: Terrain, position_m: Ar
     near = np.abs(above_rad) < SCREENED_RAD[-1]
     if _screened_gain(rows(near), np.abs(above_rad[near])) < SCREENED_NATS:
         return None
-    near = np.abs(above_rad) < WIDEST_RAD
-    reach_m = REACH * terrain.search_radius_m
-    ground = terrain.near(position_m, reach_m, azimuth[near], NODES_ACROSS).interpolated()
+    near = np.abs(above_rad) < PAIRED_RAD
+    reach_m = TRACED_REACH * terrain.search_radius_m
+    ground = terrain.near(position_m, reach_m, azimuth[near], TRACED_NODES).interpolated()
     return _best_pair(rows(near), ground, position_m)
 
 
@@ -160,8 +161,8 @@ def _best_pair(rows: _Rows, terrain: Terrain, position_m: Array) -> DoubleExposu
     def one(points_m: Array) -> Array:
         return rows.of_one(rows.above(terrain, points_m[:, 0]))
 
-    steps_m = STEPS * terrain.search_radius_m
-    starts = pairs[np.argsort(-two(pairs), kind="stable")[:STARTS]]
+    steps_m = CLIMB_STEPS * terrain.search_radius_m
+    starts = pairs[np.argsort(-two(pairs), kind="stable")[:CLIMBS]]
     best, pair = max((_climb(two, start, steps_m) for start in starts), key=lambda found: found[0])
     single = max(_climb(one, start[None], steps_m)[0] for start in (position_m, *pair, pair.mean(axis=0)))
     first, second = (rows.above(terrain, pair[k][None]) for k in (0, 1))
@@ -169,19 +170,55 @@ def _best_pair(rows: _Rows, terrain: Terrain, position_m: Array) -> DoubleExposu
     between = (first != second)[0]
     dimmed = np.where(first[0] > 0, rows.dimmed[:, part], rows.dimmed[:, -1 - part])
     free_nats = float((dimmed - rows.free)[between].sum())
-    return DoubleExposure(pair, float(PARTS[part]), best - single, free_nats, int(np.count_nonzero(between)))
+    return DoubleExposure(pair, float(EXPOSURE_PARTS[part]), best - single, free_nats, int(np.count_nonzero(between)))
 
 
 def _climb(fits: Callable[[Array], Array], start_m: Array, steps_m: Array) -> tuple[float, Array]:
     """The best fit near one or two positions (k, 2), and where; `fits` takes (m, k, 2)."""
     at, best = start_m, float(fits(start_m[None])[0])
-    ways = np.einsum("kl,wc->kwlc", np.eye(len(start_m)), CIRCLE[:: DIRECTIONS // 8]).reshape(-1, *start_m.shape)
-    ways = np.concatenate([ways, np.broadcast_to(CIRCLE[:: DIRECTIONS // 8, None], (8, *start_m.shape))])
+    ways = np.einsum("kl,wc->kwlc", np.eye(len(start_m)), CIRCLE[:: MOVE_DIRECTIONS // 8]).reshape(-1, *start_m.shape)
+    ways = np.concatenate([ways, np.broadcast_to(CIRCLE[:: MOVE_DIRECTIONS // 8, None], (8, *start_m.shape))])
     for step_m in steps_m:
-        for _ in range(ROUNDS):
+        for _ in range(CLIMB_ROUNDS):
             tried = at + step_m * ways
             fit = fits(tried)
             if fit.max() <= best:
                 break
             best, at = float(fit.max()), tried[int(np.argmax(fit))]
     return best, at
+
+
+def measure_scatter(expected_e: Array, flux_e: Array, sigma_e: Array) -> tuple[Array, float]:
+    """Scatter of visible stars' measured light `flux_e` (n,) about `expected_e`, beyond the noise `sigma_e`.
+
+    The variance per expected electron and per its square (2,), from the residuals' squares with deviant ones clipped;
+    and the share of outliers.
+    """
+    terms, per_e = np.stack([expected_e, np.square(expected_e)], axis=1), np.asarray([0.0, 0.0])
+    beyond = np.square(flux_e - expected_e)
+    kept = beyond < np.square(np.maximum(CLIPPED_SIGMAS * sigma_e, 0.5 * expected_e))
+    for _ in range(SCATTER_ROUNDS):
+        variance = np.square(sigma_e) + terms @ per_e
+        weighted = terms[kept] / variance[kept, None]
+        rest = (beyond - np.square(sigma_e))[kept] / variance[kept]
+        per_e = np.asarray(np.linalg.lstsq(weighted, rest, rcond=None)[0])
+        if per_e.min() < 0:  # one of them alone
+            one = int(np.argmax(per_e))
+            alone = float(weighted[:, one] @ rest / np.square(weighted[:, one]).sum())
+            per_e = np.where(np.arange(2) == one, max(alone, 0.0), 0.0)
+        kept = beyond < CLIPPED_SIGMAS**2 * (np.square(sigma_e) + terms @ per_e)
+    return per_e, max(OUTLIERS, 1.0 - float(np.mean(kept)))
+
+
+def log_likelihoods(
+    light: Array, expected_e: Array, flux_e: Array, sigma_e: Array, per_e: Array, outliers: float
+) -> Array:
+    """Log-likelihoods (n, k) of fluxes `flux_e` (n,) where stars shine with parts `light` (k,) of what is expected.
+
+    `sigma_e` (n,): noise without the star; `per_e` (2,) and `outliers`: from `measure_scatter`.
+    """
+    mean = expected_e[:, None] * light
+    variance = np.square(sigma_e)[:, None] + per_e[0] * mean + per_e[1] * np.square(mean)
+    normal = -0.5 * np.square(flux_e[:, None] - mean) / variance - 0.5 * np.log(2 * np.pi * variance)
+    anything = np.log(outliers) - np.log(2.0 * expected_e + 10.0 * sigma_e)
+    return np.logaddexp(np.log1p(-outliers) + normal, anything[:, None])

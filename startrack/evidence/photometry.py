@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.types import Array, Bools, Detections, Ints
+from startrack.evidence.photometry_kernel import measure_sources
 from startrack.psf import pixel_profile_table, stamp_radius
 
 PROFILE_SIGMAS = 6.0  # half width of a neighbour's profile: 1e-9 of its light lies beyond
@@ -46,8 +47,6 @@ def measure(detections: Detections, sources: Sources) -> Photometry:
     The `detections` have the image, its background and noise, its saturated pixels and the PSF. All sources must lie at
     least `half_width` inside the frame. The neighbours' expected light is subtracted.
     """
-    from startrack.evidence.photometry_kernel import measure_sources
-
     sigma_px, d = detections.psf_sigma_px, detections
     radius = half_width(sigma_px)
     reach_px = radius + 3.0 * sigma_px
@@ -59,16 +58,12 @@ def measure(detections: Detections, sources: Sources) -> Photometry:
         sources.xy_px[order], sources.flux_e[order], sources.fraction_sigma[order], sources.visible[order],
         first, columns, reach_px, reach_px, radius, table, measured, usable,
     )  # fmt: skip
-    columns_out, usable_out = np.empty((4, len(order))), np.empty_like(usable)
-    columns_out[:, order], usable_out[order] = measured.T, usable
-    flux_e, variance_e2, own_shot, neighbour_variance_e2 = columns_out
+    given = np.argsort(order)
+    flux_e, variance_e2, own_shot, neighbour_variance_e2 = np.ascontiguousarray(measured[given].T)
     return Photometry(
-        flux_e=flux_e,
-        variance_e2=variance_e2,
-        own_shot=own_shot,
-        neighbour_variance_e2=neighbour_variance_e2,
-        usable=usable_out,
-    )
+        flux_e=flux_e, variance_e2=variance_e2, own_shot=own_shot, neighbour_variance_e2=neighbour_variance_e2,
+        usable=usable[given],
+    )  # fmt: skip
 
 
 def neighbour_profiles(sigma_px: float) -> Array:

@@ -12,8 +12,10 @@ import numpy as np
 
 from startrack.core.kernels import REORDERED_SUMS, njit
 
-ZERO, ONE, LEAST = np.float32(0.0), np.float32(1.0), np.float32(1e-30)  # literals would be of double precision
-OUTLIER_VARIANCES = np.float32(5.0**2)
+ZERO = np.float32(0.0)  # literals would be of double precision
+LEAST = np.finfo(np.float32).tiny  # of a divisor
+SURE_SIGMAS = 5.0  # from here on chance is excluded: two in a million
+OUTLIER_VARIANCES = np.float32(SURE_SIGMAS**2)
 MODEL_VARIANCE = np.float32(0.05**2)  # of a star's squared light, pixel by pixel: the real PSF is no Gaussian
 MAX_MASKED_PX = 6  # a stamp with more deviant pixels is not a star on a smooth background
 
@@ -47,25 +49,14 @@ def measure_sources(
             x, y = k + left - centre[j, 0], k + top - centre[j, 1]
             _add_light(light, side, np.float32(flux_e[j] * visible[j]), across, down, j, x, y)
         _load_stamp(
-            image,
-            background,
-            noise,
-            dead,
-            across,
-            down,
-            i,
-            left,
-            top,
-            radius,
-            k,
-            light,
-            profile,
-            data,
-            variance,
+            image, background, noise, dead, across, down, i, left, top, radius, k, light, profile, data, variance,
             weight,
-        )
+        )  # fmt: skip
         flux, middle, strength, masked = _fit_masking(profile, light, data, variance, weight)
-        usable[i] = masked <= MAX_MASKED_PX and _visible_fraction(profile, weight) > 0.5
+        seen = ZERO  # part of the star's light in pixels that have a weight
+        for p in range(size):
+            seen += profile[p] if weight[p] > ZERO else ZERO
+        usable[i] = masked <= MAX_MASKED_PX and seen > 0.5
         measured[i, 0], measured[i, 1], measured[i, 2], measured[i, 3] = 0.0, 1.0, 0.0, 0.0
         if not usable[i]:
             continue
@@ -135,7 +126,7 @@ def _load_stamp(
             profile[p] = height * across[source, c0 + c]
             data[p] = image[y, x] - background[y, x] - light[p]
             variance[p] = noise[y, x] * noise[y, x]
-            weight[p] = ZERO if dead[y, x] else ONE / variance[p]
+            weight[p] = ZERO if dead[y, x] else np.float32(1.0) / variance[p]
 
 
 @njit(inline="always")
@@ -204,15 +195,6 @@ def _fit_masking(profile, light, data, variance, weight):
         weight[worst] = ZERO
         masked += 1
     return flux, middle, strength, masked
-
-
-@njit(inline="always")
-def _visible_fraction(profile, weight):
-    """Part of the star's light in pixels that have a weight."""
-    total = ZERO
-    for p in range(len(profile)):
-        total += profile[p] if weight[p] > ZERO else ZERO
-    return total
 
 
 @njit(inline="always")

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.core.kernels import njit
+from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Bools, Ints
 from startrack.evidence.sky_pixels import SkyPixels
 from startrack.evidence.sky_step import MEDIAN_ABS_NORMAL
@@ -16,11 +17,10 @@ SECTORS = 240  # of 1.5 degrees, as the localizer's
 LEVEL_SIGMAS = 4.0  # of the edge: from here on a pixel shows the sky or the ground alone
 MIN_SIDE_PIXELS = 30  # of a sector on either side of the skyline
 MIN_KEPT = 0.5  # of them, by the last clipping: else the sector shows something else than those beside it
-LEVEL_SECTORS = 5.0  # standard deviation of the smoothing along the skyline: 7.5 degrees
+LEVEL_SECTORS = 5.0  # standard deviation of the smoothing of levels and noise along the skyline: 7.5 degrees
 SLOPE_SECTORS = (20.0, 7.0)  # of the slopes away from the skyline, and of what these leave
 FIRST_CLIP_SIGMAS, CLIP_SIGMAS = 6.0, 3.5  # of the pixels: faint stars and defects
-NOISE_SECTORS = 5.0  # of the smoothing of the pixels' noise
-ROUNDS = 3
+LEVEL_ROUNDS = 3
 MEDIAN_STEP = 8  # of the pixels from which the first levels are taken
 SLOPE_EXCESS = 2.0  # mean square of slopes that the noise explains, in units of their variance
 GROUND, SKY = range(2)
@@ -63,11 +63,11 @@ def measure_levels(pixels: SkyPixels, sector: Ints) -> SkyLevels:
     covered = np.asarray((counts >= MIN_SIDE_PIXELS).all(axis=0))
     level, noise = _first_levels(side, light)
     slope, clip = np.zeros((2, SECTORS)), FIRST_CLIP_SIGMAS
-    for _ in range(ROUNDS):
+    for _ in range(LEVEL_ROUNDS):
         sums = np.zeros((2, 6, SECTORS))
         _sum_sides(side, sector, height, light, level, slope, clip * noise, sums)
         sums *= covered
-        count, squares = _smooth(sums[:, [0, 5]], NOISE_SECTORS).swapaxes(0, 1)
+        count, squares = _smooth(sums[:, [0, 5]], LEVEL_SECTORS).swapaxes(0, 1)
         noise = np.sqrt(np.maximum(squares / np.maximum(count, 1e-9), 1e-12))
         more, kept = _significant_slopes(sums, slope, noise)
         own = sums[:, 3] - more * sums[:, 1]
@@ -95,7 +95,7 @@ def _level_errors(
     independent = np.square(noise_e) / count
     z2 = np.square(own_e) / independent
     correlation = max(float(np.median(z2[:, covered])) / MEDIAN_ABS_NORMAL**2, 1.0) if covered.any() else 1.0
-    nearby, seen = (_smooth(np.asarray(a, dtype=np.float64), NOISE_SECTORS) for a in (z2 * covered, covered))
+    nearby, seen = (_smooth(np.asarray(a, dtype=np.float64), LEVEL_SECTORS) for a in (z2 * covered, covered))
     rough = np.maximum(nearby / np.maximum(seen, 1e-9), correlation)
     extrapolated = np.square(sums[:, 1]) / count / np.maximum(_spread(sums), 1e-9)
     return np.sqrt(correlation * independent), independent * rough * (1.0 + kept_slope * extrapolated), correlation
@@ -108,7 +108,7 @@ def _first_levels(side: Ints, light_e: Array) -> tuple[Array, Array]:
         values = light_e[side == s][::MEDIAN_STEP]
         if len(values):
             middle[s] = np.median(values)
-            noise[s] = np.median(np.abs(values - middle[s])) / MEDIAN_ABS_NORMAL
+            noise[s] = robust_sigma(values, middle[s])
     return np.repeat(middle[:, None], SECTORS, axis=1), np.repeat(noise[:, None], SECTORS, axis=1)
 
 

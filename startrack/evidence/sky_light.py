@@ -12,20 +12,38 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from math import sqrt
+from typing import Any
 
 import numpy as np
 
 from startrack.core.kernels import njit, normal_cdf
+from startrack.core.statistics import relative_weights, robust_sigma
 from startrack.core.types import Array, Bools, Evidence
-from startrack.evidence.sky_levels import CLIP_SIGMAS, GROUND, SECTORS, SKY, SkyLevels, measure_levels, sector_of
+from startrack.evidence.expected_stars import SURE_SIGMAS
+from startrack.evidence.sky_levels import (
+    CLIP_SIGMAS,
+    GROUND,
+    LEVEL_SECTORS,
+    SECTORS,
+    SKY,
+    SkyLevels,
+    measure_levels,
+    sector_of,
+)
 from startrack.evidence.sky_pixels import SkyPixels
 from startrack.evidence.sky_step import Horizon
+from startrack.evidence.star_evidence import SEEN_LLR
 
-HEIGHT_PX = 0.75  # of a cell
+CELL_PX = 0.75  # of a cell
 LEVELS = 13  # cells of a sector: up to 4.9 px above and below the predicted skyline
 CLIP_SHIFT_PX = 1.0  # a pixel is an outlier only if no skyline within this distance explains it
-INFORMED_NATS = 3.0  # by which the best shift must exceed the outermost ones
 SHIFTS_PX = np.linspace(-4.0, 4.0, 161)  # of the skyline in one sector, above the predicted one
+NEEDED_SECTORS = SECTORS // 4  # with a step; fewer determine no shift of the skyline
+MIN_STEP_SIGMAS = 8.0  # of the mean step
+SECTOR_STEP_SIGMAS = 3.0  # of the step of one sector
+MISFIT_SIGMAS = 6.0  # of a sector's misfit against the others'
+RAMP_PX = 4.0  # standard deviation of an edge that is no skyline: light that fades
+SHARP_NATS = 10.0  # by which the sharp edge must explain the pixels better than such a ramp
 MIDDLES_RAD = (2 * np.arange(SECTORS) + 1) * np.pi / SECTORS
 
 
@@ -68,17 +86,13 @@ class SkyLight:
         step = np.where(self.levels.step_e > 0, self.levels.step_e, np.inf)
         return np.asarray((np.square(per_ground) * variance[GROUND] + np.square(per_sky) * variance[SKY]) / step**2)
 
-    def evidence(self, sectors: Bools, raised_px: Array, variance_factor: float = 1.0) -> Evidence:
-        """Rows of the chosen `sectors` (SECTORS,), for the localizer.
-
-        They are put lower by `raised_px` (SECTORS,), by which the image shows them too high; the variances are taken
-        `variance_factor` times as large.
-        """
-        factor = variance_factor * (1.0 + self._variance_by_levels_px2 / np.square(self.shift_sigma_px))
+    def evidence(self, sectors: Bools) -> Evidence:
+        """Rows of the chosen `sectors` (SECTORS,), for the localizer."""
+        factor = 1.0 + self._variance_by_levels_px2 / np.square(self.shift_sigma_px)
         s, h = np.nonzero((self.extended_nats > 0.0) & sectors[:, None])
         return Evidence(
             azimuth_rad=MIDDLES_RAD[s],
-            elevation_rad=self.elevation_rad[s] + (self.height_px[s, h] - raised_px[s]) / self.px_per_rad[s],
+            elevation_rad=self.elevation_rad[s] + self.height_px[s, h] / self.px_per_rad[s],
             llr=self.llr[s, h] / factor[s],
             extended_nats=self.extended_nats[s, h] / factor[s],
             edge_sigma_rad=self.edge_px / self.px_per_rad[s],
@@ -86,13 +100,9 @@ class SkyLight:
 
 
 def measure_sky_light(pixels: SkyPixels, horizon: Horizon) -> SkyLight:
-    """The light of the sky by `pixels` near a predicted `horizon`."""
-    return sum_cells(pixels, measure_levels(pixels, sector_of(pixels.azimuth_rad)), horizon)
-
-
-def sum_cells(pixels: SkyPixels, levels: SkyLevels, horizon: Horizon) -> SkyLight:
-    """Sums of `pixels` in cells about a predicted `horizon`, above which their heights are, with known `levels`."""
+    """The light of the sky by `pixels` near a predicted `horizon`, above which their heights are."""
     sector = sector_of(pixels.azimuth_rad)
+    levels = measure_levels(pixels, sector)
     sums = np.zeros((SECTORS, LEVELS, 3))
     scale = np.zeros((SECTORS, 2))
     _sum_cells(
@@ -100,7 +110,7 @@ def sum_cells(pixels: SkyPixels, levels: SkyLevels, horizon: Horizon) -> SkyLigh
         np.square(levels.noise_e) * levels.correlation, levels.correlation, pixels.edge_px, CLIP_SIGMAS, sums, scale,
     )  # fmt: skip
     # The pixels of a cell spread over its height.
-    edge_px = sqrt(pixels.edge_px**2 + HEIGHT_PX**2 / 12)
+    edge_px = sqrt(pixels.edge_px**2 + CELL_PX**2 / 12)
     llr, extended = sums[..., 0], sums[..., 1]
     height_px = sums[..., 2] / np.where(extended > 0, extended, 1.0)
     shift, sigma, misfit = _shifts(height_px, llr, extended, edge_px)
@@ -125,17 +135,55 @@ def _shifts(height_px: Array, llr: Array, extended: Array, edge_px: float) -> tu
     log = np.empty((SECTORS, len(SHIFTS_PX)))
     _score_shifts(height_px, llr, extended, edge_px, log)
     best = log.max(axis=1)
-    informed = best - np.maximum(log[:, 0], log[:, -1]) > INFORMED_NATS
-    weight = np.exp(log - best[:, None])
-    weight /= weight.sum(axis=1, keepdims=True)
-    mean = weight @ SHIFTS_PX
-    variance = weight @ np.square(SHIFTS_PX) - np.square(mean)
-    step = SHIFTS_PX[1] - SHIFTS_PX[0]
+    informed = best - np.maximum(log[:, 0], log[:, -1]) > SEEN_LLR
+    _, mean, sigma = average_shifts(log, SHIFTS_PX)
     # Each cell's own best fraction of sky, free of any skyline.
     free = np.clip(llr / np.where(extended > 0, extended, 1.0) + 0.5, 0.0, 1.0)
     misfit = (llr * free + 0.5 * extended * free * (1.0 - free)).sum(axis=1) - best
-    sigma = np.sqrt(np.maximum(variance, step**2 / 12))
     return np.where(informed, mean, 0.0), np.where(informed, sigma, np.inf), misfit
+
+
+def average_shifts(log_weights: Array, shifts: Array) -> tuple[Array, Array, Array]:
+    """Weights (n, m) of evenly spaced `shifts` (m,), by their logarithms; means and standard deviations (n,)."""
+    weight = relative_weights(log_weights, axis=1)
+    weight /= weight.sum(axis=1, keepdims=True)
+    mean = weight @ shifts
+    variance = weight @ np.square(shifts) - np.square(mean)
+    return weight, mean, np.sqrt(np.maximum(variance, (shifts[1] - shifts[0]) ** 2 / 12))
+
+
+def sectors_with_step(sky: SkyLight) -> Bools:
+    """Sectors (SECTORS,) where the light steps from a ground to a sky that continue those beside them.
+
+    None at all where the step as a whole is too weak, or fades instead of stepping.
+    """
+    levels = sky.levels
+    averaged = 2 * sqrt(np.pi) * LEVEL_SECTORS  # sectors in one smoothed level
+    sigma = np.hypot(*(levels.own_sigma_e * sqrt(levels.correlation / averaged)))
+    good = levels.covered & np.isfinite(sky.shift_sigma_px) & (levels.step_e > SECTOR_STEP_SIGMAS * sigma)
+    own = np.abs(levels.own_e) / (levels.own_sigma_e * sqrt(levels.correlation))
+    good &= (own < SURE_SIGMAS).all(axis=0)
+    if good.any():
+        misfit = sky.misfit_nats[good]
+        good &= sky.misfit_nats < np.median(misfit) + MISFIT_SIGMAS * max(robust_sigma(misfit), 1.0)
+    mean_step = levels.step_e[good].mean() if good.any() else 0.0
+    mean_sigma = sqrt(float(np.sum(np.square(sigma[good]))) * LEVEL_SECTORS) / max(int(np.count_nonzero(good)), 1)
+    enough = np.count_nonzero(good) >= NEEDED_SECTORS and mean_step > MIN_STEP_SIGMAS * mean_sigma
+    return good if enough and _is_sharp(sky, good) else np.zeros(SECTORS, dtype=bool)
+
+
+def _is_sharp(sky: SkyLight, sectors: Bools) -> bool:
+    """Whether a step as sharp as a star explains the cells of the sectors better than a wide ramp, by far."""
+    from scipy.special import ndtr
+
+    heights = sky.height_px[sectors] - sky.shift_px[sectors, None]
+    llr, extended = sky.llr[sectors], sky.extended_nats[sectors]
+
+    def nats(edge_px: float) -> float:
+        fraction: Any = ndtr(heights / edge_px)
+        return float(np.sum(fraction * (llr + 0.5 * extended * (1.0 - fraction))))
+
+    return nats(sky.edge_px) > nats(RAMP_PX) + SHARP_NATS
 
 
 @njit(cache=True, nogil=True)
@@ -153,7 +201,7 @@ def _score_shifts(height, llr, extended, edge, log):
 @njit(cache=True, nogil=True)
 def _sum_cells(sector, height, light, scale, covered, level, slope, variance, correlation, edge, clip, sums, scales):
     """Add up sums (SECTORS, LEVELS, 3) of l, c and c times the height; scales (SECTORS, 2): pixels, their scale."""
-    half = 0.5 * sums.shape[1] * HEIGHT_PX
+    half = 0.5 * sums.shape[1] * CELL_PX
     for k in range(len(sector)):
         i, h = sector[k], height[k]
         if covered[i] and abs(h) < half:
@@ -165,7 +213,7 @@ def _sum_cells(sector, height, light, scale, covered, level, slope, variance, co
             q = light[k] - ground
             beyond = max(step * least - q, q - step * most, 0.0)
             if step > 0.0 and beyond * beyond * correlation <= clip * clip * s2:
-                j = min(int((h + half) / HEIGHT_PX), sums.shape[1] - 1)
+                j = min(int((h + half) / CELL_PX), sums.shape[1] - 1)
                 sums[i, j, 0] += (q * step - 0.5 * step * step) / s2
                 sums[i, j, 1] += step * step / s2
                 sums[i, j, 2] += step * step / s2 * h

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 # mypy: disable-error-code="no-untyped-def"
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
@@ -11,14 +11,21 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.core.kernels import njit
 from startrack.core.types import Array, Bools, Detections
-from startrack.evidence.sky_step import BAND_PX, SKYLINE_POINTS, Horizon, Skyline, skyline_band
+from startrack.evidence.sky_step import (
+    BAND_PX,
+    ELEVATION_STEP_RAD,
+    SKYLINE_POINTS,
+    Horizon,
+    Skyline,
+    look_through,
+    skyline_band,
+)
 from startrack.evidence.star_evidence import StarPhotometry, filtered_noise_e
 from startrack.frames import azel_from_rays, off_axis_rad, rays_from_azel
 from startrack.psf import noise_area_px
 
 MASKED_SIGMA = 0.4  # light of a known star, in a pixel's noise, from which the pixel is left out
-EDGE_PX = 3.0  # beside the end of the image circle
-SCALE_STEP_RAD = 1e-3  # in elevation
+CIRCLE_EDGE_PX = 3.0  # beside the end of the image circle
 UNRESOLVED_PX2 = 1.0 / 12.0  # variance of the position in a pixel
 
 
@@ -33,11 +40,6 @@ class SkyPixels:
     light_e: Array
     edge_px: float  # width of a sharp edge in the image: the PSF and the pixel
 
-    def above(self, horizon: Horizon) -> SkyPixels:
-        """The same pixels above another skyline, a few pixels away."""
-        height = (self.elevation_rad - horizon(self.azimuth_rad)) * self.px_per_rad
-        return replace(self, height_px=height)
-
 
 def pixels_near_skyline(
     detections: Detections, camera: Camera, R_cam_enu: Array, horizon: Horizon, stars: StarPhotometry
@@ -48,14 +50,11 @@ def pixels_near_skyline(
     """
     band = skyline_band(detections.image_e.shape, camera, R_cam_enu, horizon)
     _leave_out_stars(band, detections, stars)
-    pixel = np.flatnonzero(band)
-    pixel = pixel[~detections.dead.ravel()[pixel]]
-    rows, columns = np.divmod(pixel, band.shape[1])
-    rays_cam = camera.unproject(np.stack([columns, rows], axis=1).astype(np.float64))
+    pixel, rays_cam = look_through(band & ~detections.dead, camera)
     azimuth, elevation = azel_from_rays(rays_cam @ R_cam_enu)
     scale = scale_across(camera, R_cam_enu, horizon)(azimuth)
     height = (elevation - horizon(azimuth)) * scale
-    limit_rad = min(camera.calibrated_angle_rad, camera.max_angle_rad) - EDGE_PX / camera.focal_px[0]
+    limit_rad = min(camera.calibrated_angle_rad, camera.max_angle_rad) - CIRCLE_EDGE_PX / camera.focal_px[0]
     usable = np.flatnonzero((rays_cam[:, 2] > np.cos(limit_rad)) & (np.abs(height) < BAND_PX))
     return SkyPixels(
         azimuth_rad=azimuth[usable],
@@ -74,7 +73,6 @@ def scale_across(camera: Camera, R_cam_enu: Array, horizon: Horizon) -> Skyline:
     """
     azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_POINTS, endpoint=False)
     elevation = horizon(azimuth)
-
     rays_cam = rays_from_azel(azimuth, elevation) @ R_cam_enu.T
     seen = off_axis_rad(rays_cam) < min(camera.max_angle_rad, camera.lens.max_invertible_rad)
 
@@ -82,7 +80,7 @@ def scale_across(camera: Camera, R_cam_enu: Array, horizon: Horizon) -> Skyline:
         rays_enu = rays_from_azel(np.roll(azimuth, turned), np.roll(elevation, turned) + raised_rad)
         return camera.project_unlimited((rays_enu @ R_cam_enu.T)[seen])
 
-    up = (pixels(0, SCALE_STEP_RAD) - pixels(0, -SCALE_STEP_RAD)) / (2 * SCALE_STEP_RAD)
+    up = (pixels(0, ELEVATION_STEP_RAD) - pixels(0, -ELEVATION_STEP_RAD)) / (2 * ELEVATION_STEP_RAD)
     along = pixels(-1, 0.0) - pixels(1, 0.0)
     across = np.abs(up[:, 0] * along[:, 1] - up[:, 1] * along[:, 0])
     scale = np.ones(SKYLINE_POINTS)

@@ -17,24 +17,24 @@ from numpy.typing import NDArray
 
 from startrack.camera import Camera
 from startrack.core.kernels import njit
+from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Bools, Detections, Ints
+from startrack.evidence.expected_stars import SURE_SIGMAS
 from startrack.frames import azel_from_rays, off_axis_rad, rays_from_azel
 from startrack.terrain import Terrain
 
 BAND_PX = 12.0  # from the skyline to the last pixels that are used; the background model has no sharper edge
-STEP_PX = 0.5
-STEP_SAMPLES = 1800  # azimuths at which the step is measured
-STEP_OFFSETS_PX = np.array([-11.0, -9.5, -8.0, -6.5, 6.5, 8.0, 9.5, 11.0])  # heights above the skyline
+PROFILE_STEP_PX = 0.5
+SIDES_PX = np.arange(0.5 * (BAND_PX + 1.0), BAND_PX, 3 * PROFILE_STEP_PX)  # of pixels on both sides
 STEP_SECTORS = 36
 SKYLINE_POINTS = 1440
-SKYLINE_SAMPLES = 7200  # one in 3 arcmin: half a pixel of a 180-degree fisheye
+SKYLINE_SAMPLES = 5 * SKYLINE_POINTS  # one in 3 arcmin: half a pixel of a 180-degree fisheye
+ELEVATION_STEP_RAD = 1e-3  # of derivatives
 MEDIAN_ABS_NORMAL = 0.6745  # median of the absolute value of a standard normal variable
 MAX_SHIFT_PX = 0.7  # one sigma
 MAX_SLOPE = 1.0
 MIN_MEDIAN_PX = 12  # for a median
-MEDIAN_LOSS = 1.2533  # standard deviation of the median of normal values, as a multiple of that of their mean
-SIGNIFICANT_SIGMAS = 5.0  # of a step that is stated as the brightness of the sky
-ARCSEC2_PER_SR = (180 * 3600 / np.pi) ** 2
+MEDIAN_LOSS = np.sqrt(np.pi / 2)  # standard deviation of the median of normal values, in that of their mean
 
 Horizon = Callable[[Array], Array]  # azimuths (n,) to elevations (n,) [rad]
 
@@ -46,9 +46,9 @@ class Skyline:
     elevation_rad: Array
 
     @classmethod
-    def trace(cls, position_m: Array, terrain: Terrain) -> Skyline:
+    def trace(cls, position_m: Array, terrain: Terrain, samples: int = SKYLINE_SAMPLES) -> Skyline:
         """The horizon of a `terrain` at `position_m` (2,), traced once: on a height map that takes time."""
-        azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_SAMPLES, endpoint=False)
+        azimuth = np.linspace(0.0, 2 * np.pi, samples, endpoint=False)
         return cls(terrain.horizon_rad(np.asarray(position_m)[None, :], azimuth))
 
     def __call__(self, azimuth_rad: Array) -> Array:
@@ -85,11 +85,12 @@ class SkyStep:
         step is not significant, or the camera has no zero point, or the exposure no known duration.
         """
         sensor = camera.sensor
-        if sensor is None or not exposure_s or not self.light_e > SIGNIFICANT_SIGMAS * self.sigma_e:
+        if sensor is None or not exposure_s or not self.light_e > SURE_SIGMAS * self.sigma_e:
             return None
         angle = np.array(self.angle_rad)
-        arcsec2 = float(camera.pixel_solid_angle_sr(angle)) * ARCSEC2_PER_SR * float(sensor.throughput(angle))
-        return float(-2.5 * np.log10(self.light_e / (arcsec2 * exposure_s * sensor.zero_point_e_per_s)))
+        arcsec2 = float(camera.pixel_solid_angle_sr(angle)) * np.degrees(3600) ** 2
+        per_s = arcsec2 * float(sensor.throughput(angle)) * sensor.zero_point_e_per_s
+        return float(-2.5 * np.log10(self.light_e / (per_s * exposure_s)))
 
 
 def measure_sky_step(detections: Detections, camera: Camera, R_cam_enu: Array, horizon: Horizon) -> SkyStep | None:
@@ -97,18 +98,22 @@ def measure_sky_step(detections: Detections, camera: Camera, R_cam_enu: Array, h
 
     Pixels of the `detections`' image are taken above and below the skyline, which `camera` and `R_cam_enu` place in it.
     """
-    azimuth = np.linspace(0.0, 2 * np.pi, STEP_SAMPLES, endpoint=False)
+    azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_SAMPLES // 4, endpoint=False)
     elevation = horizon(azimuth)
     angle = off_axis_rad(rays_from_azel(azimuth, elevation) @ R_cam_enu.T)
-    shift_rad = np.multiply.outer(STEP_OFFSETS_PX, 1.0 / _px_per_rad(camera, angle))
+    offsets_px = np.concatenate([-SIDES_PX[::-1], SIDES_PX])
+    shift_rad = np.multiply.outer(offsets_px, 1.0 / _px_per_rad(camera, angle))
     rays_enu = rays_from_azel(azimuth, elevation + shift_rad)
     xy_px, inside = camera.project(rays_enu @ R_cam_enu.T)
     columns, rows = np.rint(xy_px[inside]).astype(np.int64).T
     if not len(rows):
         return None
-    light, saturated = detections.image_e[rows, columns], detections.dead[rows, columns]
-    above = (STEP_OFFSETS_PX[:, None] > 0) & inside
-    light_e, sigma_e = _step_e(light[~saturated], above[inside][~saturated])
+    light, live = detections.image_e[rows, columns], ~detections.dead[rows, columns]
+    above = ((offsets_px[:, None] > 0) & inside)[inside]
+    sides, light_e, sigma_e = (light[live & above], light[live & ~above]), 0.0, 0.0
+    if all(map(len, sides)):
+        (sky, sky_sigma), (ground, ground_sigma) = (_grouped_median(side) for side in sides)
+        light_e, sigma_e = sky - ground, float(np.hypot(sky_sigma, ground_sigma))
     noise_e = float(np.median(detections.noise_e[rows, columns]))
     return SkyStep(horizon, light_e, sigma_e, noise_e, float(np.median(angle[inside.any(axis=0)])))
 
@@ -119,27 +124,26 @@ def subtract_sky_step(detections: Detections, camera: Camera, R_cam_enu: Array, 
     `camera` and `R_cam_enu` place the skyline in the image. The step is the median of the pixels at equal distances
     from the skyline, sector by sector.
     """
-    image_e, dead = detections.image_e, detections.dead
-    rows, columns = np.divmod(np.flatnonzero(skyline_band(image_e.shape, camera, R_cam_enu, horizon)), image_e.shape[1])
-    rays_cam = camera.unproject(np.stack([columns, rows], axis=1).astype(float))
+    band = skyline_band(detections.image_e.shape, camera, R_cam_enu, horizon)
+    pixel, rays_cam = look_through(band & ~detections.dead, camera)
     azimuth, elevation = azel_from_rays(rays_cam @ R_cam_enu)
     above = (elevation - horizon(azimuth)) * _px_per_rad(camera, off_axis_rad(rays_cam))
-    near = (np.abs(above) < BAND_PX) & ~dead[rows, columns]
-    rows, columns, azimuth, above = rows[near], columns[near], azimuth[near], above[near]
-    if not len(rows):
+    near = np.abs(above) < BAND_PX
+    pixel, azimuth, above = pixel[near], azimuth[near], above[near]
+    if not len(pixel):
         return detections
-    rest = (image_e[rows, columns] - detections.background_e[rows, columns]).astype(np.float64)
-    spread = detections.noise_e[rows, columns].astype(np.float64)
-    steps = int(2 * BAND_PX / STEP_PX)
+    background, noise = detections.background_e.copy(), detections.noise_e.copy()
+    rest = (detections.image_e.ravel()[pixel] - background.ravel()[pixel]).astype(np.float64)
+    spread = noise.ravel()[pixel].astype(np.float64)
+    steps = int(2 * BAND_PX / PROFILE_STEP_PX)
     cell = (azimuth / (2 * np.pi) * STEP_SECTORS).astype(np.int64) % STEP_SECTORS * steps + _step_of(above, steps)
     middle = _medians(rest, cell, STEP_SECTORS * steps).reshape(STEP_SECTORS, steps)
-    background, noise = detections.background_e.copy(), detections.noise_e.copy()
     profile = _interpolate_table(middle, azimuth, above)
-    background[rows, columns] += profile.astype(np.float32)
+    background.reshape(-1)[pixel] += profile.astype(np.float32)
     across = _step_of(above, steps)  # all sectors together: the noise is known better than it varies
     ratio = _medians(np.abs(rest - profile) / spread, across, steps) / MEDIAN_ABS_NORMAL
     ratio = np.where(ratio > 0, ratio, 1.0)
-    noise[rows, columns] *= ratio[across].astype(np.float32)
+    noise.reshape(-1)[pixel] *= ratio[across].astype(np.float32)
     return replace(detections, background_e=background, noise_e=noise)
 
 
@@ -191,6 +195,13 @@ def skyline_band(shape: tuple[int, ...], camera: Camera, R_cam_enu: Array, horiz
     return picture.view(np.bool_)
 
 
+def look_through(chosen: Bools, camera: Camera) -> tuple[Ints, Array]:
+    """Indices (n,) of the `chosen` pixels (H, W) in the flat image, and their directions (n, 3) from the `camera`."""
+    pixel = np.flatnonzero(chosen)
+    rows, columns = np.divmod(pixel, chosen.shape[1])
+    return pixel, camera.unproject(np.stack([columns, rows], axis=1).astype(np.float64))
+
+
 def _px_per_rad_at(azimuth_rad: Array, elevation_rad: Array, camera: Camera, R_cam_enu: Array) -> Array:
     """Scale of the image (n,) in directions of enu; beyond the lens's view that of its edge."""
     angle = off_axis_rad(rays_from_azel(azimuth_rad, elevation_rad) @ R_cam_enu.T)
@@ -215,15 +226,6 @@ def _interpolate_circle(values, azimuth, found):  # type: ignore[no-untyped-def]
         found[k] = (1.0 - part) * values[low] + part * values[low + 1 if low + 1 < m else 0]
 
 
-def _step_e(light_e: NDArray[np.float32], above: Bools) -> tuple[float, float]:
-    """Difference of the pixels (n,) `above` the skyline and the others, and its standard deviation."""
-    sides = light_e[above], light_e[~above]
-    if not all(map(len, sides)):
-        return 0.0, 0.0
-    (sky, sky_sigma), (ground, ground_sigma) = (_grouped_median(side) for side in sides)
-    return sky - ground, float(np.hypot(sky_sigma, ground_sigma))
-
-
 def _grouped_median(light_e: NDArray[np.float32]) -> tuple[float, float]:
     """Median of pixels (n,) and its standard deviation; whole counts are taken as spread evenly over their step.
 
@@ -235,12 +237,11 @@ def _grouped_median(light_e: NDArray[np.float32]) -> tuple[float, float]:
     below = np.cumsum(counts) - counts
     at = int(np.searchsorted(below, 0.5 * len(light_e), side="right")) - 1
     median = float(values[at]) + quantum * ((0.5 * len(light_e) - below[at]) / counts[at] - 0.5)
-    sigma = float(np.median(np.abs(light_e - median))) / MEDIAN_ABS_NORMAL
-    return median, sigma * MEDIAN_LOSS / float(np.sqrt(len(light_e)))
+    return median, float(robust_sigma(light_e, median) * MEDIAN_LOSS / np.sqrt(len(light_e)))
 
 
 def _step_of(above_px: Array, steps: int) -> Ints:
-    return np.clip(((above_px + BAND_PX) / STEP_PX).astype(np.int64), 0, steps - 1)
+    return np.clip(((above_px + BAND_PX) / PROFILE_STEP_PX).astype(np.int64), 0, steps - 1)
 
 
 def _medians(values: Array, cell: Ints, cells: int) -> Array:
@@ -257,7 +258,7 @@ def _interpolate_table(table: Array, azimuth_rad: Array, above_px: Array) -> Arr
     """Values (n,) of the table (sectors, steps), linear both ways; fading to nothing at the band's ends."""
     sectors, steps = table.shape
     s = azimuth_rad / (2 * np.pi) * sectors - 0.5
-    d = np.clip((above_px + BAND_PX) / STEP_PX - 0.5, 0.0, steps - 1.001)
+    d = np.clip((above_px + BAND_PX) / PROFILE_STEP_PX - 0.5, 0.0, steps - 1.001)
     s0, d0 = np.floor(s).astype(np.int64), np.floor(d).astype(np.int64)
     fs, fd = s - s0, d - d0
     at = [(1 - fd) * table[row, d0] + fd * table[row, d0 + 1] for row in (s0 % sectors, (s0 + 1) % sectors)]

@@ -9,34 +9,26 @@ from numpy.typing import NDArray
 
 from startrack.camera import Camera
 from startrack.core.types import Array, Body, Bools, Detections, Evidence, Ints, Stars
-from startrack.evidence.expected_stars import BAD_PIXELS, USABLE, ExpectedStars, expect_stars
-from startrack.evidence.flux_scale import FluxScale
-from startrack.evidence.likelihood_ratio import gaussian_llr, visibility_llr
+from startrack.evidence.expected_stars import BAD_PIXELS, USABLE, ExpectedStars, FluxScale, expect_stars
 from startrack.evidence.photometry import Photometry, Sources, measure
 from startrack.frames import turn_azel
 from startrack.psf import noise_area_px
 
-MIN_SNR = 0.6  # a sixth of the time less than with 0.5; mean errors grow by 2 % (60 frames, with the sky's light)
-MIN_PSF_AREAS_PER_STAR = 2.0  # with more stars in the pixels the same light would be counted twice
 DECIDABLE_SNR = 2.0  # of stars whose own flux shows whether they are visible
-NOISE_STEP_PX = 16  # both ways: the noise is interpolated between blocks of 16 px
+NOISE_BLOCK_PX = 16  # both ways: the noise is interpolated between blocks of 16 px
 SEEN_LLR = 3.0  # from here on a star counts as seen, from minus this as hidden
+MISSING_PROBABILITY = 2e-3  # a visible star is not measured: variable, wrong entry, small obstacle
+ANOMALY_PROBABILITY = 1e-3  # light where the ground is: track, reflection, defect
+CAP = 9.0  # natural logarithm; largest evidence of one star
 
 
 @dataclass(frozen=True, kw_only=True)
-class StarPhotometry:
+class StarPhotometry(ExpectedStars):
     """Expected and measured light of each catalogue star in the frame (n); the star table's rows."""
 
-    star: Ints  # index into Stars
-    xy_px: Array  # (n, 2) predicted
-    azimuth_rad: Array
-    elevation_rad: Array
-    expected_e: Array
     flux_e: Array  # measured
     sigma_e: Array  # of the measured flux without a star
     llr: Array  # 0 where unusable
-    cause_code: NDArray[np.int8]  # index into `causes`; 0 where usable
-    causes: tuple[str, ...]  # why stars are unusable; the first is ""
 
     @property
     def cause(self) -> NDArray[np.str_]:
@@ -77,19 +69,13 @@ class StarPhotometry:
     def evidence(self) -> Evidence:
         """The rays for the localizer."""
         use = self.usable
-        return Evidence(
-            azimuth_rad=self.azimuth_rad[use],
-            elevation_rad=self.elevation_rad[use],
-            llr=self.llr[use],
-        )
+        return Evidence(azimuth_rad=self.azimuth_rad[use], elevation_rad=self.elevation_rad[use], llr=self.llr[use])
 
 
 @dataclass(frozen=True)
 class StarEvidence:
     """Forced photometry at the catalogue's stars, turned into log-likelihood ratios."""
 
-    faintest_snr: float = MIN_SNR
-    crowded: float = MIN_PSF_AREAS_PER_STAR
     capped: bool = True  # False: plain Gaussian ratios, to measure the effect of the caps
 
     def __call__(
@@ -106,59 +92,32 @@ class StarEvidence:
     ) -> StarPhotometry:
         """Photometry of every star in view.
 
-        Args:
-            detections: their image, its background and noise, and the PSF are used.
-            camera: projects the stars.
-            stars: of the catalogue, brightest first.
-            bodies: whose glare spoils the stars beside them.
-            R_cam_icrs: (3, 3).
-            R_enu_icrs: (3, 3).
-            scale: of the fluxes.
-            position_sigma_px: error of the predicted pixels per axis.
-            visible: (len(stars),) probability that each star is visible where that is known already; it is used for
-                the star's light in its neighbours' measurements only.
+        The image of the `detections` is measured, with its background, noise and PSF. `visible` (len(stars),) is the
+        probability that each star is visible where that is known already; it is used for the star's light in its
+        neighbours' measurements only. The other arguments are those of `expect_stars`.
         """
-        sigma_px = detections.psf_sigma_px
         found = expect_stars(
-            camera, stars, bodies, R_cam_icrs, R_enu_icrs, scale, psf_sigma_px=sigma_px,
-            least_e=self.least_e(filtered_noise_e(detections)), area_px=self.area_px(sigma_px),
-            position_sigma_px=position_sigma_px, mask=detections.mask,
+            camera, stars, bodies, R_cam_icrs, R_enu_icrs, scale, psf_sigma_px=detections.psf_sigma_px,
+            noise_e=filtered_noise_e(detections), position_sigma_px=position_sigma_px, mask=detections.mask,
         )  # fmt: skip
         sources = found.sources(0.5)
         shining = _guess_visibility(detections, sources) if visible is None else visible[found.star[found.measurable]]
         return self.judge(found, measure(detections, replace(sources, visible=shining)))
 
-    def least_e(self, noise_e: float) -> float:
-        """Expected flux [e] below which stars are left out, with noise of `noise_e` through the matched filter."""
-        return self.faintest_snr * max(noise_e, 1e-9)
-
-    def area_px(self, psf_sigma_px: float) -> float:
-        """Area of the image [px^2] that each star needs, for a PSF of `psf_sigma_px`."""
-        return self.crowded * noise_area_px(psf_sigma_px)
-
     def judge(self, found: ExpectedStars, light: Photometry) -> StarPhotometry:
         """The stars expected (`found`) with the `light` at the measurable ones, and its log-likelihood ratios."""
         which, cause = found.measurable, found.cause_code.copy()
-        llr, sigma = _ratios(light, found.flux_e[which], found.fraction_sigma[which], self.capped)
+        llr, sigma = _ratios(light, found.expected_e[which], found.fraction_sigma[which], self.capped)
         cause[which[~light.usable & (cause[which] == USABLE)]] = BAD_PIXELS
-        n = len(found.star)
-        return StarPhotometry(
-            star=found.star,
-            xy_px=found.xy_px,
-            azimuth_rad=found.azimuth_rad,
-            elevation_rad=found.elevation_rad,
-            expected_e=found.flux_e,
-            flux_e=_scatter_rows(light.flux_e, which, n),
-            sigma_e=_scatter_rows(sigma, which, n),
-            llr=np.where(cause == USABLE, _scatter_rows(llr, which, n), 0.0),
-            cause_code=cause,
-            causes=found.causes,
-        )
+        columns = np.zeros((3, len(found.star)))
+        columns[:, which] = light.flux_e, sigma, np.where(cause[which] == USABLE, llr, 0.0)
+        measured = dict(zip(("flux_e", "sigma_e", "llr"), columns, strict=True))
+        return StarPhotometry(**vars(found) | measured | {"cause_code": cause})
 
 
 def filtered_noise_e(detections: Detections) -> float:
     """Typical noise [e] of a star's flux: that of a pixel, through the matched filter."""
-    pixel_e = float(np.median(detections.noise_e[::NOISE_STEP_PX, ::NOISE_STEP_PX]))
+    pixel_e = float(np.median(detections.noise_e[::NOISE_BLOCK_PX, ::NOISE_BLOCK_PX]))
     return pixel_e * float(np.sqrt(noise_area_px(detections.psf_sigma_px)))
 
 
@@ -173,9 +132,8 @@ def _guess_visibility(detections: Detections, sources: Sources) -> Array:
     bright = np.flatnonzero(sources.flux_e > DECIDABLE_SNR * noise_e * np.sqrt(area_px))
     if len(bright):
         expected, fraction = sources.flux_e[bright], sources.fraction_sigma[bright]
-        alone = Sources(
-            xy_px=sources.xy_px[bright], flux_e=expected, fraction_sigma=fraction, visible=np.zeros(len(bright))
-        )
+        hidden = np.zeros(len(bright))
+        alone = Sources(xy_px=sources.xy_px[bright], flux_e=expected, fraction_sigma=fraction, visible=hidden)
         llr, _ = _ratios(measure(detections, alone), expected, fraction)
         shining[bright] = 1.0 / (1.0 + np.exp(-llr))
     return shining
@@ -190,7 +148,26 @@ def _ratios(light: Photometry, expected_e: Array, fraction: Array, capped: bool 
     return ratio(light.flux_e, expected_e, sigma, np.sqrt(shining)), sigma
 
 
-def _scatter_rows(values: Array, index: Ints, n: int) -> Array:
-    full = np.zeros(n)
-    full[index] = values
-    return full
+def visibility_llr(flux_e: Array, expected_e: Array, sigma_hidden_e: Array, sigma_shining_e: Array) -> Array:
+    """ln p(flux | visible) - ln p(flux | hidden) (n,), capped.
+
+    Visible: Gaussian about the expected flux, or with a small probability about nothing. Hidden: Gaussian about
+    nothing, or with a small probability any flux up to twice the expected one.
+    """
+    at_star = _log_normal(flux_e - expected_e, sigma_shining_e)
+    at_zero = _log_normal(flux_e, sigma_hidden_e)
+    anything = -np.log(2.0 * expected_e + 10.0 * sigma_hidden_e)
+    # Under either hypothesis the measurement may be an outlier; this floor limits the weight of one outlier.
+    shines = np.logaddexp(np.log1p(-MISSING_PROBABILITY) + at_star, np.log(MISSING_PROBABILITY) + at_zero)
+    shines = np.logaddexp(shines, np.log(ANOMALY_PROBABILITY) + anything)
+    hidden = np.logaddexp(np.log1p(-ANOMALY_PROBABILITY) + at_zero, np.log(ANOMALY_PROBABILITY) + anything)
+    return np.clip(shines - hidden, -CAP, CAP)
+
+
+def gaussian_llr(flux_e: Array, expected_e: Array, sigma_hidden_e: Array, sigma_shining_e: Array) -> Array:
+    """The ratio without outliers and without a cap, for comparisons only."""
+    return _log_normal(flux_e - expected_e, sigma_shining_e) - _log_normal(flux_e, sigma_hidden_e)
+
+
+def _log_normal(x: Array, sigma: Array) -> Array:
+    return -0.5 * np.square(x / sigma) - np.log(sigma) - 0.5 * np.log(2 * np.pi)

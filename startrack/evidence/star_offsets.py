@@ -15,18 +15,18 @@ import numpy as np
 
 from startrack.camera import Camera, compensating_rotation, lens_jacobian
 from startrack.core.types import Array, Bools
-from startrack.evidence.sky_step import Horizon
+from startrack.evidence.expected_stars import CLIPPED_SIGMAS
+from startrack.evidence.sky_step import ELEVATION_STEP_RAD, SKYLINE_POINTS, Horizon
 from startrack.frames import azel_from_rays, off_axis_rad, rays_from_azel
 
-NEAR_PX = 60.0  # from the skyline to the stars that are used: five degrees of a 180-degree fisheye
-SAMPLES, STEP_RAD = 360, 1e-3  # around the skyline, and in elevation
-FIRST_CLIPPED_PX, CLIPPED_SIGMAS, ROUNDS = 1.0, 4.0, 3  # of a star's offset from the terms fitted so far: blends
+NEAR_SKYLINE_PX = 60.0  # from the skyline to the stars that are used: five degrees of a 180-degree fisheye
+FIRST_CLIPPED_PX, CLIPPING_ROUNDS = 1.0, 3  # of offsets from the terms fitted so far: blends
 SIGNIFICANT_CHI2 = 20.5  # of five terms: one in a thousand; below, the lens is as its file says
 LEAST_SIGMA_PX = 1e-3  # of a term
 # Of a term of a calibrated lens, from night to night: beyond what one calibration can know of it. Positions by four
 # nights outside the calibration of an all-sky camera erred by 0.8 m an axis where 0.1 px is 0.8 m.
 NIGHT_SIGMA_PX = 0.1
-MIN_STARS = 10
+OFFSET_STARS = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +68,11 @@ def measure_star_offsets(
     up, scale = _up_in_image(camera, R_cam_enu, azimuth, elevation)
     above_px = (elevation - horizon(azimuth)) * scale
     offset = np.einsum("ni,ni->n", residual_px, up)
-    near, terms, sigma = np.abs(above_px) < NEAR_PX, offset_terms(azimuth), np.sqrt(variance_px2)
+    near, terms, sigma = np.abs(above_px) < NEAR_SKYLINE_PX, offset_terms(azimuth), np.sqrt(variance_px2)
     limit, mean = np.maximum(CLIPPED_SIGMAS * sigma, FIRST_CLIPPED_PX), np.zeros(5)
-    for _ in range(ROUNDS):
+    for _ in range(CLIPPING_ROUNDS):
         used: Bools = near & (np.abs(offset - terms @ mean) < limit)
-        if np.count_nonzero(used) < MIN_STARS:
+        if np.count_nonzero(used) < OFFSET_STARS:
             return StarOffsets(np.zeros(5), prior)
         weighted = terms[used] / variance_px2[used, None]
         normal, right = weighted.T @ terms[used], weighted.T @ offset[used]
@@ -86,7 +86,7 @@ def measure_star_offsets(
 
 def _prior_px2(camera: Camera, R_cam_enu: Array, attitude_covariance_rad2: Array, horizon: Horizon) -> Array:
     """Covariance (5, 5) of the terms by attitude and lens together."""
-    azimuth = np.linspace(0.0, 2 * np.pi, SAMPLES, endpoint=False)
+    azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_POINTS // 4, endpoint=False)
     rays_cam = rays_from_azel(azimuth, horizon(azimuth)) @ R_cam_enu.T
     seen = off_axis_rad(rays_cam) < min(camera.calibrated_angle_rad, camera.lens.max_invertible_rad)
     azimuth, elevation, rays_cam = azimuth[seen], horizon(azimuth[seen]), rays_cam[seen]
@@ -107,7 +107,7 @@ def _up_in_image(camera: Camera, R_cam_enu: Array, azimuth: Array, elevation: Ar
     """Unit vectors (n, 2) of growing elevation in the image, and pixels per radian (n,)."""
     low, high = (
         camera.project_unlimited(rays_from_azel(azimuth, elevation + step) @ R_cam_enu.T)
-        for step in (-STEP_RAD, STEP_RAD)
+        for step in (-ELEVATION_STEP_RAD, ELEVATION_STEP_RAD)
     )
     length = np.maximum(np.hypot(*(high - low).T), 1e-9)
-    return (high - low) / length[:, None], length / (2 * STEP_RAD)
+    return (high - low) / length[:, None], length / (2 * ELEVATION_STEP_RAD)

@@ -9,7 +9,7 @@ import numpy as np
 from startrack.chain import Detected, Identified, Located, Measured, Outcome, Refused, last_value
 from startrack.core.errors import Reason, length_text
 from startrack.core.types import Array, Blocked
-from startrack.evidence.star_evidence import DECIDABLE_SNR
+from startrack.evidence import DECIDABLE_SNR
 from startrack.frames import rays_from_azel
 from startrack.localization.clock import duration
 from startrack.output.values import DOMINANT

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from startrack.catalog import star_names
 from startrack.chain import Identified, Inputs, Measured, Oriented
 from startrack.core.types import Array, Ints, MeasuredSkyline, Stars
-from startrack.evidence.star_evidence import SEEN_LLR
+from startrack.evidence import SEEN_LLR
 from startrack.output.quantity import Quantity
 
 if TYPE_CHECKING:

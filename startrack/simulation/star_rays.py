@@ -12,12 +12,9 @@ from datetime import datetime
 import numpy as np
 
 from startrack.catalog import StarCatalog
-from startrack.chain import StarRays
-from startrack.core.statistics import robust_sigma
+from startrack.chain import CERTAIN_PROBABILITY, StarRays
 from startrack.core.types import TIME_SIGMA_S, Array, BadInput, Bools, Ints
-from startrack.evidence import FluxScale, Skyline, StarEvidence
-from startrack.evidence.expected_stars import expect_stars
-from startrack.evidence.flux_scale import BRIGHT_SNR, MIN_SCATTER, MIN_STARS
+from startrack.evidence import FluxScale, Skyline, StarEvidence, expect_stars, expected_flux_scale
 from startrack.exposure import combine_masks
 from startrack.frames import R_enu_icrs, azel_from_rays, observer_velocity_m_s, off_axis_rad
 from startrack.localization import clock_at
@@ -28,7 +25,6 @@ from startrack.terrain import Terrain
 
 EXACT_RAD = np.radians(2.0)  # from the skyline; farther, its elevations at one azimuth in 3 arcmin decide
 UNDECIDED_RAD = np.radians(0.2)  # from the skyline: here the visibility of a neighbour is not known
-CERTAIN_PROBABILITY = 0.99  # of the neighbours elsewhere, as where the pipeline measures a second time
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +78,7 @@ def simulate_rays(
     stars, R_enu = catalog.at(when, observer_velocity_m_s(site, when)), R_enu_icrs(site, when)
     found = expect_stars(
         camera, stars, list(scene.bodies), scene.R_cam_icrs, R_enu, scale, psf_sigma_px=sensor.psf_sigma_px,
-        least_e=photometry.least_e(typical_e), area_px=photometry.area_px(sensor.psf_sigma_px),
-        mask=combine_masks(None, camera.mask, camera.size_px),
+        noise_e=typical_e, mask=combine_masks(None, camera.mask, camera.size_px),
     )  # fmt: skip
     true = np.asarray(stars.rays_icrs[found.star] @ scene.R_enu_icrs.T)  # directions at the true time
     above = _height_above(true, frame.skyline)
@@ -122,14 +117,9 @@ def _visible_stars(scene: Scene, ground: Terrain) -> _Frame:
 
 def _expected_scale(scene: Scene, frame: _Frame, noise_e: float) -> FluxScale:
     """The scale of fluxes that the bright visible stars of the scene show, with `noise_e` of a star's flux."""
-    zero_mag = 2.5 * np.log10(scene.sensor.zero_point_e_per_s * scene.exposure_s)
+    zero_mag = 2.5 * float(np.log10(scene.sensor.zero_point_e_per_s * scene.exposure_s))
     star = frame.star[frame.visible]
-    bright = star[scene.stars.v_mag[star] < zero_mag - 2.5 * np.log10(BRIGHT_SNR * noise_e)]
-    if len(bright) < MIN_STARS:
-        return FluxScale(float(zero_mag), 0.0, MIN_SCATTER, len(bright))
-    error = scene.v_error_mag[bright]
-    middle, scatter = float(np.median(error)), 0.4 * np.log(10) * robust_sigma(error)
-    return FluxScale(float(zero_mag) - middle, 0.0, max(scatter, MIN_SCATTER), len(bright))
+    return expected_flux_scale(zero_mag, noise_e, scene.stars.v_mag[star], scene.v_error_mag[star])
 
 
 def _height_above(rays_enu: Array, skyline: Skyline) -> Array:

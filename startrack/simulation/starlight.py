@@ -9,8 +9,7 @@ import numpy as np
 
 from startrack.core.kernels import njit
 from startrack.core.types import Array
-from startrack.evidence.photometry import Photometry, Sources, half_width, neighbour_profiles, order_by_cell
-from startrack.evidence.photometry_kernel import profiles_of
+from startrack.evidence import Photometry, Sources, half_width, neighbour_profiles, order_by_cell, profiles_of
 from startrack.psf import pixel_profile
 
 NEIGHBOUR_SIGMAS = 3.0  # of the PSF beyond half a stamp, to the last star whose light is subtracted, as in `measure`

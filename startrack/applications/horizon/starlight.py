@@ -9,8 +9,7 @@ import numpy as np
 from startrack.applications.horizon.frames import SkyFrame
 from startrack.catalog import airmass
 from startrack.core.types import Array, Evidence, Stars
-from startrack.evidence import FluxScale, StarEvidence, StarPhotometry
-from startrack.evidence.star_evidence import SEEN_LLR
+from startrack.evidence import SEEN_LLR, FluxScale, StarEvidence, StarPhotometry
 from startrack.frames import azel_from_rays, off_axis_rad
 
 BRIGHT_SNR = 12.0

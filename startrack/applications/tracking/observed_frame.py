@@ -22,7 +22,6 @@ from startrack.core.files import write_atomically
 from startrack.core.types import Array, Clock, Evidence, Fix, ImageErrors, ShownError
 from startrack.estimation.observations import FrameEstimate
 from startrack.estimation.smoother import SIGMAS_95
-from startrack.evidence.sky_levels import SECTORS
 from startrack.localization.posterior import MIN_ROW_NATS
 from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD
 from startrack.localization.summary import camera_at
@@ -131,7 +130,7 @@ def _located_evidence(located: Located) -> Evidence:
     stars = replace(located.evidence(), near=None)
     if located.sky_light is None or located.sky_used is None:
         return stars
-    light = located.sky_light.evidence(located.sky_used, np.zeros(SECTORS))
+    light = located.sky_light.evidence(located.sky_used)
     rows = Evidence.concatenate(stars, light) if located.by_stars else light
     return replace(rows, clock=stars.clock, image_errors=located.image_errors)
 

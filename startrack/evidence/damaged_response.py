@@ -52,23 +52,15 @@ class DamagedResponse:
 
 def measure_noise(detections: Detections) -> Detections:
     """The `detections` with a noise of the pixels that holds for clipped values too: their spread in blocks."""
-    image = detections.image_e - detections.background_e
+    image, side = detections.image_e - detections.background_e, NOISE_BLOCK_PX
     height, width = image.shape
-    rows, columns = -(-height // NOISE_BLOCK_PX), -(-width // NOISE_BLOCK_PX)
-    padded = cv2.copyMakeBorder(
-        image, 0, rows * NOISE_BLOCK_PX - height, 0, columns * NOISE_BLOCK_PX - width, cv2.BORDER_REFLECT_101
-    )
-    blocks = (
-        padded.reshape(rows, NOISE_BLOCK_PX, columns, NOISE_BLOCK_PX)
-        .transpose(0, 2, 1, 3)
-        .reshape(-1, NOISE_BLOCK_PX**2)
-    )
-    kept = np.sort(blocks, axis=1)[:, : int((1.0 - LEFT_OUT_PART) * NOISE_BLOCK_PX**2)]
+    rows, columns = -(-height // side), -(-width // side)
+    padded = np.pad(image, ((0, rows * side - height), (0, columns * side - width)), mode="reflect")
+    blocks = padded.reshape(rows, side, columns, side).transpose(0, 2, 1, 3).reshape(-1, side**2)
+    kept = np.sort(blocks, axis=1)[:, : int((1.0 - LEFT_OUT_PART) * side**2)]
     spread = cv2.medianBlur(kept.std(axis=1).astype(np.float32).reshape(rows, columns), 5)
     usual = float(np.median(spread[spread > 0])) if spread.any() else 1.0
-    noise: NDArray[np.float32] = cv2.resize(
-        np.maximum(spread, SMALLEST_NOISE * usual), (columns * NOISE_BLOCK_PX, rows * NOISE_BLOCK_PX)
-    )  # type: ignore[assignment]
+    noise: NDArray[np.float32] = cv2.resize(np.maximum(spread, SMALLEST_NOISE * usual), padded.shape[::-1])  # type: ignore[assignment]
     return replace(detections, noise_e=np.ascontiguousarray(noise[:height, :width]))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -37,12 +37,21 @@ def background_and_noise(image: Image, quantum: float, sigma_px: float) -> tuple
     level_map = cv2.medianBlur(level.reshape(shape), 3)
     spread_map = cv2.medianBlur(spread.reshape(shape), 5)
     background = _enlarge(level_map, side, image.shape)
-    if _steep_fraction(level_map, spread_map) > STEEP_FRACTION:  # a slope within a block is no noise
+    # Blocks between which the level changes by more than the noise: a slope within a block is no noise.
+    rows, columns = np.abs(np.diff(level_map, axis=0)), np.abs(np.diff(level_map, axis=1))
+    steep = [step > spread for step, spread in ((rows, spread_map[1:]), (columns, spread_map[:, 1:]))]
+    if max(float(np.mean(s)) if s.size else 0.0 for s in steep) > STEEP_FRACTION:
         _, spread = _measure_blocks(image - background, side, quantum, _median_and_spread)
         spread_map = np.minimum(spread_map, cv2.medianBlur(spread.reshape(shape), 5))
     rounding = quantum**2 / 12.0
     if np.median(spread_map) < MIN_NOISE_STEPS * quantum:
-        (spread,) = _measure_blocks(image, side, quantum, partial(_clipped_spread, quantum=np.float32(quantum)))
+        few = np.float32(4 * quantum)  # the quantiles of little more than one value do not show the noise
+
+        def measure_spread(ordered: Image) -> tuple[Image]:
+            middle = ordered[:, ordered.shape[1] // 2, None]
+            return (np.clip(ordered, middle - few, middle + few).std(axis=1),)
+
+        (spread,) = _measure_blocks(image, side, quantum, measure_spread)
         spread_map = cv2.medianBlur(spread.reshape(shape), 5)
     noise_map = np.sqrt(np.maximum(np.square(spread_map) - rounding, rounding), dtype=np.float32)
     return background, _enlarge(noise_map, side, image.shape)
@@ -95,13 +104,6 @@ def coarse_width(width_px: int) -> int:
     return 2 * int(round(width_px / COARSE_PX - 1) // 2) + 1 if width_px > COARSE_PX else 1
 
 
-def _steep_fraction(level: NDArray[Any], spread: NDArray[Any]) -> float:
-    """Part of the blocks between which the level changes by more than the noise."""
-    steps = [np.abs(np.diff(level, axis=axis)) for axis in (0, 1)]
-    return max(float(np.mean(steps[0] > spread[1:])) if len(level) > 1 else 0.0,
-               float(np.mean(steps[1] > spread[:, 1:])) if level.shape[1] > 1 else 0.0)  # fmt: skip
-
-
 def _measure_blocks(
     image: Image, side: int, quantum: float, measure: Callable[[Image], tuple[Image, ...]]
 ) -> list[Image]:
@@ -150,12 +152,6 @@ def _fill_blocks(image, side, part_steps, blocks):  # type: ignore[no-untyped-de
                 row, left = i * side + r // 2 * apart + r % 2, j * side
                 for c in range(BLOCK_PX):
                     blocks[i, j, r, c] = image[row, left + c // 2 * apart + c % 2] + part_steps[r, c]
-
-
-def _clipped_spread(ordered: Image, quantum: np.float32) -> tuple[Image]:
-    """Standard deviation (n,) of rows (n, m) of little more than one value, whose quantiles do not show the noise."""
-    middle = ordered[:, ordered.shape[1] // 2, None]
-    return (np.clip(ordered, middle - 4 * quantum, middle + 4 * quantum).std(axis=1),)
 
 
 @lru_cache(maxsize=8)

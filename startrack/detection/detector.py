@@ -30,11 +30,9 @@ from startrack.detection.frame import (
     bin_frame,
     binning_factor,
     electrons,
-    mask_or_none,
     radius_for,
-    recorded_step,
 )
-from startrack.detection.peaks import Peaks, find_peaks, unbin_peaks
+from startrack.detection.peaks import Peaks, find_peaks, nearest_pixels
 from startrack.detection.psf_width import WIDTH_TOLERANCE, guess_psf_width, measure_psf_width
 from startrack.detection.streaks import are_elongated, find_streaks
 from startrack.exposure import combine_masks, touch_masked
@@ -83,9 +81,11 @@ class Detector:
         if float(image[0, 0]) == float(image[-1, -1]) == float(image[::64, ::64].max()) and not np.ptp(image):
             raise TooFewStars("the frame is flat: every pixel has the same value (lens cap, or a saturated day sky?)")
         known = camera.sensor.psf_sigma_px if camera is not None and camera.sensor is not None else None
-        quantum = smallest_step(image) if exposure.correction is None else recorded_step(exposure, camera)
+        # Dark frame and flat field do not undo the rounding of the counts.
+        gain = 1.0 if camera is None or camera.sensor is None else camera.sensor.gain_e_per_adu
+        quantum = smallest_step(image) if exposure.correction is None else gain * smallest_step(exposure.recorded_adu)
         source = _FrameSource(
-            image, quantum, mask_or_none(dead), SourceNoise(per_unit=0.0 if known is None else 1.0),
+            image, quantum, dead if dead.any() else None, SourceNoise(per_unit=0.0 if known is None else 1.0),
             None if mask is None else mask.masked,
         )  # fmt: skip
         candidates = self._candidates(source, self.psf_sigma_px or known)
@@ -147,7 +147,10 @@ class Detector:
         frame = replace(frame, source_noise=candidates.fitted.source_noise)
         positions = (stars.xy_px - 0.5 * (side - 1)) / side
         peaks = self._find_peaks(frame, bin_frame(frame, side), side, sigma, known=positions)
-        peaks = unbin_peaks(peaks, side, frame.shape, radius_for(sigma))
+        if side > 1:
+            start = side * peaks.start_xy_px + 0.5 * (side - 1)
+            pixels = nearest_pixels(start, frame.shape, radius_for(sigma))
+            peaks = Peaks(pixels, start, peaks.surround / side**2, peaks.own_part)
         return frame, self._select_stars(frame, fit_all(frame, peaks, sigma, known=stars), 1, sigma)
 
     def _find_peaks(self, frame: Frame, small: Frame, side: int, sigma: float, known: Array | None = None) -> Peaks:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from startrack.camera import Camera
 from startrack.core.types import Bools, Exposure, Ints
-from startrack.detection.background import Image, smallest_step
+from startrack.detection.background import Image
 from startrack.psf import stamp_radius
 
 Pixels = NDArray[np.floating[Any]]  # stamps, in either precision
@@ -96,12 +96,6 @@ def electrons(exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray
     return image, saturated
 
 
-def recorded_step(exposure: Exposure, camera: Camera | None) -> float:
-    """Smallest step between the counts as recorded, in the unit of `electrons`: dark and flat do not undo rounding."""
-    gain = 1.0 if camera is None or camera.sensor is None else camera.sensor.gain_e_per_adu
-    return gain * smallest_step(exposure.recorded_adu)
-
-
 def stamps(image: NDArray[Any], centres: Ints, radius: int) -> NDArray[Any]:
     """Cut-outs (n, 2r+1, 2r+1) of the image around the integer pixels (n, 2) (x, y), which must be `radius` inside."""
     side = 2 * radius + 1
@@ -146,8 +140,3 @@ def _sums(image: Image, side: int) -> Image:
     size = image.shape[1] // side, image.shape[0] // side
     small: Any = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     return np.asarray(small * np.float32(side * side), dtype=np.float32)
-
-
-def mask_or_none(dead: Bools) -> Bools | None:
-    """The mask, or None where no pixel is unusable."""
-    return dead if dead.any() else None

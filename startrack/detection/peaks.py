@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.kernels import njit
-from startrack.core.types import Array, Bools, Ints
+from startrack.core.types import Array, Ints
 from startrack.detection.background import COARSE_PX, coarse_width, local_level
 from startrack.detection.frame import Frame, Image, radius_for
 from startrack.psf import filter_kernel
@@ -38,6 +38,8 @@ def find_peaks(frame: Frame, sigma: float, lowest: float, most: int, known: Arra
 
     `known` (m, 2): positions of stars whose light `frame.found` holds; they come first, then the other peaks.
     """
+    from scipy.spatial import cKDTree
+
     margin = radius_for(sigma)
     most = min(most, MAX_STAMP_PIXELS // (2 * margin + 1) ** 2)
     kernel = filter_kernel(sigma)
@@ -53,16 +55,22 @@ def find_peaks(frame: Frame, sigma: float, lowest: float, most: int, known: Arra
     peaks, start, surround = pixels[chosen], (pixels + offset)[chosen], level[chosen]
     blobs = _saturated_blobs(frame.dead, margin)
     if known is not None:
-        away = _are_off_known(known, start, sigma)
+        # Peaks on a known star are the PSF's misfit.
+        away = cKDTree(known).query(start)[0] > OWN_RESIDUE_SIGMAS * sigma
         peaks, start, surround = peaks[away], start[away], surround[away]
         blobs = np.concatenate([known, blobs])
-    centres = np.concatenate([_pixels_of(blobs, frame.shape, margin), peaks])
+    noise = frame.noise[peaks[:, 1], peaks[:, 0]].astype(np.float64)
     return Peaks(
-        centres=centres,
+        centres=np.concatenate([nearest_pixels(blobs, frame.shape, margin), peaks]),
         start_xy_px=np.concatenate([blobs, start]),
-        surround=np.concatenate([np.zeros(len(blobs)), surround * _values_at(frame.noise, peaks)]),
+        surround=np.concatenate([np.zeros(len(blobs)), surround * noise]),
         own_part=min(float(1.0 / squared**2) / width**2, 0.5),
     )
+
+
+def nearest_pixels(xy_px: Array, shape: tuple[int, int], margin: int) -> Ints:
+    """The pixels (n, 2) nearest to positions (n, 2) that lie `margin` inside a frame of this shape (H, W)."""
+    return np.clip(np.rint(xy_px).astype(np.int64), margin, np.array([shape[1], shape[0]]) - 1 - margin)
 
 
 def bright_pixels(frame: Frame, lowest: float, most: int, margin: int) -> Ints:
@@ -109,7 +117,10 @@ def _strip_peaks(
     own = filtered[rows.start - first : rows.stop - first]
     row, column = np.divmod(np.flatnonzero(own > np.float32(lowest)), own.shape[1])
     row += rows.start
-    good = _are_usable(frame, row, column, len(kernel) // 2 + 1)
+    (height, right), margin = frame.shape, len(kernel) // 2 + 1
+    good = (row >= margin) & (row < height - margin) & (column >= margin) & (column < right - margin)
+    if frame.dead is not None:
+        good &= ~frame.dead[row, column]
     row -= first
     _require_highest(filtered, row, column, good)
     row, column = row[good], column[good]
@@ -127,28 +138,6 @@ def _require_highest(image, row, column, good):  # type: ignore[no-untyped-def]
             for i in range(y - 1, y + 2):
                 for j in range(x - 1, x + 2):
                     good[k] = good[k] and image[y, x] >= image[i, j]
-
-
-def _are_off_known(known: Array, start: Array, sigma: float) -> Bools:
-    """The peaks (n,) that are not on a known star: peaks there are the PSF's misfit."""
-    from scipy.spatial import cKDTree
-
-    return np.asarray(cKDTree(known).query(start)[0] > OWN_RESIDUE_SIGMAS * sigma, dtype=bool)
-
-
-def _pixels_of(xy_px: Array, shape: tuple[int, int], margin: int) -> Ints:
-    pixels = np.rint(xy_px).astype(np.int64)
-    return np.clip(pixels, margin, np.array([shape[1], shape[0]]) - 1 - margin)
-
-
-def _values_at(image: Image, centres: Ints) -> Array:
-    return np.asarray(image[centres[:, 1], centres[:, 0]].astype(np.float64))
-
-
-def _are_usable(frame: Frame, rows: Ints, columns: Ints, margin: int) -> Bools:
-    height, width = frame.shape
-    good = (rows >= margin) & (rows < height - margin) & (columns >= margin) & (columns < width - margin)
-    return good if frame.dead is None else good & ~frame.dead[rows, columns]
 
 
 def _parabola(filtered: Any, y: Ints, x: Ints) -> Array:
@@ -199,12 +188,3 @@ def _group_touching(row: Ints, column: Ints, width: int) -> tuple[int, Ints]:
     graph = coo_matrix((np.ones(len(i), dtype=np.int8), (i, j)), shape=(len(position), len(position)))
     count, label = connected_components(graph, directed=False)
     return int(count), label.astype(np.int64)
-
-
-def unbin_peaks(peaks: Peaks, side: int, shape: tuple[int, int], margin: int) -> Peaks:
-    """Peaks of a binned frame as candidates of the frame itself, of this shape (H, W), `margin` off its border."""
-    if side == 1:
-        return peaks
-    start = side * peaks.start_xy_px + 0.5 * (side - 1)
-    pixels = np.clip(np.rint(start).astype(np.int64), margin, np.array([shape[1], shape[0]]) - 1 - margin)
-    return Peaks(pixels, start, peaks.surround / side**2, peaks.own_part)

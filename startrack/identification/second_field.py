@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.core.types import Array, Centroids, Identification, Ints, NotIdentified, NotLocated, Stars
+from startrack.core.types import Centroids, Identification, NotIdentified, NotLocated, Stars
 from startrack.estimation.match import SIGNIFICANT_SNR
 from startrack.identification.attitude_search import INLIER_PX
 from startrack.identification.lost_in_space import Identifier
@@ -68,9 +68,16 @@ def find_second_field(centroids: Centroids, camera: Camera, stars: Stars, first:
 
     The arguments are those of `check_single_field`.
     """
+    from scipy.spatial import cKDTree
+
     if first.unexplained < max(LEAST_UNEXPLAINED, LEAST_PART * len(first)):
         return None
-    left = _unexplained(centroids, camera, stars, first)[:MOST_SOURCES]
+    predicted_px, inside = camera.project(stars.rays_icrs @ first.R_cam_icrs.T)
+    seen = np.flatnonzero(inside & (stars.v_mag < float(stars.v_mag[first.star].max()) + FAINTER_MAG))
+    distance, _ = cKDTree(predicted_px[seen]).query(centroids.xy_px, distance_upper_bound=INLIER_PX)
+    unexplained = np.isinf(distance) & (centroids.snr > SIGNIFICANT_SNR)
+    unexplained[first.detection] = False
+    left = np.flatnonzero(unexplained)[:MOST_SOURCES]
     if len(left) < LEAST_UNEXPLAINED:
         return None
     sources = centroids.take(left)
@@ -81,29 +88,20 @@ def find_second_field(centroids: Centroids, camera: Camera, stars: Stars, first:
     if len(second) < LEAST_STARS:
         return None
     turn = second.R_cam_icrs @ first.R_cam_icrs.T
-    expected_px, _ = camera.project(stars.rays_icrs[second.star] @ first.R_cam_icrs.T)
-    shift_px = np.linalg.norm(sources.xy_px[second.detection] - expected_px, axis=1)
+    xy_px = sources.xy_px[second.detection]
+    shift_px = np.linalg.norm(xy_px - predicted_px[second.star], axis=1)
+    # The nearest bright stars of the first field: identified ones, where both fields lie in one another.
+    bright = np.flatnonzero(inside & (stars.v_mag < np.median(stars.v_mag[first.star])))
+    _, nearest = cKDTree(predicted_px[bright]).query(xy_px)
     light = _light(sources, camera, stars, second) / _light(centroids, camera, stars, first)
     return SecondField(
         stars=len(second),
         turn_rad=float(np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0))),
         shift_px=float(np.median(shift_px)),
         ratio=min(light, 1.0 / light),
-        interleaved=_interleaved(sources.xy_px[second.detection], camera, stars, first),
+        interleaved=float(np.mean(np.isin(bright[nearest], first.star))),
         false_alarm_probability=second.false_alarm_probability,
     )
-
-
-def _unexplained(centroids: Centroids, camera: Camera, stars: Stars, first: Identification) -> Ints:
-    """Indices, brightest first, of the significant sources without a predicted star nearby."""
-    from scipy.spatial import cKDTree
-
-    faintest = float(stars.v_mag[first.star].max()) + FAINTER_MAG
-    predicted_px, inside = camera.project(stars.rays_icrs[stars.v_mag < faintest] @ first.R_cam_icrs.T)
-    distance, _ = cKDTree(predicted_px[inside]).query(centroids.xy_px, distance_upper_bound=INLIER_PX)
-    far = np.isinf(distance) & (centroids.snr > SIGNIFICANT_SNR)
-    far[first.detection] = False
-    return np.flatnonzero(far)
 
 
 def _light(sources: Centroids, camera: Camera, stars: Stars, found: Identification) -> float:
@@ -114,13 +112,3 @@ def _light(sources: Centroids, camera: Camera, stars: Stars, found: Identificati
     throughput = 1.0 if camera.sensor is None else camera.sensor.throughput(camera.angle_rad(sources.xy_px[detection]))
     light = sources.flux_e[detection] / np.maximum(throughput, 1e-3)
     return float(np.median(light * 10 ** (0.4 * stars.v_mag[star])))
-
-
-def _interleaved(xy_px: Array, camera: Camera, stars: Stars, first: Identification) -> float:
-    """Part of the pixels (n, 2) next to which the nearest bright star of the first field is one that is identified."""
-    from scipy.spatial import cKDTree
-
-    bright = np.flatnonzero(stars.v_mag < np.median(stars.v_mag[first.star]))
-    predicted_px, inside = camera.project(stars.rays_icrs[bright] @ first.R_cam_icrs.T)
-    _, nearest = cKDTree(predicted_px[inside]).query(xy_px)
-    return float(np.mean(np.isin(bright[inside][nearest], first.star)))

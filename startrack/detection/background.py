@@ -17,7 +17,7 @@ BLOCK_PX = 16  # side of the blocks for a PSF up to 1.5 WIDEST_PX
 WIDEST_PX = 1.4
 STEEP_FRACTION = 0.03  # of the blocks
 MIN_NOISE_STEPS = 1.0  # noise in units of the smallest step below which the pixels hold too few values for quantiles
-LOW, HIGH = 0.05, 0.65  # quantiles of the pixels between which the noise is measured
+LOW_QUANTILE, HIGH_QUANTILE = 0.05, 0.65  # quantiles of the pixels between which the noise is measured
 COARSE_PX = 4  # the local level is a mean over squares of this side
 CLIPPED_SIGMA = 2.5
 Image = NDArray[np.float32]
@@ -165,13 +165,13 @@ def _dither_steps(count: int) -> Image:
 def _scale_weights(count: int) -> Image:
     """Weights (count,) of ordered values whose sum is the standard deviation of the noise.
 
-    The slope of the normal quantile plot between the quantiles LOW and HIGH, by least squares: as sharp as the median
-    absolute deviation, and half as much misled by stars, which are all on one side.
+    The slope of the normal quantile plot between two quantiles, by least squares: as sharp as the median absolute
+    deviation, and half as much misled by stars, which are all on one side.
     """
     from scipy.special import ndtri
 
     part = (np.arange(count) + 0.625) / (count + 0.25)
-    expected = np.where((part > LOW) & (part < HIGH), ndtri(part), 0.0)
+    expected = np.where((part > LOW_QUANTILE) & (part < HIGH_QUANTILE), ndtri(part), 0.0)
     inside = expected != 0.0
     expected[inside] -= expected[inside].mean()
     return (expected / np.sum(np.square(expected))).astype(np.float32)

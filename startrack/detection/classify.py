@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from startrack.core.types import Array, Bools, Ints
 from startrack.detection.deblend import Fitted, own_signal
-from startrack.detection.fit import ROUNDS_AGAIN, PointFits, Stamps, fit_points
+from startrack.detection.fit import FIT_ROUNDS_AGAIN, PointFits, Stamps, fit_points
 from startrack.detection.frame import Frame, Pixels, SourceNoise
 from startrack.detection.psf_width import MIN_BRIGHT_SOURCES, WIDTH_SNR
 
-WIDTHS_PX = (0.6, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0)
+THRESHOLD_WIDTHS_PX = (0.6, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0)
 HEIGHTS = (5.80, 5.70, 5.54, 5.43, 5.33, 5.18, 5.09)  # measured at USUAL_SKEWNESS: equal rates of false stars
 NOMINAL_HEIGHT = 5.42
 USUAL_SKEWNESS, LARGEST_SKEWNESS = 0.088, 0.3  # the first: 100 photons and 3 electrons of read noise
@@ -47,7 +47,7 @@ def refit_saturated(fitted: Fitted, sigma: float) -> tuple[Fitted, Array]:
     clipped = np.flatnonzero(are_saturated(fitted.stamps) & (fits.chi2 > POOR_CHI2_PER_DOF * fits.dof))
     for wider in WIDTH_FACTORS if len(clipped) else ():
         stamps = fitted.stamps.take(clipped)
-        again = fit_points(stamps, fits.xy_px[clipped], wider * sigma, fitted.source_noise, 0.0, ROUNDS_AGAIN)
+        again = fit_points(stamps, fits.xy_px[clipped], wider * sigma, fitted.source_noise, 0.0, FIT_ROUNDS_AGAIN)
         better = np.flatnonzero(again.chi2 < fits.chi2[clipped])
         fits = fits.with_rows(clipped[better], again.take(better))
         width[clipped[better]] = wider * sigma
@@ -132,7 +132,7 @@ def detection_threshold(threshold_snr: float, sigma_px: float, skewness: float) 
     heavier than a Gaussian's (first term of the Cornish-Fisher expansion with the skewness after filtering), and its
     quantiles below the median, from which the noise is measured, lie closer together.
     """
-    height = float(np.interp(np.log(sigma_px), np.log(WIDTHS_PX), HEIGHTS))
+    height = float(np.interp(np.log(sigma_px), np.log(THRESHOLD_WIDTHS_PX), HEIGHTS))
     filtered = FILTERED_SKEWNESS / np.sqrt(sigma_px**2 + 1.0 / 12.0)
     height += (skewness - USUAL_SKEWNESS) * (filtered * (height**2 - 1.0) / 6.0 + NOISE_TOO_SMALL * height)
     return float(np.sqrt(max(height**2 + threshold_snr**2 - NOMINAL_HEIGHT**2, 9.0)))

@@ -8,8 +8,8 @@ import numpy as np
 
 from startrack.core.types import Array, Ints
 from startrack.detection.fit import (
-    ROUNDS,
-    ROUNDS_AGAIN,
+    FIT_ROUNDS,
+    FIT_ROUNDS_AGAIN,
     PointFits,
     Stamps,
     concatenate_fits,
@@ -49,7 +49,7 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = 
     cleaned = _subtract_neighbours(stamps, last)
     fits = concatenate_fits([
         fit_points(cleaned.take(which), peaks.start_xy_px[which], sigma, frame.source_noise, peaks.own_part, rounds)
-        for which, rounds in ((slice(0, refined), ROUNDS_AGAIN), (slice(refined, None), ROUNDS))
+        for which, rounds in ((slice(0, refined), FIT_ROUNDS_AGAIN), (slice(refined, None), FIT_ROUNDS))
         if len(centres[which])
     ])  # fmt: skip
     star, other = _find_pairs(centres, 1.5 * radius + 3.0 * sigma)
@@ -59,7 +59,7 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = 
 
     def fit_again(which: Ints, signal: Pixels) -> PointFits:
         part = _subtract_neighbours(stamps.take(which), signal)
-        again = fit_points(part, fits.xy_px[which], sigma, source_noise, peaks.own_part, ROUNDS_AGAIN)
+        again = fit_points(part, fits.xy_px[which], sigma, source_noise, peaks.own_part, FIT_ROUNDS_AGAIN)
         return fits.with_rows(which, again)
 
     bright = _find_reweighted(fits, sigma, variance, frame.source_noise, source_noise)

@@ -10,12 +10,12 @@ from startrack.core.types import Array, Bools, Ints
 from startrack.detection.frame import MODEL_ERROR, Pixels, SourceNoise
 from startrack.psf import pixel_profile
 
-ROUNDS, ROUNDS_AGAIN = 3, 2  # iterations of a first fit, and of a repeated one
+FIT_ROUNDS, FIT_ROUNDS_AGAIN = 3, 2  # iterations of a first fit, and of a repeated one
 BRIGHT_STAR_SNR = 15.0  # of stars that show what the frame's stars are like
 MIN_NOISE_STARS, MAX_NOISE_STARS = 20, 120
 FAINT_FRACTION = 0.3  # of the pixel's variance: pixels with less signal are left out
 MAX_LEVERAGE = 0.5  # residuals of pixels with a larger leverage do not show the noise
-BINS, MIN_PIXELS_PER_BIN = 12, 15
+NOISE_BINS, MIN_PIXELS_PER_BIN = 12, 15
 MAX_CORRELATION = 2.0
 MEDIAN_OF_SQUARE = 0.4549  # of a unit Gaussian
 MIN_MODEL_ERROR = 0.005
@@ -134,10 +134,10 @@ def measure_source_noise(s: Stamps, fits: PointFits, alone: Bools, sigma: float,
     if len(bright) < MIN_NOISE_STARS:
         return expected
     signal, squared, variance, correlation = _squared_residuals(s.take(bright), fits.take(bright), sigma)
-    if (expected.per_unit == 0.0 and correlation > MAX_CORRELATION) or len(signal) < BINS * MIN_PIXELS_PER_BIN:
+    if (expected.per_unit == 0.0 and correlation > MAX_CORRELATION) or len(signal) < NOISE_BINS * MIN_PIXELS_PER_BIN:
         return expected
     order = np.argsort(signal, kind="stable")
-    bins = [part for part in np.array_split(order, BINS) if len(part) >= MIN_PIXELS_PER_BIN]
+    bins = [part for part in np.array_split(order, NOISE_BINS) if len(part) >= MIN_PIXELS_PER_BIN]
     level, total, dark = (
         np.array([np.median(values[part]) for part in bins]) for values in (signal, squared, variance)
     )

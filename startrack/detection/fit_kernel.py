@@ -14,7 +14,7 @@ MAX_STEP_PX = 0.5
 POSITION_PRIOR = 0.1  # per px^2: positions within about 3 px of the start keep sources without light solvable
 FLUX_PRIOR = 1e-12
 SQRT_2PI = math.sqrt(2.0 * math.pi)
-T, A1, A2, A3, A4, A5 = float(ERF_T), *(float(a) for a in ERF_COEFFICIENTS)
+ERF_SCALE, A1, A2, A3, A4, A5 = float(ERF_T), *(float(a) for a in ERF_COEFFICIENTS)
 
 
 @njit(cache=True, nogil=True, fastmath=REORDERED_SUMS)
@@ -90,7 +90,7 @@ def _profile(profile, slope, axis, offset, sigma_px, radius) -> None:
     for j in range(2 * radius + 2):
         edge = (j - radius - 0.5 - offset) / sigma_px
         density = math.exp(-0.5 * edge * edge)
-        t = 1.0 / (1.0 + T * abs(edge))
+        t = 1.0 / (1.0 + ERF_SCALE * abs(edge))
         area = 0.5 - density * t * (A1 + t * (A2 + t * (A3 + t * (A4 + t * A5))))
         area = area if edge >= 0.0 else -area
         density /= sigma_px * SQRT_2PI

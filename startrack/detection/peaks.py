@@ -15,7 +15,7 @@ from startrack.detection.background import COARSE_PX, coarse_width, local_level
 from startrack.detection.frame import Frame, Image, radius_for
 from startrack.psf import filter_kernel
 
-STRIP_ROWS = 320
+PEAK_ROWS = 320
 MAX_STAMP_PIXELS = 2_500_000  # of all candidates together: bounds time and memory, for any content of the frame
 MAX_BLOBS = 1000  # saturated; the largest
 MAX_DEAD_GROUPED_PX = 20_000  # pixels up to which they are grouped without looking at the whole mask
@@ -47,8 +47,8 @@ def find_peaks(frame: Frame, sigma: float, lowest: float, most: int, known: Arra
     width = COARSE_PX * coarse_width(6 * margin + 1)
     pad = COARSE_PX * -(-(width // 2 + 2 * COARSE_PX + len(kernel)) // COARSE_PX)
     strips = [
-        _strip_peaks(frame, slice(top, min(top + STRIP_ROWS, frame.shape[0])), pad, kernel, lowest * squared, width)
-        for top in range(0, frame.shape[0], STRIP_ROWS)
+        _strip_peaks(frame, slice(top, min(top + PEAK_ROWS, frame.shape[0])), pad, kernel, lowest * squared, width)
+        for top in range(0, frame.shape[0], PEAK_ROWS)
     ]
     pixels, height, offset, level = (np.concatenate(part) for part in zip(*strips, strict=True))
     chosen = np.argsort(-height, kind="stable")[:most]
@@ -80,8 +80,8 @@ def bright_pixels(frame: Frame, lowest: float, most: int, margin: int) -> Ints:
     """
     height, width = frame.shape
     found, level = [], []
-    for top in range(margin, height - margin, STRIP_ROWS):
-        rows = slice(top, min(top + STRIP_ROWS, height - margin))
+    for top in range(margin, height - margin, PEAK_ROWS):
+        rows = slice(top, min(top + PEAK_ROWS, height - margin))
         limit = cv2.scaleAdd(frame.noise[rows], lowest, frame.background[rows])
         row, column = np.divmod(np.flatnonzero(frame.image[rows] > limit), width)
         inside = (column >= margin) & (column < width - margin)

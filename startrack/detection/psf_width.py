@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from startrack.core.types import Array, Bools, Ints
-from startrack.detection.fit import ROUNDS_AGAIN, PointFits, Stamps, fit_points
+from startrack.detection.fit import FIT_ROUNDS_AGAIN, PointFits, Stamps, fit_points
 from startrack.detection.frame import Frame, Pixels, radius_for
 from startrack.detection.peaks import bright_pixels, find_peaks
 from startrack.psf import pixel_profile_single
@@ -114,7 +114,7 @@ def guess_psf_width(prepare: Callable[[float], Frame], sigma: float) -> float:
             break
         data, variance = frame.data(centres, radius), frame.variance(centres, radius)
         stamps = Stamps(data, variance, frame.usable_pixels(centres, radius), centres, np.zeros(len(centres)))
-        fits = fit_points(stamps, centres.astype(np.float64), sigma, frame.source_noise, 0.0, ROUNDS_AGAIN)
+        fits = fit_points(stamps, centres.astype(np.float64), sigma, frame.source_noise, 0.0, FIT_ROUNDS_AGAIN)
         measured = measure_psf_width(frame, centres, fits, sigma)
         if measured is None:
             break

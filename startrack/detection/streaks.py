@@ -10,6 +10,7 @@ import numpy as np
 from startrack.core.types import Array, Bools, Ints
 from startrack.detection.fit import BRIGHT_STAR_SNR
 from startrack.detection.frame import Frame
+from startrack.detection.psf_width import MAX_BRIGHT_SOURCES
 
 PIXEL_SIGMAS = 2.5  # of the lightly smoothed image: pixels of a streak
 SMOOTH_PX = 1.0
@@ -17,7 +18,7 @@ MIN_AREA_PX, MAX_AREA_PX = 12, 20_000
 MIN_STREAKS = 6  # streaks of similar direction and length
 LONG_PX, SLENDER = 4.5, 2.5  # shortest streak, and its length over its width
 SAME_DIRECTION, SAME_LENGTH = np.cos(np.radians(15.0)), 0.3
-ELONGATION_RADIUS_PX, ELONGATION_PEAKS, ELONGATION_SIGMAS = 7, 100, 4.0
+ELONGATION_RADIUS_PX, ELONGATION_SIGMAS = 7, 4.0
 ELONGATION = 2.2  # variance along a source [px^2], and over that across it
 IN_LINE_FRACTION = 0.45
 STREAKED_FRACTION = 0.6  # of the bright blobs
@@ -49,7 +50,7 @@ def are_elongated(frame: Frame, centres: Ints) -> bool:
     """Whether the highest peaks (n, 2) are parts of elongated sources: a quick test."""
     height, width = frame.shape
     margin = np.minimum(centres, np.array([width, height]) - 1 - centres).min(axis=1)
-    centres = centres[margin >= ELONGATION_RADIUS_PX][:ELONGATION_PEAKS]
+    centres = centres[margin >= ELONGATION_RADIUS_PX][:MAX_BRIGHT_SOURCES]
     if len(centres) < MIN_STREAKS:
         return False
     signal, noise = frame.data(centres, ELONGATION_RADIUS_PX), np.sqrt(frame.variance(centres, ELONGATION_RADIUS_PX))

@@ -1,11 +1,11 @@
 """Which detection is which catalogue star, with a camera file or from a field of view alone."""
 
 from startrack.identification.centroids import IdentifiedCentroids, identify_centroids
-from startrack.identification.lost_in_space import Identifier
+from startrack.identification.lost_in_space import MAX_FALSE_ALARM, Identifier
 from startrack.identification.second_field import check_single_field
 from startrack.identification.unknown_lens import WIDE_FIELD_RAD, UnknownLensSolution, identify_unknown_lens
 
 __all__ = [
-    "WIDE_FIELD_RAD", "IdentifiedCentroids", "Identifier", "UnknownLensSolution", "check_single_field",
-    "identify_centroids", "identify_unknown_lens",
+    "MAX_FALSE_ALARM", "WIDE_FIELD_RAD", "IdentifiedCentroids", "Identifier", "UnknownLensSolution",
+    "check_single_field", "identify_centroids", "identify_unknown_lens",
 ]  # fmt: skip

@@ -16,7 +16,13 @@ from startrack.camera import Camera
 from startrack.core.types import Array, Bools, Centroids, Ints
 from startrack.estimation.adjust import CHI2_2DOF_MEDIAN, OUTLIER_CHI2, SMALLEST_EXTRA_PX2
 from startrack.estimation.false_alarm import PATTERN_MATCHES, expected_false_alarms
-from startrack.estimation.match import CandidatePairs, PhotometricScale, upper_median
+from startrack.estimation.match import (
+    BRIGHTER_MAG,
+    CandidatePairs,
+    PhotometricScale,
+    brightness_agreement,
+    upper_median,
+)
 from startrack.frames import wahba
 from startrack.identification.index import CatalogPatterns, Neighbours, PixelScale
 from startrack.identification.triangles import PatternIndex, sides_of_few, triangles
@@ -37,8 +43,8 @@ PLAUSIBLE = 1e-2  # expected false alarms below which a hypothesis is refined; t
 GATE_PX = 6.0  # from a predicted star, in which detections are matched
 FIRST_GATE_PX = GATE_PX / 2
 INLIER_PX = 1.5  # largest distance of a detection on its star
-BLEND_SIGMAS = 3.0  # of the PSF: radius within which stars share one detection
-ROUNDS = 4  # of matching and rotating; one suffices if the bright stars determine the attitude
+ONE_SOURCE_SIGMAS = 3.0  # of the PSF: radius within which stars share one detection
+MATCH_ROUNDS = 4  # of matching and rotating; one suffices if the bright stars determine the attitude
 SETTLED_PX = 0.15
 MAX_DRIFT_PX = 0.7  # change of the attitude up to which the neighbours remain valid
 
@@ -62,7 +68,7 @@ class Sources:
     @property
     def neighbour_radius_rad(self) -> float:
         """Distance from a detection within which stars are looked up at a rough attitude."""
-        return (max(GATE_PX, BLEND_SIGMAS * self.centroids.psf_sigma_px) + 1.0) * self.scale.largest_rad_per_px
+        return (max(GATE_PX, ONE_SOURCE_SIGMAS * self.centroids.psf_sigma_px) + 1.0) * self.scale.largest_rad_per_px
 
     def mirror_image(self) -> Sources:
         """The same detections seen by the mirror-image camera."""
@@ -231,7 +237,7 @@ def refine_attitude(sources: Sources, hypothesis: AttitudeHypothesis) -> Attitud
     rays_icrs, v_mag = stars.rays_icrs[star], stars.v_mag[star]
     v_sigma_mag = stars.v_sigma_mag[star] + d.brightness_sigma_mag
     xy_px = d.xy_px[detection]
-    for _ in range(ROUNDS):
+    for _ in range(MATCH_ROUNDS):
         px, inside = sources.camera.project(rays_icrs @ R.T)
         off = px - xy_px
         distance = np.sqrt(np.einsum("ni,ni->n", off, off))
@@ -270,3 +276,9 @@ def _select_inliers(pairs: CandidatePairs, which: Ints, variance_px2: Array) -> 
     extra = upper_median(squared[first]) / CHI2_2DOF_MEDIAN - upper_median(stated[first])
     variance = stated + max(extra, SMALLEST_EXTRA_PX2)
     return first & (squared < OUTLIER_CHI2 * variance), variance
+
+
+def agreement_of(centroids: Centroids, v_mag: Array, measured_mag: Array, dimmed_mag: float = BRIGHTER_MAG) -> float:
+    """Fraction of random pairs that agree in brightness; 1 where the brightness is not known."""
+    known = np.isfinite(centroids.brightness_sigma_mag)
+    return brightness_agreement(v_mag, measured_mag, dimmed_mag) if known else 1.0

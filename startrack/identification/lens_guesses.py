@@ -28,11 +28,11 @@ MIDDLE_SHAPES = (PINHOLE, 0.4, -0.4)
 CIRCLES = (0.5, 0.62, 0.42, 0.78, 1.0)  # radius of the image circle over the frame's shorter side
 SEEN_CIRCLES = (1.0, 1.25)  # radius at half the field over that of the visible disc: a dome may hide the horizon
 REDUCED_SIDE_PX = 160  # longer side of the reduced background
-DIRECTIONS = 72  # in which the edge is looked for
+EDGE_POINTS = 72  # in which the edge is looked for
 LARGEST_OFFSET_1 = 0.1  # of the centre from the frame's, over the shorter side
 SMALLEST_RADIUS_1, LARGEST_RADIUS_1 = 0.28, 0.62  # over the frame's shorter side
 RING_1 = 0.05  # of the radius: distance of the rings inside and outside the edge
-STEP_PX = 2.0
+DISC_STEP_PX = 2.0
 MIN_CONTRAST_1 = 0.2  # median over the directions; moonlit photographs with trees reach 0.3
 MIN_SEEN_1 = 0.5  # of the directions that lie in the frame
 DARKEST_PERCENTILE = 0.5
@@ -155,12 +155,12 @@ def image_circle(background: NDArray[Any]) -> ImageCircle | None:
     if float(small.max()) <= 0.0:
         return None
     middle, shorter = 0.5 * (np.array(shape) - 1), min(shape)
-    radii = np.arange(SMALLEST_RADIUS_1 * shorter, LARGEST_RADIUS_1 * shorter, STEP_PX)
-    best = _best_disc(small, middle, LARGEST_OFFSET_1 * shorter, radii, STEP_PX)
+    radii = np.arange(SMALLEST_RADIUS_1 * shorter, LARGEST_RADIUS_1 * shorter, DISC_STEP_PX)
+    best = _best_disc(small, middle, LARGEST_OFFSET_1 * shorter, radii, DISC_STEP_PX)
     if best is None:
         return None
-    radii = best[1] + np.arange(-STEP_PX, STEP_PX + 0.1, 0.5)
-    best = _best_disc(small, best[0], STEP_PX, radii, 0.5)
+    radii = best[1] + np.arange(-DISC_STEP_PX, DISC_STEP_PX + 0.1, 0.5)
+    best = _best_disc(small, best[0], DISC_STEP_PX, radii, 0.5)
     if best is None or best[2] < MIN_CONTRAST_1:
         return None
     (x, y), radius, _ = best
@@ -171,7 +171,7 @@ def _best_disc(
     image: NDArray[Any], middle: Array, offset: float, radii: Array, step: float
 ) -> tuple[Array, float, float] | None:
     """Centre, radius and median contrast of the best disc of these radii, its centre up to `offset` from `middle`."""
-    direction = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
+    direction = np.arange(EDGE_POINTS) * 2 * np.pi / EDGE_POINTS
     around = np.stack([np.cos(direction), np.sin(direction)], axis=1)
     shift = np.arange(-offset, offset + 0.5 * step, step)
     centres = middle + np.stack(np.meshgrid(shift, shift), axis=-1).reshape(-1, 2)

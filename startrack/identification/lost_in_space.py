@@ -17,17 +17,18 @@ from startrack.estimation.false_alarm import (
     log_trials,
     probability,
 )
-from startrack.estimation.match import DIMMED_MAG, SIGNIFICANT_SNR, brightness_agreement, upper_median
+from startrack.estimation.match import DIMMED_MAG, SIGNIFICANT_SNR, upper_median
 from startrack.identification.attitude_search import (
-    BLEND_SIGMAS,
     FIRST_GATE_PX,
     GATE_PX,
     INLIER_PX,
     MIN_MATCHES,
+    ONE_SOURCE_SIGMAS,
     AttitudeHypothesis,
     AttitudeMatch,
     AttitudeSearch,
     Sources,
+    agreement_of,
     refine_attitude,
 )
 from startrack.identification.index import patterns_of, pixel_scale_of
@@ -132,7 +133,9 @@ class Identifier:
                     matched=inliers,
                 )
         named = pairs.select_unambiguous(
-            match.matched[match.named], match.variance_px2[match.named], BLEND_SIGMAS * sources.centroids.psf_sigma_px
+            match.matched[match.named],
+            match.variance_px2[match.named],
+            ONE_SOURCE_SIGMAS * sources.centroids.psf_sigma_px,
         )
         return Identification(
             detection=pairs.detection[named],
@@ -147,9 +150,7 @@ class Identifier:
         radius_rad = radius_px * sources.scale.axis_rad_per_px
         predicted = max(int(len(match.visible_v_mag) * sources.scale.frame_fraction), hits)
         density = density_per_sr(sources.rays_cam, min(LOCAL_FRACTION * sources.scale.diameter_rad, CAP_RADIUS_RAD))
-        agreement = 1.0
-        if np.isfinite(sources.centroids.brightness_sigma_mag):
-            agreement = brightness_agreement(match.visible_v_mag, match.pairs.scale.measured_mag, DIMMED_MAG)
+        agreement = agreement_of(sources.centroids, match.visible_v_mag, match.pairs.scale.measured_mag, DIMMED_MAG)
         each = agreement * coincidence_probability(density * np.pi * radius_rad**2)
         return float(log_p_value(hits, predicted, each))
 

@@ -17,18 +17,17 @@ from startrack.estimation.false_alarm import (
     log_trials,
 )
 from startrack.estimation.match import CandidatePairs, PhotometricScale, match_nearest
-from startrack.identification.attitude_search import GATE_PX, INLIER_PX
+from startrack.identification.attitude_search import GATE_PX, INLIER_PX, agreement_of
 from startrack.identification.hypotheses import SAME_VIEW_RAD, HypothesisSearch, Window
 from startrack.identification.index import PerObject
 from startrack.identification.lens_guesses import PINHOLE, guess_lenses
 from startrack.identification.pinhole_view import PinholeView
-from startrack.identification.region_growing import FEWEST, GATE_SIGMAS
+from startrack.identification.region_growing import FEWEST, GATE_OVER_SIGMA
 from startrack.identification.similar_triangles import narrow_sizes, patterns_for
 from startrack.identification.verify_unknown_lens import (
-    SCALE_MATCHES,
+    MATCHES_FOR_SCALE,
     TESTED,
     VerifiedLens,
-    agreement_of,
     blend_radius_px,
     coincidence_radius_px,
     significance,
@@ -37,13 +36,13 @@ from startrack.identification.verify_unknown_lens import (
 
 STARS_IN_FIELD, SIDE_OF_FIELD = 24, 0.4  # pattern stars; longest side of their triangles over the field's diameter
 # Ranks of brightness whose triangles vote together.
-ROUNDS = tuple(Window(first, first, end) for first, end in ((0, 10), (0, 16), (8, 22), (0, 22), (20, 34)))
+VOTING_ROUNDS = tuple(Window(first, first, end) for first, end in ((0, 10), (0, 16), (8, 22), (0, 22), (20, 34)))
 # Detections, stars for each, the gate (part of the frame's width, but at least pixels), and the largest log p-value
 # bound of the matches in the inner half of the gate.
-STAGES = ((60, 1.5, 0.010, 6.0, -4.0), (120, 1.5, 0.005, 4.0, -8.0), (400, 2.0, 0.0, 2.5, -10.0))
-STEPS = 2
-MARGIN = 1.15  # of the frame: the focal length is not known
-SIGMA_PX = INLIER_PX / GATE_SIGMAS  # scale of the loss of the last fits
+VIEW_STAGES = ((60, 1.5, 0.010, 6.0, -4.0), (120, 1.5, 0.005, 4.0, -8.0), (400, 2.0, 0.0, 2.5, -10.0))
+VIEW_STEPS = 2
+VIEW_MARGIN = 1.15  # of the frame: the focal length is not known
+SIGMA_PX = INLIER_PX / GATE_OVER_SIGMA  # scale of the loss of the last fits
 SMALLEST_ERROR_PX = 0.1  # of a centroid against the lens
 MIN_FOR_DISTORTION, DISTORTED_RMS_1 = 25, 0.7  # a distorted lens leaves less than this part of the residual
 
@@ -87,7 +86,7 @@ class NarrowField:
         patterns = patterns_for(self.stars, narrow_sizes(self.field_sr, STARS_IN_FIELD, SIDE_OF_FIELD))
         (guess,) = guess_lenses(self.search.size_px, self.fov_rad, (PINHOLE,))
         seen: list[Array] = []
-        for window in ROUNDS:
+        for window in VOTING_ROUNDS:
             if window.first and len(self.search.xy_px) <= window.first + 4:
                 continue
             for found in self.search.voted_hypotheses(patterns, guess, window):
@@ -102,13 +101,13 @@ class NarrowField:
     def _grow(self, view: PinholeView) -> VerifiedLens | None:
         """The view fitted with more stars and smaller gates, and verified; None where too few stars agree."""
         width, height = view.size_px
-        corner = np.arctan(0.5 * MARGIN * np.hypot(width, height) / view.focal_px)
+        corner = np.arctan(0.5 * VIEW_MARGIN * np.hypot(width, height) / view.focal_px)
         near = _star_tree_of(self.stars).query_ball_point(view.R_cam_icrs[2], 2 * np.sin(0.5 * corner))
         number = np.sort(np.asarray(near, dtype=np.int64))
         stars = _NearStars(
             number, *(q[number] for q in (self.stars.rays_icrs, self.stars.v_mag, self.stars.v_sigma_mag))
         )
-        for count, per_detection, fraction, least_px, most_log_p in STAGES:
+        for count, per_detection, fraction, least_px, most_log_p in VIEW_STAGES:
             gate_px = max(fraction * width, least_px)
             xy = self.centroids.xy_px[:count]
             px, inside = view.project(stars.rays_icrs)
@@ -118,7 +117,9 @@ class NarrowField:
             if len(star) < FEWEST or bound > most_log_p:
                 return None
             distorted = len(star) >= MIN_FOR_DISTORTION
-            view = view.fit(xy[detection], stars.rays_icrs[some[star]], gate_px / GATE_SIGMAS, distorted, STEPS)
+            view = view.fit(
+                xy[detection], stars.rays_icrs[some[star]], gate_px / GATE_OVER_SIGMA, distorted, VIEW_STEPS
+            )
         return self._verify(view, stars)
 
     def _tree(self, count: int) -> Any:
@@ -178,7 +179,7 @@ class NarrowField:
         close = np.flatnonzero(distance < INLIER_PX)
         if len(close) < FEWEST:
             return None
-        close = close[np.argsort(star[close], kind="stable")][:SCALE_MATCHES]
+        close = close[np.argsort(star[close], kind="stable")][:MATCHES_FOR_SCALE]
         scale = PhotometricScale.from_matches(
             centroids.flux_e, centroids.saturated, stars.v_mag[star[close]], detection[close]
         )
@@ -218,6 +219,6 @@ def _fit_lens(view: PinholeView, xy_px: Array, rays_icrs: Array) -> PinholeView:
     view = view.fit(xy_px, rays_icrs, SIGMA_PX, distorted=len(xy_px) >= MIN_FOR_DISTORTION)
     if not view.distortion:
         return view
-    pinhole = replace(view, distortion=0.0).fit(xy_px, rays_icrs, SIGMA_PX, distorted=False, steps=STEPS)
+    pinhole = replace(view, distortion=0.0).fit(xy_px, rays_icrs, SIGMA_PX, distorted=False, steps=VIEW_STEPS)
     left = [np.sum(np.square(xy_px - v.project(rays_icrs)[0])) for v in (view, pinhole)]
     return view if len(xy_px) >= MIN_FOR_DISTORTION and left[0] < DISTORTED_RMS_1**2 * left[1] else pinhole

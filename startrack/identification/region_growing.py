@@ -14,9 +14,9 @@ from startrack.estimation.match import match_mutual
 from startrack.estimation.normal_equations import observations_of_image
 from startrack.identification.attitude_search import INLIER_PX
 
-ROUNDS = 2  # of matching and fitting within a stage
+GROWTH_ROUNDS = 2  # of matching and fitting within a stage
 FEWEST = 5  # matches
-GATE_SIGMAS = 4.0  # the gate over the sigma of the loss
+GATE_OVER_SIGMA = 4.0  # the gate over the sigma of the loss
 MATCH_LOSS = cauchy_loss(4.0)  # chi-square of a match whose weight is halved
 SHAPE_SIGMA = 0.5  # prior of the family's shape
 FOCAL_SIGMA, CENTRE_SIGMA = 0.1, 0.06  # priors, in focal lengths
@@ -76,14 +76,14 @@ def grow(
     grown = None
     for stage in stages:
         some = xy_px[: stage.detections]
-        for _ in range(ROUNDS):
+        for _ in range(GROWTH_ROUNDS):
             gate_px = max(stage.gate_rad * camera.focal_px[0], INLIER_PX)
             near = (middle_icrs, stage.radius_rad)
             detection, star, predicted = match_in_view(camera, R, some, rays_icrs, gate_px, near)
             if len(star) < FEWEST:
                 return None
             camera, R, distance = fit_camera(
-                camera, R, some[detection], rays_icrs[star], stage.free, gate_px / GATE_SIGMAS, hypothesis.camera
+                camera, R, some[detection], rays_icrs[star], stage.free, gate_px / GATE_OVER_SIGMA, hypothesis.camera
             )
             grown = GrownLens(camera, R, detection, star)
         # The detections' density in the rectangle between their 5th and 95th percentiles.

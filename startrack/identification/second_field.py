@@ -22,7 +22,9 @@ from startrack.identification.attitude_search import INLIER_PX
 from startrack.identification.lost_in_space import Identifier
 
 LEAST_UNEXPLAINED = 12  # significant sources; untouched frames have 0 to 4
-LEAST_PART = 0.03  # of them, to the identified stars: second exposures of 30 to 50 % had 0.11 to 0.39, ghosts to 0.015
+LEAST_UNEXPLAINED_PART = (
+    0.03  # of them, to the identified stars: second exposures of 30 to 50 % had 0.11 to 0.39, ghosts to 0.015
+)
 LEAST_STARS = 8  # of a second field
 FAINTER_MAG = 1.0  # predicted stars fainter than the faintest identified one explain sources, too
 MOST_SOURCES = 150  # brightest ones that are identified
@@ -70,7 +72,7 @@ def find_second_field(centroids: Centroids, camera: Camera, stars: Stars, first:
     """
     from scipy.spatial import cKDTree
 
-    if first.unexplained < max(LEAST_UNEXPLAINED, LEAST_PART * len(first)):
+    if first.unexplained < max(LEAST_UNEXPLAINED, LEAST_UNEXPLAINED_PART * len(first)):
         return None
     predicted_px, inside = camera.project(stars.rays_icrs @ first.R_cam_icrs.T)
     seen = np.flatnonzero(inside & (stars.v_mag < float(stars.v_mag[first.star].max()) + FAINTER_MAG))

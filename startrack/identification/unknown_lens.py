@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera, with_covariance
-from startrack.core.types import Array, Centroids, Identification, Ints, NotIdentified, Stars
+from startrack.core.types import Array, Centroids, Identification, NotIdentified, Stars
 from startrack.estimation.adjust import HUBER_WITH_CUT, Scheme, State, adjust
 from startrack.estimation.false_alarm import probability
 from startrack.estimation.normal_equations import observations_of_image
@@ -147,7 +147,14 @@ class _Search:
                 detected=len(centroids),
             )
         self.hypotheses = HypothesisSearch(self.xy_px[chosen], size_px)
-        self.field_sr = self._field_sr()
+        half = np.tan(fov_rad / 2)
+        other = half * size_px[1] / size_px[0]
+        # Solid angle of the image circle, or of the frame.
+        self.field_sr = float(
+            2 * np.pi * (1 - np.cos(min(fov_rad / 2, np.pi / 2)))
+            if self.wide
+            else 4 * np.arcsin(half * other / np.sqrt((1 + half**2) * (1 + other**2)))
+        )
         # Rounded, one index serves many fields.
         self.rounded_sr = float(np.exp(np.round(FIELD_STEPS_PER_E * np.log(self.field_sr)) / FIELD_STEPS_PER_E))
 
@@ -168,6 +175,8 @@ class _Search:
     def _grow_all(self, guesses: list[LensGuess], max_tried: int) -> Iterator[VerifiedLens]:
         """The lenses that the hypotheses of these guesses grow to, until so many patterns have been tried."""
         search, stages = self.hypotheses, self._stages()
+        corner = np.arctan(np.tan(self.fov_rad / 2) * np.hypot(*self.size_px) / self.size_px[0])
+        nearest_1 = np.cos(corner * FITTED_BEYOND_1)  # of the axis to stars that a camera that is not wide may see
         for sizes, window in self._rounds():
             patterns = patterns_for(self.stars, sizes)
             if window.done >= len(search.xy_px):
@@ -179,7 +188,7 @@ class _Search:
                     if any(np.trace(other.T @ R) > 1 + 2 * np.cos(SAME_LENS_RAD) for other in seen):
                         continue
                     seen.append(R)
-                    around = None if self.wide else self._stars_around(R[2])
+                    around = None if self.wide else np.flatnonzero(self.stars.rays_icrs @ R[2] > nearest_1)
                     stars = self.stars if around is None else self.stars.take(around)
                     grown = grow(hypothesis, self.xy_px, stars.rays_icrs, stages)
                     if grown is None or (self.wide and len(grown.star) < self.min_matches):
@@ -197,19 +206,6 @@ class _Search:
             return
         for in_field, side, windows in NARROW_PATTERNS:
             yield from ((narrow_sizes(self.rounded_sr, in_field, side), w) for w in NARROW_WINDOWS[:windows])
-
-    def _stars_around(self, axis_icrs: Array) -> Ints:
-        """Indices of the stars that a camera that is not wide may see."""
-        corner = np.arctan(np.tan(self.fov_rad / 2) * np.hypot(*self.size_px) / self.size_px[0])
-        return np.flatnonzero(self.stars.rays_icrs @ axis_icrs > np.cos(corner * FITTED_BEYOND_1))
-
-    def _field_sr(self) -> float:
-        """Solid angle of the frame, or of the image circle."""
-        if self.wide:
-            return float(2 * np.pi * (1 - np.cos(min(self.fov_rad / 2, np.pi / 2))))
-        half = np.tan(self.fov_rad / 2)
-        other = half * self.size_px[1] / self.size_px[0]
-        return float(4 * np.arcsin(half * other / np.sqrt((1 + half**2) * (1 + other**2))))
 
     def _stages(self) -> tuple[GrowthStage, ...]:
         """The stages of growth, smaller for smaller fields."""

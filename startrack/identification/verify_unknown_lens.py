@@ -20,15 +20,14 @@ from startrack.estimation.match import (
     DEPTH_BELOW_THRESHOLD_MAG,
     MIN_UNSATURATED,
     SIGNIFICANT_SNR,
-    brightness_agreement,
     instrumental_mag,
     is_isolated,
     match_by_brightness,
 )
-from startrack.identification.attitude_search import BLEND_SIGMAS, GATE_PX, INLIER_PX
+from startrack.identification.attitude_search import GATE_PX, INLIER_PX, ONE_SOURCE_SIGMAS, agreement_of
 from startrack.identification.region_growing import (
     FEWEST,
-    GATE_SIGMAS,
+    GATE_OVER_SIGMA,
     GrownLens,
     fit_camera,
     match_in_view,
@@ -47,8 +46,8 @@ ORDERS = ((150, 4), (60, 3), (25, 2), (0, 1))  # coefficients of the polynomial 
 MIN_FOR_CENTRE = 30
 FITTED_BEYOND_1 = 1.3  # of half the field of view: up to here a fitted lens may have stars
 WIDEST_PSF_PX = 1.5  # for blends
-BLEND_MAG = float(-2.5 * np.log10(0.25))  # a neighbour with more than this part of a star's flux makes it ambiguous
-SCALE_STARS, SCALE_MATCHES = 5000, 200  # brightest stars predicted, and matches used, for the photometric scale
+RIVAL_MAG = float(-2.5 * np.log10(0.25))  # a neighbour with more than this part of a star's flux makes it ambiguous
+STARS_FOR_SCALE, MATCHES_FOR_SCALE = 5000, 200  # brightest stars predicted, and matches used, for the photometric scale
 UNEXPLAINED_MARGIN_MAG = 2.0  # fainter stars than this below a detection do not explain it
 
 
@@ -90,19 +89,19 @@ def match_by_flux(
     if not len(centroids):
         return FluxMatches(none, none, np.zeros(0), 0.0, 0, np.zeros(0), 1.0)
     tree, brightness = cKDTree(centroids.xy_px), instrumental_mag(centroids.flux_e)
-    px, inside = camera.project(stars.rays_icrs[:SCALE_STARS] @ R_cam_icrs.T)
+    px, inside = camera.project(stars.rays_icrs[:STARS_FOR_SCALE] @ R_cam_icrs.T)
     seen = np.flatnonzero(inside)
     distance, nearest = tree.query(px[seen], distance_upper_bound=gate_px)
     hit = np.isfinite(distance)
     usable = hit.copy()
     usable[hit] = ~centroids.saturated[nearest[hit]]
-    first = np.flatnonzero(usable if np.count_nonzero(usable) >= MIN_UNSATURATED else hit)[:SCALE_MATCHES]
+    first = np.flatnonzero(usable if np.count_nonzero(usable) >= MIN_UNSATURATED else hit)[:MATCHES_FOR_SCALE]
     if len(first) < MIN_UNSATURATED:
         return FluxMatches(none, none, np.zeros(0), 0.0, len(seen), np.zeros(0), 1.0)
     zero_mag = float(np.median(stars.v_mag[seen[first]] - brightness[nearest[first]]))
     faintest = zero_mag + float(np.max(brightness))
     limit = faintest + DEPTH_BELOW_THRESHOLD_MAG
-    count = int(np.searchsorted(stars.v_mag, limit + BLEND_MAG))
+    count = int(np.searchsorted(stars.v_mag, limit + RIVAL_MAG))
     px, inside = camera.project(stars.rays_icrs[:count] @ R_cam_icrs.T)
     seen = np.flatnonzero(inside)
     detection, star, distance = match_by_brightness(
@@ -110,17 +109,12 @@ def match_by_flux(
         star_sigma_mag=stars.v_sigma_mag + centroids.brightness_sigma_mag, detection_mag=brightness + zero_mag,
         saturated=centroids.saturated, limit_mag=limit, tolerance_mag=BRIGHTER_MAG,
     )  # fmt: skip
-    alone = is_isolated(centroids.xy_px[detection], star, px, seen, stars.v_mag, blend_px, BLEND_MAG)
+    alone = is_isolated(centroids.xy_px[detection], star, px, seen, stars.v_mag, blend_px, RIVAL_MAG)
     bright = stars.v_mag[seen][stars.v_mag[seen] < limit - DEPTH_BELOW_THRESHOLD_MAG]
     return FluxMatches(
         detection[alone], star[alone], distance[alone], zero_mag, len(bright), distance,
         agreement_of(centroids, bright, brightness + zero_mag),
     )  # fmt: skip
-
-
-def agreement_of(centroids: Centroids, v_mag: Array, measured_mag: Array) -> float:
-    """Fraction of random pairs that agree in brightness; 1 where the brightness is not known."""
-    return brightness_agreement(v_mag, measured_mag) if np.isfinite(centroids.brightness_sigma_mag) else 1.0
 
 
 def verify(grown: GrownLens, centroids: Centroids, stars: Stars, tried: int, widest_rad: float) -> VerifiedLens | None:
@@ -192,7 +186,7 @@ def _refine(grown: GrownLens, centroids: Centroids, stars: Stars, widest_rad: fl
     def fit_again(detection: Ints, star: Ints, gate_px: float) -> tuple[Camera, Array]:
         free = _free_parameters(camera, len(star))
         xy, rays = centroids.xy_px[detection], stars.rays_icrs[star]
-        fitted, attitude, _ = fit_camera(camera, R, xy, rays, free, gate_px / GATE_SIGMAS, prior)
+        fitted, attitude, _ = fit_camera(camera, R, xy, rays, free, gate_px / GATE_OVER_SIGMA, prior)
         return _limit_angles(fitted, widest_rad), attitude
 
     for gate_px, count in FITS:
@@ -228,7 +222,7 @@ def _limit_angles(camera: Camera, widest_rad: float) -> Camera:
 
 def blend_radius_px(centroids: Centroids) -> float:
     """Distance [px] within which stars share one detection."""
-    return BLEND_SIGMAS * min(centroids.psf_sigma_px, WIDEST_PSF_PX)
+    return ONE_SOURCE_SIGMAS * min(centroids.psf_sigma_px, WIDEST_PSF_PX)
 
 
 def coincidence_radius_px(distance_px: Array) -> float:

@@ -16,12 +16,12 @@ from startrack.estimation.frame_matching import Frame, FrameMatches, match_frame
 from startrack.estimation.joint_fit import JointFit
 from startrack.estimation.normal_equations import Observations
 from startrack.frames import R_from_rotvec, Site
+from startrack.identification import MAX_FALSE_ALARM
 
 MIN_STARS_MATCHED = 40
 SMALLEST_FRACTION = 0.6
 LARGEST_HELD_OUT_RMS_PX = 1.0
 LARGEST_MAP_SIGMA_PX = 0.5
-MAX_FALSE_ALARM = 1e-9
 IMAGE_RINGS, IMAGE_SECTORS = 4, 8
 STARS_PER_RING = 3
 STARS_PER_SECTOR = 2

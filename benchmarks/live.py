@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from _results import table, write_section
 
-from startrack.applications.tracking.write import FILES
+from startrack.applications.tracking.write import TRACK_FILES
 from startrack.cli.main import main as run_command
 
 WARM_UP = 2  # images
@@ -131,7 +131,7 @@ def kill_at_random(root: Path, kills: int) -> Path:
 
 def all_equal(one: Path, other: Path) -> bool:
     """Whether both folders have the same files of the track."""
-    return all((one / name).read_bytes() == (other / name).read_bytes() for name in FILES)
+    return all((one / name).read_bytes() == (other / name).read_bytes() for name in TRACK_FILES)
 
 
 if __name__ == "__main__":

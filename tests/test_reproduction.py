@@ -294,7 +294,7 @@ def test_a_stopped_run_goes_on_from_where_it_was(tmp_path, monkeypatch):
     monkeypatch.setattr(methods, "compute_chunk", stop_after)
     with fix_store(tmp_path, jobs=1, progress=hide_progress) as store, pytest.raises(KeyboardInterrupt):
         list(store.chunks("stopped", wanted))
-    assert len(list((tmp_path / methods.FOLDER).iterdir())) == 2  # whole chunks only, no temporary files
+    assert len(list((tmp_path / methods.FIX_FOLDER).iterdir())) == 2  # whole chunks only, no temporary files
     computed.clear()
     monkeypatch.setattr(methods, "compute_chunk", lambda task: computed.append(task) or compute_chunk(task))
     with fix_store(tmp_path, jobs=1, progress=hide_progress) as store:

@@ -22,8 +22,8 @@ from startrack.rendering import Series, limiting_v_mag, load_sky_catalog
 from startrack.simulation import draw_ground, simulate_rays
 from startrack.terrain import Terrain, load_terrain
 
-FOLDER = ".predict"
-SOURCES = (  # their content is part of a chunk's key
+DRAW_FOLDER = ".predict"
+DRAW_SOURCES = (  # their content is part of a chunk's key
     "localization/*.py", "simulation/*.py", "evidence/*.py", "rendering/*.py", "terrain/*.py", "chain/star_fix.py",
     "applications/prediction/draws.py",
 )  # fmt: skip
@@ -80,7 +80,7 @@ class Task:
         settings = asdict(self)
         for name in ("camera", "terrain"):
             settings["conditions"][name] = Path(settings["conditions"][name]).name
-        return settings_digest(SOURCES, settings)
+        return settings_digest(DRAW_SOURCES, settings)
 
 
 class Predictor:
@@ -186,7 +186,13 @@ def draw_store(out: Path, *, draws: int, jobs: int, progress: Progress, cluster:
     """
     limit_s = draws * TASK_LIMIT_S  # a draw takes as long as an image
     return ChunkStore(
-        out / FOLDER, draw_task, lambda task: task.key, jobs=jobs, progress=progress, cluster=cluster, limit_s=limit_s
+        out / DRAW_FOLDER,
+        draw_task,
+        lambda task: task.key,
+        jobs=jobs,
+        progress=progress,
+        cluster=cluster,
+        limit_s=limit_s,
     )
 
 

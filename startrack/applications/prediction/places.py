@@ -15,10 +15,10 @@ from startrack.rendering import Drive
 from startrack.terrain import EQUIRECTANGULAR, Projection, Raster, Terrain
 
 MAX_CELLS = 1_000_000
-CELLS_ACROSS = 10  # of the default spacing
+DEFAULT_CELLS_ACROSS = 10  # of the default spacing
 HEIGHT_STEPS = 4  # the horizontal position of a map's point depends on its height: 1 part in 1000 a step
-ROUNDING_1 = 1e-9  # relative, of a length of whole steps
-RING = np.linspace(0.0, 2 * np.pi, 181)
+LENGTH_ROUNDING_1 = 1e-9  # relative, of a length of whole steps
+RING_RAD = np.linspace(0.0, 2 * np.pi, 181)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ def area_cells(terrain: Terrain, spacing_m: float) -> AreaCells:
     site, projection = terrain.site, terrain.projection
     if site is None or projection is None:
         raise BadInput("bad_terrain", f"terrain {terrain.name} has no map projection: only those on the Moon have one")
-    ring_m = terrain.search_radius_m * np.stack([np.sin(RING), np.cos(RING)], axis=-1)
+    ring_m = terrain.search_radius_m * np.stack([np.sin(RING_RAD), np.cos(RING_RAD)], axis=-1)
     x, y = projection.xy_from_latlon(*latlon_from_enu(site, ring_m[:, 0], ring_m[:, 1], 0.0))
     middle_x, middle_y = projection.xy_from_latlon(site.latitude_rad, site.longitude_rad)
     dx, dy = spacing_m * _units_per_m(projection, site)
@@ -101,7 +101,7 @@ def area_cells(terrain: Terrain, spacing_m: float) -> AreaCells:
 
 def default_spacing_m(terrain: Terrain) -> float:
     """At most a tenth of the width [m] of a `terrain`'s search area, a nice number."""
-    return nice_step(2 * terrain.search_radius_m / CELLS_ACROSS)
+    return nice_step(2 * terrain.search_radius_m / DEFAULT_CELLS_ACROSS)
 
 
 def path_points(drive: Drive, terrain: Terrain, spacing_m: float) -> PathPoints:
@@ -110,7 +110,7 @@ def path_points(drive: Drive, terrain: Terrain, spacing_m: float) -> PathPoints:
     Raises BadInput (bad_odometry) where a point is outside of the search area, or no camera can stand there.
     """
     length_m = float(drive.distance_m[-1])
-    count = int(np.ceil(length_m / spacing_m * (1 - ROUNDING_1))) + 1
+    count = int(np.ceil(length_m / spacing_m * (1 - LENGTH_ROUNDING_1))) + 1
     if count > MAX_CELLS:
         raise BadInput("bad_odometry", f"{count} points on the path: more than {MAX_CELLS}")
     distance_m = np.linspace(0.0, length_m, count)

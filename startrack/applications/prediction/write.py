@@ -33,9 +33,9 @@ from startrack.output import (
 )
 from startrack.terrain import write_bands
 
-MAP, TABLE, PICTURE = "predict.tif", "predict.ecsv", "predict.png"
+MAP, CELL_TABLE, MAP_PICTURE = "predict.tif", "predict.ecsv", "predict.png"
 COMPARISON_TABLE, COMPARISON_PICTURE = "predict-compare.ecsv", "predict-compare.png"
-FILES = (MAP, TABLE, RECORD_FILE, PICTURE, COMPARISON_TABLE, COMPARISON_PICTURE)
+PREDICTION_FILES = (MAP, CELL_TABLE, RECORD_FILE, MAP_PICTURE, COMPARISON_TABLE, COMPARISON_PICTURE)
 PATH_CURVES = {FILTERED: "images so far, and odometry", SMOOTHED: "all images, and odometry"}
 
 
@@ -45,9 +45,9 @@ def write_report(report: Report, out: Path, *, plots: bool) -> list[Path]:
     if isinstance(points, AreaCells):  # the quantities as bands, in the projection of the terrain's map
         bands = {one.key: points.band(report.cells[one.key]) for one in CELL_QUANTITIES}
         write_bands(out / MAP, points.frame, bands)
-    made[TABLE] = _table(report).encode()
+    made[CELL_TABLE] = _table(report).encode()
     if plots:
-        made[PICTURE] = png_bytes(_picture(report))
+        made[MAP_PICTURE] = png_bytes(_picture(report))
     if report.variants:
         made[COMPARISON_TABLE] = _comparison_table(report.variants).encode()
         if plots:
@@ -56,7 +56,7 @@ def write_report(report: Report, out: Path, *, plots: bool) -> list[Path]:
     for name, data in made.items():
         write_atomically(out / name, data, overwrite=True)
     names = [*([MAP] if isinstance(points, AreaCells) else []), *made]
-    for name in set(FILES) - set(names):
+    for name in set(PREDICTION_FILES) - set(names):
         (out / name).unlink(missing_ok=True)
     return [out / name for name in names]
 

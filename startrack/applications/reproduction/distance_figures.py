@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 MAGNITUDES = np.arange(2.0, 7.01, 0.25)
 ASPECT_RATIOS = np.logspace(-1, 3, 33)
-STEPS = f"views compared at every {STEP_M:.0f} m"
+VIEWS = f"views compared at every {STEP_M:.0f} m"
 
 
 def fig3_7(context: Context) -> Artefact:
@@ -39,7 +39,7 @@ def fig3_7(context: Context) -> Artefact:
     caption = (
         f"Figure 3.7: Effects of changing the star detection limit, {context.size.traverses} starfields (line: mean, "
         f"band: all). At magnitude 6: mean {six[0]:.1f} m, thesis 14.9 m; largest {six[1]:.0f} m, thesis 215 m "
-        f"({STEPS}; every single change counted, the mean is {six[2]:.1f} m)."
+        f"({VIEWS}; every single change counted, the mean is {six[2]:.1f} m)."
     )
     draw = partial(_draw_panels, MAGNITUDES, curves, "Minimum Detected Magnitude", (700.0, 7000.0), False)
     columns = (
@@ -57,7 +57,7 @@ def fig3_9(context: Context) -> Artefact:
     widest = _gaps(context, MAGNITUDE, 50.0).mean(axis=0)
     caption = (
         f"Figure 3.9: Effects of changing the crater aspect ratio, {context.size.traverses} starfields (line: mean, "
-        f"band: all; {STEPS}; dashed: every change counted). At 10:1 mean {ten[0]:.1f} m and largest {ten[1]:.0f} m "
+        f"band: all; {VIEWS}; dashed: every change counted). At 10:1 mean {ten[0]:.1f} m and largest {ten[1]:.0f} m "
         f"(thesis 14.9 and 215 m); at 50:1 largest {widest[1]:.0f} m (thesis: approximately 1 km)."
     )
     draw = partial(_draw_panels, ASPECT_RATIOS, curves, "Crater Aspect Ratio (Diameter:Depth)", (250.0, 8000.0), True)
@@ -73,7 +73,7 @@ def fig3_8(context: Context) -> Artefact:
     gaps, middles = gaps_m(changes, cylinder), (changes[1:] + changes[:-1]) / 2
     inner, outer = (float(gaps[part].mean()) for part in (np.abs(middles) < 2000, np.abs(middles) > 8000))
     caption = (
-        f"Figure 3.8: Plot of the distance between starfield changes along a crater traverse, one starfield, {STEPS}. "
+        f"Figure 3.8: Plot of the distance between starfield changes along a crater traverse, one starfield, {VIEWS}. "
         f"Largest {gaps.max():.0f} m (thesis 215 m); mean {inner:.1f} m within 2 km of the centre, {outer:.1f} m "
         "beyond 8 km."
     )

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DPI = 100
-EDGE = "#1a9641"  # the thesis draws the crater's edge in green
+EDGE_COLOUR = "#1a9641"  # the thesis draws the crater's edge in green
 STAR, OTHER_STAR = "#20304a", "#b9c0cc"
 CENTRE = PUBLISHED = "#d7191c"  # and centres of mass in red
 COLOURS = 128  # of a PNG's palette: enough for these drawings, at a third of the size

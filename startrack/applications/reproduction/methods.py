@@ -31,8 +31,8 @@ from startrack.localization.convex_hull import hull_position
 from startrack.localization.pseudo_gradient import PseudoGradient, descend
 from startrack.terrain import Cylinder
 
-FOLDER = ".chunks"
-SOURCES = (  # their content is part of a chunk's key
+FIX_FOLDER = ".chunks"
+FIX_SOURCES = (  # their content is part of a chunk's key
     "localization/*.py", "terrain/cylinder.py", "applications/reproduction/simulator.py",
     "applications/reproduction/methods.py",
 )  # fmt: skip
@@ -61,7 +61,7 @@ class Task:
     @property
     def key(self) -> str:
         """Of its chunk."""
-        return settings_digest(SOURCES, asdict(self))
+        return settings_digest(FIX_SOURCES, asdict(self))
 
 
 def tasks_of(method: str, seed: int, sky: int, count: int, **settings: Any) -> list[Task]:
@@ -73,7 +73,7 @@ def tasks_of(method: str, seed: int, sky: int, count: int, **settings: Any) -> l
 def fix_store(out: Path, *, jobs: int, progress: Progress, cluster: str | None = None) -> ChunkStore[Task]:
     """The store of chunks of fixes under the folder `out`, made in `jobs` processes or on a `cluster`."""
     return ChunkStore(
-        out / FOLDER, compute_chunk, lambda task: task.key, jobs=jobs, progress=progress, cluster=cluster
+        out / FIX_FOLDER, compute_chunk, lambda task: task.key, jobs=jobs, progress=progress, cluster=cluster
     )  # fmt: skip
 
 

@@ -25,7 +25,7 @@ EDGE_POINTS = 360  # of the drawn crater edge (section 3.2.1)
 STEP_M = 5.0  # of the traverse through the middle of the crater (section 3.2.2)
 GRID_POINTS = 161  # a side; odd, so that the position itself is a point of the first grid and the cell is not missed
 FIRST_HALF_M = 20.0
-MARGIN, REFINEMENTS = 1.05, 2  # of the grid
+CELL_MARGIN, REFINEMENTS = 1.05, 2  # of the grid
 SHACKLETON = Site(body="moon", latitude_rad=float(np.radians(-89.66)), longitude_rad=float(np.radians(129.78)))
 
 
@@ -149,7 +149,7 @@ def cell_centroid(points_m: Array, position_m: Array, radius_m: float) -> Array:
     for _ in range(REFINEMENTS):
         step = np.array([x[1] - x[0], y[1] - y[0]])
         ends = np.array([[x[columns[0]], y[rows[0]]], [x[columns[-1]], y[rows[-1]]]])
-        middle, half = ends.mean(axis=0), MARGIN * (np.diff(ends, axis=0)[0] / 2 + step)
+        middle, half = ends.mean(axis=0), CELL_MARGIN * (np.diff(ends, axis=0)[0] / 2 + step)
         closer, x_closer, y_closer = _cell_mask(points_m, seen, middle - half, middle + half, radius_m)
         if not closer.any():  # a sliver between the new grid's points: the coarser grid's result is kept
             break

@@ -11,7 +11,7 @@ from startrack.applications.reproduction import published
 from startrack.applications.reproduction.artefact import Artefact, Context, Picture
 from startrack.applications.reproduction.drawing import (
     CENTRE,
-    EDGE,
+    EDGE_COLOUR,
     OTHER_STAR,
     STAR,
     fisheye_axes,
@@ -111,7 +111,7 @@ def _draw_line(sky: Sky) -> Figure:
         position = np.array([1e3 * east, 0.0])
         seen = visible_stars(points, position, cylinder.radius_m)
         axes.plot(*stars[seen].T, ".", color=STAR, markersize=1.6)
-        axes.plot(*fisheye_points(*crater_edge(cylinder, position)).T, color=EDGE, linewidth=1.0)
+        axes.plot(*fisheye_points(*crater_edge(cylinder, position)).T, color=EDGE_COLOUR, linewidth=1.0)
         fisheye_axes(axes)
         axes.set_title(f"{east:g} km: {int(seen.sum())} stars", fontsize=9)
     return figure
@@ -146,7 +146,7 @@ def _draw_view(sky: Sky) -> Figure:
     seen = visible_stars(sky.project_to_rim_plane(cylinder), EXAMPLE_M, cylinder.radius_m)
     axes.plot(*stars[~seen].T, ".", color=OTHER_STAR, markersize=3)
     axes.plot(*stars[seen].T, ".", color=STAR, markersize=3)
-    axes.plot(*fisheye_points(*crater_edge(cylinder, EXAMPLE_M)).T, color=EDGE, linewidth=1.5)
+    axes.plot(*fisheye_points(*crater_edge(cylinder, EXAMPLE_M)).T, color=EDGE_COLOUR, linewidth=1.5)
     fisheye_axes(axes)
     axes.set_title(f"{EXAMPLE_M[0] / 1e3:.0f} km east, {EXAMPLE_M[1] / 1e3:.0f} km north of the centre", fontsize=10)
     return figure

@@ -19,7 +19,7 @@ from startrack.estimation.smoother import Smoothed, smooth
 SLIP_PROBABILITY, SLIP_SIGMA_M = 0.05, 20.0  # of a move by wheel slip, and its size on each axis
 WRONG_PROBABILITY, WRONG_SIGMA_M = 1e-3, 200.0  # of a frame, and the error of its position on each axis
 EARLIER_NATS = 1e-6  # of two frames that contradict each other equally the later one is left out
-NEIGHBOURS = 2  # frames and moves to each side that one gross error makes doubtful
+DOUBTFUL_NEIGHBOURS = 2  # frames and moves to each side that one gross error makes doubtful
 MAX_ROUNDS = 30
 
 
@@ -83,7 +83,7 @@ def _improve_slips(found: Smoothed, steps: Steps, slipped: Bools) -> Bools:
     """
     improved = slipped.copy()
     for k in np.flatnonzero(slipped).tolist():
-        near = np.arange(max(k - 2 * NEIGHBOURS, 0), min(k + 2 * NEIGHBOURS + 1, len(slipped)))
+        near = np.arange(max(k - 2 * DOUBTFUL_NEIGHBOURS, 0), min(k + 2 * DOUBTFUL_NEIGHBOURS + 1, len(slipped)))
         near = near[(near != k) & np.isfinite(steps.sigma_m[near])]
         near = near[(improved == slipped)[near]] if improved[k] else near[:0]
         gains = [_gain(found, steps, slipped, k, other) for other in near.tolist()]
@@ -174,8 +174,8 @@ def wrong_covariance(estimate: FrameEstimate) -> Array:
 
 def _worst_nearby(doubt: Array) -> Bools:
     """Those above even odds that no neighbour exceeds."""
-    padded = np.pad(doubt, 2 * NEIGHBOURS, constant_values=-np.inf)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 4 * NEIGHBOURS + 1)
+    padded = np.pad(doubt, 2 * DOUBTFUL_NEIGHBOURS, constant_values=-np.inf)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 4 * DOUBTFUL_NEIGHBOURS + 1)
     return np.asarray((doubt > 0.0) & (doubt >= windows.max(axis=1)))
 
 

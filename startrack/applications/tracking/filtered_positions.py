@@ -21,7 +21,7 @@ from startrack.applications.tracking.contradictions import (
     wrong_covariance,
     wrong_log_odds,
 )
-from startrack.applications.tracking.frame_estimate import LEAST_HALF_M, REACH_SIGMAS, observe_together
+from startrack.applications.tracking.frame_estimate import FRAME_REACH_SIGMAS, LEAST_FRAME_HALF_M, observe_together
 from startrack.applications.tracking.frame_model import FrameModel, sample_together
 from startrack.applications.tracking.observed_frame import ObservedFrame
 from startrack.applications.tracking.track_errors import TrackErrors
@@ -178,7 +178,7 @@ def positions_at_rest(frames: Sequence[ObservedFrame], terrain: Terrain, errors:
     first, *later = np.flatnonzero(mode >= 0).tolist()
     found = take(first, frames[first].modes[mode[first]])
     reference = by_fixes.position_m[0]
-    half = max(REACH_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(found.covariance_m2[0])[1])), LEAST_HALF_M)
+    half = max(FRAME_REACH_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(found.covariance_m2[0])[1])), LEAST_FRAME_HALF_M)
     models: list[FrameModel] = []
     for k in (first, *later):
         evidence = frames[k].evidence

@@ -20,8 +20,8 @@ from startrack.localization.importance_sampling import WeightedPoints, moments
 from startrack.localization.skyline_model import MIDDLES_RAD
 from startrack.terrain import NO_POST, Terrain
 
-REACH_SIGMAS, MARGIN_M = 6.0, 5.0  # of a Gaussian, to the side of the neighbourhood
-LEAST_HALF_M = 40.0  # of the neighbourhood
+FRAME_REACH_SIGMAS, FRAME_MARGIN_M = 6.0, 5.0  # of a Gaussian, to the side of the neighbourhood
+LEAST_FRAME_HALF_M = 40.0  # of the neighbourhood
 MAX_NEIGHBOURHOODS = 3  # after so many the posterior is taken as it is
 MIN_NOISE_SHARE = 0.3  # of the evidence's covariance: the least noise that a frame has of its own
 NEGLIGIBLE_POST = 1e-4  # part of the variance of a position, by all posts that are left out together
@@ -42,7 +42,7 @@ def estimate_frame(
     """
     reference, spread = position_m, covariance_m2
     for _ in range(MAX_NEIGHBOURHOODS):
-        half = max(REACH_SIGMAS * _widest(spread) + MARGIN_M, LEAST_HALF_M)
+        half = max(FRAME_REACH_SIGMAS * _widest(spread) + FRAME_MARGIN_M, LEAST_FRAME_HALF_M)
         models = [FrameModel.of_evidence(evidence, terrain, errors, reference, half)]
         found = sample_together(models, reference, spread)
         mean, covariance = moments(found.points, found.share)

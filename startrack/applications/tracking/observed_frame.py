@@ -27,7 +27,7 @@ from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD
 from startrack.localization.summary import camera_at
 from startrack.terrain import Terrain
 
-FORMAT = "startrack.observed-frame/3"
+FRAME_FORMAT = "startrack.observed-frame/3"
 ROWS = ("azimuth_rad", "elevation_rad", "llr", "edge_sigma_rad", "extended_nats")
 MODE_SIGMA_M = 10.0  # of a mode whose circle is not known
 T = TypeVar("T")
@@ -178,7 +178,7 @@ def encode_frame(frame: ObservedFrame) -> bytes:
         if part is not None:  # a dataclass of numbers and arrays
             arrays |= {f"{prefix}.{f.name}": np.asarray(getattr(part, f.name)) for f in fields(part)}
     head = {
-        "format": FORMAT, "name": frame.name, "time_utc": frame.time_utc.isoformat(), "modes": len(frame.modes),
+        "format": FRAME_FORMAT, "name": frame.name, "time_utc": frame.time_utc.isoformat(), "modes": len(frame.modes),
         "fixes": len(frame.fixes), "shown": [asdict(one) for one in frame.shown], "reason": frame.reason,
         "message": frame.message,
     }  # fmt: skip
@@ -192,8 +192,8 @@ def decode_frame(data: bytes) -> ObservedFrame:
     with np.load(io.BytesIO(data), allow_pickle=False) as archive:
         arrays: dict[str, Any] = dict(archive)
     head = json.loads(str(arrays["head"]))
-    if head["format"] != FORMAT:
-        raise ValueError(f"format {head['format']}, expected {FORMAT}")
+    if head["format"] != FRAME_FORMAT:
+        raise ValueError(f"format {head['format']}, expected {FRAME_FORMAT}")
     rows = None
     if "evidence.llr" in arrays:
         clock = _value(Clock, "clock", arrays) if "clock.turn_rad_s" in arrays else None

@@ -28,13 +28,13 @@ from startrack.output import (
     quantity_columns,
 )
 
-FILES = ("track.tum", "track.filtered.tum", "track.ecsv", "track.geojson", "track.json", "track.crests.ecsv")
+TRACK_FILES = ("track.tum", "track.filtered.tum", "track.ecsv", "track.geojson", "track.json", "track.crests.ecsv")
 HERE = Path(__file__).parent
-SCRIPTS = ("basics.js", "view.js", "input.js", "map.js")  # of the page of results
+PAGE_SCRIPTS = ("basics.js", "view.js", "input.js", "map.js")  # of the page of results
 RELIEF_MARGIN = 1.35  # of the map, beyond its edge where the window is wide
-LEFT_OUT = ("_body_enu",)  # quantities that the page does not show
+OFF_PAGE = ("_body_enu",)  # quantities that the page does not show
 ACCURATE = ("latitude_deg", "longitude_deg")
-DECIMALS = 4
+PAGE_DECIMALS = 4
 
 
 def track_record(track: Track, odometry: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -149,14 +149,14 @@ def track_page(track: Track, picture_png: bytes, *, title: str, odometry_m: Arra
         "picture": f"data:image/png;base64,{base64.b64encode(picture_png).decode('ascii')}",
     }
     style, script = ((HERE / name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
-    return filled_frame(f"{title} · startrack", {"results": head}, SCRIPTS, style=style, script=script)
+    return filled_frame(f"{title} · startrack", {"results": head}, PAGE_SCRIPTS, style=style, script=script)
 
 
 def _frame_columns(track: Track) -> dict[str, list[Any]]:
     """The quantities of all frames by their keys."""
     records = frame_records(track)
-    keys = [q.key for q in FRAME_QUANTITIES if not q.key.endswith(LEFT_OUT)]
-    return {key: [_rounded(record[key], 8 if key in ACCURATE else DECIMALS) for record in records] for key in keys}
+    keys = [q.key for q in FRAME_QUANTITIES if not q.key.endswith(OFF_PAGE)]
+    return {key: [_rounded(record[key], 8 if key in ACCURATE else PAGE_DECIMALS) for record in records] for key in keys}
 
 
 def _rounded(value: Any, decimals: int) -> Any:

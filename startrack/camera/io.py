@@ -19,7 +19,7 @@ from startrack.frames import R_from_quat_xyzw, quat_xyzw_from_R
 
 UNIT_QUATERNION_1 = 1e-3  # largest error of the length
 MIN_SIGMA = 1e-15  # of a parameter, px or 1; smaller ones count as zero
-ROUNDING_1 = 1e-6  # of correlations: asymmetry and negative eigenvalues up to this are rounding
+CORRELATION_ROUNDING_1 = 1e-6  # of correlations: asymmetry and negative eigenvalues up to this are rounding
 MAX_PARAMETERS = 32
 CAMERA_PARAMETERS = ("fx", "fy", "cx", "cy", "p1", "p2")  # beside those of the lens
 SENSOR = Table(closed=True, keys={
@@ -209,6 +209,9 @@ def _covariance(values: dict[str, Any] | None, lens: Lens) -> tuple[tuple[str, .
     sigma = np.sqrt(np.maximum(np.diag(matrix), 0.0))
     sigma[sigma < MIN_SIGMA] = 1.0
     correlation = matrix / np.outer(sigma, sigma)
-    if np.abs(correlation - correlation.T).max() > ROUNDING_1 or np.linalg.eigvalsh(correlation).min() < -ROUNDING_1:
+    if (
+        np.abs(correlation - correlation.T).max() > CORRELATION_ROUNDING_1
+        or np.linalg.eigvalsh(correlation).min() < -CORRELATION_ROUNDING_1
+    ):
         raise ValueError("covariance.matrix is no covariance: it must be symmetric and positive semi-definite")
     return order, matrix

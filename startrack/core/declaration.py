@@ -19,7 +19,7 @@ from startrack.core.errors import BadInput
 Schema = dict[str, Any]
 LARGEST = 1e12  # default limit of a number's size: no length, flux or count in a file of ours is larger
 SHOWN_CHARS = 40  # of a wrong value in a message
-SIMILAR = 0.8  # ratio (difflib) from which an unknown key counts as a misspelt one
+SIMILAR_KEY_1 = 0.8  # ratio (difflib) from which an unknown key counts as a misspelt one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,7 +188,7 @@ class Table(Key):
             raise ValueError(f"{name or 'the file'} must be a table of keys, not {value_text(value)}")
         prefix = f"{name}." if name else ""
         for unknown in sorted(str(key) for key in set(value) - set(self.keys)):
-            meant = get_close_matches(unknown.lower(), self.keys, n=1, cutoff=SIMILAR)
+            meant = get_close_matches(unknown.lower(), self.keys, n=1, cutoff=SIMILAR_KEY_1)
             if meant or self.closed:
                 hint = f": is {meant[0]} meant?" if meant else f"; known: {', '.join(self.keys)}"
                 shown = unknown[:SHOWN_CHARS] if unknown.isprintable() else value_text(unknown)

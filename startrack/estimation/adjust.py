@@ -19,9 +19,9 @@ from startrack.estimation.normal_equations import NormalEquations, Observations,
 from startrack.frames import R_from_rotvec
 
 CHI2_2DOF_MEDIAN = 1.3863
-OUTLIER_CHI2 = 16.0  # 4 sigma in each axis: rejects one good star in 3000
+STAR_OUTLIER_CHI2 = 16.0  # 4 sigma in each axis: rejects one good star in 3000
 HUBER_SIGMAS = 2.5  # residual beyond which the influence of an observation is constant
-MIN_STARS = 3
+MIN_ATTITUDE_STARS = 3
 SMALLEST_EXTRA_PX2, LARGEST_EXTRA_PX2 = 1e-6, 1e8
 SMALLEST_DAMPING, FIRST_DAMPING, MAX_DAMPING = 1e-12, 1e-6, 1e6
 SMALLEST_RISE_RAD = 0.2  # angle up to which the radius of a valid lens must increase
@@ -96,11 +96,11 @@ def cauchy_loss(scale_chi2: float) -> Loss:
 
 def _huber_factor(chi2: Array) -> Array:
     factor = np.minimum(1.0, HUBER_SIGMAS / np.sqrt(np.maximum(chi2, 1e-12)))
-    return np.where(chi2 < OUTLIER_CHI2, factor, 0.0)
+    return np.where(chi2 < STAR_OUTLIER_CHI2, factor, 0.0)
 
 
 SQUARES = Loss(lambda chi2: chi2, np.ones_like)
-HUBER_WITH_CUT = Loss(lambda chi2: np.minimum(chi2, OUTLIER_CHI2), _huber_factor)
+HUBER_WITH_CUT = Loss(lambda chi2: np.minimum(chi2, STAR_OUTLIER_CHI2), _huber_factor)
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def adjust(
             extra = extra_variance_px2(residual, points.covariance_px2, len(free) + 3 * points.images)
             inverse = inverse_covariance(points.covariance_px2, extra)
         factor = scheme.loss.weight_factor(chi_square(residual, inverse))
-        if (agreeing := int(np.count_nonzero(factor))) < MIN_STARS:
+        if (agreeing := int(np.count_nonzero(factor))) < MIN_ATTITUDE_STARS:
             raise NotIdentified("fewer than 3 stars agree on an attitude", matched=agreeing)
         weight = inverse * factor[:, None, None]
         terms = state.terms(points, rays, free)

@@ -8,7 +8,7 @@ import numpy as np
 
 from startrack.camera import Camera, lens_jacobian
 from startrack.core.types import Array, Attitude, Bools, NotIdentified
-from startrack.estimation.adjust import HUBER_WITH_CUT, MIN_STARS, OUTLIER_CHI2, Scheme, State, adjust
+from startrack.estimation.adjust import HUBER_WITH_CUT, MIN_ATTITUDE_STARS, STAR_OUTLIER_CHI2, Scheme, State, adjust
 from startrack.estimation.normal_equations import NormalEquations, Terms, observations_of_image
 
 MIN_FOR_SCATTER = 30  # stars from which the scatter of the residuals is a better covariance than the stated one
@@ -39,12 +39,12 @@ def solve_attitude(
     the scatter does not contain it: it is added to the attitude's covariance. Raises NotIdentified with fewer than 3
     stars.
     """
-    if len(xy_px) < MIN_STARS:
+    if len(xy_px) < MIN_ATTITUDE_STARS:
         raise NotIdentified("fewer than 3 stars agree on an attitude", matched=len(xy_px))
     points = observations_of_image(xy_px, covariance_px2, rays_icrs)
     start = State(camera=camera, R_cam_icrs=np.array(R_cam_icrs)[None])
     found = adjust(start, points, (), SCHEME)
-    used = found.chi2 < OUTLIER_CHI2
+    used = found.chi2 < STAR_OUTLIER_CHI2
     pose, weight, residual = found.terms.pose[used], found.weight[used], found.residual_px[used]
     by_stars = _covariance_by_stars(pose, found.inverse[used], weight, residual)
     rays_cam = found.state.rays_cam(points)[used]

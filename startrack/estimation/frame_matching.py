@@ -13,6 +13,7 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.catalog import Sky, StarCatalog, sky_at
 from startrack.core.types import Array, BadInput, Bools, Centroids, Exposure, Ints
+from startrack.estimation.false_alarm import CELLS_ACROSS
 from startrack.estimation.match import instrumental_mag, is_isolated, match_by_brightness
 from startrack.exposure import NO_TIME
 from startrack.frames import Site, off_axis_rad
@@ -28,7 +29,6 @@ NEAR_CURVE_MAG = 1.2  # stars with a zero point this close to the curve are used
 CURVE_ROUNDS = 4
 SECURE_MAG = 0.7  # a star this much brighter than the frame's limit is detected where the sky is open
 LIMIT_QUANTILE = 0.85
-CELLS_ACROSS = 12  # of the frame's longer side; a cell without matches is not open sky
 
 
 @dataclass(frozen=True, kw_only=True)

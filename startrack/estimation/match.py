@@ -20,7 +20,7 @@ BRIGHTER_MAG = 0.8  # a detection is at most this much brighter than its star
 DIMMED_MAG = 1.6  # and at most this much fainter: haze, branches, the edge of the lens
 PX_PER_MAG = 0.6  # distance with the same cost as a difference of one magnitude
 DISTINCT_MAG = 0.3  # if one of the stars that share a detection is this much brighter, the detection is named after it
-DECISIVE_NATS = 12.0  # log-likelihood ratio that decides between two positions
+DECISIVE_BLEND_NATS = 12.0  # log-likelihood ratio that decides between two positions
 SIGNIFICANT_SNR = 10.0  # detections above this should have a catalogue star
 MIN_UNSATURATED = 3  # for the photometric scale; below this, saturated stars are used too
 SMALLEST_FLUX = 1e-9
@@ -220,10 +220,10 @@ class CandidatePairs:
     def _is_decided(self, own: int, group: Ints, variance_px2: float) -> bool:
         """Whether the pair `own` explains its detection, and no nearly as bright star of the pairs `group` does."""
         squared = np.square(self.distance_px[group]) - self.distance_px[own] ** 2
-        if squared.min(initial=0.0) < -2 * DECISIVE_NATS * variance_px2 or not self.agrees_in_brightness[own]:
+        if squared.min(initial=0.0) < -2 * DECISIVE_BLEND_NATS * variance_px2 or not self.agrees_in_brightness[own]:
             return False
         rivals = (self.v_mag[group] < self.v_mag[own] + DISTINCT_MAG) & (self.star[group] != self.star[own])
-        return not np.any(squared[rivals] < 2 * DECISIVE_NATS * variance_px2)
+        return not np.any(squared[rivals] < 2 * DECISIVE_BLEND_NATS * variance_px2)
 
     def count_unexplained(self, snr: Array, gate_px: float) -> int:
         """Number of significant detections without a star nearer than the gate."""

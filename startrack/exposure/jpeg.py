@@ -18,7 +18,7 @@ from startrack.exposure.decoding import Decoded, bad_image, check_size, exif_war
 from startrack.exposure.facts import facts_in_text
 
 START_OF_SCAN, END_OF_IMAGE = 0xDA, b"\xff\xd9"
-STRIP_ROWS = 512
+DECODED_ROWS = 512
 PARAMETERLESS = {0x01, *range(0xD0, 0xD8)}  # markers without a length: TEM and the restarts
 # If data are missing before the end marker, decoders fill the rest without a warning. These bytes, inserted there, show
 # it: they do not change a complete picture, and become part of an incomplete one. They hold each of the eight restart
@@ -69,8 +69,8 @@ def _strips(image: Any) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
     except OSError as error:
         raise bad_image(f"truncated or damaged JPEG: {error}") from error
     width, height = image.size
-    for top in range(0, height, STRIP_ROWS):
-        bottom = min(top + STRIP_ROWS, height)
+    for top in range(0, height, DECODED_ROWS):
+        bottom = min(top + DECODED_ROWS, height)
         yield slice(top, bottom), np.asarray(image.crop((0, top, width, bottom)))
 
 

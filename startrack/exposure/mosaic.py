@@ -25,7 +25,7 @@ STDERR = 2  # its file descriptor
 Picture = NDArray[np.float32]
 
 MOSAIC_WARNING = "colour mosaic: its four kinds of pixels are brought to one level and one gain"
-BLOCK_PX = 32  # of a phase's own pixels: the background is smooth over that
+PHASE_BLOCK_PX = 32  # of a phase's own pixels: the background is smooth over that
 STAR_BOX_PX = 4  # holds each phase four times
 STAR_SIGMAS = 8.0
 MIN_STAR_PIXELS = 400  # of each phase, to estimate its gain
@@ -72,7 +72,7 @@ def _without_stderr() -> Iterator[None]:
 
 def equalize_mosaic(pixels_adu: Picture, saturation_adu: float | None) -> Picture:
     """The mosaic `pixels_adu` (H, W) scaled to one level and gain; pixels at `saturation_adu` stay saturated."""
-    if min(pixels_adu.shape) < 4 * BLOCK_PX:
+    if min(pixels_adu.shape) < 4 * PHASE_BLOCK_PX:
         return pixels_adu  # too small to hold stars of every phase
     levels = [_block_medians(pixels_adu[i::2, j::2]) for i, j in PHASES]
     common = np.asarray(np.mean(levels, axis=0), dtype=np.float32)
@@ -93,8 +93,10 @@ def equalize_mosaic(pixels_adu: Picture, saturation_adu: float | None) -> Pictur
 
 def _block_medians(phase: Picture) -> Picture:
     """Medians of the blocks of one kind of pixels."""
-    rows, columns = (n // BLOCK_PX for n in phase.shape)
-    blocks = phase[: rows * BLOCK_PX, : columns * BLOCK_PX].reshape(rows, BLOCK_PX, columns, BLOCK_PX)
+    rows, columns = (n // PHASE_BLOCK_PX for n in phase.shape)
+    blocks = phase[: rows * PHASE_BLOCK_PX, : columns * PHASE_BLOCK_PX].reshape(
+        rows, PHASE_BLOCK_PX, columns, PHASE_BLOCK_PX
+    )
     return np.asarray(np.median(blocks.swapaxes(1, 2).reshape(rows, columns, -1), axis=2), dtype=np.float32)
 
 

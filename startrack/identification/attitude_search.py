@@ -14,7 +14,7 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.core.types import Array, Bools, Centroids, Ints
-from startrack.estimation.adjust import CHI2_2DOF_MEDIAN, OUTLIER_CHI2, SMALLEST_EXTRA_PX2
+from startrack.estimation.adjust import CHI2_2DOF_MEDIAN, SMALLEST_EXTRA_PX2, STAR_OUTLIER_CHI2
 from startrack.estimation.false_alarm import PATTERN_MATCHES, expected_false_alarms
 from startrack.estimation.match import (
     BRIGHTER_MAG,
@@ -256,9 +256,9 @@ def refine_attitude(sources: Sources, hypothesis: AttitudeHypothesis) -> Attitud
         R = refined
     visible = stars.rays_icrs[:complete] @ R[2] > np.cos(sources.camera.max_angle_rad)
     squared, misfit = np.square(pairs.distance_px[matched]), pairs.brightness_misfit[matched]
-    inlier = squared < np.maximum(INLIER_PX**2, OUTLIER_CHI2 * sources.variance_px2[detection[matched]])
+    inlier = squared < np.maximum(INLIER_PX**2, STAR_OUTLIER_CHI2 * sources.variance_px2[detection[matched]])
     # Position and brightness may not both be at the edge of what is allowed.
-    named = inlier & agree & (squared / (OUTLIER_CHI2 * variance) + misfit * misfit < 1.0)
+    named = inlier & agree & (squared / (STAR_OUTLIER_CHI2 * variance) + misfit * misfit < 1.0)
     return AttitudeMatch(refined, pairs, matched, named, inlier, variance, stars.v_mag[:complete][visible])
 
 
@@ -275,6 +275,7 @@ def _select_inliers(pairs: CandidatePairs, which: Ints, variance_px2: Array) -> 
     squared = np.square(distance)
     extra = upper_median(squared[first]) / CHI2_2DOF_MEDIAN - upper_median(stated[first])
     variance = stated + max(extra, SMALLEST_EXTRA_PX2)
+<<<<<<< HEAD
     return first & (squared < OUTLIER_CHI2 * variance), variance
 
 
@@ -282,3 +283,6 @@ def agreement_of(centroids: Centroids, v_mag: Array, measured_mag: Array, dimmed
     """Fraction of random pairs that agree in brightness; 1 where the brightness is not known."""
     known = np.isfinite(centroids.brightness_sigma_mag)
     return brightness_agreement(v_mag, measured_mag, dimmed_mag) if known else 1.0
+=======
+    return first & (squared < STAR_OUTLIER_CHI2 * variance), variance
+>>>>>>> 2719ba8 (Give constants one name each, and share two of them)

@@ -13,7 +13,7 @@ from startrack.core.types import Array, BadInput, Value, array
 
 PATH_COLUMNS = ("east_m", "north_m")
 MAX_FRAMES = 1_000_000  # of a drive: more is a wrong unit
-ROUNDING_1 = 1e-9  # relative, of a number of steps: a path of whole steps has a frame at its end
+STEP_ROUNDING_1 = 1e-9  # relative, of a number of steps: a path of whole steps has a frame at its end
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ class Drive(Value):
         Raises BadInput (bad_odometry) for fewer than two or more than a million.
         """
         duration_s = float(self.distance_m[-1]) / self.speed_m_s
-        steps = int(min(duration_s / every_s * (1 + ROUNDING_1), 1e15))
+        steps = int(min(duration_s / every_s * (1 + STEP_ROUNDING_1), 1e15))
         if not 1 <= steps < MAX_FRAMES:
             raise BadInput(
                 "bad_odometry",
@@ -66,7 +66,7 @@ class Drive(Value):
 
     def heading_rad(self, time_s: float) -> float:
         """Azimuth [rad] of the path `time_s` after the start; at a waypoint that of the line that begins there."""
-        along_m = self.speed_m_s * time_s * (1 + ROUNDING_1)
+        along_m = self.speed_m_s * time_s * (1 + STEP_ROUNDING_1)
         line = min(int(np.searchsorted(self.distance_m, along_m, side="right")), len(self.waypoints_m) - 1)
         east_m, north_m = self.waypoints_m[line] - self.waypoints_m[line - 1]
         return float(np.arctan2(east_m, north_m) % (2 * np.pi))

@@ -275,14 +275,10 @@ def _select_inliers(pairs: CandidatePairs, which: Ints, variance_px2: Array) -> 
     squared = np.square(distance)
     extra = upper_median(squared[first]) / CHI2_2DOF_MEDIAN - upper_median(stated[first])
     variance = stated + max(extra, SMALLEST_EXTRA_PX2)
-<<<<<<< HEAD
-    return first & (squared < OUTLIER_CHI2 * variance), variance
+    return first & (squared < STAR_OUTLIER_CHI2 * variance), variance
 
 
 def agreement_of(centroids: Centroids, v_mag: Array, measured_mag: Array, dimmed_mag: float = BRIGHTER_MAG) -> float:
     """Fraction of random pairs that agree in brightness; 1 where the brightness is not known."""
     known = np.isfinite(centroids.brightness_sigma_mag)
     return brightness_agreement(v_mag, measured_mag, dimmed_mag) if known else 1.0
-=======
-    return first & (squared < STAR_OUTLIER_CHI2 * variance), variance
->>>>>>> 2719ba8 (Give constants one name each, and share two of them)

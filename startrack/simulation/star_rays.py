@@ -13,10 +13,6 @@ import numpy as np
 
 from startrack.catalog import StarCatalog
 from startrack.chain import CERTAIN_PROBABILITY, StarRays
-<<<<<<< HEAD
-=======
-from startrack.core.statistics import robust_sigma
->>>>>>> 2719ba8 (Give constants one name each, and share two of them)
 from startrack.core.types import TIME_SIGMA_S, Array, BadInput, Bools, Ints
 from startrack.evidence import FluxScale, Skyline, StarEvidence, expect_stars, expected_flux_scale
 from startrack.exposure import combine_masks

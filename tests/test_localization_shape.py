@@ -6,11 +6,13 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from localization_helpers import locate_or_refuse
 
 from startrack.core.types import Array, Evidence, NotLocated
 from startrack.localization import ExactPosterior
 from startrack.localization.importance_sampling import moments
 from startrack.localization.joint_posterior import sample_posterior
+from startrack.localization.shared_errors import SharedErrors
 from startrack.terrain import Cylinder, load_terrain
 
 TRUE = load_terrain("shackleton-thesis")
@@ -39,12 +41,16 @@ def test_the_true_crater_is_consistent(place_m: tuple[float, float]) -> None:
 
 @pytest.mark.parametrize("stretch", [0.96, 1.04])
 @pytest.mark.parametrize("place_m", PLACES)
-def test_a_crater_too_deep_or_shallow_is_refused(place_m: tuple[float, float], stretch: float) -> None:
+def test_a_crater_too_deep_or_shallow_is_contradicted(place_m: tuple[float, float], stretch: float) -> None:
+    """The file says exact; the circle is that of a file that says nothing, or the image is refused."""
     assert isinstance(TRUE, Cylinder)
     evidence, wrong = evidence_at(place_m, 2), replace(TRUE, depth_m=stretch * TRUE.depth_m)
-    with pytest.raises(NotLocated, match=r"(unlike the map's|on no map) .* time") as refusal:
-        ExactPosterior()(evidence, wrong)
-    assert refusal.value.reason == "inconsistent_evidence"
+    fix, reason = locate_or_refuse(evidence, wrong)
+    if fix is None:
+        assert reason == "inconsistent_evidence"
+    else:
+        assert fix.contradicted in ("depth_sigma_m", "diameter_sigma_m")
+        assert np.linalg.norm(fix.position_enu_m[:2] - place_m) < fix.radius999_m
 
 
 def shared_of(guess: Cylinder, evidence: Evidence) -> tuple[Array, Array]:
@@ -116,3 +122,20 @@ def test_errors_of_the_horizon_in_a_part_of_the_view_are_refused(coverage_deg: f
         except NotLocated:
             refused += 1
     assert refused == len(seeds)
+
+
+def test_an_error_of_the_width_scales_the_position_with_the_crater() -> None:
+    """Seen from positions before the scaling, the skyline rises as the slopes say; `with_shape` makes the ground."""
+    assert isinstance(TRUE, Cylinder)
+    silent = replace(TRUE, depth_sigma_m=1.0, diameter_sigma_m=1.0, ellipse_sigma_1=0.0, rim_tilt_sigma_rad=0.0)
+    errors, azimuth, place = SharedErrors.of(silent, None), np.linspace(0.0, 6.0, 50), np.array([4000.0, -5000.0])
+    level = silent.horizon_rad(place[None], azimuth).ravel()
+    slopes = errors.slopes_rad(silent, place, azimuth, level)
+    for number, one in enumerate(errors.listed):
+        values = 1e-3 * (np.arange(len(errors)) == number)
+        (moved,) = errors.turned(place[None], values[None])
+        named = {error.name: value for error, value in zip(errors.listed, values, strict=True)}
+        ground = silent.with_shape(np.array([named.get(error.name, 0.0) for error in silent.shape_errors]))
+        rise = ground.horizon_rad(moved[None], azimuth).ravel() - level
+        np.testing.assert_allclose(rise, 1e-3 * slopes[number], atol=2e-3 * np.abs(rise).max(), err_msg=one.name)
+        assert np.allclose(moved, place * (1.001 if one.name == "diameter_1" else 1.0))

@@ -12,14 +12,14 @@ import numpy as np
 from startrack.core.types import Array, Clock
 from startrack.localization.clock import TIME_ROUNDS, is_linear, turned_model, turned_models
 from startrack.localization.free_skyline import free_log_likelihood
-from startrack.localization.importance_sampling import Gaussian, WeightedPoints, moments, normal_sequence, sample
+from startrack.localization.importance_sampling import FEW, Gaussian, WeightedPoints, moments, normal_sequence, sample
 from startrack.localization.sector_moments import solve_linear
 from startrack.localization.skyline_model import SkylineModel
 
 HIDDEN_COPIES = 6  # of each point, with values of the errors that the rows do not show
 DOUBTFUL_NATS = 5.0  # by which a map beats a free skyline, below which other times are tried too
 WIDER, LINEAR_PART = 2.0, 0.01  # variance of the first points, in that of the plain and of the linear solution
-GROSS_ROUNDS = (120, 160, 200)
+GROSS_ROUNDS = (120, 160, 200, 300, 400, 500)  # points; FEW effective ones end them
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +138,7 @@ def sample_gross_error(
     clock = _gross_clock(other)
     if clock is not None and not plain.suits_map:
         return _at_other_times(plain, other, clock, references_m)
-    return [sample_hypothesis(other, references_m, _gross_modes(plain, other), rounds=rounds)]
+    return [sample_hypothesis(other, references_m, _gross_modes(plain, other), rounds=rounds, enough=FEW)]
 
 
 def _at_other_times(plain: Hypothesis, model: SkylineModel, clock: Clock, references_m: Array) -> list[Hypothesis]:

@@ -16,7 +16,7 @@ DEGREES, FAR_DEGREES = 5.0, 3.0  # of freedom of the t distributions
 FAR_PART, FAR, FAR_OTHERS = 0.4, 4.0, 1.4  # of the points; how much farther out, in position and in the others
 ROUNDS = (200, 400, 800, 1000, 1200)  # points
 MORE_POINTS = 0.3  # part by which each further dimension has more
-ENOUGH = 600.0  # effective points that end the rounds
+ENOUGH, FEW = 600.0, 60.0  # effective points that end the rounds, and those of a less likely hypothesis
 TEMPERED = 7.0  # effective points a dimension to which weights are tempered before the distributions move
 KEPT_PART = 0.03  # of the former covariance
 LEAST_WEIGHT = 1e-5  # of a mode; a lighter one is dropped
@@ -163,10 +163,11 @@ def sample(
     modes: Sequence[Gaussian],
     rounds: Sequence[int] = ROUNDS,
     first: Sequence[Distribution] = (),
+    enough: float = ENOUGH,
 ) -> WeightedPoints:
     """Weighted points of exp(log_density), which takes points (n, d), from about its `modes`.
 
-    The first round draws from the distributions `first` besides.
+    The first round draws from the distributions `first` besides; `enough` effective points end the rounds.
     """
     points: list[Array] = []
     density: list[Array] = []
@@ -182,7 +183,7 @@ def sample(
         found = _weigh(np.concatenate(points), np.concatenate(density), parts)
         if not np.isfinite(found.log_weight).any():
             continue
-        if found.effective > ENOUGH:
+        if found.effective > enough:
             break
         modes = _move(found, modes)
     return found

@@ -9,7 +9,7 @@ import numpy as np
 from startrack.core.types import Array, Evidence, NotLocated
 from startrack.localization.horizon_bias import NEARBY_M
 from startrack.localization.hypothesis import WIDER, Hypothesis, sample_gross_errors, sample_hypothesis, solve_model
-from startrack.localization.importance_sampling import ROUNDS, BoxDistribution, Gaussian, effective_points, moments
+from startrack.localization.importance_sampling import FEW, ROUNDS, BoxDistribution, Gaussian, effective_points, moments
 from startrack.localization.search import NATS, Explored
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel
@@ -21,7 +21,6 @@ MOST_GROUPS, MOST_MODES = 6, 4  # groups of boxes, and modes of a group
 MOST_BOXES = 160  # of a group, that the chain is computed at; and the points drawn from them
 FIRST_ROUNDS = ROUNDS[:2]  # that show whether a group of boxes is likely, and how wide the posterior is
 APART_BOXES = 3.0  # between two modes that sampling begins with
-FEW = 60.0  # effective points of the best hypothesis, below which it is sampled anew
 
 
 def sample_posterior(explored: Explored, rows: Evidence, terrain: Terrain) -> list[Hypothesis]:

@@ -7,11 +7,12 @@ from functools import cached_property
 
 import numpy as np
 
-from startrack.core.types import Array, Clock
+from startrack.core.types import Array, Clock, Ints
 from startrack.frames import R_from_rotvec, turn_azel
 from startrack.localization.sector_moments import SectorMoments
 from startrack.terrain import ShapeError, Terrain
 
+SCALE_STEP = 1e-3  # of a crater's size, at which the skyline's change with it is taken
 TURN_STEP_RAD = 2e-3  # of the sky, at which the skyline's change with the time is taken: its crests are no narrower
 ROUGH_RAD = np.radians(0.002)  # of ground that nobody states as exact: 0.35 m of a rim 10 km away
 CLOCK_FACT = "time_sigma_s"
@@ -25,7 +26,7 @@ class SharedErrors:
     """The errors (k,) of a terrain and of a clock, in the units that their names end with.
 
     In ground that is the same after a turn about the vertical, the vertical part of the clock's turn only turns the
-    position: there the parameters hold the position before that turn.
+    position: there the parameters hold the position before that turn, and before it is scaled with the crater.
     """
 
     listed: tuple[ShapeError, ...]
@@ -83,6 +84,10 @@ class SharedErrors:
         known = {one.name: number for number, one in enumerate(terrain.shape_errors)}
         shape = np.reshape(terrain.shape_slopes_rad(position_m, azimuth_rad), (-1, len(azimuth_rad)))
         shape = shape[[known[one.name] for one in self.listed if one.fact != CLOCK_FACT]]
+        if len(self._scales):
+            farther, nearer = (position_m * (1.0 + sign * SCALE_STEP) for sign in (1.0, -1.0))
+            horizon = np.asarray(terrain.horizon_rad(np.array([farther, nearer])[:, None], azimuth_rad))
+            shape[self._scales] += (horizon[0] - horizon[1]) / (2 * SCALE_STEP)
         if self.clock is None:
             return shape
         turn = self.clock.turn_rad_s.copy()
@@ -97,8 +102,14 @@ class SharedErrors:
             raised.append(np.asarray(terrain.horizon_rad(position_m[None], azimuth)).ravel() - elevation)
         return np.vstack([shape, (raised[1] - raised[0]) / (2 * step_s)])
 
+    @cached_property
+    def _scales(self) -> Ints:
+        """Which errors scale a round crater, and the position with it."""
+        return np.flatnonzero([one.scales and self.axisymmetric for one in self.listed])
+
     def turned(self, points: Array, values: Array) -> Array:
-        """Positions (n, 2) turned by the clock's error among the values (n, k) of the errors, in a round crater."""
+        """Positions (n, 2) turned and scaled by the values (n, k) of the errors, in a round crater."""
+        points = points * (1.0 + values[:, self._scales].sum(axis=1, keepdims=True))
         if self.clock is None or not self.axisymmetric:
             return points
         angle = self.clock.turn_rad_s[2] * values[:, -1]

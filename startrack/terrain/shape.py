@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +24,7 @@ class ShapeError:
     sigma: float
     gross_probability: float = 0.0
     gross_sigma: float = 0.0
+    scales: bool = False  # an error of a round crater's size: positions are that much farther from its axis too
 
     @property
     def is_stated(self) -> bool:
@@ -40,13 +41,15 @@ class Fact:
     sigma: float  # of each, in the unit of the errors
     gross_probability: float = 0.0
     gross_sigma: float = 0.0
+    scales: bool = False
 
     def shape_errors(self, stated: float | None) -> list[ShapeError]:
         """Those of the errors that count; `stated` is the sigma in the unit of the errors, None where it is not."""
         sigma, probability = (self.sigma, self.gross_probability) if stated is None else (float(stated), 0.0)
         return [
             ShapeError(
-                name=name, fact=self.key, sigma=sigma, gross_probability=probability, gross_sigma=self.gross_sigma
+                name=name, fact=self.key, sigma=sigma, gross_probability=probability, gross_sigma=self.gross_sigma,
+                scales=self.scales,
             )
             for name in self.errors
             if sigma > 0.0 or self.gross_sigma > 0.0
@@ -54,7 +57,9 @@ class Fact:
 
 
 DEPTH = Fact(key="depth_sigma_m", errors=("depth_1",), sigma=1e-3, gross_probability=0.01, gross_sigma=0.01)
-DIAMETER = Fact(key="diameter_sigma_m", errors=("diameter_1",), sigma=1e-3, gross_probability=0.01, gross_sigma=0.01)
+DIAMETER = Fact(
+    key="diameter_sigma_m", errors=("diameter_1",), sigma=1e-3, gross_probability=0.01, gross_sigma=0.01, scales=True
+)  # fmt: skip
 ELLIPSE = Fact(
     key="ellipse_sigma_1", errors=("ellipse_cos_1", "ellipse_sin_1"), sigma=5e-4, gross_probability=0.01,
     gross_sigma=5e-3,
@@ -74,6 +79,13 @@ VERTICAL = Fact(
 CAMERA_ERROR = Fact(key="camera_height_sigma_m", errors=("camera_height_m",), sigma=0.02)
 CYLINDER_FACTS = (DEPTH, DIAMETER, ELLIPSE, RIM_TILT)
 MAP_FACTS = (BIAS, STRETCH, VERTICAL, CAMERA_ERROR)
+BY_KEY = {fact.key: fact for fact in (*CYLINDER_FACTS, *MAP_FACTS)}
+
+
+def as_unstated(error: ShapeError) -> ShapeError:
+    """What counts for an `error` if its statement is not believed: the default, and a larger sigma that is stated."""
+    fact = BY_KEY[error.fact]
+    return replace(error, sigma=max(error.sigma, fact.sigma), gross_probability=fact.gross_probability)
 
 
 def select_slopes(errors: Sequence[ShapeError], slopes_rad: dict[str, Array], shape: Iterable[int]) -> Array:

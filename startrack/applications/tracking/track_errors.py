@@ -94,14 +94,12 @@ class TrackErrors:
         return replace(errors, covariance=own)
 
     def turn_m(self, position_m: Array) -> Array:
-        """(2, k) by which the positions of parameters are turned with the clock, at `position_m` (2,).
+        """(2, k) by which the positions of parameters are turned and scaled with the errors, at `position_m` (2,).
 
-        See `SharedErrors`: in ground that is the same after a turn the parameters hold the position before it.
+        See `SharedErrors`: in a round crater the parameters hold the position before its turn and its scaling.
         """
-        found = np.zeros((2, len(self)))
-        clock = self.listed.clock
-        if self.listed.axisymmetric and clock is not None:
-            at = self.names.index(CLOCK)
-            angle = clock.turn_rad_s[2] * self.sigma[at]
-            found[:, at] = angle * np.array([-position_m[1], position_m[0]])
+        m, small = len(self.listed), 1e-3
+        found, one = np.zeros((2, len(self))), small * np.diag(self.sigma[:m])
+        points = np.tile(position_m, (m, 1))
+        found[:, :m] = (self.listed.turned(points, one) - self.listed.turned(points, -one)).T / (2 * small)
         return found

@@ -21,9 +21,9 @@ from startrack.output.quantity import (
     schema_of,
 )
 from startrack.output.record import FORMATS
-from startrack.terrain import TERRAIN_KEYS
+from startrack.terrain import MAKERS, TERRAIN_KEYS
 
-TERRAIN: Schema = TERRAIN_KEYS.schema() | {"oneOf": [{"required": ["cylinder"]}, {"required": ["dem"]}]}
+TERRAIN: Schema = TERRAIN_KEYS.schema() | {"oneOf": [{"required": [ground]} for ground in MAKERS]}
 REFUSALS = [one.value for one in Reason if one is not Reason.AMBIGUOUS]
 SECTIONS = {
     name: schema_of(QUANTITIES, name, description)

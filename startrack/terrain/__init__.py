@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from startrack.terrain.cylinder import Cylinder
 from startrack.terrain.io import KEYS as TERRAIN_KEYS
-from startrack.terrain.io import body_of_terrain, files_of_terrain, load_terrain, terrain_from_dict
+from startrack.terrain.io import MAKERS, body_of_terrain, files_of_terrain, load_terrain, terrain_from_dict
 from startrack.terrain.protocol import (
     NO_POST,
     ForwardingTerrain,
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from startrack.terrain.state_file import StateableError, state_errors, stateable_errors
 
 __all__ = [
-    "EQUIRECTANGULAR", "NO_POST", "STEREOGRAPHIC", "TERRAIN_KEYS", "Cylinder", "ForwardingTerrain", "HeightMap",
-    "HorizonPosts", "Projection", "Raster", "ShapeError", "StateableError", "Terrain", "body_of_terrain",
+    "EQUIRECTANGULAR", "MAKERS", "NO_POST", "STEREOGRAPHIC", "TERRAIN_KEYS", "Cylinder", "ForwardingTerrain",
+    "HeightMap", "HorizonPosts", "Projection", "Raster", "ShapeError", "StateableError", "Terrain", "body_of_terrain",
     "files_of_terrain", "import_maps", "load_terrain", "read_map", "require_bounds", "require_horizons",
     "require_terrain", "state_errors", "stateable_errors", "terrain_from_dict", "write_bands", "write_map",
 ]  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
@@ -119,8 +120,8 @@ def _load_cached(path: Path, text: str, stamps: tuple[Any, ...]) -> Terrain:
 
 
 def _map_files(keys: dict[str, Any], folder: Path) -> list[Path]:
-    """Paths of the height maps that the keys name."""
-    files = keys["dem"]["file"] if "dem" in keys else ()
+    """Paths of the files that the ground of the keys is read from: those of its key `file`, if it has one."""
+    files = next((keys[ground].get("file", ()) for ground in MAKERS if ground in keys), ())
     return [folder / file for file in ((files,) if isinstance(files, str) else files)]
 
 
@@ -147,16 +148,14 @@ def terrain_from_dict(values: dict[str, Any], default_name: str = "terrain", fol
         longitude_rad=float(np.radians(origin["longitude_deg"])),
         height_m=origin["height_m"],
     )
-    if ("cylinder" in keys) == ("dem" in keys):
-        what = "it has two grounds" if "dem" in keys else "it has no ground"
+    makers = [make for ground, make in MAKERS.items() if ground in keys]
+    if len(makers) != 1:
+        what = "it has two grounds" if makers else "it has no ground"
         raise BadInput("bad_terrain", f"{what}: give a [cylinder] with diameter_m and depth_m, or a [dem] with file")
-    name = keys.get("name", default_name)
-    if "cylinder" in keys:
-        return _make_cylinder(keys, name, site)
-    return _make_height_map(keys, name, site, folder or Path())
+    return makers[0](keys, keys.get("name", default_name), site, folder or Path())
 
 
-def _make_cylinder(keys: dict[str, Any], name: str, site: Site) -> Cylinder:
+def _make_cylinder(keys: dict[str, Any], name: str, site: Site, _: Path) -> Cylinder:
     cylinder, rover = keys["cylinder"], keys["rover"]
     sigmas: dict[str, Any] = {fact.key: cylinder.get(fact.key) for fact in CYLINDER_FACTS}
     if cylinder.get("exact", False):
@@ -206,3 +205,9 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
         most_slope_rad=float(np.radians(search["max_slope_deg"])),
         glare_rad=tuple((float(np.radians(a)), float(np.radians(b))) for a, b in search.get("glare_deg", ())),
     )
+
+
+MAKERS: dict[str, Callable[[dict[str, Any], str, Site, Path], Terrain]] = {  # of each ground, by its table in KEYS
+    "cylinder": _make_cylinder,
+    "dem": _make_height_map,
+}

@@ -13,7 +13,7 @@ from test_calibration_fit import CENTRE_PX, FOCAL_PX, ROUGH, simulate_frames
 
 from startrack.applications.calibration import fit_lens, observations
 from startrack.applications.calibration.shared_errors import FLOOR_PX, birge_ratio, nights, widen_covariance
-from startrack.applications.calibration.verify import SIGNIFICANT_SIGMAS, difference_px
+from startrack.applications.calibration.verify import CHANGED_SIGMAS, difference_px
 from startrack.camera import Camera, cap_grid, projection_covariance_px2
 from startrack.core.types import Array
 from startrack.estimation.joint_fit import JointFit
@@ -66,8 +66,8 @@ def changes_in_sigmas(flex_px: float, *, widened: bool) -> Array:
 def test_with_a_flex_from_night_to_night_the_sigma_of_a_change_is_sound() -> None:
     """The field bends by 0.06 px, as between the nights of the sample photographs."""
     before, after = (changes_in_sigmas(0.06, widened=widened) for widened in (False, True))
-    assert np.mean(before > SIGNIFICANT_SIGMAS) > 0.3
-    assert np.mean(after > SIGNIFICANT_SIGMAS) == 0.0
+    assert np.mean(before > CHANGED_SIGMAS) > 0.3
+    assert np.mean(after > CHANGED_SIGMAS) == 0.0
     assert 0.5 < np.sqrt(np.mean(np.square(after))) < 1.5
 
 

@@ -20,10 +20,10 @@ from startrack.frames import Site, off_axis_rad
 from startrack.terrain import body_of_terrain
 
 TOLERANCE_MAG = 0.9
-BLEND_MAG = 2.0  # a neighbour less than this fainter than the star shifts its centroid
-BLEND_SIGMAS = 3.5  # of the PSF
+BLENDED_MAG = 2.0  # a neighbour less than this fainter than the star shifts its centroid
+BLENDED_SIGMAS = 3.5  # of the PSF
 DEPTH_MAG = 0.5  # stars are predicted to this much below the faintest source
-SCALE_STARS = 4000  # brightest stars used for the zero point
+ZERO_POINT_STARS = 4000  # brightest stars used for the zero point
 MIN_STARS_FOR_SHAPE = 30
 NEAR_CURVE_MAG = 1.2  # stars with a zero point this close to the curve are used in its fit
 CURVE_ROUNDS = 4
@@ -120,16 +120,16 @@ def match_frame(frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: flo
     tree = cKDTree(found.xy_px)
     zero_mag = zero_point(frame, camera, R_cam_icrs, within_rad, gate_px, tree)
     limit = float(source_mag.max()) + DEPTH_MAG
-    faintest_v = limit + BLEND_MAG + float(np.max(zero_mag(np.linspace(0.0, within_rad, 50))))
+    faintest_v = limit + BLENDED_MAG + float(np.max(zero_mag(np.linspace(0.0, within_rad, 50))))
     count = int(np.searchsorted(stars.v_mag, faintest_v))
     px, angle, seen = predict_pixels(frame, camera, R_cam_icrs, within_rad, count)
     star_mag = stars.v_mag[:count] - zero_mag(angle)  # instrumental
-    seen = seen[star_mag[seen] < limit + BLEND_MAG]
+    seen = seen[star_mag[seen] < limit + BLENDED_MAG]
     detection, star, _ = match_by_brightness(
         tree, px, seen, gate_px, star_mag=star_mag, star_sigma_mag=stars.v_sigma_mag[:count],
         detection_mag=source_mag, saturated=found.saturated, limit_mag=limit, tolerance_mag=TOLERANCE_MAG,
     )  # fmt: skip
-    alone = is_isolated(px[star], star, px, seen, stars.v_mag, BLEND_SIGMAS * found.psf_sigma_px, BLEND_MAG)
+    alone = is_isolated(px[star], star, px, seen, stars.v_mag, BLENDED_SIGMAS * found.psf_sigma_px, BLENDED_MAG)
     faintest = float(np.quantile(source_mag[detection], LIMIT_QUANTILE)) if len(detection) else -np.inf
     bright = seen[star_mag[seen] < faintest - SECURE_MAG]
     expected = bright[_is_open_sky(px[bright], found.xy_px[detection], frame.exposure.size_px)]
@@ -173,7 +173,7 @@ def zero_point(
     taken within `gate_px`.
     """
     found, v_mag = frame.sources, frame.sky.stars.v_mag
-    px, angle, seen = predict_pixels(frame, camera, R_cam_icrs, within_rad, SCALE_STARS)
+    px, angle, seen = predict_pixels(frame, camera, R_cam_icrs, within_rad, ZERO_POINT_STARS)
     distance, nearest = tree.query(px[seen], distance_upper_bound=gate_px)
     hit = np.isfinite(distance)
     hit[hit] &= ~found.saturated[nearest[hit]]

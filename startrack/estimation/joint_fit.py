@@ -9,15 +9,15 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.core.types import Array, Ints, NotIdentified
 from startrack.estimation.frame_matching import NO_BRIGHT_STARS, Frame, FrameMatches, match_frame
-from startrack.estimation.lens_fit import MIN_STARS, LensFit, fit_lens
+from startrack.estimation.lens_fit import MIN_LENS_STARS, LensFit, fit_lens
 from startrack.estimation.normal_equations import Observations, observations
 from startrack.frames import off_axis_rad
 
 RING_RAD = np.radians(8.0)  # width of the ring added in each round
 SMALLEST_GROWTH_RAD = np.radians(0.5)
 BRIGHTEST_SOURCES = 1000  # sources used; hot pixels may outnumber the bright stars
-GATES_PX = (6.0, 4.0, 3.0, 2.0)  # the first while the region grows, the others for all stars
-GATE_SIGMAS = 4.5  # of the residuals, for the last gates
+JOINT_GATES_PX = (6.0, 4.0, 3.0, 2.0)  # the first while the region grows, the others for all stars
+LAST_GATE_SIGMAS = 4.5  # of the residuals, for the last gates
 NARROWEST_GATE_PX = 0.8
 GROWTH_ROUNDS = 16
 FINAL_ROUNDS = 8
@@ -56,8 +56,8 @@ def grow_from_matches(
     fit = _fit_matches((frame,), (matched,), camera, R_cam_icrs[None], _coefficients(known, len(matched)))
     for _ in range(GROWTH_ROUNDS):
         within = known + RING_RAD
-        matched = match_frame(frame, fit.camera, fit.R_cam_icrs[0], within, GATES_PX[0])
-        if len(matched) < MIN_STARS:
+        matched = match_frame(frame, fit.camera, fit.R_cam_icrs[0], within, JOINT_GATES_PX[0])
+        if len(matched) < MIN_LENS_STARS:
             break
         fit = _fit_matches((frame,), (matched,), fit.camera, fit.R_cam_icrs, _coefficients(within, len(matched)))
         reached = fit.camera.calibrated_angle_rad
@@ -72,7 +72,7 @@ def fit_frames(frames: tuple[Frame, ...], camera: Camera, R_cam_icrs: Array) -> 
 
     `R_cam_icrs` (frames, 3, 3) and the camera must be right within a few pixels where stars were matched.
     """
-    before, gates_px, gate_px = 0, GATES_PX[1:], 0.0
+    before, gates_px, gate_px = 0, JOINT_GATES_PX[1:], 0.0
     for k in range(FINAL_ROUNDS):
         first = k < len(gates_px)
         gate_px = gates_px[k] if first else gate_px
@@ -86,7 +86,7 @@ def fit_frames(frames: tuple[Frame, ...], camera: Camera, R_cam_icrs: Array) -> 
         if k > len(gates_px) and abs(total - before) <= SETTLED_FRACTION * total:
             break
         before = total
-        gate_px = float(np.clip(GATE_SIGMAS * fit.rms_px / np.sqrt(2.0), NARROWEST_GATE_PX, gates_px[-1]))
+        gate_px = float(np.clip(LAST_GATE_SIGMAS * fit.rms_px / np.sqrt(2.0), NARROWEST_GATE_PX, gates_px[-1]))
     return JointFit(frames=frames, matches=matches, points=_points(frames, matches), fit=fit, gate_px=gate_px)
 
 

@@ -36,13 +36,13 @@ from startrack.estimation.lens_models import (
 from startrack.estimation.normal_equations import Observations
 from startrack.frames import off_axis_rad
 
-MIN_STARS = 12
-OUTLIER_CHI2 = 20.0  # two axes: rejects one good star in 20,000
+MIN_LENS_STARS = 12
+WRONG_MATCH_CHI2 = 20.0  # two axes: rejects one good star in 20,000
 CAUCHY_CHI2 = 5.0  # chi-square at which the robust loss has halved a star's weight
 ROBUST = Scheme(loss=cauchy_loss(CAUCHY_CHI2), settled_px=2e-3)  # this fit only separates wrong matches from right ones
 ROBUST_ROUNDS = 4
 FIRST_SIGMA_PX = 1.0
-SCATTER_SIGMAS = 3.0  # deviation of chi-square above which the stated centroid errors are scaled
+SCATTER_SIGMAS = 3.0  # deviation of a chi-square up to which it is chance
 MIN_BEYOND, FRACTION_BEYOND = 3, 0.01  # stars at the calibrated angle or farther off the axis
 WIDEST_GAP_RAD = np.radians(8.0)
 
@@ -91,14 +91,16 @@ def fit_state(
     state: CameraState, points: Observations, *, coefficients: int | None = None, square: bool = False
 ) -> LensFit:
     """The same as fit_lens, from a state; that of boards has positions beside the attitudes."""
-    if len(points) < MIN_STARS:
-        raise NotIdentified(f"{len(points)} matched stars cannot determine a lens: at least {MIN_STARS} are needed")
+    if len(points) < MIN_LENS_STARS:
+        raise NotIdentified(
+            f"{len(points)} matched stars cannot determine a lens: at least {MIN_LENS_STARS} are needed"
+        )
     for _ in range(2):
         robust, extra_px2 = _fit_robustly(state, points, coefficients)
         inverse = inverse_covariance(points.covariance_px2, extra_px2)
-        used = chi_square(robust.residual_px, inverse) < OUTLIER_CHI2
+        used = chi_square(robust.residual_px, inverse) < WRONG_MATCH_CHI2
         good = points.take(used)
-        if len(good) < MIN_STARS:
+        if len(good) < MIN_LENS_STARS:
             raise NotIdentified(f"only {len(good)} of {len(points)} matched stars agree on a lens", matched=len(good))
         model, best, candidates = best_model(robust.state, good, extra_px2, coefficients, square)
         if extensions_of(best.state.camera) == extensions_of(state.camera):
@@ -126,7 +128,7 @@ def _finish(
     dof = max(2 * len(good) - best.parameters, 1)
     stated = inverse_covariance(good.covariance_px2, SMALLEST_EXTRA_PX2)
     chi2 = float(np.sum(chi_square(best.residual_px, stated)))
-    believed = chi2 < dof + SCATTER_SIGMAS * np.sqrt(2.0 * dof)
+    believed = is_chance(chi2, dof)
     extra_px2 = (
         0.0 if believed else extra_variance_px2(best.residual_px, good.covariance_px2, best.parameters, by_sum=True)
     )
@@ -151,6 +153,11 @@ def _finish(
         chi2_per_dof=chi2 / dof,
         candidates=candidates,
     )
+
+
+def is_chance(chi2: float, freedom: int) -> bool:
+    """Whether a chi-square exceeds its degrees of freedom by no more than chance makes it."""
+    return bool(chi2 < freedom + SCATTER_SIGMAS * np.sqrt(2.0 * freedom))
 
 
 def calibrated_radius_rad(off_axis_rad: Array) -> float:

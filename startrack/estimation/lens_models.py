@@ -12,7 +12,7 @@ from startrack.estimation.adjust import SQUARES, CameraState, Scheme, Solution, 
 from startrack.estimation.normal_equations import Observations
 from startrack.frames import off_axis_rad
 
-FOLDS = 10
+LENS_FOLDS = 10
 EQUALLY_GOOD_CHI2 = 4.0  # up to this difference the longer polynomial is chosen: its covariance is valid up to the edge
 RISES_BEYOND_1 = 1.1  # of the outermost star's angle: the polynomial must increase up to there
 NARROW_RAD = np.radians(30.0)
@@ -24,7 +24,7 @@ def assign_folds(points: Observations, angle_rad: Array) -> Ints:
     """Fold (n,) of each observation: every image and every ring is divided evenly among the folds."""
     order = np.lexsort((angle_rad, points.image))
     fold = np.empty(len(points), dtype=np.int64)
-    fold[order] = np.arange(len(points)) % FOLDS
+    fold[order] = np.arange(len(points)) % LENS_FOLDS
     return fold
 
 
@@ -34,7 +34,7 @@ def held_out_residual_px(solution: Solution, fold: Ints) -> Array:
     One Gauss-Newton step from the solution with all observations: there the fit is nearly linear.
     """
     terms, out = solution.terms, np.array(solution.residual_px)
-    for k in range(FOLDS):
+    for k in range(LENS_FOLDS):
         held = np.flatnonzero(fold == k)
         if not len(held):
             continue

@@ -37,12 +37,11 @@ def measure_photometry(joint: JointFit, known: KnownSensor) -> Photometry:
     throughput = fit.throughput
     notes = list(fit.warnings)
     bias = known.bias_adu if known.bias_adu is not None else properties.bias_adu
-    gain = known.gain_e_per_adu
-    if gain is None and properties.transfer is not None:
-        gain = properties.transfer.gain_e_per_adu
-    noise = known.read_noise_e
-    if noise is None and properties.transfer is not None and bias is not None:
-        noise = properties.transfer.read_noise_e(bias)
+    gain, noise, transfer = known.gain_e_per_adu, known.read_noise_e, properties.transfer
+    if gain is None and transfer is not None:
+        gain = transfer.gain_e_per_adu
+    if noise is None and transfer is not None and bias is not None:
+        noise = transfer.read_noise_e(bias)
     if gain is None:
         notes.append("gain: not measured; give two pictures of equal exposure with bright and dark parts of sky, or "
                      "--gain")  # fmt: skip

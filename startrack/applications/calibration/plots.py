@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from startrack.applications.calibration.acceptance import star_coverage
-from startrack.applications.calibration.record import projection_by_angle
+from startrack.applications.calibration.record import cone_rays, projection_by_angle
 from startrack.applications.calibration.run import Calibration
 from startrack.camera import Camera
 from startrack.core.types import Array
@@ -17,11 +17,10 @@ from startrack.core.types import Array
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-INK, GOOD, BAD, LINE = "#1b2430", "#0072b2", "#d55e00", "#009e73"
+DARK, GOOD, BAD, LINE = "#1b2430", "#0072b2", "#d55e00", "#009e73"
 ARROW_FRACTION = 0.02  # of the frame's width: length of an arrow of the RMS residual
 MAP_SIDE = 160
 MAX_ARROWS = 1000  # more overlap
-CIRCLE_RAD = np.linspace(0.0, 2 * np.pi, 181)
 
 
 def report_png(calibration: Calibration) -> bytes:
@@ -47,11 +46,7 @@ def _draw_frame(axes: Axes, camera: Camera) -> None:
         (camera.calibrated_angle_rad, "-", f"calibrated to {np.degrees(camera.calibrated_angle_rad):.1f}°"),
         (camera.max_angle_rad, ":", f"image circle {np.degrees(camera.max_angle_rad):.1f}°"),
     ):
-        rays = np.stack(
-            [np.sin(angle) * np.cos(CIRCLE_RAD), np.sin(angle) * np.sin(CIRCLE_RAD), np.full(181, np.cos(angle))],
-            axis=1,
-        )
-        px, _ = camera.project(rays * (1 - 1e-12))
+        px, _ = camera.project(cone_rays(np.array(angle), np.linspace(0.0, 2 * np.pi, 181)))
         axes.plot(px[:, 0], px[:, 1], style, color=LINE, linewidth=1.2, label=label)
     axes.legend(loc="lower right", fontsize=8, framealpha=0.9)
 
@@ -86,7 +81,7 @@ def _draw_by_angle(axes: Axes, calibration: Calibration) -> None:
     sigma = projection_by_angle(camera, grid)[2]
     for sign in (-1, 1):
         label = "3 map sigma" if sign > 0 else None
-        axes.plot(np.degrees(grid), sign * 3 * sigma, color=INK, linewidth=1.2, label=label)
+        axes.plot(np.degrees(grid), sign * 3 * sigma, color=DARK, linewidth=1.2, label=label)
     axes.axvline(float(np.degrees(camera.calibrated_angle_rad)), color=LINE, linewidth=1.2)
     top = 4.0 * max(fit.held_out_rms_px, 1e-3)
     axes.set(ylim=(-top, top), xlabel="angle off the axis, degrees", ylabel="held-out residual px")
@@ -108,17 +103,16 @@ def _draw_sigma(axes: Axes, camera: Camera) -> None:
 
 def _draw_sectors(axes: Axes, calibration: Calibration) -> None:
     cover = star_coverage(calibration.joint)
-    by_sector = cover.rms_px
-    drawn = axes.imshow(np.ma.masked_invalid(by_sector), cmap="magma", aspect="auto", vmin=0.0)
+    drawn = axes.imshow(np.ma.masked_invalid(cover.rms_px), cmap="magma", aspect="auto", vmin=0.0)
     axes.figure.colorbar(drawn, ax=axes, shrink=0.85, label="held-out RMS px")
-    dark = np.nanmax(by_sector) * 0.5 if np.isfinite(by_sector).any() else 0.0
-    for ring, row in enumerate(by_sector):
+    dark = np.nanmax(cover.rms_px) * 0.5 if np.isfinite(cover.rms_px).any() else 0.0
+    for ring, row in enumerate(cover.rms_px):
         for sector, value in enumerate(row):
             text = f"{value:.2f}\n{cover.stars[ring, sector]:.0f} stars" if np.isfinite(value) else "no star"
             colour = "white" if np.isfinite(value) and value < dark else "black"
             axes.text(sector, ring, text, ha="center", va="center", fontsize=8, color=colour)
     edges = np.degrees(cover.ring_edges_rad)
-    rings, sectors = by_sector.shape
+    rings, sectors = cover.rms_px.shape
     axes.set_xticks(range(sectors), [f"{360 * k // sectors}°" for k in range(sectors)])
     axes.set_yticks(range(rings), [f"{a:.0f}–{b:.0f}°" for a, b in pairwise(edges)])
     axes.set(xlabel="sector, from image right, clockwise", ylabel="ring")

@@ -16,7 +16,7 @@ from startrack.core.errors import Reason
 from startrack.core.types import Array
 from startrack.frames import format_utc, quat_xyzw_from_R
 
-FORMAT = "startrack.calibration/1"
+CALIBRATION_FORMAT = "startrack.calibration/1"
 REFRACTION_REMOVED = "taken out"
 MAP_ANGLES = 10
 
@@ -76,7 +76,7 @@ def board_dict(found: BoardCalibration) -> dict[str, Any]:
 def _outcome(found: Checked, camera: Camera) -> dict[str, Any]:
     failed = found.failed_checks
     return {
-        "format": FORMAT,
+        "format": CALIBRATION_FORMAT,
         "status": "refused" if failed else "ok",
         "reason": failed[0].reason if failed else None,
         "message": found.message,
@@ -94,7 +94,7 @@ def _gates(found: Checked) -> list[dict[str, Any]]:
 def refusal_dict(reason: str, text: str, refused: tuple[RefusedImage, ...] = ()) -> dict[str, Any]:
     """The JSON object of a calibration without a lens."""
     return {
-        "format": FORMAT,
+        "format": CALIBRATION_FORMAT,
         "status": "refused",
         "reason": reason,
         "message": text,
@@ -177,18 +177,16 @@ def projection_by_angle(camera: Camera, angle_rad: Array) -> tuple[Array, Array,
 
     Sigma is the RMS over eight directions.
     """
-    around = np.linspace(0.0, 2 * np.pi, 8, endpoint=False)
-    rays = np.stack(
-        [
-            np.sin(angle_rad)[:, None] * np.cos(around),
-            np.sin(angle_rad)[:, None] * np.sin(around),
-            np.cos(angle_rad)[:, None] * np.ones_like(around),
-        ],
-        axis=-1,
-    )
+    rays = cone_rays(angle_rad[:, None], np.linspace(0.0, 2 * np.pi, 8, endpoint=False))
     sigma = np.sqrt(np.mean(np.square(camera.projection_sigma_px(rays)), axis=1))
     radius = np.sqrt(np.prod(camera.focal_px)) * camera.lens.rho(angle_rad)
     return radius, np.degrees(camera.mean_scale_rad_per_px(np.maximum(angle_rad, 1e-6))) * 60.0, sigma
+
+
+def cone_rays(angle_rad: Array, around_rad: Array) -> Array:
+    """Rays (..., 3) at angles off the axis and directions around it, clockwise from image right."""
+    x, y, z = np.sin(angle_rad) * np.cos(around_rad), np.sin(angle_rad) * np.sin(around_rad), np.cos(angle_rad)
+    return np.stack(np.broadcast_arrays(x, y, z), axis=-1)
 
 
 def camera_summary(camera: Camera) -> str:

@@ -20,8 +20,8 @@ from startrack.estimation.joint_fit import JointFit
 from startrack.psf import pixel_profile, stamp_radius
 
 DARK_BEYOND_1 = 1.06  # of the image circle's radius: the sensor is dark beyond
-SAMPLE = 4  # every so many rows and columns
-MIN_DARK_SAMPLES = 250
+EVERY_PX = 4  # every so many rows and columns
+MIN_DARK_EVERY_PXS = 250
 LARGEST_DARK_SPREAD_1 = 0.2  # of the levels of the dark corners, over their difference from the sky
 MIN_SATURATED_PIXELS = 12
 STILL_PX = 0.3
@@ -107,19 +107,19 @@ def _dark_level(exposures: list[Exposure], camera: Camera) -> float | None:
     """
     width, height = camera.size_px
     x, y = np.meshgrid(
-        (np.arange(0, width, SAMPLE) - camera.centre_px[0]) / camera.focal_px[0],
-        (np.arange(0, height, SAMPLE) - camera.centre_px[1]) / camera.focal_px[1],
+        (np.arange(0, width, EVERY_PX) - camera.centre_px[0]) / camera.focal_px[0],
+        (np.arange(0, height, EVERY_PX) - camera.centre_px[1]) / camera.focal_px[1],
     )
     rim = float(camera.lens.rho(np.array(camera.max_angle_rad)))
     dark, lit = np.hypot(x, y) > DARK_BEYOND_1 * rim, np.hypot(x, y) < 0.8 * rim
-    if np.count_nonzero(dark) < MIN_DARK_SAMPLES:
+    if np.count_nonzero(dark) < MIN_DARK_EVERY_PXS:
         return None
     corners = [dark & (right == (x > 0)) & (below == (y > 0)) for right in (True, False) for below in (True, False)]
     levels = []
     for exposure in exposures:
-        p = exposure.pixels_adu[::SAMPLE, ::SAMPLE]
+        p = exposure.pixels_adu[::EVERY_PX, ::EVERY_PX]
         level, sky = float(np.median(p[dark])), float(np.median(p[lit]))
-        in_corners = [float(np.median(p[corner])) for corner in corners if corner.sum() > MIN_DARK_SAMPLES // 5]
+        in_corners = [float(np.median(p[corner])) for corner in corners if corner.sum() > MIN_DARK_EVERY_PXS // 5]
         if max(in_corners) - min(in_corners) < LARGEST_DARK_SPREAD_1 * (sky - level):
             levels.append(level)
     return min(levels) if levels else None

@@ -17,14 +17,13 @@ from startrack.camera import cap_grid, projection_covariance_px2
 from startrack.core.types import Ints
 from startrack.estimation.adjust import SMALLEST_EXTRA_PX2, inverse_covariance
 from startrack.estimation.joint_fit import JointFit
-from startrack.estimation.lens_fit import LensFit
+from startrack.estimation.lens_fit import LensFit, is_chance
 from startrack.estimation.normal_equations import Observations
 
 # RMS of the projection, per calibration. All-sky camera of the Lowell Discovery Telescope, nights of 2018-06-29 and
 # 2018-08-06, each calibrated alone: within 80 degrees the projections differ by 0.063 px; the stars explain 0.021 px.
 FLOOR_PX = 0.04
 MIN_REGION_STARS = 3
-CHANCE_SIGMAS = 3.0  # excess of the chi-square of the regions up to which it is chance
 NIGHT_GAP = timedelta(hours=6)  # between exposures of different nights
 
 
@@ -58,7 +57,7 @@ def birge_ratio(fit: LensFit, points: Observations, groups: Ints) -> float:
     chi2 = float(np.einsum("ci,cij,cj->", weighted[enough], np.linalg.inv(weight[enough]), weighted[enough]))
     fitted = len(fit.camera.covariance_order) + 3 * len(np.unique(groups))
     freedom = 2 * int(enough.sum()) - fitted
-    if freedom < 1 or chi2 < freedom + CHANCE_SIGMAS * np.sqrt(2.0 * freedom):
+    if freedom < 1 or is_chance(chi2, freedom):
         return 1.0
     return float(np.sqrt(chi2 / freedom))
 

@@ -17,8 +17,8 @@ from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Ints
 from startrack.estimation.joint_fit import JointFit
 
-MIN_STARS = 30
-BRIGHT_SNR = 10.0
+MIN_THROUGHPUT_STARS = 30
+MIN_FLUX_SNR = 10.0
 LOSS_MAG = 0.2  # residual beyond which a star's influence is constant
 PHOTOMETRY_MAG = 0.05  # error of a star's magnitude beyond catalogue and noise
 LARGEST_TERM_SIGMA_MAG = 0.03  # per airmass, or per B-V: a term with a larger sigma is left out
@@ -28,7 +28,7 @@ THROUGHPUT_1 = (MIN_THROUGHPUT_1, 1.1)  # relative to the axis, up to the calibr
 EXTINCTION_MAG = (0.0, 1.5)  # per airmass; 0.1 to 0.5 in clear air
 COLOUR_MAG = (-1.0, 1.0)  # per B-V
 AT_BOUND_1 = 1e-3  # of the range of a term
-FOLDS = 5
+HELD_OUT_PARTS = 5
 LARGEST_HELD_OUT_MAG = 0.4  # median scatter of held-out stars
 LARGEST_HELD_OUT_RATIO = 1.5  # of held-out scatter to that of the fit
 LARGEST_IMAGE_OFFSET_MAG = 0.15  # of an image's zero point from the common one: clouds, or twilight
@@ -92,7 +92,7 @@ def measure_throughput(joint: JointFit, flux_ratio: float = 1.0) -> ThroughputFi
     `flux_ratio`: by which the detector's fluxes are multiplied (its PSF is not quite each star's own).
     """
     stars = _star_fluxes(joint)
-    if stars is None or len(stars.gain_mag) < MIN_STARS:
+    if stars is None or len(stars.gain_mag) < MIN_THROUGHPUT_STARS:
         return ThroughputFit(None, (
             "zero point: not measured; the images must state their exposure time (EXPTIME, exposure_s), and 30 "
             "unsaturated stars are needed",
@@ -161,13 +161,13 @@ def _held_out_mag(stars: StarFluxes, terms: list[str], edge_rad: float) -> Array
     images = len(np.unique(stars.image))
     order = np.argsort(stars.angle_rad, kind="stable")
     fold = np.empty(len(order), dtype=np.int64)
-    fold[order] = np.arange(len(order)) % FOLDS
+    fold[order] = np.arange(len(order)) % HELD_OUT_PARTS
     fold = stars.image if images > 1 else fold
     residual = np.empty(len(fold))
     for k in np.unique(fold):
         held = fold == k
         rest = stars.take(~held)
-        if len(rest.gain_mag) < MIN_STARS:
+        if len(rest.gain_mag) < MIN_THROUGHPUT_STARS:
             rest = stars
         residual[held] = (stars.gain_mag - _model(stars, _fit(rest, terms, edge_rad).values, edge_rad))[held]
     return residual
@@ -185,7 +185,7 @@ def _star_fluxes(joint: JointFit) -> StarFluxes | None:
         d, s = matched.detection[used], matched.star[used]
         found, sky = frame.sources, frame.sky
         angle = joint.fit.camera.angle_rad(found.xy_px[d])
-        good = (found.snr[d] > BRIGHT_SNR) & ~found.saturated[d] & (angle < calibrated) & np.isfinite(sky.b_v[s])
+        good = (found.snr[d] > MIN_FLUX_SNR) & ~found.saturated[d] & (angle < calibrated) & np.isfinite(sky.b_v[s])
         if sky.elevation_rad is not None:
             good &= sky.elevation_rad[s] > LOWEST_ELEVATION_RAD
         d, s, angle = d[good], s[good], angle[good]

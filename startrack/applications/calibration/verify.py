@@ -17,7 +17,7 @@ from startrack.estimation.joint_fit import fit_frames, grow_from_matches
 from startrack.frames import Site
 
 ALLOWED_PX = 0.3  # acceptable RMS change of the projection: a tenth of it propagates to the position
-SIGNIFICANT_SIGMAS = 3.0
+CHANGED_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,7 @@ class Verification:
     @property
     def is_valid(self) -> bool:
         """Whether the file can still be used."""
-        return self.change_px <= max(ALLOWED_PX, SIGNIFICANT_SIGMAS * self.change_sigma_px)
+        return self.change_px <= max(ALLOWED_PX, CHANGED_SIGMAS * self.change_sigma_px)
 
     @property
     def message(self) -> str:

@@ -1,4 +1,7 @@
-"""The image along columns of constant azimuth: stars and saturated pixels taken out, and means along and across."""
+"""The image along columns of constant azimuth, on the grid of azimuths and elevations of the skyline.
+
+Stars and saturated pixels are taken out. Means are taken along and across the columns.
+"""
 
 from __future__ import annotations
 
@@ -9,19 +12,38 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.applications.horizon.grid import COLUMNS, LOWEST_RAD, column_azimuths_rad
 from startrack.camera import Camera
-from startrack.core.types import Array, Bools, Detections
+from startrack.core.types import Array, Detections, Ints
 from startrack.frames import off_axis_rad, rays_from_azel
 
+SKYLINE_AZIMUTHS = 360  # of the result, one degree each
+COLUMNS_PER_AZIMUTH = 4
+AZIMUTH_COLUMNS = SKYLINE_AZIMUTHS * COLUMNS_PER_AZIMUTH
+LOWEST_RAD, GRID_STEP_RAD = np.radians(-5.0), np.radians(0.02)  # of the grid of elevations
 TOP_RAD = np.radians(67.0)  # of the columns
 SAMPLES_PER_PX = 3
 FINEST_PX_RAD = np.radians(0.06)  # pixels of narrow fields are taken as larger ones
 SIDE_SAMPLES = 3  # across a column
 FILL_COLUMNS, FILL_SHARE = 21, 0.1  # around a star, and how many of them without a star are enough
-LARGE_AREA_PX, GLARE_PX = 500, 40  # of the Moon and what surrounds it
+LARGE_AREA_PX, MOON_GLARE_PX = 500, 40  # of the Moon and what surrounds it
 SATURATED_PX = 5  # around saturated pixels nothing is measured
 HOT_SIGMAS = 6.0  # above the median of the neighbours: stars and hot pixels
+
+
+def elevations_rad() -> Array:
+    """Elevations (n,) of the grid, ascending."""
+    return np.asarray(np.arange(LOWEST_RAD, (np.pi + GRID_STEP_RAD) / 2, GRID_STEP_RAD))
+
+
+def column_azimuths_rad() -> Array:
+    """Azimuths (AZIMUTH_COLUMNS,) of the columns' middles; four lie evenly about each degree."""
+    return np.asarray((np.arange(AZIMUTH_COLUMNS) + 0.5 - COLUMNS_PER_AZIMUTH / 2) * (2 * np.pi / AZIMUTH_COLUMNS))
+
+
+def column_of(azimuth_rad: Array) -> Ints:
+    """The column (n,) that each azimuth (n,) lies in."""
+    column = np.floor(azimuth_rad * (AZIMUTH_COLUMNS / (2 * np.pi)) + COLUMNS_PER_AZIMUTH / 2)
+    return np.asarray(column, dtype=np.int64) % AZIMUTH_COLUMNS
 
 
 @dataclass(frozen=True)
@@ -44,22 +66,25 @@ class Columns:
 
 
 def sample_columns(
-    image_e: NDArray[np.float32], noise_e: NDArray[np.float32], lost: NDArray[np.uint8],
-    stars: tuple[Array, Array], camera: Camera, R_cam_enu: Array,
+    detections: Detections, stars: tuple[Array, Array], camera: Camera, R_cam_enu: Array
 ) -> Columns:  # fmt: skip
-    """An image (H, W) along columns of azimuth, `stars` (pixels (m, 2), radii (m,)) replaced by their surroundings.
+    """The image of `detections` along columns of azimuth; masked pixels and those near saturated ones are left out.
 
-    Nothing is measured at the pixels `lost` (H, W), as `lost_pixels` gives them.
+    `stars` (pixels (m, 2), radii (m,)), fainter ones and hot pixels are replaced by their surroundings.
     """
+    noise_e, lost = detections.noise_e, _lost_pixels(detections)
+    smooth = cv2.medianBlur(detections.image_e, 3)
+    stands_out = np.abs(detections.image_e - smooth) > HOT_SIGMAS * noise_e
+    image_e = np.where(stands_out, smooth, detections.image_e).astype(np.float32)
     px_rad = _px_rad(camera, R_cam_enu)
     elevation = np.arange(LOWEST_RAD, TOP_RAD, px_rad / SAMPLES_PER_PX)
-    disks = np.zeros(image_e.shape, np.uint8)
+    disks = np.zeros_like(lost)
     for (i, j), radius in zip(np.rint(stars[0]).astype(int).tolist(), stars[1], strict=True):
         cv2.circle(disks, (i, j), round(radius), 1, -1)
-    shape = len(elevation), COLUMNS
+    shape = len(elevation), AZIMUTH_COLUMNS
     total, spread, points = np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=bool)
     for k in range(SIDE_SAMPLES):
-        azimuth = column_azimuths_rad() + ((k + 0.5) / SIDE_SAMPLES - 0.5) * 2 * np.pi / COLUMNS
+        azimuth = column_azimuths_rad() + ((k + 0.5) / SIDE_SAMPLES - 0.5) * 2 * np.pi / AZIMUTH_COLUMNS
         xy, inside = camera.project(rays_from_azel(azimuth[None, :], elevation[:, None]) @ R_cam_enu.T)
         x, y = (np.ascontiguousarray(xy[..., axis], dtype=np.float32) for axis in (0, 1))
         hidden = ~inside | (cv2.remap(lost, x, y, cv2.INTER_NEAREST) > 0)
@@ -67,23 +92,20 @@ def sample_columns(
         spread += cv2.remap(noise_e, x, y, cv2.INTER_NEAREST)
         points |= cv2.remap(disks, x, y, cv2.INTER_NEAREST) > 0
     columns = Columns(elevation, total / SIDE_SAMPLES, spread / SIDE_SAMPLES, px_rad / SAMPLES_PER_PX, px_rad)
-    return _fill_points(columns, points)
+    without = replace(columns, light_e=np.where(points, np.nan, columns.light_e))
+    around = average_columns(without, FILL_COLUMNS, FILL_SHARE).light_e
+    return replace(columns, light_e=np.where(points, around, columns.light_e))
 
 
-def lost_pixels(detections: Detections) -> NDArray[np.uint8]:
+def _lost_pixels(detections: Detections) -> NDArray[np.uint8]:
     """Pixels (H, W) that are masked, or near saturated ones; nearer ones of a lamp or a star than of the Moon."""
-    if detections.mask is None:
-        return _around_saturated(detections.dead)
-    masked = detections.mask.masked
-    return _around_saturated(detections.dead & ~masked) | masked.view(np.uint8)
-
-
-def _around_saturated(dead: Bools) -> NDArray[np.uint8]:
-    count, label, facts, _ = cv2.connectedComponentsWithStats(dead.astype(np.uint8))
+    masked = np.zeros_like(detections.dead) if detections.mask is None else detections.mask.masked
+    saturated = detections.dead & ~masked
+    count, label, facts, _ = cv2.connectedComponentsWithStats(saturated.astype(np.uint8))
     large = np.isin(label, 1 + np.flatnonzero(facts[1:count, cv2.CC_STAT_AREA] > LARGE_AREA_PX))
     around = [cv2.dilate(part.astype(np.uint8), np.ones((2 * px + 1,) * 2, np.uint8))
-              for part, px in ((dead, SATURATED_PX), (large, GLARE_PX))]  # fmt: skip
-    return np.asarray(np.maximum(*around), dtype=np.uint8)
+              for part, px in ((saturated, SATURATED_PX), (large, MOON_GLARE_PX))]  # fmt: skip
+    return np.asarray(np.maximum(*around) | masked.view(np.uint8), dtype=np.uint8)
 
 
 def _px_rad(camera: Camera, R_cam_enu: Array) -> float:
@@ -95,12 +117,6 @@ def _px_rad(camera: Camera, R_cam_enu: Array) -> float:
     return max(float(px_rad), FINEST_PX_RAD)
 
 
-def remove_points(image_e: NDArray[np.float32], noise_e: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The image (H, W) with stars and hot pixels replaced by the median of their neighbours."""
-    smooth = cv2.medianBlur(image_e, 3)
-    return np.where(np.abs(image_e - smooth) > HOT_SIGMAS * noise_e, smooth, image_e).astype(np.float32)
-
-
 def average_columns(columns: Columns, width: int, least: float = 0.49) -> Columns:
     """Running means over an odd number of columns, of which at least the share `least` must be in view."""
     from scipy.ndimage import uniform_filter1d
@@ -110,13 +126,6 @@ def average_columns(columns: Columns, width: int, least: float = 0.49) -> Column
     share = uniform_filter1d(known.astype(float), width, axis=1, mode="wrap")
     light = np.where(share > least, total / np.maximum(share, 1e-9), np.nan)
     return replace(columns, light_e=light)
-
-
-def _fill_points(columns: Columns, points: Bools) -> Columns:
-    """The columns with stars, the samples `points` (k, columns), replaced by the mean of their neighbours."""
-    without = replace(columns, light_e=np.where(points, np.nan, columns.light_e))
-    around = average_columns(without, FILL_COLUMNS, FILL_SHARE).light_e
-    return replace(columns, light_e=np.where(points, around, columns.light_e))
 
 
 def mean_above(columns: Columns, low_px: float, high_px: float) -> Array:

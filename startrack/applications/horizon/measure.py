@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.applications.horizon.columns import lost_pixels
+from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, COLUMNS_PER_AZIMUTH, SKYLINE_AZIMUTHS
 from startrack.applications.horizon.frames import LeftOut, SkyFrame, orient_frames
-from startrack.applications.horizon.grid import BINS, COLUMNS, COLUMNS_PER_BIN
 from startrack.applications.horizon.posterior import (
     Marginals,
     column_log_prior,
@@ -25,7 +24,6 @@ from startrack.core.errors import NoSolution
 from startrack.core.types import Array, Bools, Exposure, MeasuredSkyline
 from startrack.frames import Site, off_axis_rad, rays_from_azel
 
-BEYOND_CIRCLE_RAD = np.radians(4.5)  # the edge of the image circle is stated to some degrees; light is followed so far
 WIDTHS = ((1, 0.6), (7, 0.3), (21, 0.2))  # columns averaged, and weight: they share their pixels with their neighbours
 UNKNOWN_SIGMA_RAD = np.radians(2.0)  # a wider posterior is no measurement
 PLACE_SIGMA_RAD = np.radians(0.04)  # a quarter of a usual pixel: the edge's place depends on how the ground is lit
@@ -77,7 +75,8 @@ def measure_frames(frames: tuple[SkyFrame, ...], left_out: tuple[LeftOut, ...], 
         first = left_out[0]
         raise NoSolution(f"{first.name}: {first.message}", reason=first.reason)
     stars = [measure_stars(frame) for frame in frames]
-    steps = [_steps_of(frame, light) for frame, light in zip(frames, stars, strict=True)]
+    widths = tuple(width for width, _ in WIDTHS)
+    steps = [find_steps(frame, light, widths) for frame, light in zip(frames, stars, strict=True)]
     total = column_log_prior()
     for light, by_width in zip(stars, steps, strict=True):
         total = total + star_log_likelihood(light.rays, light.missing, light.spurious)
@@ -87,39 +86,25 @@ def measure_frames(frames: tuple[SkyFrame, ...], left_out: tuple[LeftOut, ...], 
     return SkylineResult(_skyline(marginals, frames, stars, steps, site), frames, left_out)
 
 
-def _steps_of(frame: SkyFrame, light: StarLight) -> list[Steps]:
-    found = frame.detections
-    edge = min(frame.camera.max_angle_rad + BEYOND_CIRCLE_RAD, frame.camera.lens.max_invertible_rad)
-    camera = replace(frame.camera, max_angle_rad=edge)
-    widths = tuple(width for width, _ in WIDTHS)
-    return find_steps(
-        found.image_e,
-        found.noise_e,
-        lost_pixels(found),
-        camera,
-        frame.R_cam_enu,
-        widths=widths,
-        stars_px=light.bright_px,
-        glare_px=light.glare_px,
-    )
-
-
 def _skyline(
     marginals: Marginals, frames: Sequence[SkyFrame], stars: Sequence[StarLight], steps: Sequence[list[Steps]],
     site: Site,
 ) -> MeasuredSkyline:  # fmt: skip
     """The columns' posterior as bins of one degree; the errors that the frames share are added once."""
-    columns = marginals.mean_rad.reshape(BINS, COLUMNS_PER_BIN)
-    azimuth = np.radians(np.arange(BINS, dtype=np.float64) * (360.0 / BINS))
+    columns = marginals.mean_rad.reshape(SKYLINE_AZIMUTHS, COLUMNS_PER_AZIMUTH)
+    azimuth = np.radians(np.arange(SKYLINE_AZIMUTHS, dtype=np.float64) * (360.0 / SKYLINE_AZIMUTHS))
     elevation = columns.mean(axis=1)
-    scatter = np.mean(np.square(marginals.sigma_rad.reshape(BINS, COLUMNS_PER_BIN)), axis=1)
-    variation = _neighbourhood_variance(marginals.mean_rad)
+    scatter = np.mean(np.square(marginals.sigma_rad.reshape(SKYLINE_AZIMUTHS, COLUMNS_PER_AZIMUTH)), axis=1)
+    half = COLUMNS_PER_AZIMUTH // 2
+    variation = _by_bin(marginals.mean_rad, half).var(axis=1)  # within one degree to either side
     shared = np.square(_common_sigma_rad(frames, azimuth, elevation, site)) + PLACE_SIGMA_RAD**2
     shared += np.square(_gap_depth(steps, marginals.mean_rad))
     by_stars, by_light = _has_star(stars, azimuth, elevation), _has_step(steps, marginals.mean_rad)
     known = (scatter + variation + shared < UNKNOWN_SIGMA_RAD**2) & (by_stars | by_light)
-    known = _beside_known_bins(known)
-    variance = scatter / COLUMNS_PER_BIN + np.square(variation) / (variation + WALL_RAD**2) + shared
+    # A shorter run than three is a halo or a reflection more often than ground, and beside an unknown bin the ground
+    # often rises.
+    known &= np.roll(known, 1) & np.roll(known, -1)
+    variance = scatter / COLUMNS_PER_AZIMUTH + np.square(variation) / (variation + WALL_RAD**2) + shared
     source = np.select([by_stars & by_light, by_light, by_stars], ["both", "sky light", "stars"], "")
     return MeasuredSkyline(
         azimuth_rad=azimuth,
@@ -129,32 +114,23 @@ def _skyline(
     )
 
 
-def _beside_known_bins(known: Bools) -> Bools:
-    """The known bins (n,) with known neighbours.
-
-    A shorter run is a halo or a reflection more often than ground, and beside an unknown bin the ground often rises.
-    """
-    return np.asarray(known & np.roll(known, 1) & np.roll(known, -1))
-
-
-def _neighbourhood_variance(elevation_rad: Array) -> Array:
-    """Variance (BINS,) of the skyline within one degree to either side."""
-    half = COLUMNS_PER_BIN // 2
-    around = np.arange(-half, COLUMNS_PER_BIN + half)
-    columns = np.arange(BINS)[:, None] * COLUMNS_PER_BIN + around
-    return np.asarray(elevation_rad[columns % COLUMNS].var(axis=1))
-
-
 def _gap_depth(steps: Sequence[list[Steps]], elevation_rad: Array) -> Array:
-    """How far (BINS,) below the skyline light is seen again: one elevation does not describe a tree with gaps."""
-    depth = np.zeros(COLUMNS)
+    """How far (SKYLINE_AZIMUTHS,) below the skyline light is seen again, as through a tree with gaps."""
+    depth = np.zeros(AZIMUTH_COLUMNS)
     for one in (one for by_width in steps for one in by_width[:2]):
         below = elevation_rad[one.column] - one.elevation_rad
         light = (one.contrast > GAP_CONTRAST) & (one.significance > GAP_SIGNIFICANCE)
         light &= (below > NEAR_LIGHT_RAD) & (below < DEEPEST_GAP_RAD)
         np.maximum.at(depth, one.column[light], below[light])
-    columns = np.arange(BINS)[:, None] * COLUMNS_PER_BIN + np.arange(-2 * COLUMNS_PER_BIN, 3 * COLUMNS_PER_BIN)
-    return np.asarray(depth[columns % COLUMNS].mean(axis=1))
+    return np.asarray(_by_bin(depth, 2 * COLUMNS_PER_AZIMUTH).mean(axis=1))
+
+
+def _by_bin(values: Array, beside: int) -> Array:
+    """The values (AZIMUTH_COLUMNS,) of the columns of each bin and of so many `beside` it, (SKYLINE_AZIMUTHS, n)."""
+    columns = np.arange(SKYLINE_AZIMUTHS)[:, None] * COLUMNS_PER_AZIMUTH + np.arange(
+        -beside, COLUMNS_PER_AZIMUTH + beside
+    )
+    return values[columns % AZIMUTH_COLUMNS]
 
 
 def _common_sigma_rad(frames: Sequence[SkyFrame], azimuth: Array, elevation: Array, site: Site) -> Array:
@@ -183,11 +159,11 @@ def _has_star(stars: Sequence[StarLight], azimuth: Array, elevation: Array) -> B
 
 def _has_step(steps: Sequence[list[Steps]], elevation_rad: Array) -> Bools:
     """Whether steps of light lie at the skyline of most columns of each bin."""
-    found = np.zeros(COLUMNS, dtype=bool)
+    found = np.zeros(AZIMUTH_COLUMNS, dtype=bool)
     for one in (one for by_width in steps for one in by_width):
         near = np.abs(one.elevation_rad - elevation_rad[one.column]) < NEAR_LIGHT_RAD
         found[one.column[near]] = True
-    return np.asarray(found.reshape(BINS, COLUMNS_PER_BIN).mean(axis=1) >= 0.5)
+    return np.asarray(found.reshape(SKYLINE_AZIMUTHS, COLUMNS_PER_AZIMUTH).mean(axis=1) >= 0.5)
 
 
 def predicted_visible(skyline: MeasuredSkyline, azimuth_rad: Array, elevation_rad: Array) -> tuple[Bools, Bools]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.applications.horizon.grid import COLUMNS, LOWEST_RAD, STEP_RAD, column_of, elevations_rad
+from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, GRID_STEP_RAD, LOWEST_RAD, column_of, elevations_rad
 from startrack.applications.horizon.skylight import MIN_SIGNIFICANCE, Steps
 from startrack.core.types import Array, Evidence
 
@@ -31,25 +31,25 @@ LOW_MISSING, LOW_SCALE_RAD = 0.4, np.radians(3.0)  # near the horizon: haze dims
 HIGH_1_PER_RAD = 4.0  # per column; neighbours add up
 LEAST_LLR = 0.25  # rows below it are left out
 LARGEST_LLR = 500.0  # of a star, before the limits: its exponential would overflow at 710
-EDGE_SIGMAS = 5.0
+STAR_EDGE_SIGMAS = 5.0
 OUTLIER_PROBABILITY = 1e-4  # of a column whose evidence means nothing
 
 
 @dataclass(frozen=True)
 class Marginals:
-    """Posterior of each column (COLUMNS) on the grid of elevations."""
+    """Posterior of each column (AZIMUTH_COLUMNS) on the grid of elevations."""
 
     mean_rad: Array
     sigma_rad: Array
 
 
 def column_log_prior() -> Array:
-    """Logarithm (COLUMNS, n) of the prior of the skyline: high ones are rare."""
-    return np.tile(-HIGH_1_PER_RAD * np.maximum(elevations_rad(), 0.0), (COLUMNS, 1))
+    """Logarithm (AZIMUTH_COLUMNS, n) of the prior of the skyline: high ones are rare."""
+    return np.tile(-HIGH_1_PER_RAD * np.maximum(elevations_rad(), 0.0), (AZIMUTH_COLUMNS, 1))
 
 
 def star_log_likelihood(rays: Evidence, missing: float, spurious: float) -> Array:
-    """Log-likelihood (COLUMNS, n) of the stars' rows at each elevation of the skyline.
+    """Log-likelihood (AZIMUTH_COLUMNS, n) of the stars' rows at each elevation of the skyline.
 
     `missing`: probability that a visible star is not seen (cloud), `spurious`: that a hidden one seems seen (a gap in
     the leaves, a hot pixel).
@@ -64,16 +64,16 @@ def star_log_likelihood(rays: Evidence, missing: float, spurious: float) -> Arra
     use = (np.abs(limited) > LEAST_LLR) & (rays.elevation_rad > LOWEST_RAD) & (rays.elevation_rad < elevation[-1])
     rays, limited = rays.take(use), limited[use]
     column = column_of(rays.azimuth_rad)
-    edge_rad = float(rays.edge_sigma_rad.max(initial=STEP_RAD))
-    half = int(np.ceil(EDGE_SIGMAS * edge_rad / STEP_RAD))
-    first = np.rint((rays.elevation_rad - LOWEST_RAD) / STEP_RAD).astype(int) - half
+    edge_rad = float(rays.edge_sigma_rad.max(initial=GRID_STEP_RAD))
+    half = int(np.ceil(STAR_EDGE_SIGMAS * edge_rad / GRID_STEP_RAD))
+    first = np.rint((rays.elevation_rad - LOWEST_RAD) / GRID_STEP_RAD).astype(int) - half
     # Below its window a star is visible, above it hidden: a step; within it the profile of the edge.
-    steps = np.zeros((COLUMNS, n + 1))
+    steps = np.zeros((AZIMUTH_COLUMNS, n + 1))
     np.add.at(steps, (column, np.zeros_like(column)), limited)
     np.add.at(steps, (column, np.clip(first, 0, n)), -limited)
     total = np.cumsum(steps, axis=1)[:, :n]
     at = first[:, None] + np.arange(2 * half + 1)
-    z = (rays.elevation_rad[:, None] - (LOWEST_RAD + STEP_RAD * at)) / edge_rad
+    z = (rays.elevation_rad[:, None] - (LOWEST_RAD + GRID_STEP_RAD * at)) / edge_rad
     profile = np.logaddexp(log_ndtr(z) + limited[:, None], log_ndtr(-z))
     inside = (at >= 0) & (at < n)
     np.add.at(total, (np.broadcast_to(column[:, None], at.shape)[inside], at[inside]), profile[inside])
@@ -87,9 +87,9 @@ def limit_llr(llr: Array, missing: Array, spurious: float) -> Array:
 
 
 def step_log_likelihood(steps: Steps, temper: float) -> Array:
-    """Log-likelihood (COLUMNS, n) of one image's steps of light at each elevation of the skyline, times `temper`."""
+    """Log-likelihood (AZIMUTH_COLUMNS, n), times `temper`, of an image's steps of light at each elevation."""
     elevation = elevations_rad()
-    total = np.zeros((COLUMNS, len(elevation)))
+    total = np.zeros((AZIMUTH_COLUMNS, len(elevation)))
     noise = NOISE_PER_RAD * np.exp(-0.5 * (np.square(steps.significance) - MIN_SIGNIFICANCE**2))
     contrast = np.abs(steps.contrast)
     in_sky = noise + SKY_PER_RAD * np.exp(-contrast / SKY_CONTRAST) + RARE_PER_RAD
@@ -109,14 +109,16 @@ def step_log_likelihood(steps: Steps, temper: float) -> Array:
 
 
 def combine_columns(log_likelihood: Array) -> Marginals:
-    """Marginals of the chain with the log-likelihoods (COLUMNS, n)."""
+    """Marginals of the chain with the log-likelihoods (AZIMUTH_COLUMNS, n)."""
     from scipy.fft import irfft, next_fast_len, rfft
 
     columns, n = log_likelihood.shape
     likelihood = np.exp(log_likelihood - log_likelihood.max(axis=1, keepdims=True))
     likelihood = likelihood / likelihood.mean(axis=1, keepdims=True) + OUTLIER_PROBABILITY
     size = next_fast_len(2 * n)
-    kernel = rfft(_kernel(n, size))
+    distance = GRID_STEP_RAD * np.minimum(np.arange(size), size - np.arange(size))
+    shapes = np.exp(-distance / CHANGES_RAD[:, None])
+    kernel = rfft(np.sum(np.array(CHANGE_WEIGHTS)[:, None] * shapes / shapes.sum(axis=1, keepdims=True), axis=0))
 
     def predict(message: Array) -> Array:
         spread = np.maximum(irfft(rfft(message, size) * kernel, size)[:n], 0.0)
@@ -139,12 +141,3 @@ def combine_columns(log_likelihood: Array) -> Marginals:
     mean = posterior @ elevation
     variance = np.maximum(posterior @ np.square(elevation) - np.square(mean), 0.0)
     return Marginals(mean, np.sqrt(variance))
-
-
-def _kernel(n: int, size: int) -> Array:
-    distance = STEP_RAD * np.minimum(np.arange(size), size - np.arange(size))
-    parts = [
-        w * np.exp(-distance / s) / np.sum(np.exp(-distance / s))
-        for w, s in zip(CHANGE_WEIGHTS, CHANGES_RAD, strict=True)
-    ]
-    return np.asarray(np.sum(parts, axis=0))

@@ -6,24 +6,24 @@ need not be the skyline: trees have inner edges, the sky has clouds and reflecti
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from startrack.applications.horizon.columns import (
+    AZIMUTH_COLUMNS,
     SAMPLES_PER_PX,
     Columns,
     average_columns,
     mean_above,
-    remove_points,
     sample_columns,
 )
-from startrack.applications.horizon.edges import measure_edges
-from startrack.applications.horizon.grid import COLUMNS
-from startrack.camera import Camera
+from startrack.applications.horizon.frames import SkyFrame
+from startrack.applications.horizon.starlight import StarLight
 from startrack.core.types import Array, Bools, Ints
 
+BEYOND_CIRCLE_RAD = np.radians(4.5)  # the edge of the image circle is stated to some degrees; light is followed so far
 GAP_PX = 1.0  # on either side of the step: the blurred edge
 SKY_PX, GROUND_PX = 4.0, 3.0  # lengths of the averages above and below
 MAX_SLOPE_1 = 0.08  # change of the sky's brightness over SKY_PX, relative to it
@@ -33,6 +33,18 @@ RELATIVE_ERROR = 0.02  # of the extrapolated sky, of its brightness above the da
 DARKEST_PERCENT = 0.5
 HIGHEST_STEP_RAD = np.radians(45.0)  # above, columns are narrower than pixels and see the same features
 LEVEL_RAD, ABOVE_RAD = np.radians(2.0), np.radians(20.0)  # for the brightness of the sky above a step
+WINDOW_PX = 10.0  # half width of the window in which an edge's place is measured
+REACH_PX, PLACE_STEP_PX = 2.5, 0.25
+PLACES_PX = np.arange(-REACH_PX, REACH_PX + PLACE_STEP_PX / 2, PLACE_STEP_PX)  # tried
+EDGE_SIGMAS_PX = (0.8, 1.5, 2.5, 3.5)  # widths tried: the PSF, fuzzy trees, haze
+EDGE_PARAMETERS = 5  # place, width, two levels, slope
+SHAPE_ERROR = 0.3  # of the difference between the fitted edge and the half level
+BLURRED_PX = 1.5  # error of the place of an edge of the largest width: where ground begins in haze
+MIN_SIGMA_PX, MAX_SIGMA_PX = 0.1, 2.0  # of a place; beyond, it is not measured
+SMOOTH_SAMPLES = 5  # odd: the mean is at its middle
+LEVEL_PX = 2  # of ground that must be in view below an edge,
+EDGE_ENDS_SIGMAS = 2.0  # which ends so many of its widths below its place
+SKY_LEVEL_PX = 3.0  # above the edge: where the sky's level is taken; below, haze darkens it
 
 
 @dataclass(frozen=True)
@@ -46,22 +58,17 @@ class Steps:
     significance: Array
 
 
-def find_steps(
-    image_e: NDArray[np.float32], noise_e: NDArray[np.float32], lost: NDArray[np.uint8], camera: Camera,
-    R_cam_enu: Array, *, widths: tuple[int, ...], stars_px: Array, glare_px: Array,
-) -> list[Steps]:  # fmt: skip
-    """All significant steps of an image (H, W) [e], for each width of columns averaged.
-
-    `noise_e`: of its pixels; `lost`: those that are left out (`lost_pixels`), like the light of stars, of radii
-    `glare_px` (m,) around `stars_px` (m, 2).
-    """
-    columns = sample_columns(remove_points(image_e, noise_e), noise_e, lost, (stars_px, glare_px), camera, R_cam_enu)
+def find_steps(frame: SkyFrame, stars: StarLight, widths: tuple[int, ...]) -> list[Steps]:
+    """All significant steps of the image of a `frame`, for each width of columns averaged; `stars` are left out."""
+    edge = min(frame.camera.max_angle_rad + BEYOND_CIRCLE_RAD, frame.camera.lens.max_invertible_rad)
+    camera = replace(frame.camera, max_angle_rad=edge)
+    columns = sample_columns(frame.detections, (stars.bright_px, stars.glare_px), camera, frame.R_cam_enu)
     return [_steps_of(average_columns(columns, width), width) for width in widths]
 
 
 def _steps_of(columns: Columns, width: int) -> Steps:
     """The steps of columns that are means over `width`."""
-    width_px = width * 2 * np.pi / COLUMNS / columns.px_rad
+    width_px = width * 2 * np.pi / AZIMUTH_COLUMNS / columns.px_rad
     dark = float(np.nanpercentile(columns.light_e, DARKEST_PERCENT))
     at_ground = _level_above(columns, GAP_PX, 2 * GAP_PX + GROUND_PX / 2, dark)
     below = mean_above(columns, -GAP_PX - GROUND_PX, -GAP_PX)
@@ -74,7 +81,7 @@ def _steps_of(columns: Columns, width: int) -> Steps:
     peak = _is_peak(significance, round(PEAK_PX * SAMPLES_PER_PX)) & (significance > MIN_SIGNIFICANCE)
     peak &= columns.elevation_rad[:, None] < HIGHEST_STEP_RAD
     row, column = np.nonzero(peak)
-    elevation, sigma_px, good = measure_edges(columns, row, column, noise)
+    elevation, sigma_px, good = _measure_edges(columns, row, column, noise)
     contrast = difference[row, column] / np.maximum(_sky_level(columns)[row, column] - dark, 1e-9)
     sigma_rad = sigma_px * columns.px_rad
     return Steps(column[good], elevation[good], sigma_rad[good], contrast[good], significance[row, column][good])
@@ -106,3 +113,102 @@ def _is_peak(values: Array, half: int) -> Bools:
 
     clean = np.nan_to_num(values)
     return (clean > 0) & (clean == maximum_filter1d(clean, 2 * half + 1, axis=0))
+
+
+def _measure_edges(columns: Columns, row: Ints, column: Ints, noise: Array) -> tuple[Array, Array, Bools]:
+    """Elevation [rad] and sigma [px] (n,) of steps at samples (row, column) (n,), and which of them are measured.
+
+    Least squares of a level of ground and a sloping level of sky, joined by an edge of one of several widths; the mean
+    and the scatter of the edge's place over all widths and places, by their likelihoods.
+    """
+    half = round(WINDOW_PX * SAMPLES_PER_PX)
+    good = (row >= half) & (row < len(columns.elevation_rad) - half)
+    middle = np.where(good, row, half)
+    light, depth_px = _fill_below(columns.light_e[middle[:, None] + np.arange(-half, half + 1), column[:, None]], half)
+    good &= np.isfinite(light).all(axis=1)
+    light = np.where(good[:, None], light, 0.0)
+    light = light - light.mean(axis=1, keepdims=True)
+    weight, best = _weigh_edges(light, half, noise[row, column])
+    by_place = weight.sum(axis=0)
+    mean_px = PLACES_PX @ by_place
+    variance_px2 = np.maximum(np.square(PLACES_PX) @ by_place - np.square(mean_px), 0.0)
+    half_px = _half_level(light, half, best)
+    half_px = np.where(np.abs(half_px - mean_px) < REACH_PX, half_px, mean_px)
+    width_px = np.einsum("w,wpn->n", np.array(EDGE_SIGMAS_PX), weight)
+    shape_px = np.hypot(SHAPE_ERROR * np.abs(half_px - mean_px), BLURRED_PX * (width_px / EDGE_SIGMAS_PX[-1]) ** 3)
+    sigma_px = np.sqrt(variance_px2 + np.square(shape_px) + MIN_SIGMA_PX**2)
+    elevation = columns.elevation_rad[middle] + half_px * columns.px_rad
+    # An edge ends in the ground's level. A ramp that ends at the edge of the view may be the sky's.
+    good &= (depth_px >= WINDOW_PX) | (mean_px - EDGE_ENDS_SIGMAS * width_px > LEVEL_PX - depth_px)
+    return elevation, sigma_px, good & (sigma_px < MAX_SIGMA_PX)
+
+
+def _fill_below(light: Array, half: int) -> tuple[Array, Array]:
+    """Samples (n, 2 half + 1) with their part below the view at the level of the lowest ground in view.
+
+    Also the depth (n,) of the view below the middle [px].
+    """
+    first = np.minimum(np.argmax(np.isfinite(light), axis=1), half)
+    lowest = first[:, None] + np.arange(LEVEL_PX * SAMPLES_PER_PX)
+    level = np.take_along_axis(light, lowest, axis=1).mean(axis=1, keepdims=True)
+    filled = np.where(np.arange(light.shape[1]) < first[:, None], level, light)
+    return filled, (half - first) / SAMPLES_PER_PX
+
+
+def _weigh_edges(light: Array, half: int, noise_e: Array) -> tuple[Array, Ints]:
+    """Posterior (widths, places, n) of the edges in samples (n, 2 half + 1), and the index of each best one (n,)."""
+    total = np.sum(np.square(light), axis=1)
+    rest = np.stack([
+        [total - np.sum(np.square(light @ _edge_basis(half, place, width)), axis=1) for place in PLACES_PX]
+        for width in EDGE_SIGMAS_PX
+    ])  # fmt: skip
+    flat = rest.reshape(-1, len(light))
+    least = flat.min(axis=0)
+    # Samples of one pixel are not independent.
+    variance = np.maximum(np.square(noise_e), least / SAMPLES_PER_PX / (2 * WINDOW_PX + 1 - EDGE_PARAMETERS))
+    chi2 = np.maximum(rest - least, 0.0) / SAMPLES_PER_PX / np.where(variance > 0, variance, 1.0)
+    weight = np.exp(-0.5 * chi2)
+    return weight / weight.sum(axis=(0, 1)), flat.argmin(axis=0)
+
+
+def _half_level(light: Array, half: int, best: Ints) -> Array:
+    """Places [px] (n,) where the samples (n, 2 half + 1) cross the middle between ground and sky of the fit `best`.
+
+    Of fuzzy ground (trees) it depends less on the light on the leaves than the place of the fitted edge does.
+    """
+    from scipy.ndimage import uniform_filter1d
+
+    x = np.arange(-half, half + 1) / SAMPLES_PER_PX
+    smooth = uniform_filter1d(light, SMOOTH_SAMPLES, axis=1)
+    found = np.full(len(light), np.nan)
+    for k in np.unique(best):
+        place, width = PLACES_PX[k % len(PLACES_PX)], EDGE_SIGMAS_PX[k // len(PLACES_PX)]
+        rows = np.flatnonzero(best == k)
+        ground, sky, slope = np.linalg.lstsq(_edge_profile(half, place, width), light[rows].T, rcond=None)[0]
+        level = 0.5 * (ground + sky + slope * SKY_LEVEL_PX)[:, None]
+        above = (smooth[rows] - level) * np.sign(sky - ground)[:, None]
+        crossing = (above[:, :-1] < 0) & (above[:, 1:] >= 0)
+        distance = np.where(crossing, np.abs(x[:-1] - place), np.inf)
+        at = np.argmin(distance, axis=1)
+        low, high = above[np.arange(len(rows)), at], above[np.arange(len(rows)), at + 1]
+        found[rows] = np.where(
+            np.isfinite(distance.min(axis=1)),
+            x[at] - low / np.where(high > low, high - low, 1.0) / SAMPLES_PER_PX,
+            np.nan,
+        )
+    return found
+
+
+@lru_cache(maxsize=512)
+def _edge_basis(half: int, place_px: float, sigma_px: float) -> Array:
+    """Orthonormal columns (2 half + 1, 3) that span the profiles of an edge."""
+    return np.linalg.qr(_edge_profile(half, place_px, sigma_px))[0]
+
+
+def _edge_profile(half: int, place_px: float, sigma_px: float) -> Array:
+    """Columns (2 half + 1, 3): ground, sky and the sky's slope, for an edge at a place in the window."""
+    from scipy.special import ndtr
+
+    x = np.arange(-half, half + 1) / SAMPLES_PER_PX - place_px
+    sky = ndtr(x / sigma_px)
+    return np.stack([1.0 - sky, sky, sky * x], axis=1)

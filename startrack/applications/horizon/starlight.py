@@ -8,24 +8,24 @@ import numpy as np
 
 from startrack.applications.horizon.frames import SkyFrame
 from startrack.catalog import airmass
+from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Evidence, Stars
 from startrack.evidence import SEEN_LLR, FluxScale, StarEvidence, StarPhotometry
 from startrack.frames import azel_from_rays, off_axis_rad
 
-BRIGHT_SNR = 12.0
+FITTED_SNR = 12.0
 USUAL_EXTINCTION_MAG, EXTINCTION_SIGMA_MAG = 0.2, 0.1  # per airmass, in clear air
 FREE_TERM_MAG = 3.0  # prior sigma of the other terms of the throughput
 BELOW_STARS_MAG = 0.1  # per airmass beyond that of most stars: haze
 TYPICAL_SCATTER_MAG = 0.3
 MIN_SCATTER_MAG = 0.1
 TESTED_QUANTILE = 0.95
-ROUNDS = 12
-HIGH_RAD = np.radians(45.0)
+DIMMING_ROUNDS = 12
+HIGHEST_NEEDED_RAD = np.radians(45.0)
 SPURIOUS_PROBABILITY = 0.01
-GLARE_PX, GLARE_PER_DECADE_PX = 3.0, 2.5  # of the faintest of them, and more for each factor of ten
+STAR_GLARE_PX, GLARE_PER_DECADE_PX = 3.0, 2.5  # of the faintest of them, and more for each factor of ten
 BRIGHT_SIGMAS = 12.0  # stars beside which the sky's light is not measured
-EDGE_PX = 1.0  # width of the skyline as a star of the usual PSF shows it
-NORMAL_BY_MAD = 1.4826
+STAR_EDGE_PX = 1.0  # width of the skyline as a star of the usual PSF shows it
 
 
 @dataclass(frozen=True)
@@ -49,20 +49,20 @@ def fit_dimming(frame: SkyFrame) -> Dimming:
     """The dimming that fits the bright identified stars, by robust least squares with a prior on the extinction."""
     d, s = frame.matched_detection, frame.matched_star
     found, stars = frame.detections, frame.sky.stars
-    use = (found.snr[d] > BRIGHT_SNR) & ~found.saturated[d] & (stars.v_sigma_mag[s] < 0.15)
+    use = (found.snr[d] > FITTED_SNR) & ~found.saturated[d] & (stars.v_sigma_mag[s] < 0.15)
     d, s = (d[use], s[use]) if use.sum() >= 5 else (d, s)
     rays = stars.rays_icrs[s]
     angle, air = off_axis_rad(rays @ frame.R_cam_icrs.T), _airmass(rays @ frame.R_enu_icrs.T)
     gain = stars.v_mag[s] + 2.5 * np.log10(found.flux_e[d])
-    prior = np.diag([0.0, FREE_TERM_MAG**-2, FREE_TERM_MAG**-2, EXTINCTION_SIGMA_MAG**-2])
+    prior = np.diag([0.0, 1.0 / FREE_TERM_MAG, 1.0 / FREE_TERM_MAG, 1.0 / EXTINCTION_SIGMA_MAG])
     usual = np.array([0.0, 0.0, 0.0, USUAL_EXTINCTION_MAG])
-    matrix, scatter, weight = _design(angle, air), TYPICAL_SCATTER_MAG, np.ones(len(s))
-    for _ in range(ROUNDS):
-        weighted = matrix * (weight / scatter**2)[:, None]
-        terms = np.linalg.solve(weighted.T @ matrix + prior, weighted.T @ gain + prior @ usual)
+    matrix, scatter, root = _design(angle, air), TYPICAL_SCATTER_MAG, np.full(len(s), 1.0 / TYPICAL_SCATTER_MAG)
+    for _ in range(DIMMING_ROUNDS):
+        rows = np.concatenate([matrix * root[:, None], prior])
+        terms = np.linalg.lstsq(rows, np.concatenate([gain * root, prior @ usual]), rcond=None)[0]
         rest = gain - matrix @ terms
-        scatter = max(NORMAL_BY_MAD * float(np.median(np.abs(rest))), MIN_SCATTER_MAG)
-        weight = 1.0 / (1.0 + np.square(rest / (2.0 * scatter)))
+        scatter = max(robust_sigma(rest, 0.0), MIN_SCATTER_MAG)
+        root = 1.0 / (scatter * np.sqrt(1.0 + np.square(rest / (2.0 * scatter))))
     return Dimming(terms, scatter, float(np.quantile(air, TESTED_QUANTILE)))
 
 
@@ -80,16 +80,15 @@ class StarLight:
 def measure_stars(frame: SkyFrame) -> StarLight:
     """Every catalogue star in view of a frame."""
     dimming = fit_dimming(frame)
-    stars = _dimmed(frame, dimming)
     camera = replace(frame.camera, sensor=None, calibrated_angle_rad=frame.camera.max_angle_rad)
     scale = FluxScale(0.0, 0.0, 0.4 * np.log(10) * dimming.scatter_mag, len(frame.matched_star))
     light = StarEvidence()(
-        frame.detections, camera, stars, list(frame.bodies), frame.R_cam_icrs, frame.R_enu_icrs, scale,
-        frame.extra_sigma_px,
+        frame.detections, camera, _dimmed(frame, dimming), list(frame.bodies), frame.R_cam_icrs, frame.R_enu_icrs,
+        scale, frame.extra_sigma_px,
     )  # fmt: skip
     rows = light.evidence()
     scale_rad = camera.mean_scale_rad_per_px(np.array(min(camera.max_angle_rad, np.pi / 2)))
-    rays = replace(rows, edge_sigma_rad=np.full(len(rows), EDGE_PX * float(scale_rad)))
+    rays = replace(rows, edge_sigma_rad=np.full(len(rows), STAR_EDGE_PX * float(scale_rad)))
     bright_px, glare_px = _glare(frame, dimming, light)
     return StarLight(rays, bright_px, glare_px, _missing_share(rays))
 
@@ -106,13 +105,13 @@ def _glare(frame: SkyFrame, dimming: Dimming, light: StarPhotometry) -> tuple[Ar
     snr = np.concatenate([light.expected_e, flux_e[seen]]) / noise_e
     missing = np.concatenate([light.llr < -SEEN_LLR, np.zeros(int(seen.sum()), dtype=bool)])  # behind the ground
     bright = (snr > BRIGHT_SIGMAS) & ~missing
-    radius_px = GLARE_PX + GLARE_PER_DECADE_PX * np.log10(snr[bright] / BRIGHT_SIGMAS)
+    radius_px = STAR_GLARE_PX + GLARE_PER_DECADE_PX * np.log10(snr[bright] / BRIGHT_SIGMAS)
     return np.concatenate([light.xy_px, px[seen]])[bright], radius_px
 
 
 def _missing_share(rays: Evidence) -> float:
     """Share of decided stars that are not seen where no ground is expected."""
-    highest = rays.elevation_rad > min(HIGH_RAD, float(np.quantile(rays.elevation_rad, 0.5, method="lower")))
+    highest = rays.elevation_rad > min(HIGHEST_NEEDED_RAD, float(np.quantile(rays.elevation_rad, 0.5, method="lower")))
     decided = rays.llr[highest & (np.abs(rays.llr) > SEEN_LLR)]
     return float((np.count_nonzero(decided < 0) + 1) / (len(decided) + 2))
 

@@ -13,7 +13,7 @@ from startrack.core.types import Array, BadInput, MeasuredSkyline
 from startrack.frames import Site
 from startrack.output import png_bytes, skyline_table_text, skyline_texts_deg
 
-SUFFIXES = (".csv", ".ecsv", ".hrz", ".png")  # and none: the folder of a Stellarium landscape
+SKYLINE_SUFFIXES = (".csv", ".ecsv", ".hrz", ".png")  # and none: the folder of a Stellarium landscape
 LANDSCAPE, HORIZON_LIST = "landscape.ini", "horizon.txt"
 TINY_DEG = 1e-5  # Stellarium draws a polygon with a corner at exactly 0 or 180 degrees badly
 
@@ -21,8 +21,8 @@ TINY_DEG = 1e-5  # Stellarium draws a polygon with a corner at exactly 0 or 180 
 def kind_of(output: str) -> str:
     """The suffix of an output path, "" for a folder. Raises BadOutput (bad_image, for lack of a better code)."""
     suffix = "" if output.endswith(("/", "\\")) else Path(output).suffix.lower()
-    if suffix not in (*SUFFIXES, ""):
-        known = ", ".join(SUFFIXES)
+    if suffix not in (*SKYLINE_SUFFIXES, ""):
+        known = ", ".join(SKYLINE_SUFFIXES)
         raise BadOutput("bad_image", f"{output}: the suffix is none of {known}; a name without one is a folder")
     return suffix
 

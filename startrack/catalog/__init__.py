@@ -5,6 +5,7 @@ from startrack.catalog.sky import (
     MOST_BELOW_PART,
     Sky,
     airmass,
+    apparent_bodies,
     apparent_elevation_rad,
     is_below_horizon,
     sky_at,
@@ -21,7 +22,7 @@ from startrack.catalog.stars import (
 )
 
 __all__ = [
-    "LOWEST_STAR_RAD", "MOST_BELOW_PART", "Sky", "StarCatalog", "airmass", "apparent_elevation_rad", "bodies",
-    "has_deep_catalog", "hipparcos_rows_in_deep", "is_below_horizon", "load_catalog", "load_deep_catalog",
-    "proper_name_designations", "sky_at", "star_names",
+    "LOWEST_STAR_RAD", "MOST_BELOW_PART", "Sky", "StarCatalog", "airmass", "apparent_bodies",
+    "apparent_elevation_rad", "bodies", "has_deep_catalog", "hipparcos_rows_in_deep", "is_below_horizon",
+    "load_catalog", "load_deep_catalog", "proper_name_designations", "sky_at", "star_names",
 ]  # fmt: skip

@@ -7,8 +7,9 @@ from datetime import datetime
 
 import numpy as np
 
+from startrack.catalog.solar_system import bodies
 from startrack.catalog.stars import StarCatalog
-from startrack.core.types import Array, Bools, Stars
+from startrack.core.types import Array, Body, Bools, Stars
 from startrack.frames import R_enu_icrs, Site, azel_from_rays, observer_velocity_m_s, rays_from_azel, refract_rad
 
 LOWEST_PREDICTED_RAD = np.radians(3.0)  # below it refraction is not predictable
@@ -57,6 +58,15 @@ def sky_at(
 def apparent_elevation_rad(elevation_rad: Array, site: Site) -> Array:
     """Apparent elevations (...) of sources at true elevations (...) over a `site` on the Earth, in average air."""
     return refract_rad(elevation_rad, float(SEA_LEVEL_HPA * np.exp(-site.height_m / SCALE_HEIGHT_M)))
+
+
+def apparent_bodies(site: Site, time_utc: datetime) -> tuple[Body, ...]:
+    """Planets, Sun and Moon in apparent directions over a `site` on the Earth, refraction included."""
+    R, found = R_enu_icrs(site, time_utc), []
+    for body in bodies(site, time_utc):
+        azimuth, elevation = azel_from_rays(R @ body.ray_icrs)
+        found.append(replace(body, ray_icrs=rays_from_azel(azimuth, apparent_elevation_rad(elevation, site)) @ R))
+    return tuple(found)
 
 
 def airmass(elevation_rad: Array) -> Array:

@@ -1,1 +1,1 @@
-"""Statistics: attitude, least squares, matches of detections and stars, chance, filter and smoother of tracks."""
+"""Statistics: attitude, lens, least squares, matches of detections and stars, chance, filter and smoother of tracks."""

@@ -262,9 +262,7 @@ def _fit_jointly(run: _Run) -> tuple[JointFit, tuple[Frame, ...]]:
 
 def _max_angle_rad(fitted: Camera, start: Camera | None, fov_rad: float | None) -> float:
     """Edge of the image circle: as given, else the frame's corner; at most the turning point of the polynomial."""
-    edge = corner_angle_rad(fitted)
-    if start is not None:
-        edge = start.max_angle_rad
-    elif fov_rad is not None and fov_rad >= WIDE_FIELD_RAD:
+    edge = corner_angle_rad(fitted) if start is None else start.max_angle_rad
+    if start is None and fov_rad is not None and fov_rad >= WIDE_FIELD_RAD:
         edge = 0.5 * fov_rad
     return float(max(min(edge, fitted.lens.max_invertible_rad), fitted.calibrated_angle_rad))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
 
 import numpy as np
 
@@ -14,8 +13,7 @@ from startrack.catalog import (
     MOST_BELOW_PART,
     Sky,
     StarCatalog,
-    apparent_elevation_rad,
-    bodies,
+    apparent_bodies,
     is_below_horizon,
     sky_at,
 )
@@ -24,7 +22,7 @@ from startrack.core.errors import BadInput, Reason
 from startrack.core.types import Array, Body, Detections, Exposure, Ints
 from startrack.estimation.frame_matching import frame_of, require_body, require_time
 from startrack.estimation.joint_fit import JointFit, fit_frames
-from startrack.frames import R_enu_icrs, Site, azel_from_rays, rays_from_azel
+from startrack.frames import R_enu_icrs, Site
 from startrack.identification import WIDE_FIELD_RAD
 
 
@@ -83,8 +81,14 @@ def orient_frames(
             identified.append(outcome)
     if not identified:
         return (), tuple(left_out)
-    joint = _fit_lens(identified, catalog, site)
-    camera = replace(joint.fit.camera, max_angle_rad=_edge_rad(joint.fit.camera, camera, fov_rad))
+    frames = tuple(frame_of(one.exposure, one.detections, catalog, site) for one in identified)
+    lead = max(identified, key=lambda one: len(one.identification))
+    joint = fit_frames(frames, lead.camera, np.stack([one.attitude_fit.attitude.R_cam_icrs for one in identified]))
+    fitted = joint.fit.camera
+    edge = fitted.max_angle_rad if camera is None else camera.max_angle_rad
+    if camera is None and fov_rad is not None and fov_rad >= WIDE_FIELD_RAD:
+        edge = 0.5 * fov_rad
+    camera = replace(fitted, max_angle_rad=float(min(edge, fitted.lens.max_invertible_rad)))
     found = tuple(_sky_frame(k, one, joint, camera, catalog, site) for k, one in enumerate(identified))
     return found, tuple(left_out)
 
@@ -115,24 +119,6 @@ def _require_above_horizon(one: Oriented, site: Site) -> None:
         )
 
 
-def _fit_lens(identified: list[Oriented], catalog: StarCatalog, site: Site) -> JointFit:
-    """The lens of all frames and their attitudes, with refraction. Raises NotIdentified where too few stars agree."""
-    frames = tuple(frame_of(one.exposure, one.detections, catalog, site) for one in identified)
-    R = np.stack([one.attitude_fit.attitude.R_cam_icrs for one in identified])
-    lead = max(identified, key=lambda one: len(one.identification))
-    return fit_frames(frames, lead.camera, R)
-
-
-def _edge_rad(fitted: Camera, given: Camera | None, fov_rad: float | None) -> float:
-    """Edge of the image circle: of the camera file, else by the field of view; the lens must be invertible there."""
-    edge = fitted.max_angle_rad
-    if given is not None:
-        edge = given.max_angle_rad
-    elif fov_rad is not None and fov_rad >= WIDE_FIELD_RAD:
-        edge = 0.5 * fov_rad
-    return float(min(edge, fitted.lens.max_invertible_rad))
-
-
 def _sky_frame(k: int, one: Oriented, joint: JointFit, camera: Camera, catalog: StarCatalog, site: Site) -> SkyFrame:
     time_utc = require_time(one.exposure)
     sky = sky_at(catalog, time_utc, site, LOWEST_STAR_RAD)
@@ -148,17 +134,7 @@ def _sky_frame(k: int, one: Oriented, joint: JointFit, camera: Camera, catalog: 
         attitude_sigma_rad=float(np.sqrt(np.max(np.diag(joint.fit.pose_covariance_rad2[k])))),
         extra_sigma_px=joint.fit.extra_sigma_px,
         sky=sky,
-        bodies=_lifted_bodies(site, time_utc, R),
+        bodies=apparent_bodies(site, time_utc),
         matched_detection=joint.matches[k].detection,
         matched_star=order[np.searchsorted(sky.stars.hip[order], hip_of_match)],
     )
-
-
-def _lifted_bodies(site: Site, time_utc: datetime, R: Array) -> tuple[Body, ...]:
-    """Planets, Sun and Moon in apparent directions."""
-    found = []
-    for body in bodies(site, time_utc):
-        azimuth, elevation = azel_from_rays(R @ body.ray_icrs)
-        lifted = rays_from_azel(azimuth, apparent_elevation_rad(elevation, site))
-        found.append(replace(body, ray_icrs=lifted @ R))
-    return tuple(found)

@@ -46,7 +46,7 @@ def _draw_frame(axes: Axes, camera: Camera) -> None:
         (camera.calibrated_angle_rad, "-", f"calibrated to {np.degrees(camera.calibrated_angle_rad):.1f}°"),
         (camera.max_angle_rad, ":", f"image circle {np.degrees(camera.max_angle_rad):.1f}°"),
     ):
-        px, _ = camera.project(cone_rays(np.array(angle), np.linspace(0.0, 2 * np.pi, 181)))
+        px = camera.project_unlimited(cone_rays(np.array(angle), np.linspace(0.0, 2 * np.pi, 181)))
         axes.plot(px[:, 0], px[:, 1], style, color=LINE, linewidth=1.2, label=label)
     axes.legend(loc="lower right", fontsize=8, framealpha=0.9)
 

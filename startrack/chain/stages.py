@@ -103,8 +103,7 @@ class Inputs:
     @property
     def warnings(self) -> list[str]:
         """Facts in the image's file that were not used."""
-        damage = [] if self.damage is None else [self.damage.message]
-        return [*self.exposure.warnings, *damage]
+        return [*self.exposure.warnings, *([self.damage.message] if self.damage is not None else [])]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -151,8 +150,7 @@ class Oriented(Identified):
         attitude = self.attitude_fit.attitude
         if self.exposure.time_utc is not None:
             return attitude
-        widened = attitude.covariance_rad2 + UNKNOWN_TIME_SIGMA_RAD**2 * np.eye(3)
-        return Attitude(R_cam_icrs=attitude.R_cam_icrs, covariance_rad2=widened)
+        return replace(attitude, covariance_rad2=attitude.covariance_rad2 + UNKNOWN_TIME_SIGMA_RAD**2 * np.eye(3))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

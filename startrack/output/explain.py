@@ -83,15 +83,11 @@ def _facts(located: Located) -> Iterator[str]:
 
 def _silent(measured: Measured) -> Iterator[str]:
     """The facts that nobody states, where no position shows what each would gain."""
-    silent = _unstated(measured)
-    if silent:
-        yield f"facts: {', '.join(silent)} are not stated and count as uncertain ({_where(silent[0])})"
-
-
-def _unstated(measured: Measured) -> list[str]:
     clock = ["time_sigma_s"] if measured.clock.gross_probability > 0.0 else []
     shape = [error.fact for error in measured.terrain.shape_errors if not error.is_stated]
-    return list(dict.fromkeys([*shape, *clock]))
+    silent = list(dict.fromkeys([*shape, *clock]))
+    if silent:
+        yield f"facts: {', '.join(silent)} are not stated and count as uncertain ({_where(silent[0])})"
 
 
 def _where(fact: str) -> str:

@@ -23,7 +23,7 @@ from startrack.output.quantity import (
 from startrack.output.record import FORMATS
 from startrack.terrain import MAKERS, TERRAIN_KEYS
 
-TERRAIN: Schema = TERRAIN_KEYS.schema() | {"oneOf": [{"required": [ground]} for ground in MAKERS]}
+TERRAIN_FILE: Schema = TERRAIN_KEYS.schema() | {"oneOf": [{"required": [ground]} for ground in MAKERS]}
 REFUSALS = [one.value for one in Reason if one is not Reason.AMBIGUOUS]
 SECTIONS = {
     name: schema_of(QUANTITIES, name, description)
@@ -45,7 +45,7 @@ COMMON: Schema = {
     "message": TEXT,
 }
 # An image that could not even be read has no more than the common keys.
-MEASURED: Schema = {
+STAGE_KEYS: Schema = {
     "stars": SECTIONS["stars"],
     "timing_ms": object_schema(dict.fromkeys(STAGES, POSITIVE)),
     "provenance": SECTIONS["provenance"],
@@ -56,14 +56,14 @@ WARNINGS: Schema = {"type": "array", "items": TEXT, "description": "what was fou
 EXPLAIN: Schema = {
     "type": "array", "items": TEXT, "description": "with --explain: what a refused or wide answer would need"
 }  # fmt: skip
-ADVICE: Schema = {"type": "string", "description": "what to do next, by the reason; absent where the status is ok"}
+ADVICE_TEXT: Schema = {"type": "string", "description": "what to do next, by the reason; absent where the status is ok"}
 
 
 def _result(kind: str, title: str, own: Schema, rules: list[Schema]) -> Schema:
     keys = {"format": {"const": FORMATS[kind]}, **COMMON}
     return file_schema(
         title,
-        object_schema(keys, optional={"advice": ADVICE, **own, **MEASURED, "warnings": WARNINGS})
+        object_schema(keys, optional={"advice": ADVICE_TEXT, **own, **STAGE_KEYS, "warnings": WARNINGS})
         | {"allOf": [*_STATUS_RULES, *rules]},
     )
 
@@ -73,8 +73,8 @@ def _if_status(status: str, then: Schema) -> Schema:
 
 
 _STATUS_RULES = [
-    _if_status("ok", {"properties": {"reason": {"const": None}}, "required": [*MEASURED]}),
-    _if_status("ambiguous", {"properties": {"reason": {"const": "ambiguous"}}, "required": [*MEASURED]}),
+    _if_status("ok", {"properties": {"reason": {"const": None}}, "required": [*STAGE_KEYS]}),
+    _if_status("ambiguous", {"properties": {"reason": {"const": "ambiguous"}}, "required": [*STAGE_KEYS]}),
     _if_status("refused", {"properties": {"reason": {"enum": REFUSALS}}}),
 ]
 _FIX_RULES = [
@@ -87,8 +87,8 @@ MATCH = object_schema({
     "x_px": NUMBER,
     "y_px": NUMBER,
 })  # fmt: skip
-DETECTION = object_schema({"x_px": NUMBER, "y_px": NUMBER, "flux_e": NUMBER, "snr": NUMBER})
-LEFT_OUT = object_schema({"image": TEXT, "reason": {"enum": REFUSALS}, "message": TEXT})
+POINT_SOURCE = object_schema({"x_px": NUMBER, "y_px": NUMBER, "flux_e": NUMBER, "snr": NUMBER})
+LEFT_OUT_IMAGE = object_schema({"image": TEXT, "reason": {"enum": REFUSALS}, "message": TEXT})
 HORIZON = object_schema(
     {
         "format": {"const": "startrack.horizon/1"},
@@ -97,7 +97,7 @@ HORIZON = object_schema(
         "message": TEXT,
     },
     optional={
-        "advice": ADVICE,
+        "advice": ADVICE_TEXT,
         "output": TEXT,
         "images": {"type": "array", "items": TEXT},
         "left_out": {
@@ -140,7 +140,7 @@ SCHEMAS: dict[str, Schema] = {
     "detection": _result(
         "detection",
         "Point sources of one image",
-        {"detections": {"type": "array", "items": DETECTION}},
+        {"detections": {"type": "array", "items": POINT_SOURCE}},
         [_if_status("ok", {"required": ["detections"]})],
     ),
     "horizon": file_schema("Summary of a measured skyline", HORIZON | {"allOf": _HORIZON_RULES}),
@@ -151,5 +151,5 @@ SCHEMAS: dict[str, Schema] = {
     ),
     "sidecar": file_schema("Facts beside an image", SIDECAR_KEYS.schema()),
     "camera": file_schema("Camera file", camera_keys().schema()),
-    "terrain": file_schema("Terrain file", TERRAIN),
+    "terrain": file_schema("Terrain file", TERRAIN_FILE),
 }

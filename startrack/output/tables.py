@@ -22,7 +22,7 @@ from startrack.output.quantity import Quantity
 if TYPE_CHECKING:
     from startrack.evidence import StarPhotometry
 
-STATUSES = ("seen", "hidden", "uncertain", "unusable")
+STAR_STATUSES = ("seen", "hidden", "uncertain", "unusable")
 FAINTER_THAN_FAINTEST_MATCH_MAG = 0.5
 LEAST_HALF_RAD, MOST_HALF_RAD = np.radians(0.02), np.radians(5.0)
 
@@ -89,19 +89,22 @@ def star_table_text(value: Inputs) -> str:
     if not isinstance(value, Oriented):
         raise ValueError("no star table without identified stars")
     if not isinstance(value, Measured):
-        return ecsv_text(_predicted_columns(value))
+        star, xy_px = stars_in_view(value)
+        return ecsv_text([*_catalog_columns(value.stars, star), *_place_columns(value, star, xy_px)])
+    light = value.light
     return ecsv_text([
-        *_catalog_columns(value.stars, value.light.star),
-        *_direction_columns(value.light),
-        *_place_columns(value, value.light.star, value.light.xy_px),
-        *_light_columns(value.light, _flux_unit(value)),
+        *_catalog_columns(value.stars, light.star),
+        Column("azimuth_deg", np.degrees(light.azimuth_rad), "float64", "deg", "%.5f", "north through east, in enu"),
+        Column("elevation_deg", np.degrees(light.elevation_rad), "float64", "deg", "%.5f", "in enu"),
+        *_place_columns(value, light.star, light.xy_px),
+        *_light_columns(light, "electron" if value.camera.sensor is not None else "adu"),
     ])  # fmt: skip
 
 
 def status_of(light: StarPhotometry) -> NDArray[np.str_]:
     """Status (n,) of each star by its photometry: seen, hidden, uncertain, or unusable where it was not measured."""
     kinds = np.select([light.cause != "", light.llr >= SEEN_LLR, light.llr <= -SEEN_LLR], [3, 0, 1], 2)
-    return np.array(STATUSES)[kinds]
+    return np.array(STAR_STATUSES)[kinds]
 
 
 def names_of(hips: Ints) -> list[str]:
@@ -119,11 +122,6 @@ def stars_in_view(value: Oriented) -> tuple[Ints, Array]:
     return candidates[inside], xy_px[inside]
 
 
-def _predicted_columns(value: Oriented) -> list[Column]:
-    star, xy_px = stars_in_view(value)
-    return [*_catalog_columns(value.stars, star), *_place_columns(value, star, xy_px)]
-
-
 def _catalog_columns(stars: Stars, star: Ints) -> list[Column]:
     hips = stars.hip[star]
     return [
@@ -131,13 +129,6 @@ def _catalog_columns(stars: Stars, star: Ints) -> list[Column]:
         Column("hip", ["" if hip == 0 else hip for hip in hips.tolist()], "int64", description="Hipparcos number"),
         Column("name", names_of(hips), "string", description="proper name, or Bayer, Flamsteed or variable"),
         Column("v_mag", stars.v_mag[star], "float64", "mag", "%.3f", "Johnson V of the catalogue"),
-    ]
-
-
-def _direction_columns(light: StarPhotometry) -> list[Column]:
-    return [
-        Column("azimuth_deg", np.degrees(light.azimuth_rad), "float64", "deg", "%.5f", "north through east, in enu"),
-        Column("elevation_deg", np.degrees(light.elevation_rad), "float64", "deg", "%.5f", "in enu"),
     ]
 
 
@@ -181,10 +172,6 @@ def _light_columns(light: StarPhotometry, unit: str) -> Sequence[Column]:
         Column("status", status_of(light), "string", description="seen, hidden, uncertain or unusable"),
         Column("cause", light.cause, "string", description="why it is unusable"),
     ]
-
-
-def _flux_unit(value: Identified) -> str:
-    return "electron" if value.camera.sensor is not None else "adu"
 
 
 def skyline_table_text(skyline: MeasuredSkyline) -> str:

@@ -20,7 +20,7 @@ from startrack.output.tables import half_range_rad
 from startrack.terrain import Terrain, load_terrain
 
 RELIEF_CELLS = 420
-MARGIN = 1.03  # beyond the map, for its edge
+MAP_MARGIN = 1.03  # beyond the map, for its edge
 BRIGHTEST = 215.0
 
 
@@ -111,7 +111,7 @@ def ground_map(
     }
     if terrain.rim_radius_m is not None:
         return {**shape, "rim_m": terrain.rim_radius_m}
-    half_m = MARGIN * terrain.reach_m if half_m is None else half_m
+    half_m = MAP_MARGIN * terrain.reach_m if half_m is None else half_m
     return {**shape, "half_m": half_m, "centre_m": list(centre_m), "relief": _relief(terrain, centre_m, half_m)}
 
 

@@ -17,7 +17,7 @@ from startrack.output.quantity import Quantity
 from startrack.output.record import at_record
 from startrack.output.text import rows
 
-KINDS = (".fix.json", ".identification.json")  # of one image the first that is there counts
+RECORD_ENDS = (".fix.json", ".identification.json")  # of one image the first that is there counts
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Found:
     @property
     def kind(self) -> str:
         """Kind of the record by its file's name: fix or identification."""
-        return "identification" if self.path.name.endswith(KINDS[1]) else "fix"
+        return "identification" if self.path.name.endswith(RECORD_ENDS[1]) else "fix"
 
     def companion(self, suffix: str) -> Path:
         """Path of the companion with a `suffix` such as `.stars.ecsv`."""
@@ -65,7 +65,7 @@ def result_at(path: str | os.PathLike[str]) -> Found:
     if not file.is_file():
         raise BadInput("bad_image", f"{path}: no such result")
     try:
-        if not file.name.endswith(KINDS):
+        if not file.name.endswith(RECORD_ENDS):
             raise ValueError("its name has another ending")
         return Found(_stem(file.name), file, _record(file))
     except ValueError as cause:
@@ -82,7 +82,7 @@ def _files(root: Path) -> list[Path]:
     chosen: dict[str, Path] = {}
     for parent, folders, files in os.walk(root):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
-        for kind in KINDS:
+        for kind in RECORD_ENDS:
             for name in files:
                 if name.endswith(kind) and not name.startswith("."):
                     chosen.setdefault((Path(parent).relative_to(root) / _stem(name)).as_posix(), Path(parent) / name)
@@ -112,7 +112,7 @@ def _finite(text: str) -> float | None:
 
 
 def _stem(name: str) -> str:
-    return next((name.removesuffix(kind) for kind in KINDS if name.endswith(kind)), name)
+    return next((name.removesuffix(kind) for kind in RECORD_ENDS if name.endswith(kind)), name)
 
 
 Position = tuple[float, float]  # east, north [m]

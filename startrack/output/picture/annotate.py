@@ -44,7 +44,7 @@ from startrack.output.text import Rows, rows
 from startrack.output.values import mode_text, modes_record
 
 PANEL_WIDTH, PANEL_HEIGHT = 620, 1160
-MARGIN = 28
+PANEL_MARGIN = 28
 FACT_SIZE = 20.0
 FACT_STEP, LEGEND_STEP = 1.6 * FACT_SIZE, round(1.6 * TEXT_PX)
 VALUE_AT = 7.5 * FACT_SIZE  # from the left margin
@@ -57,10 +57,10 @@ def draw_panel(canvas: Canvas, left: int, outcome: Outcome, truth_enu_m: tuple[f
     """Fill the canvas from `left` to its right edge, top to bottom."""
     width, height = canvas.size
     canvas.rectangle((left, 0, width - 1, height - 1), PANEL)
-    left, right = left + MARGIN, width - MARGIN
+    left, right = left + PANEL_MARGIN, width - PANEL_MARGIN
     value = last_value(outcome)
     facts, legend = _facts(value), _legend(value, truth_enu_m is not None)
-    legend_top = height - MARGIN - LEGEND_STEP * len(legend) - 14
+    legend_top = height - PANEL_MARGIN - LEGEND_STEP * len(legend) - 14
     top = _draw_header(canvas, left, right, outcome)
     room = (left, top, right, legend_top - 30 - FACT_STEP * len(facts))
     y = _draw_figures(canvas, room, value, truth_enu_m)
@@ -79,12 +79,12 @@ def draw_panel(canvas: Canvas, left: int, outcome: Outcome, truth_enu_m: tuple[f
 def _draw_header(canvas: Canvas, left: float, right: float, outcome: Outcome) -> float:
     """Name of the image, status, and the message of a result that is not ok; returns where the next thing may stand."""
     status = outcome.status.upper()
-    badge = text_width(status, FACT_SIZE) + MARGIN
-    canvas.rectangle((right - badge, MARGIN, right, MARGIN + 36), STATUS[outcome.status])
-    canvas.text((right - badge / 2, MARGIN + 18), status, FACT_SIZE, (255, 255, 255), "mm")
+    badge = text_width(status, FACT_SIZE) + PANEL_MARGIN
+    canvas.rectangle((right - badge, PANEL_MARGIN, right, PANEL_MARGIN + 36), STATUS[outcome.status])
+    canvas.text((right - badge / 2, PANEL_MARGIN + 18), status, FACT_SIZE, (255, 255, 255), "mm")
     name = _shorten_text(image_name(outcome.exposure), 27.0, right - left - badge - 20)
-    canvas.text((left, MARGIN + 28), name, 27.0, INK)
-    y = float(MARGIN + 36 + 28)
+    canvas.text((left, PANEL_MARGIN + 28), name, 27.0, INK)
+    y = float(PANEL_MARGIN + 36 + 28)
     canvas.text((left, y), _shorten_text(_inputs_text(last_value(outcome)), TEXT_PX, right - left), TEXT_PX, DIM_INK)
     y += 18
     if outcome.status == "ok":

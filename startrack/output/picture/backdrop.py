@@ -21,7 +21,7 @@ SMOOTHING_PX = (0.5, 3.0)  # of the display, as wide as the PSF within these
 CALM_SNR = 2.6  # fainter light than that is treated as noise and left out
 KNEE_SNR, GLARE_SNR = 5.0, 400.0  # where the stretch turns from linear to logarithmic, and where it ends
 STAR_PX = 15  # on the canvas: wider sources are not stars
-EDGE_PX = 8.0
+RIM_PX = 8.0
 SAMPLE = 4  # levels are taken from every fourth pixel
 FLAT_SNR = 3.0
 WALL_SHADE = 0.75  # how far the wall's colour replaces the sky's
@@ -66,9 +66,9 @@ def backdrop(value: Inputs, size: tuple[int, int], wall: Image | None = None) ->
     inside_px = np.full(size[::-1], np.inf, dtype=np.float32)
     if value.camera is not None and value.camera.size_px == value.exposure.size_px:
         inside_px = _distance_to_edge_px(value.camera, size)
-    sky, light = _background_and_light(value, size, inside_px > EDGE_PX)
+    sky, light = _background_and_light(value, size, inside_px > RIM_PX)
     # Next to the circle's edge the background is not known well, and its residual is not light.
-    light *= np.clip(inside_px / np.float32(EDGE_PX), 0, 1)
+    light *= np.clip(inside_px / np.float32(RIM_PX), 0, 1)
     shade = None if wall is None else wall * np.float32(WALL_SHADE)
     lit = np.clip(inside_px + np.float32(0.5), 0, 1)
     channels = []

@@ -8,11 +8,11 @@ import numpy as np
 from scipy.special import ndtr
 
 from startrack.core.errors import Reason
-from startrack.core.types import Array, Evidence, Fix, NotLocated
+from startrack.core.types import SECTORS, Array, Evidence, Fix, NotLocated
 from startrack.localization import ExactPosterior
 from startrack.localization.obstacle_chain import LEVELS_RAD, STATES, WRONG_SECTOR, transitions
 from startrack.localization.sector_likelihood import Sectors
-from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS, SECTORS, sector_of
+from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS, sector_of
 from startrack.terrain import ForwardingTerrain, Terrain
 
 PART = 300  # positions at a time: their matrices fit the processor's cache

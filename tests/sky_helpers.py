@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.special import ndtr
 
-from startrack.core.types import Array
-from startrack.evidence import BAND_PX, SECTORS
+from startrack.core.types import SECTORS, Array
+from startrack.evidence import BAND_PX
 from startrack.evidence.sky_pixels import SkyPixels
 
 EDGE_PX = 1.04  # a PSF of 1 px, and the pixel

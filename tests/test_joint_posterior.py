@@ -12,7 +12,7 @@ from localization_helpers import slow_chain, slow_chain_scores
 from scipy.special import ndtr
 from test_localization_shape import evidence_at
 
-from startrack.core.types import Array, Clock, Evidence
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Clock, Evidence
 from startrack.frames import Site, sky_rotvec_rad
 from startrack.localization import ExactPosterior, importance_sampling
 from startrack.localization.clock import turn_evidence
@@ -28,12 +28,11 @@ from startrack.localization.obstacle_chain import (
     transitions,
 )
 from startrack.localization.shared_errors import SharedErrors
-from startrack.localization.skyline_model import MIDDLES_RAD, SkylineModel
+from startrack.localization.skyline_model import SkylineModel
 from startrack.localization.skyline_profiles import (
     HIGH_RAD,
     LOW_RAD,
     ROW_NATS,
-    SECTORS,
     integral_to,
     log_at,
     profiles_of,

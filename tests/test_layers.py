@@ -115,6 +115,84 @@ def test_the_check_sees_every_way_to_import(source, room, other):
     assert violations([(ROOT / room / "x.py", room, other)]) != []
 
 
+FOLDERS = {"core", "estimation", "applications"}  # of modules or packages that stand for themselves
+
+
+def owner_of(name: str) -> str:
+    """The package whose face a dotted module belongs to: `startrack.terrain`, `startrack.applications.tracking`."""
+    parts = name.split(".")
+    return ".".join(parts[: 3 if parts[1] in FOLDERS else 2])
+
+
+def name_of(path: Path) -> str:
+    return ".".join(("startrack", *path.relative_to(ROOT).with_suffix("").parts)).removesuffix(".__init__")
+
+
+def sources() -> dict[Path, ast.Module]:
+    """Files of the package and their trees, but for the entry points."""
+    paths = [path for path in sorted(ROOT.rglob("*.py")) if path not in (ROOT / "__init__.py", ROOT / "__main__.py")]
+    return {path: ast.parse(path.read_text(encoding="utf-8")) for path in paths}
+
+
+def test_packages_are_imported_by_their_faces():
+    past = [
+        f"{path.relative_to(ROOT)}: {node.module}"
+        for path, tree in sources().items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom)
+        and (node.module or "").startswith("startrack.")
+        and node.module != owner_of(node.module)
+        and not f"{name_of(path)}.".startswith(f"{owner_of(node.module)}.")
+    ]
+    assert past == []
+
+
+def test_no_private_name_is_imported():
+    names = [(path, name) for path, tree in sources().items() for name in imported_names(tree, ())]
+    private = re.compile(r"startrack\..*\._[a-z]")
+    assert [f"{path.relative_to(ROOT)}: {name}" for path, name in names if private.match(name)] == []
+
+
+def test_no_modules_import_each_other():
+    """Nor do longer circles exist. Imports for type checking and within functions do not count."""
+    trees = {name_of(path): tree for path, tree in sources().items()}
+    left = {}
+    for name, tree in trees.items():
+        now = ast.Module([node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)], type_ignores=[])
+        modules = ([m for m in trees if f"{one}.".startswith(f"{m}.")] for one in imported_names(now, ()))
+        left[name] = {max(found, key=len) for found in modules if found} - {name}
+    while free := [name for name, others in left.items() if not others & left.keys()]:
+        left = {name: others for name, others in left.items() if name not in free}
+    assert left == {}
+
+
+def is_number(node: ast.AST) -> bool:
+    parts = ast.UnaryOp | ast.BinOp | ast.Tuple | ast.operator | ast.unaryop | ast.expr_context
+    return all(isinstance(one, parts) or type(getattr(one, "value", None)) in (int, float) for one in ast.walk(node))
+
+
+def test_no_two_files_have_a_number_of_the_same_name():
+    found: dict[str, set[str]] = {}
+    for path, tree in sources().items():
+        for node in tree.body:
+            if isinstance(node, ast.Assign) and is_number(node.value):
+                for one in ast.walk(ast.Module(node.targets, type_ignores=[])):
+                    if isinstance(one, ast.Name):
+                        found.setdefault(one.id, set()).add(str(path.relative_to(ROOT)))
+    assert len(found) > 500  # the sources were read
+    assert {name: files for name, files in found.items() if len(files) > 1} == {}
+
+
+def test_nothing_asks_of_which_class_a_terrain_a_lens_or_a_localizer_is():
+    asked = re.compile(r"isinstance\([^()]*(Cylinder|HeightMap|Terrain|Posterior|Localizer|\bLens|KannalaBrandt)")
+    assert [path for path in sources() if asked.search(path.read_text(encoding="utf-8"))] == []
+
+
+def test_files_are_short_and_the_package_has_few_entries():
+    assert [path for path in sources() if len(path.read_text(encoding="utf-8").splitlines()) > 300] == []
+    assert len([path for path in ROOT.iterdir() if path.name not in ("__pycache__", "data")]) <= 22
+
+
 def test_only_the_renderer_reads_the_truth():
     """The truth beside a rendered image is for tests and scorers: no stage reads it."""
     truth = re.compile(r"\bTruth\b|\.truth\b")

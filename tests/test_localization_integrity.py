@@ -12,12 +12,10 @@ from localization_helpers import locate_or_refuse
 from test_localization_refinement import CRATER, PX_PER_RAD, sky_rows
 from test_localization_shape import TRUE, evidence_at
 
-from startrack.core.types import Array, Bools, Fix
-from startrack.evidence.sky_light import MIDDLES_RAD
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Bools, Fix
 from startrack.localization import ExactPosterior
 from startrack.localization.integrity import DIVISIONS, GROUPS, RISK, WRONG_GROUP, _divide
 from startrack.localization.search import Explored
-from startrack.localization.skyline_profiles import SECTORS
 from startrack.output import SCHEMAS, result_dict, verbose_text
 from startrack.terrain import Cylinder
 

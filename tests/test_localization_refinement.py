@@ -11,9 +11,8 @@ from render_helpers import CRATER
 from scipy.special import ndtr
 from sky_helpers import EDGE_PX, PX_PER_RAD
 
-from startrack.core.types import Array, Evidence, ImageErrors, NotLocated
-from startrack.evidence.sky_levels import SECTORS
-from startrack.evidence.sky_light import CELL_PX, LEVELS, MIDDLES_RAD
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, ImageErrors, NotLocated
+from startrack.evidence.sky_light import CELL_PX, LEVELS
 from startrack.evidence.star_offsets import offset_terms
 from startrack.localization import ExactPosterior
 from startrack.localization.likelihood import PositionLikelihood

@@ -18,8 +18,7 @@ from startrack.camera import Camera, load_camera
 from startrack.catalog import StarCatalog, load_catalog
 from startrack.chain import Inputs, Located, Refused, Settings, pipeline
 from startrack.core.errors import Reason
-from startrack.core.types import Exposure
-from startrack.evidence.sky_light import MIDDLES_RAD
+from startrack.core.types import MIDDLES_RAD, Exposure
 from startrack.localization import PseudoGradient
 from startrack.output import prepare_folder, write_results
 from startrack.output.picture.axes import GAP_PX

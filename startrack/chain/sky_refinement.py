@@ -8,12 +8,10 @@ import numpy as np
 
 from startrack.chain.measurement import fix_position
 from startrack.chain.stages import Located, Measured
-from startrack.core.types import Array, Bools, Evidence, ImageErrors, MeasuredSkyline, NotLocated
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Bools, Evidence, ImageErrors, MeasuredSkyline, NotLocated
 from startrack.evidence import (
     CLIP_SHIFT_PX,
-    MIDDLES_RAD,
     NEEDED_SECTORS,
-    SECTORS,
     SEEN_LLR,
     SkyLight,
     Skyline,

@@ -237,13 +237,10 @@ class Located(StarFix, Measured):
     @property
     def warnings(self) -> list[str]:
         """Those of `Measured`, what blocks the view, and errors beyond the defaults of facts that no file states."""
-        blocked = [] if self.blocked is None else [f"blocked and left out: {self.blocked.text}"]
+        blocked = [f"blocked and left out: {self.blocked.text}"] if self.blocked else []
         shown = [f"the image shows {one.text}, which no file states: it is estimated" for one in self.fix.shown]
         if self.fix.contradicted:
-            shown = [
-                f"the image contradicts {self.fix.contradicted} of the terrain file: what the file states of errors "
-                "of its shape is not believed, and the circles are wider"
-            ]
+            shown = [f"the image contradicts {self.fix.contradicted}: the circles are those of a silent terrain file"]
         return [*super().warnings, *blocked, *shown]
 
     @property

@@ -7,10 +7,10 @@ import math
 from collections.abc import Callable
 from typing import TypeVar
 
+from startrack.core import MAX_EXPOSURE_S
 from startrack.core.declaration import LARGEST, SHOWN_CHARS
 
 T = TypeVar("T")
-MAX_EXPOSURE_S = 1e6  # as startrack.exposure has it; written here so that help is quick
 MAX_COUNT = 1_000_000
 MAX_MAGNITUDE = 100.0
 FIELD_TOLERANCE_1 = 0.1  # as startrack.identification.unknown_lens has it; written here so that help is quick

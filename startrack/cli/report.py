@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from startrack.cli.flag_types import count
 from startrack.cli.flags import DIR, MORE, Command, flag
+from startrack.core import REPORTED_IMAGES
 from startrack.core.errors import BadInput
 from startrack.core.files import check_output, existing_folder
 
@@ -19,8 +20,7 @@ if TYPE_CHECKING:
     from startrack.output import Found
 
 PAGE = "report.html"  # of a folder; of one result NAME.report.html
-DEFAULT_IMAGES = 30
-FEW = 3
+NAMED_FILES = 3
 POSITION_M = (-6900.0, 4700.0)  # of the demo: near the wall of the thesis's crater, where the position is known best
 
 
@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def write_page_of(
-    out: str, *, truth: str | None = None, images: int = DEFAULT_IMAGES, output: str | None = None
+    out: str, *, truth: str | None = None, images: int = REPORTED_IMAGES, output: str | None = None
 ) -> Path:
     """Write the page of a folder of results or of one NAME.fix.json; its path. Raises BadInput, BadOutput."""
     from startrack.output import result_at, results_under, write_page
@@ -63,7 +63,7 @@ def _select_tabled(out: str, found: list[Found]) -> list[Found]:
         return found
     left = {one.stem for one in found if JOB in one.record and one.path.relative_to(out).as_posix() not in known}
     if left:
-        some = ", ".join(sorted(left)[:FEW]) + (", ..." if len(left) > FEW else "")
+        some = ", ".join(sorted(left)[:NAMED_FILES]) + (", ..." if len(left) > NAMED_FILES else "")
         print(
             f"startrack: left out {len(left)} results that {out}'s tables do not have ({some}): their images are no "
             "longer in the batch's folder, or startrack batch is to be run again",
@@ -143,7 +143,7 @@ COMMANDS = (
             "output": (
                 flag("-o --output FILE", "file of the page"),
                 flag("--images N", "number of images with picture and stars; the table contains all", count,
-                     default=DEFAULT_IMAGES),
+                     default=REPORTED_IMAGES),
             ),
             "more": MORE,
         },

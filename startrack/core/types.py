@@ -26,6 +26,8 @@ __all__ = [
 
 # Beyond the zenith: the search for an error of the horizon shifts the rows, by three sigma at most.
 MOST_ELEVATION_RAD = np.pi / 2 + 0.6
+SECTORS = 240  # of azimuth, 1.5 degrees each: an obstacle on no map hides what is in one together
+MIDDLES_RAD = (np.arange(SECTORS) + 0.5) * 2 * np.pi / SECTORS
 TIME_SIGMA_S = 1.0  # of the clock, where nothing is stated
 MAX_PIXELS = 200_000_000  # contract: a larger image is refused from its header, before anything is decoded
 

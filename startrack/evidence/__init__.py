@@ -5,10 +5,9 @@ from startrack.evidence.double_exposure import check_single_skyline
 from startrack.evidence.expected_stars import SURE_SIGMAS, FluxScale, expect_stars, expected_flux_scale, flux_scale
 from startrack.evidence.photometry import Photometry, Sources, half_width, neighbour_profiles, order_by_cell
 from startrack.evidence.photometry_kernel import profiles_of
-from startrack.evidence.sky_levels import SECTORS, sector_of
+from startrack.evidence.sky_levels import sector_of
 from startrack.evidence.sky_light import (
     CLIP_SHIFT_PX,
-    MIDDLES_RAD,
     NEEDED_SECTORS,
     SkyLight,
     average_shifts,
@@ -30,7 +29,7 @@ from startrack.evidence.star_evidence import DECIDABLE_SNR, SEEN_LLR, StarEviden
 from startrack.evidence.star_offsets import measure_star_offsets, offset_terms
 
 __all__ = [
-    "BAND_PX", "CLIP_SHIFT_PX", "DECIDABLE_SNR", "MIDDLES_RAD", "NEEDED_SECTORS", "SECTORS", "SEEN_LLR", "SURE_SIGMAS",
+    "BAND_PX", "CLIP_SHIFT_PX", "DECIDABLE_SNR", "NEEDED_SECTORS", "SEEN_LLR", "SURE_SIGMAS",
     "DamagedResponse", "FluxScale", "Horizon", "Photometry", "SkyLight", "SkyStep", "Skyline", "Sources",
     "StarEvidence", "StarPhotometry", "average_shifts", "check_single_skyline", "expect_stars", "expected_flux_scale",
     "filtered_noise_e", "flux_scale", "half_width", "height_above_px", "measure_noise", "measure_response",

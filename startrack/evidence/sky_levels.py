@@ -9,11 +9,10 @@ import numpy as np
 
 from startrack.core.kernels import njit
 from startrack.core.statistics import robust_sigma
-from startrack.core.types import Array, Bools, Ints
+from startrack.core.types import SECTORS, Array, Bools, Ints
 from startrack.evidence.sky_pixels import SkyPixels
 from startrack.evidence.sky_step import MEDIAN_ABS_NORMAL
 
-SECTORS = 240  # of 1.5 degrees, as the localizer's
 LEVEL_SIGMAS = 4.0  # of the edge: from here on a pixel shows the sky or the ground alone
 MIN_SIDE_PIXELS = 30  # of a sector on either side of the skyline
 MIN_KEPT = 0.5  # of them, by the last clipping: else the sector shows something else than those beside it

@@ -18,18 +18,9 @@ import numpy as np
 
 from startrack.core.kernels import njit, normal_cdf
 from startrack.core.statistics import relative_weights, robust_sigma
-from startrack.core.types import Array, Bools, Evidence
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Bools, Evidence
 from startrack.evidence.expected_stars import SURE_SIGMAS
-from startrack.evidence.sky_levels import (
-    CLIP_SIGMAS,
-    GROUND,
-    LEVEL_SECTORS,
-    SECTORS,
-    SKY,
-    SkyLevels,
-    measure_levels,
-    sector_of,
-)
+from startrack.evidence.sky_levels import CLIP_SIGMAS, GROUND, LEVEL_SECTORS, SKY, SkyLevels, measure_levels, sector_of
 from startrack.evidence.sky_pixels import SkyPixels
 from startrack.evidence.sky_step import Horizon
 from startrack.evidence.star_evidence import SEEN_LLR
@@ -44,7 +35,6 @@ SECTOR_STEP_SIGMAS = 3.0  # of the step of one sector
 MISFIT_SIGMAS = 6.0  # of a sector's misfit against the others'
 RAMP_PX = 4.0  # standard deviation of an edge that is no skyline: light that fades
 SHARP_NATS = 10.0  # by which the sharp edge must explain the pixels better than such a ramp
-MIDDLES_RAD = (2 * np.arange(SECTORS) + 1) * np.pi / SECTORS
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from startrack.core import MAX_EXPOSURE_S
 from startrack.core.declaration import SHOWN_CHARS, Choice, Number, Table, Text, value_text
 from startrack.core.files import MAX_CAUSE_CHARS, MAX_TEXT_BYTES, is_path, printable
 from startrack.core.types import BadInput
 from startrack.frames import parse_utc
 
 BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
-MAX_EXPOSURE_S = 1e6
 # Ten days rotate the Moon's sky by a third of a turn: such a clock states no time. A larger number has another unit.
 MAX_TIME_SIGMA_S = 864_000.0
 NUMBERS = {

@@ -14,7 +14,7 @@ from startrack.estimation.match import match_mutual
 from startrack.estimation.normal_equations import observations_of_image
 from startrack.identification.attitude_search import INLIER_PX
 
-GROWTH_ROUNDS = 2  # of matching and fitting within a stage
+REGION_ROUNDS = 2  # of matching and fitting within a stage
 FEWEST = 5  # matches
 GATE_OVER_SIGMA = 4.0  # the gate over the sigma of the loss
 MATCH_LOSS = cauchy_loss(4.0)  # chi-square of a match whose weight is halved
@@ -76,7 +76,7 @@ def grow(
     grown = None
     for stage in stages:
         some = xy_px[: stage.detections]
-        for _ in range(GROWTH_ROUNDS):
+        for _ in range(REGION_ROUNDS):
             gate_px = max(stage.gate_rad * camera.focal_px[0], INLIER_PX)
             near = (middle_icrs, stage.radius_rad)
             detection, star, predicted = match_in_view(camera, R, some, rays_icrs, gate_px, near)

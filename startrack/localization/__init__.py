@@ -3,10 +3,18 @@
 from typing import Any, Protocol
 
 from startrack.core.types import Evidence, Fix
-from startrack.localization.clock import clock_at, clock_matters
-from startrack.localization.convex_hull import Hull
-from startrack.localization.posterior import ExactPosterior
-from startrack.localization.pseudo_gradient import PseudoGradient
+from startrack.localization.clock import clock_at, clock_matters, duration
+from startrack.localization.convex_hull import Hull, hull_position
+from startrack.localization.importance_sampling import Gaussian, WeightedPoints, moments, sample
+from startrack.localization.integrity import RISK, clear_logs
+from startrack.localization.posterior import MIN_ROW_NATS, ExactPosterior
+from startrack.localization.pseudo_gradient import PseudoGradient, descend
+from startrack.localization.sector_likelihood import Sectors
+from startrack.localization.sector_moments import solve_linear
+from startrack.localization.shared_errors import ErrorBasis, SharedErrors
+from startrack.localization.skyline_model import NO_IMAGE_ERRORS, SkylineModel
+from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD
+from startrack.localization.summary import camera_at
 from startrack.terrain import Terrain
 
 
@@ -59,6 +67,34 @@ def require_localizer(given: Any) -> Localizer:
 
 
 __all__ = [
-    "DEFAULT_LOCALIZER", "LOCALIZERS", "ExactPosterior", "Hull", "Localizer", "PseudoGradient", "clock_at",
-    "clock_matters", "has_posterior", "localizer_name", "require_localizer",
-]  # fmt: skip
+    "DEFAULT_LOCALIZER",
+    "HIGH_RAD",
+    "LOCALIZERS",
+    "LOW_RAD",
+    "MIN_ROW_NATS",
+    "NO_IMAGE_ERRORS",
+    "RISK",
+    "ErrorBasis",
+    "ExactPosterior",
+    "Gaussian",
+    "Hull",
+    "Localizer",
+    "PseudoGradient",
+    "Sectors",
+    "SharedErrors",
+    "SkylineModel",
+    "WeightedPoints",
+    "camera_at",
+    "clear_logs",
+    "clock_at",
+    "clock_matters",
+    "descend",
+    "duration",
+    "has_posterior",
+    "hull_position",
+    "localizer_name",
+    "moments",
+    "require_localizer",
+    "sample",
+    "solve_linear",
+]

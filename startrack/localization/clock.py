@@ -17,7 +17,7 @@ from startrack.localization.shared_errors import is_noticeable
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain
 
-REACH_SIGMAS = 4.0  # of the stated error, to the last time that is tried
+CLOCK_REACH_SIGMAS = 4.0  # of the stated error, to the last time that is tried
 TURN_S = 600.0  # over which the sky's turn is taken
 GROSS_PROBABILITY, GROSS_SIGMA_S = 0.01, 3600.0  # of a clock whose error nobody states
 WRONG_SIGMA_S = 21_600.0  # of one whose stated error is wrong: a local time, a half of the day
@@ -92,7 +92,7 @@ class Track:
     def limits_s(self) -> tuple[float, float]:
         """First and last time that is tried [s later]."""
         clock = self.clock
-        low, high = (-clock.offset_s + side * REACH_SIGMAS * clock.sigma_s for side in (-1, 1))
+        low, high = (-clock.offset_s + side * CLOCK_REACH_SIGMAS * clock.sigma_s for side in (-1, 1))
         return max(low, -clock.reach_s), min(high, clock.reach_s)
 
     @property

@@ -12,10 +12,10 @@ from startrack.core.types import Array
 from startrack.localization.obstacle_chain import clear_emission
 from startrack.localization.skyline_profiles import LOW_RAD, Profiles
 
-NODES, SPREAD = 121, 6.5  # of heights about the map's skyline, closer about it
+FREE_HEIGHTS, SPREAD = 121, 6.5  # of heights about the map's skyline, closer about it
 ROUGHNESS_RAD = np.radians([0.003, 0.01, 0.03, 0.1])  # mean steps from sector to sector, equally likely
 JUMP = 1e-4  # probability of a step to anywhere
-HEIGHTS_RAD = -LOW_RAD * np.sinh(SPREAD * np.linspace(-1, 1, NODES)) / np.sinh(SPREAD)
+HEIGHTS_RAD = -LOW_RAD * np.sinh(SPREAD * np.linspace(-1, 1, FREE_HEIGHTS)) / np.sinh(SPREAD)
 CELLS_RAD = np.gradient(HEIGHTS_RAD)
 
 

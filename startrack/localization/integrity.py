@@ -13,10 +13,9 @@ from math import log
 import numpy as np
 
 from startrack.core.kernels import njit
-from startrack.core.types import Array, Bools, Integrity
+from startrack.core.types import SECTORS, Array, Bools, Integrity
 from startrack.localization.obstacle_chain import fill_clear_emissions
 from startrack.localization.skyline_model import SkylineModel
-from startrack.localization.skyline_profiles import SECTORS
 
 GROUPS = 8  # of azimuth, 45 degrees wide
 DIVISIONS = 3  # into such groups, each turned by 15 degrees: an obstacle of up to 30 degrees is wholly in one group

@@ -7,10 +7,9 @@ from functools import cached_property
 
 import numpy as np
 
-from startrack.core.types import Array, Evidence
+from startrack.core.types import SECTORS, Array, Evidence
 from startrack.localization.box_sums import BoxAverage, PrefixSums
 from startrack.localization.sector_likelihood import Sectors, add_contributions
-from startrack.localization.skyline_profiles import SECTORS
 from startrack.terrain import Terrain, require_horizons
 
 SECTOR_RAD = 2 * np.pi / SECTORS

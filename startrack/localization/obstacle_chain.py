@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from startrack.core.kernels import njit
-from startrack.core.types import Array, Ints
-from startrack.localization.skyline_profiles import SECTORS, Profiles, cell_at, integral_to, log_at
+from startrack.core.types import SECTORS, Array, Ints
+from startrack.localization.skyline_profiles import Profiles, cell_at, integral_to, log_at
 
 LEVELS_RAD = np.radians([0.04, 0.08, 0.14, 0.24, 0.4, 0.65, 1.0, 1.6, 2.5, 4.0, 6.5, 10.0, 16.0])  # edges
 STATES = len(LEVELS_RAD) + 1  # the map's skyline, the levels between the edges, and everything hidden

@@ -28,7 +28,7 @@ FIRST_REACH_M, LAST_REACH_M, BOXES_ACROSS = 16.0, 256.0, 5  # of boxes about a p
 RIM_NATS = 3.0  # less probability than the whole has the rim of these boxes
 BOXES_AT_ONCE = 2000  # so that memory stays flat
 LOOK_UP_COST = 0.08  # of a bound, in horizons traced
-MANY_BOXES, MOST_BOXES = 4000, 16_000  # of a level: from which on a better position is sought, and of the last one
+MANY_BOXES, LAST_MOST_BOXES = 4000, 16_000  # of a level: from which on a better position is sought, and of the last one
 
 
 class Explored(NamedTuple):
@@ -173,7 +173,7 @@ class Search:
         finest_m = min(FINEST_M, FINEST_PART * half)
         while True:
             centres, upper = self._bound(centres, half)
-            is_last = 4 * len(centres) > MOST_BOXES
+            is_last = 4 * len(centres) > LAST_MOST_BOXES
             if 4 * len(centres) > MANY_BOXES and self._climb(centres, half):
                 continue
             if half <= finest_m or is_last:

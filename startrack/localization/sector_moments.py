@@ -13,7 +13,7 @@ from startrack.core.types import Array
 from startrack.localization.skyline_profiles import Profiles, cell_at
 
 REACH_RAD = np.radians(1.2)  # of heights about the reference's skyline
-LEAST_SIGMA_RAD, LEAST_INFORMATION = 1e-7, 1e-9
+LEAST_SIGMA_RAD, LEAST_SHOWN_PART = 1e-7, 1e-9
 FREEDOM = 3.0  # degrees of freedom of the residuals: obstacles and wrong rows do not lead the solution
 REWEIGHTINGS = 6
 
@@ -27,7 +27,7 @@ class SectorMoments(NamedTuple):
     @property
     def information(self) -> Array:
         """(SECTORS,) part of the window's variance that the rows take away; next to 0 where they show nothing."""
-        return np.clip(1.0 - 3.0 * self.variance_rad2 / REACH_RAD**2, LEAST_INFORMATION, 1.0)
+        return np.clip(1.0 - 3.0 * self.variance_rad2 / REACH_RAD**2, LEAST_SHOWN_PART, 1.0)
 
 
 def measure_moments(profiles: Profiles) -> SectorMoments:

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from startrack.core.types import Array, Evidence, ImageErrors, Ints
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, ImageErrors, Ints
 from startrack.localization.obstacle_chain import (
     MOVES,
     Levels,
@@ -25,10 +25,9 @@ from startrack.localization.obstacle_chain import (
 )
 from startrack.localization.sector_moments import SectorMoments, measure_moments
 from startrack.localization.shared_errors import ErrorBasis, SharedErrors
-from startrack.localization.skyline_profiles import HIGH_RAD, ROW_NATS, SECTORS, Profiles, profiles_of
+from startrack.localization.skyline_profiles import HIGH_RAD, ROW_NATS, Profiles, profiles_of
 from startrack.terrain import Terrain
 
-MIDDLES_RAD = (np.arange(SECTORS) + 0.5) * 2 * np.pi / SECTORS
 SAMPLES = 6 * SECTORS  # of the skyline around the reference, between which rows are compared with it
 TRACED_RAD = np.radians(0.7)  # rows this near the skyline are compared with its own elevation at their azimuth
 LEAST_REACH_RAD = np.radians(0.1)  # of shifts, for which levels are prepared

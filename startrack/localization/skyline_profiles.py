@@ -15,11 +15,10 @@ from typing import NamedTuple
 import numpy as np
 
 from startrack.core.kernels import njit
-from startrack.core.types import Array, Evidence, Ints
+from startrack.core.types import SECTORS, Array, Evidence, Ints
 from startrack.localization.sector_likelihood import EDGE_SIGMAS
 from startrack.localization.sky_profiles import SkyProfiles
 
-SECTORS = 240  # of 1.5 degrees: an obstacle on no map hides stars together, faint and bright ones
 LOW_RAD, HIGH_RAD = np.radians(-12.0), np.radians(20.0)  # window of heights: beyond it a skyline is no skyline
 ROW_NATS = 6.0  # most that one star counts: one in 400 is variable, misnamed or not in the catalogue
 SKY_STEP_PX = 0.1  # of the edge's width: cells of the sky's light, quadratic in each, right to 0.02 nats

@@ -10,8 +10,7 @@ from startrack.core.types import Array, Blocked, NotLocated
 from startrack.localization.free_skyline import free_log_likelihood
 from startrack.localization.hypothesis import GROSS_ROUNDS, Hypothesis, sample_gross_error
 from startrack.localization.shared_errors import SharedErrors
-from startrack.terrain import ForwardingTerrain
-from startrack.terrain.shape import BY_KEY, ShapeError, as_unstated
+from startrack.terrain import ForwardingTerrain, ShapeError, as_unstated
 
 WRONG_FACT_NATS = 3.0  # by which a gross error of a stated fact must explain the rows better: 1 of 100 clean skies
 MOST_BLOCKED = 0.5  # of the skyline that the rows show: where more is on no map, another place may explain them as well
@@ -61,7 +60,8 @@ def find_contradicted_fact(found: Sequence[Hypothesis]) -> str:
     better, fact = max(((nats, fact) for fact, nats in weigh_wrong_facts(found)), default=(0.0, ""))
     if better <= WRONG_FACT_NATS:
         return ""
-    if fact not in BY_KEY or not BY_KEY[fact].gross_probability:
+    errors = [as_unstated(one) for one in found[0].model.terrain.shape_errors if one.fact == fact]
+    if all(one.is_stated for one in errors):
         raise NotLocated(
             f"an error beyond what {fact} states explains the image better, by {better:.0f} nats: is it right?",
             reason="inconsistent_evidence",

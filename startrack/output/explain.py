@@ -11,7 +11,7 @@ from startrack.core.errors import Reason, length_text
 from startrack.core.types import Array, Blocked
 from startrack.evidence import DECIDABLE_SNR
 from startrack.frames import rays_from_azel
-from startrack.localization.clock import duration
+from startrack.localization import duration
 from startrack.output.values import DOMINANT
 
 WIDE_PART = 1e-3  # of the search radius: an answer with a smaller 95 % circle needs nothing

@@ -6,7 +6,7 @@ import numpy as np
 
 from startrack.chain import Located, Measured, Oriented
 from startrack.frames import quat_xyzw_from_R
-from startrack.localization.integrity import RISK
+from startrack.localization import RISK
 from startrack.output.quantity import (
     CHANCE,
     FLAG,

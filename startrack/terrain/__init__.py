@@ -18,7 +18,7 @@ from startrack.terrain.protocol import (
     require_terrain,
 )
 from startrack.terrain.raster import EQUIRECTANGULAR, STEREOGRAPHIC, Projection, Raster
-from startrack.terrain.shape import ShapeError
+from startrack.terrain.shape import ShapeError, as_unstated
 
 if TYPE_CHECKING:
     from startrack.terrain.height_map import HeightMap
@@ -29,9 +29,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "EQUIRECTANGULAR", "MAKERS", "NO_POST", "STEREOGRAPHIC", "TERRAIN_KEYS", "Cylinder", "ForwardingTerrain",
-    "HeightMap", "HorizonPosts", "Projection", "Raster", "ShapeError", "StateableError", "Terrain", "body_of_terrain",
-    "files_of_terrain", "import_maps", "load_terrain", "read_map", "require_bounds", "require_horizons",
-    "require_terrain", "state_errors", "stateable_errors", "terrain_from_dict", "write_bands", "write_map",
+    "HeightMap", "HorizonPosts", "Projection", "Raster", "ShapeError", "StateableError", "Terrain", "as_unstated",
+    "body_of_terrain", "files_of_terrain", "import_maps", "load_terrain", "read_map", "require_bounds",
+    "require_horizons", "require_terrain", "state_errors", "stateable_errors", "terrain_from_dict", "write_bands",
+    "write_map",
 ]  # fmt: skip
 _LAZY_MODULES = {  # of names that few programs use: imported at the first use
     "HeightMap": "height_map", "StateableError": "state_file", "import_maps": "import_map", "read_map": "map_reading",

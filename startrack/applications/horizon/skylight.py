@@ -24,7 +24,7 @@ from startrack.applications.horizon.starlight import StarLight
 from startrack.core.types import Array, Bools, Ints
 
 BEYOND_CIRCLE_RAD = np.radians(4.5)  # the edge of the image circle is stated to some degrees; light is followed so far
-GAP_PX = 1.0  # on either side of the step: the blurred edge
+CLEAR_GAP_PX = 1.0  # on either side of the step: the blurred edge
 SKY_PX, GROUND_PX = 4.0, 3.0  # lengths of the averages above and below
 MAX_SLOPE_1 = 0.08  # change of the sky's brightness over SKY_PX, relative to it
 MIN_SIGNIFICANCE = 3.0
@@ -70,8 +70,8 @@ def _steps_of(columns: Columns, width: int) -> Steps:
     """The steps of columns that are means over `width`."""
     width_px = width * 2 * np.pi / AZIMUTH_COLUMNS / columns.px_rad
     dark = float(np.nanpercentile(columns.light_e, DARKEST_PERCENT))
-    at_ground = _level_above(columns, GAP_PX, 2 * GAP_PX + GROUND_PX / 2, dark)
-    below = mean_above(columns, -GAP_PX - GROUND_PX, -GAP_PX)
+    at_ground = _level_above(columns, CLEAR_GAP_PX, 2 * CLEAR_GAP_PX + GROUND_PX / 2, dark)
+    below = mean_above(columns, -CLEAR_GAP_PX - GROUND_PX, -CLEAR_GAP_PX)
     difference = below - at_ground
     noise = columns.noise_e / np.sqrt(max(width_px, 1.0))
     sigma = np.sqrt(

@@ -18,7 +18,7 @@ MAX_CELLS = 1_000_000
 DEFAULT_CELLS_ACROSS = 10  # of the default spacing
 HEIGHT_STEPS = 4  # the horizontal position of a map's point depends on its height: 1 part in 1000 a step
 LENGTH_ROUNDING_1 = 1e-9  # relative, of a length of whole steps
-RING_RAD = np.linspace(0.0, 2 * np.pi, 181)
+PLACES_RING_RAD = np.linspace(0.0, 2 * np.pi, 181)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ def area_cells(terrain: Terrain, spacing_m: float) -> AreaCells:
     site, projection = terrain.site, terrain.projection
     if site is None or projection is None:
         raise BadInput("bad_terrain", f"terrain {terrain.name} has no map projection: only those on the Moon have one")
-    ring_m = terrain.search_radius_m * np.stack([np.sin(RING_RAD), np.cos(RING_RAD)], axis=-1)
+    ring_m = terrain.search_radius_m * np.stack([np.sin(PLACES_RING_RAD), np.cos(PLACES_RING_RAD)], axis=-1)
     x, y = projection.xy_from_latlon(*latlon_from_enu(site, ring_m[:, 0], ring_m[:, 1], 0.0))
     middle_x, middle_y = projection.xy_from_latlon(site.latitude_rad, site.longitude_rad)
     dx, dy = spacing_m * _units_per_m(projection, site)

@@ -26,9 +26,7 @@ from startrack.applications.reproduction.simulator import (
 )
 from startrack.core.chunk_store import Chunk, ChunkStore, Progress, settings_digest
 from startrack.core.types import Array, Bools, Fix, NotLocated
-from startrack.localization import ExactPosterior
-from startrack.localization.convex_hull import hull_position
-from startrack.localization.pseudo_gradient import PseudoGradient, descend
+from startrack.localization import ExactPosterior, PseudoGradient, descend, hull_position
 from startrack.terrain import Cylinder
 
 FIX_FOLDER = ".chunks"

@@ -21,7 +21,7 @@ from startrack.terrain import Cylinder
 DIAMETER_M, DEPTH_M = 20_000.0, 2_000.0  # Shackleton as the thesis has it (section 3.3)
 MAGNITUDE = 6.0
 ASPECT_RATIO = DIAMETER_M / DEPTH_M
-EDGE_POINTS = 360  # of the drawn crater edge (section 3.2.1)
+RIM_POINTS = 360  # of the drawn crater edge (section 3.2.1)
 STEP_M = 5.0  # of the traverse through the middle of the crater (section 3.2.2)
 GRID_POINTS = 161  # a side; odd, so that the position itself is a point of the first grid and the cell is not missed
 FIRST_HALF_M = 20.0
@@ -101,7 +101,7 @@ def visible_stars(points_m: Array, position_m: Array, radius_m: float) -> Bools:
 
 def crater_edge(cylinder: Cylinder, position_m: Array) -> tuple[Array, Array]:
     """Azimuths and elevations (361,) [rad] of the rim from a position, at even steps along the rim, closed."""
-    rim = cylinder.radius_m * directions(np.linspace(0.0, 2 * np.pi, EDGE_POINTS + 1)) - position_m
+    rim = cylinder.radius_m * directions(np.linspace(0.0, 2 * np.pi, RIM_POINTS + 1)) - position_m
     return np.arctan2(rim[:, 0], rim[:, 1]), np.arctan2(cylinder.wall_m, np.hypot(rim[:, 0], rim[:, 1]))
 
 

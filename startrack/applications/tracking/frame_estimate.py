@@ -14,10 +14,9 @@ import numpy as np
 
 from startrack.applications.tracking.frame_model import FrameModel, balanced_moments, sample_together
 from startrack.applications.tracking.track_errors import TrackErrors
-from startrack.core.types import Array, Evidence, Ints
+from startrack.core.types import MIDDLES_RAD, Array, Evidence, Ints
 from startrack.estimation.observations import FrameEstimate
-from startrack.localization.importance_sampling import WeightedPoints, moments
-from startrack.localization.skyline_model import MIDDLES_RAD
+from startrack.localization import WeightedPoints, moments
 from startrack.terrain import NO_POST, Terrain
 
 FRAME_REACH_SIGMAS, FRAME_MARGIN_M = 6.0, 5.0  # of a Gaussian, to the side of the neighbourhood

@@ -10,13 +10,19 @@ from typing import Self
 import numpy as np
 
 from startrack.applications.tracking.track_errors import TrackErrors
-from startrack.core.types import Array, Evidence
+from startrack.core.types import SECTORS, Array, Evidence
 from startrack.estimation.observations import UNKNOWN_M
-from startrack.localization.importance_sampling import Gaussian, WeightedPoints, moments, sample
-from startrack.localization.integrity import clear_logs
-from startrack.localization.sector_moments import solve_linear
-from startrack.localization.shared_errors import ErrorBasis
-from startrack.localization.skyline_model import NO_IMAGE_ERRORS, SECTORS, SkylineModel
+from startrack.localization import (
+    NO_IMAGE_ERRORS,
+    ErrorBasis,
+    Gaussian,
+    SkylineModel,
+    WeightedPoints,
+    clear_logs,
+    moments,
+    sample,
+    solve_linear,
+)
 from startrack.terrain import Terrain
 
 STEP_SIGMAS, LEAST_STEP_RAD = 0.5, 1e-7  # of the skyline's spread, to each side: where the change with it is taken

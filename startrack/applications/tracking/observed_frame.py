@@ -22,9 +22,7 @@ from startrack.core.files import write_atomically
 from startrack.core.types import Array, Clock, Evidence, Fix, ImageErrors, ShownError
 from startrack.estimation.observations import FrameEstimate
 from startrack.estimation.smoother import SIGMAS_95
-from startrack.localization.posterior import MIN_ROW_NATS
-from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD
-from startrack.localization.summary import camera_at
+from startrack.localization import HIGH_RAD, LOW_RAD, MIN_ROW_NATS, camera_at
 from startrack.terrain import Terrain
 
 FRAME_FORMAT = "startrack.observed-frame/3"

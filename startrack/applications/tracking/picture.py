@@ -33,11 +33,11 @@ from startrack.output import (
 )
 
 TITLE_SIZE, GRAPH_TEXT_SIZE = 1.5 * CAPTION_SIZE, CAPTION_SIZE - 1.0
-LEFT_PX, TOP_PX, SIDE_PX, PANEL_PX = 70.0, 62.0, 860.0, 354.0  # of the map; width of the panel beside it
-MAP_BOX: Box = (LEFT_PX, TOP_PX, LEFT_PX + SIDE_PX, TOP_PX + SIDE_PX)
+TRACK_LEFT_PX, TOP_PX, TRACK_SIDE_PX, PANEL_PX = 70.0, 62.0, 860.0, 354.0  # of the map; width of the panel beside it
+MAP_BOX: Box = (TRACK_LEFT_PX, TOP_PX, TRACK_LEFT_PX + TRACK_SIDE_PX, TOP_PX + TRACK_SIDE_PX)
 PANEL: Box = (MAP_BOX[2] + 2 * CAPTION_SIZE, TOP_PX, MAP_BOX[2] + 2 * CAPTION_SIZE + PANEL_PX, MAP_BOX[3])
-WIDTH_PX, HEIGHT_PX = round(PANEL[2] + TITLE_SIZE), 1240
-GRAPH_TOP_PX, GRAPH_BOTTOM_PX = MAP_BOX[3] + 90.0, HEIGHT_PX - 54.0
+TRACK_WIDTH_PX, TRACK_HEIGHT_PX = round(PANEL[2] + TITLE_SIZE), 1240
+GRAPH_TOP_PX, GRAPH_BOTTOM_PX = MAP_BOX[3] + 90.0, TRACK_HEIGHT_PX - 54.0
 LOGARITHMIC = 8.0  # a scale whose ends have a larger ratio
 TICKS = 20  # of frames, at most
 
@@ -54,7 +54,7 @@ def draw_track(track: Track, odometry_m: Array | None = None) -> NDArray[np.uint
         track: with n frames.
         odometry_m: positions (n, 2) in enu by odometry alone, from the first smoothed position; None: not known.
     """
-    canvas = Canvas(WIDTH_PX, HEIGHT_PX)
+    canvas = Canvas(TRACK_WIDTH_PX, TRACK_HEIGHT_PX)
     left, top, right, _ = PANEL
     words = "camera at rest" if track.at_rest else "track"
     canvas.text((MAP_BOX[0], 40.0), f"{words} on {track.terrain.name}", TITLE_SIZE, INK)

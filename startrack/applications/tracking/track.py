@@ -18,7 +18,7 @@ from startrack.core.types import Array, BadInput, Bools, ClockError, Ints
 from startrack.estimation.observations import UNKNOWN_M
 from startrack.estimation.smoother import Smoothed, radius_holding
 from startrack.frames import quat_xyzw_from_R
-from startrack.localization.summary import camera_at
+from startrack.localization import camera_at
 from startrack.terrain import Terrain
 
 ODOMETRY_SIGMA, ODOMETRY_FLOOR_M = 0.02, 0.05  # of a move, relative to its length, and beside that

@@ -12,8 +12,7 @@ import numpy as np
 from startrack.chain import EDGE_SIGMA_PX
 from startrack.core.types import Array, BadInput, Clock, Evidence, Exposure, ImageErrors
 from startrack.exposure import NO_TIME
-from startrack.localization import clock_at
-from startrack.localization.shared_errors import SharedErrors
+from startrack.localization import SharedErrors, clock_at
 from startrack.terrain import Terrain
 
 BIAS, CLOCK, DEPTH, EDGE = "bias_rad", "clock_s", "depth_1", "edge_px"

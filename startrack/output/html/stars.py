@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from startrack.catalog import proper_name_designations
 from startrack.core.types import Array, Bools, Evidence
-from startrack.localization.sector_likelihood import Sectors
+from startrack.localization import Sectors
 
 Horizon = Callable[[Array], Array]  # azimuths (n,) to elevations (n,) [rad]
 # name on the page, column of NAME.stars.ecsv, decimals (None: a text)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from startrack.core import REPORTED_IMAGES
 from startrack.core.errors import Reason
 from startrack.core.files import write_atomically
 from startrack.output.html.details import (
@@ -44,8 +45,7 @@ SCRIPTS = (
     "sky.js", "panorama.js", "picture.js", "evidence.js", "designations.js", "search.js", "map.js", "errors.js",
     "detail.js", "table.js", "page.js",
 )  # fmt: skip
-DEFAULT_IMAGES = 30
-FEW = 4  # images whose details may be large
+FEW_IMAGES = 4  # images whose details may be large
 LARGE, SMALL = (1400, 4000, 1441), (1000, 1500, 721)  # px of the picture, stars, azimuths of the horizon
 FILES = (".annotated.png", ".stars.ecsv", ".skyline.ecsv", ".skyline.png", ".wcs", ".corr")
 
@@ -56,7 +56,7 @@ def write_page(
     *,
     unread: Sequence[str] = (),
     real: Mapping[str, Position] | None = None,
-    images: int = DEFAULT_IMAGES,
+    images: int = REPORTED_IMAGES,
     single: bool = False,
 ) -> None:
     """Write the page of the results to `path`, whole or not at all. Raises BadInput where it cannot be written.
@@ -73,7 +73,7 @@ def page_text(
     *,
     unread: Sequence[str] = (),
     real: Mapping[str, Position] | None = None,
-    images: int = DEFAULT_IMAGES,
+    images: int = REPORTED_IMAGES,
     single: bool = False,
     base: str = ".",
 ) -> str:
@@ -92,7 +92,7 @@ def page_text(
     terrains = {name: terrain for name in names if (terrain := load_or_none(name)) is not None}
     detailed = images_with_details(found, images)
     rows = [row_of(one, real.get(one.stem), k in detailed) for k, one in enumerate(found)]
-    size = LARGE if len(detailed) <= FEW else SMALL
+    size = LARGE if len(detailed) <= FEW_IMAGES else SMALL
     details = {k: _detail(found[k], terrains, size) for k in sorted(detailed)}
     head = {
         "columns": COLUMNS,

@@ -39,7 +39,7 @@ from startrack.output.picture.relief import LABEL_TRIES, edge_cover, extrapolate
 if TYPE_CHECKING:
     from startrack.terrain import Raster, Terrain
 
-HEAD_PX, SIDE_PX, LEGEND_PX = 84.0, 820, 250  # above a picture, for its title; of the map, and beside it
+HEAD_PX, SIDE_PX, PREDICTION_LEGEND_PX = 84.0, 820, 250  # above a picture, for its title; of the map, and beside it
 CURVES_PX = 1100, 620
 BOX: Box = (90.0, HEAD_PX, CURVES_PX[0] - 30.0, CURVES_PX[1] - 80.0)
 NICE = nice_numbers(-3, 6)
@@ -61,7 +61,7 @@ def prediction_picture(
     `site` is the terrain's. `radius95_m` is NaN outside of the search area and infinite where half of the draws or more
     have no position.
     """
-    canvas = Canvas(round(LEFT_PX) + SIDE_PX + LEGEND_PX, round(HEAD_PX + BELOW_PX) + SIDE_PX)
+    canvas = Canvas(round(LEFT_PX) + SIDE_PX + PREDICTION_LEGEND_PX, round(HEAD_PX + BELOW_PX) + SIDE_PX)
     box = (LEFT_PX, HEAD_PX, LEFT_PX + SIDE_PX - 9.0, HEAD_PX + SIDE_PX - 9.0)
     view = map_view(box, (0.0, 0.0), SEARCH_MARGIN * max(terrain.search_radius_m, terrain.rim_radius_m or 0.0))
     bounds_m = class_bounds_m(radius95_m.heights_m)

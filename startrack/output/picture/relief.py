@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from startrack.terrain import Terrain
 
 Image = NDArray[np.float32]
-CELL_PX = 2  # the ground is computed at every second pixel
+RELIEF_CELL_PX = 2  # the ground is computed at every second pixel
 GENTLE_SLOPE = 0.02  # gentler ground looks flat
 RELIEF_LIGHT = 3.0  # slopes that face the light, as a multiple of the floor's colour
 MAX_LEVELS = 12.0
@@ -28,7 +28,7 @@ LABEL_TRIES = 60  # places along a contour
 
 def ground_of_view(view: MapView, terrain: Terrain, shape: tuple[int, int]) -> tuple[Image, Bools]:
     """Heights [m] of the cells of a map that is `shape` (H, W) pixels large, and where there is ground."""
-    cells = max(2, shape[0] // CELL_PX), max(2, shape[1] // CELL_PX)
+    cells = max(2, shape[0] // RELIEF_CELL_PX), max(2, shape[1] // RELIEF_CELL_PX)
     return ground_cells(terrain, view.half_m, cells, view.centre_m)
 
 

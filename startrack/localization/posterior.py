@@ -57,14 +57,14 @@ class ExactPosterior:
         near = rows.near
         try:
             parts = self._explore_times(rows, terrain)
-            found, wrong = _sample(parts, terrain), ""
-            if not rows.is_first_look:
-                wrong = find_contradicted_fact(found)
-            if wrong:
-                terrain = UnstatedTerrain(terrain)
-                found = _sample(parts, terrain)
-                find_contradicted_fact(found)
-            fix = conclude(found, terrain, parts[0][1], _dropped_probability(parts[0][1]))
+            found, explored = _sample(parts, terrain), parts[0][1]
+            fix = conclude(found, terrain, explored, _dropped_probability(explored))
+            wrong = "" if rows.is_first_look else find_contradicted_fact(found)
+            if not wrong:
+                return fix
+            found = _sample(parts, UnstatedTerrain(terrain))
+            find_contradicted_fact(found)
+            fix = conclude(found, UnstatedTerrain(terrain), explored, _dropped_probability(explored))
             return replace(fix, contradicted=wrong)
         except NotLocated as refusal:
             raise name_prior(refusal, near) from refusal

@@ -24,7 +24,7 @@ from startrack.terrain import Terrain, load_terrain
 
 DRAW_FOLDER = ".predict"
 DRAW_SOURCES = (  # their content is part of a chunk's key
-    "localization/*.py", "simulation/*.py", "evidence/*.py", "rendering/*.py", "terrain/*.py", "chain/star_fix.py",
+    "localization/*.py", "simulation/*.py", "evidence/*.py", "rendering/*.py", "terrain/*.py", "chain/measurement.py",
     "applications/prediction/draws.py",
 )  # fmt: skip
 FAINTEST_V_MAG = 10.0  # of the stars in the sky, as `render` has it; and

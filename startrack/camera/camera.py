@@ -212,7 +212,10 @@ def compensating_rotation(camera: Camera, order: tuple[str, ...]) -> Array:
 
 
 def projection_covariance_px2(camera: Camera, rays_cam: Array) -> Array:
-    """Covariance (..., 2, 2) [px^2] of the projected `rays_cam` (..., 3), best rotation removed; 0 if not known."""
+    """Covariance (..., 2, 2) [px^2] of the `rays_cam` (..., 3) that a `camera` projects, best rotation removed.
+
+    It is 0 where the camera's covariance is not known.
+    """
     rays_cam = np.asarray(rays_cam, dtype=np.float64)
     if camera.covariance is None:
         return np.zeros((*rays_cam.shape[:-1], 2, 2))

@@ -90,8 +90,8 @@ def foreign_text(camera: Camera, program: str) -> str:
 def camera_from_foreign_text(text: str, program: str, name: str, calibrated_angle_rad: float | None = None) -> Camera:
     """The camera of the `text` of a file of `program`, called `name` unless the file names it.
 
-    No such file states up to which angle off the axis [rad] the lens was calibrated: None takes the angle at the edge
-    of the frame that is nearest to the centre. Raises BadInput bad_calibration.
+    No such file states `calibrated_angle_rad`, the angle off the axis up to which the lens was calibrated: None takes
+    the angle at the edge of the frame that is nearest to the centre. Raises BadInput bad_calibration.
     """
     refusal = f"not a camera file of {FOREIGN_FORMATS[program].title} that can be used"
     try:

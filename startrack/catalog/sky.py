@@ -37,7 +37,9 @@ class Sky:
 def sky_at(
     catalog: StarCatalog, time_utc: datetime, site: Site | None, lowest_rad: float = LOWEST_PREDICTED_RAD
 ) -> Sky:
-    """The catalogue at a time and site: with aberration; on the Earth with refraction, above `lowest_rad` of elevation.
+    """The `catalog` at `time_utc` and a `site`, with aberration.
+
+    On the Earth the directions have refraction, and stars are above `lowest_rad` of elevation.
 
     Without a site there is no refraction: on the Earth a lens fitted to these directions then contains it.
     """
@@ -56,12 +58,12 @@ def sky_at(
 
 
 def apparent_elevation_rad(elevation_rad: Array, site: Site) -> Array:
-    """Apparent elevations (...) of sources at true elevations (...) over a `site` on the Earth, in average air."""
+    """Apparent elevations [rad] of sources at true `elevation_rad` (...) over a `site` on the Earth, in average air."""
     return refract_rad(elevation_rad, float(SEA_LEVEL_HPA * np.exp(-site.height_m / SCALE_HEIGHT_M)))
 
 
 def apparent_bodies(site: Site, time_utc: datetime) -> tuple[Body, ...]:
-    """Planets, Sun and Moon in apparent directions over a `site` on the Earth, refraction included."""
+    """Planets, Sun and Moon in apparent directions at `time_utc` over a `site` on the Earth, refraction included."""
     R, found = R_enu_icrs(site, time_utc), []
     for body in bodies(site, time_utc):
         azimuth, elevation = azel_from_rays(R @ body.ray_icrs)
@@ -70,7 +72,7 @@ def apparent_bodies(site: Site, time_utc: datetime) -> tuple[Body, ...]:
 
 
 def airmass(elevation_rad: Array) -> Array:
-    """Airmass (...) of lines of sight at elevations (...), zenith = 1. Source: Rozenberg 1966, Twilight, p. 160."""
+    """Airmass (...) of lines of sight at `elevation_rad` (...), zenith = 1. Rozenberg 1966, Twilight, p. 160."""
     s = np.sin(elevation_rad)
     return 1.0 / (s + 0.025 * np.exp(-11.0 * s))
 

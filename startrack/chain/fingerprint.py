@@ -35,13 +35,14 @@ def sha256_of(path: str | os.PathLike[str]) -> str:
 
 
 def content_sha256(image: str, bag_image: BagImage | None) -> str:
-    """SHA-256 of an image's file, or of its message in a bag; `MISSING` if the file cannot be read."""
+    """SHA-256 of the file `image`, or of the message of `bag_image`; `MISSING` if the file cannot be read."""
     return sha256_of(image) if bag_image is None else bag_image.message.sha256
 
 
 def job_sha256(image: str, image_sha256: str, facts: dict[str, Any], *others: object) -> str:
     """SHA-256 of image, sidecar, flags, version and extras, and of dark frame and flat field.
 
+    `image_sha256` is the `content_sha256` of the `image`; `facts` are the flags by name, `others` further settings.
     `input_hashes` covers the other files that these name.
     """
     path = Path(image)
@@ -80,7 +81,7 @@ def input_hashes(
 
 
 def are_unchanged(image: str, hashes: dict[str, str]) -> bool:
-    """Whether the files of `input_hashes` have the content they had."""
+    """Whether the files have the content they had: `hashes` is what `input_hashes` returned for the `image`."""
     folder = os.path.realpath(Path(image).parent)
     return all(_cached_sha256(Path(folder, path)) == sha256 for path, sha256 in hashes.items())
 

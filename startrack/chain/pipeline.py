@@ -151,7 +151,7 @@ def detect(exposure: Exposure, camera: Camera | None, settings: Settings | None 
 
 
 def with_timing(outcome: Any, **more_ms: float) -> Any:
-    """The same outcome with wall times [ms] added to its stages' times."""
+    """The same `outcome` with `more_ms`, wall times [ms] by stage, added to its stages' times."""
     times = dict(outcome.timing_ms)
     for stage, ms in more_ms.items():
         times[stage] = times.get(stage, 0.0) + ms

@@ -37,7 +37,7 @@ class Sources:
 
 
 def half_width(sigma_px: float) -> int:
-    """Half width [px] of the measuring stamp: the star and enough around it to know the local level."""
+    """Half width [px] of the measuring stamp of a PSF of `sigma_px`: the star and enough of the level around it."""
     return stamp_radius(sigma_px) + 1
 
 
@@ -67,12 +67,15 @@ def measure(detections: Detections, sources: Sources) -> Photometry:
 
 
 def neighbour_profiles(sigma_px: float) -> Array:
-    """The table of pixel profiles of a PSF, wide enough for the light of a star in the stamps of its neighbours."""
+    """The table of pixel profiles of a PSF of `sigma_px`, wide enough for a star's light in its neighbours' stamps."""
     return pixel_profile_table(sigma_px, max(half_width(sigma_px), int(np.ceil(PROFILE_SIGMAS * sigma_px)) + 1))
 
 
 def order_by_cell(xy_px: Array, shape: tuple[int, ...], side_px: float) -> tuple[Ints, Ints, int]:
-    """Order of the sources (n, 2) by square cells of a grid over an image (H, W); each cell's first; the columns."""
+    """Order (n,) of the sources at `xy_px` (n, 2) by square cells of side `side_px`; each cell's first; the columns.
+
+    The grid of cells covers an image of `shape` (H, W).
+    """
     columns, rows = int(shape[1] / side_px) + 1, int(shape[0] / side_px) + 1
     position = (xy_px / side_px).astype(np.int64)
     cell = position[:, 1] * columns + position[:, 0]

@@ -45,7 +45,7 @@ class SkyLevels:
 
 
 def sector_of(azimuth_rad: Array) -> Ints:
-    """Sector (n,) of each azimuth."""
+    """Sector (n,) of each `azimuth_rad` (n,)."""
     return (azimuth_rad * (SECTORS / (2 * np.pi))).astype(np.int64) % SECTORS
 
 

@@ -134,7 +134,7 @@ def _shifts(height_px: Array, llr: Array, extended: Array, edge_px: float) -> tu
 
 
 def average_shifts(log_weights: Array, shifts: Array) -> tuple[Array, Array, Array]:
-    """Weights (n, m) of evenly spaced `shifts` (m,), by their logarithms; means and standard deviations (n,)."""
+    """Weights (n, m) of evenly spaced `shifts` (m,), of `log_weights` (n, m); means and standard deviations (n,)."""
     weight = relative_weights(log_weights, axis=1)
     weight /= weight.sum(axis=1, keepdims=True)
     mean = weight @ shifts

@@ -47,7 +47,10 @@ class Skyline:
 
     @classmethod
     def trace(cls, position_m: Array, terrain: Terrain, samples: int = SKYLINE_SAMPLES) -> Skyline:
-        """The horizon of a `terrain` at `position_m` (2,), traced once: on a height map that takes time."""
+        """The horizon of a `terrain` at `position_m` (2,), traced once at `samples` azimuths.
+
+        On a height map that takes time.
+        """
         azimuth = np.linspace(0.0, 2 * np.pi, samples, endpoint=False)
         return cls(terrain.horizon_rad(np.asarray(position_m)[None, :], azimuth))
 

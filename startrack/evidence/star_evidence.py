@@ -94,7 +94,8 @@ class StarEvidence:
 
         The image of the `detections` is measured, with its background, noise and PSF. `visible` (len(stars),) is the
         probability that each star is visible where that is known already; it is used for the star's light in its
-        neighbours' measurements only. The other arguments are those of `expect_stars`.
+        neighbours' measurements only. `camera`, `stars`, `bodies`, `R_cam_icrs`, `R_enu_icrs`, `scale` and
+        `position_sigma_px` are those of `expect_stars`.
         """
         found = expect_stars(
             camera, stars, bodies, R_cam_icrs, R_enu_icrs, scale, psf_sigma_px=detections.psf_sigma_px,
@@ -116,7 +117,7 @@ class StarEvidence:
 
 
 def filtered_noise_e(detections: Detections) -> float:
-    """Typical noise [e] of a star's flux: that of a pixel, through the matched filter."""
+    """Typical noise [e] of a star's flux: that of a pixel of the `detections`, through the matched filter."""
     pixel_e = float(np.median(detections.noise_e[::NOISE_BLOCK_PX, ::NOISE_BLOCK_PX]))
     return pixel_e * float(np.sqrt(noise_area_px(detections.psf_sigma_px)))
 

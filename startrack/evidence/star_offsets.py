@@ -38,7 +38,7 @@ class StarOffsets:
 
 
 def offset_terms(azimuth_rad: Array) -> Array:
-    """Terms (n, 5) of an offset as a function of azimuths (n,) [rad]: its mean, and waves once and twice around."""
+    """Terms (n, 5) of an offset as a function of `azimuth_rad` (n,): its mean, and waves once and twice around."""
     a = azimuth_rad
     return np.stack([np.ones_like(a), np.cos(a), np.sin(a), np.cos(2 * a), np.sin(2 * a)], axis=1)
 

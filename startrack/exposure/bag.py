@@ -48,7 +48,7 @@ def is_bag(path: FilePath) -> bool:
 def read_messages(
     path: FilePath, kinds: tuple[str, ...], topic: str | None, *, reason: str, flag: str
 ) -> Iterator[Message]:
-    """The messages of one `topic` of the types `kinds`, one by one, in the bag's order.
+    """The messages of one `topic` of the types `kinds`, one by one, in the order of the bag `path`.
 
     None takes the only topic of these types. `flag` is named in the advice where there are several.
 

@@ -79,12 +79,12 @@ def add_text(png: bytes, texts: Mapping[str, str]) -> bytes:
 
 
 def insert_png_chunks(png: bytes, added: Iterable[tuple[bytes, bytes]]) -> bytes:
-    """The PNG file with chunks, pairs of kind and body, before its picture data."""
+    """The PNG file `png` with the chunks `added`, pairs of kind and body, before its picture data."""
     return png[:IHDR_END] + b"".join(chunk(*one) for one in added) + png[IHDR_END:]
 
 
 def png_chunks(raw: bytes) -> Iterator[tuple[bytes, memoryview]]:
-    """(kind, body) of each chunk up to IEND, lengths and checksums verified."""
+    """(kind, body) of each chunk of the PNG file `raw` up to IEND, lengths and checksums verified."""
     view = memoryview(raw)
     at = len(SIGNATURE)
     while True:

@@ -44,7 +44,7 @@ MAX_UNKNOWN_KEY_WARNINGS = 5
 
 
 def stem(image: Path) -> str:
-    """Name without the suffixes of picture and packing: "night 1.2" for "night 1.2.fits.bz2"."""
+    """Name of the file `image` without the suffixes of picture and packing: "night 1.2" for "night 1.2.fits.bz2"."""
     return _stems(image)[-1]
 
 

@@ -33,9 +33,9 @@ class Hull:
 
 
 def hull_position(points_m: Array, wall_m: float, radius_m: float) -> Array:
-    """Position (2,) [m] from the seen stars' points (n, 2) on the rim's plane, `wall_m` above the camera.
+    """Position (2,) [m] from the seen stars' `points_m` (n, 2) on the rim's plane, `wall_m` above the camera.
 
-    Raises NotLocated where the stars span no area.
+    `radius_m` is that of the rim. Raises NotLocated where the stars span no area.
     """
     from scipy.spatial import ConvexHull, QhullError
 

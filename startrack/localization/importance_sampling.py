@@ -152,7 +152,7 @@ def effective_points(log_weight: Array) -> float:
 
 
 def moments(points: Array, weight: Array) -> Gaussian:
-    """Mean (d,) and covariance (d, d) of weighted points (n, d)."""
+    """Mean (d,) and covariance (d, d) of `points` (n, d) with `weight` (n,)."""
     mean = weight @ points / weight.sum()
     off = points - mean
     return mean, (off * weight[:, None]).T @ off / weight.sum()

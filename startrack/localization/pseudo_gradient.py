@@ -49,7 +49,11 @@ class PseudoGradient:
 def descend(
     points_m: Array, seen: Bools, start_m: Array, radius_m: float, gain: float, most_steps: int
 ) -> tuple[Array, bool]:
-    """Last position (2,) and whether the expected stars became the seen ones."""
+    """Last position (2,) [m], and whether the expected stars became the `seen` ones (n,).
+
+    At most `most_steps` steps are made from `start_m` (2,). The stars are `points_m` (n, 2) on the
+    plane of a rim of `radius_m`; `gain` multiplies each step.
+    """
     x, y = points_m[:, 0].copy(), points_m[:, 1].copy()
     seen_x, seen_y = float(x[seen].mean()), float(y[seen].mean())
     east, north = float(start_m[0]), float(start_m[1])

@@ -33,7 +33,7 @@ class Sectors:
 
     @classmethod
     def from_evidence(cls, evidence: Evidence, width_rad: float, epsilon: float) -> Sectors:
-        """Sectors of about the given width [rad]."""
+        """Sectors of the `evidence`, about `width_rad` wide; `epsilon` is the probability that one is wholly wrong."""
         return cls(evidence, max(1, round(2 * np.pi / width_rad)), epsilon)
 
     @cached_property
@@ -69,7 +69,7 @@ class Sectors:
         return np.asarray(np.sum(self.by_sector(sums), axis=-1))
 
     def by_sector(self, sums: Array) -> Array:
-        """Contribution of each sector (n, sectors) to the log-likelihood."""
+        """Contribution of each sector (n, sectors) to the log-likelihood, from the `sums` as `score` takes them."""
         below = sums - self.ceiling
         if self.epsilon == 0.0:
             return np.asarray(below)

@@ -80,7 +80,10 @@ class SharedErrors:
         return float(sum(np.log(p if fact == gross else 1.0 - p) for fact, p in each.items()))
 
     def slopes_rad(self, terrain: Terrain, position_m: Array, azimuth_rad: Array, horizon_rad: Array) -> Array:
-        """Rise (k, n) of the skyline `horizon_rad` (n,) at azimuths (n,) by one unit of each error."""
+        """Rise (k, n) of the skyline `horizon_rad` (n,) at `azimuth_rad` (n,) by one unit of each error.
+
+        The skyline is that of the `terrain` at `position_m` (2,).
+        """
         known = {one.name: number for number, one in enumerate(terrain.shape_errors)}
         shape = np.reshape(terrain.shape_slopes_rad(position_m, azimuth_rad), (-1, len(azimuth_rad)))
         shape = shape[[known[one.name] for one in self.listed if one.fact != CLOCK_FACT]]
@@ -108,7 +111,7 @@ class SharedErrors:
         return np.flatnonzero([one.scales and self.axisymmetric for one in self.listed])
 
     def turned(self, points: Array, values: Array) -> Array:
-        """Positions (n, 2) turned and scaled by the values (n, k) of the errors, in a round crater."""
+        """The positions `points` (n, 2) turned and scaled by the `values` (n, k) of the errors, in a round crater."""
         points = points * (1.0 + values[:, self._scales].sum(axis=1, keepdims=True))
         if self.clock is None or not self.axisymmetric:
             return points
@@ -118,9 +121,9 @@ class SharedErrors:
 
     @staticmethod
     def map_sigma_rad(terrain: Terrain, position_m: Array, azimuth_rad: Array) -> Array:
-        """Error (n,) of the map's skyline at azimuths (n,), as if independent of the others.
+        """Error (n,) of the skyline of a `terrain` at `azimuth_rad` (n,), as if independent of the others.
 
-        Ground of which facts are not stated is rough by ROUGH_RAD besides.
+        The skyline is that at `position_m` (2,). Ground of which facts are not stated is rough by ROUGH_RAD besides.
 
         Posts that make the skyline at several azimuths err there together: each azimuth is given the variance that
         the sum over its neighbours has, which is right for errors that go far around the compass, as of a position.
@@ -180,7 +183,8 @@ class ErrorBasis:
     ) -> ErrorBasis:
         """Of errors that raise the skyline by `slopes_rad` (k, n), a position that does by `position_slopes` (2, n).
 
-        The position is known to `reach_m` before.
+        The position is known to `reach_m` before. `gross` names the fact with a gross error, "" none. `moments` are
+        those of the skyline that the rows show.
         """
         sigma = errors.sigma(gross)
         weight = 1.0 / moments.variance_rad2

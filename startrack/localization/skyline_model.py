@@ -91,7 +91,7 @@ class SkylineModel:
         return other
 
     def with_rows(self, rows: Evidence, is_rough: bool) -> SkylineModel:
-        """The same neighbourhood with other rows and their clock."""
+        """The same neighbourhood with other `rows` and their clock; `is_rough` is the field of the class."""
         errors = replace(self.errors, clock=rows.clock)
         return self._sharing(replace(self, rows=rows, errors=errors, is_rough=is_rough), OF_GROUND)
 
@@ -156,7 +156,7 @@ class SkylineModel:
         return measure_moments(self.profiles)
 
     def shifts(self, parameters: Array) -> Array:
-        """(n, SECTORS) by how much the skyline of the map stands higher than at the reference."""
+        """(n, SECTORS) by how much the map's skyline at `parameters` (n, 2 + a) stands higher than at the reference."""
         points = np.ascontiguousarray(parameters[:, :2])
         horizon = np.asarray(self.ground.horizon_rad(points[:, None], MIDDLES_RAD))
         return np.asarray(horizon - self.horizon_rad + parameters[:, 2:] @ self.slopes_rad + self._expected_rise)
@@ -206,7 +206,7 @@ class SkylineModel:
         return known
 
     def with_image_errors(self, shifts: Array) -> tuple[Array, Array | float]:
-        """Shifts (n, SECTORS) with the likeliest errors of the image, and the logarithm (n,) of their density."""
+        """The `shifts` (n, SECTORS) with the likeliest errors of the image, and the logarithm (n,) of their density."""
         if self.image_errors is None:
             return np.ascontiguousarray(shifts), 0.0
         errors = (self.moments.mean_rad - shifts - self._image_mean) @ self._image_gain.T
@@ -240,7 +240,7 @@ class SkylineModel:
         return np.asarray(np.linalg.solve(normal, weighted))
 
     def with_likely_errors(self, points_m: Array, weight: Array) -> Array:
-        """Parameters (n, 2 + a) of positions (n, 2) with the shared errors that suit each, by the linear model.
+        """Parameters (n, 2 + a) of `points_m` (n, 2) with the shared errors that suit each, by the linear model.
 
         `weight` (SECTORS,) is that of the sectors.
         """

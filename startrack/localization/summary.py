@@ -24,7 +24,7 @@ def require_inside(points_m: Array, weight: Array, terrain: Terrain) -> Bools:
 
 
 def camera_at(point_m: Array, terrain: Terrain) -> Array:
-    """East, north and up (3,) [m] of the camera that stands at a point (2,) [m] of the `terrain`."""
+    """East, north and up (3,) [m] of the camera that stands at `point_m` (2,) of the `terrain`."""
     up_m = float(terrain.ground_m(point_m[None, :])[0]) + terrain.camera_height_m
     return np.array([point_m[0], point_m[1], up_m])
 

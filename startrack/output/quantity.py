@@ -29,12 +29,15 @@ QUATERNION: Schema = {**numbers(4, {"type": "number", "minimum": -1, "maximum": 
 
 
 def or_null(one: Schema, description: str) -> Schema:
-    """The schema `one`, or null."""
+    """The schema of `one` or null, with a `description`."""
     return {"anyOf": [one, {"type": "null"}], "description": description}
 
 
 def object_schema(required: Schema, description: str = "", optional: Schema | None = None) -> Schema:
-    """An object with the keys of `required` and `optional`. Further keys are no error: a later version may add some."""
+    """An object with the keys of `required` and `optional`, and a `description` unless it is empty.
+
+    Further keys are no error: a later version may add some.
+    """
     d: Schema = {"type": "object", "properties": {**required, **(optional or {})}, "required": list(required)}
     return {**d, "description": description} if description else d
 

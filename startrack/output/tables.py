@@ -60,7 +60,7 @@ def quantity_columns(quantities: Iterable[Quantity], values: Mapping[str, Iterab
 
 
 def format_values(form: str, values: Iterable[Any]) -> list[str]:
-    """Values as texts, an empty one for None and nan."""
+    """The `values` as texts in the %-format `form`; empty for None and nan."""
     return ["" if value is None or value != value else form % value for value in values]
 
 
@@ -81,7 +81,7 @@ def _yaml_line(column: Column) -> str:
 
 
 def star_table_text(value: Inputs) -> str:
-    """The star table of a result as ECSV, brightest star first; stars must have been identified.
+    """The star table of `value`, the last of a result, as ECSV, brightest star first; stars must have been identified.
 
     After `locate`: every star whose light was measured. Without a terrain: the matched stars and all others in the
     frame down to half a magnitude below the faintest of them, without azimuth, elevation and evidence.

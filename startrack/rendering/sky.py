@@ -21,9 +21,10 @@ DECENTRING_STEP_PX = 16  # linear interpolation of a decentring p at the focal l
 
 
 def sky_e_per_s(camera: Camera, sky_v_mag_arcsec2: float | None, angle_rad: Array) -> Array:
-    """Electrons per second and pixel (n,) of the diffuse sky at the angles off the axis (n,) [rad].
+    """Electrons per second and pixel (n,) of a `camera` from the diffuse sky, `angle_rad` (n,) off the axis.
 
-    zero_point 10^(-0.4 sky) x the pixel's solid angle in square arcseconds x throughput; 0 for a black sky (None).
+    zero_point 10^(-0.4 `sky_v_mag_arcsec2`) x the pixel's solid angle in square arcseconds x throughput; 0 for a black
+    sky (None).
     """
     sensor = camera.sensor
     if sensor is None or sky_v_mag_arcsec2 is None:
@@ -33,7 +34,10 @@ def sky_e_per_s(camera: Camera, sky_v_mag_arcsec2: float | None, angle_rad: Arra
 
 
 def sky_gradient(scene: Scene, east: Array, north: Array) -> Array:
-    """The sky's light in directions of these components in enu, relative to its mean: 1 without a gradient."""
+    """The sky's light in directions of components `east`, `north` in enu, relative to its mean; 1 without a gradient.
+
+    The `scene` states the gradient.
+    """
     to_east, to_north, _ = scene.sky_gradient * rays_from_azel(scene.sky_gradient_azimuth_rad, 0.0)
     return np.maximum(1 + to_east * east + to_north * north, 0.0)
 

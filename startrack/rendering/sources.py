@@ -36,7 +36,10 @@ CLUSTER_RAD = 0.07  # scatter of a field star about a catalogue star: 4 degrees
 
 
 def flux_e(sensor: Sensor, v_mag: Array, angle_rad: Array, exposure_s: float) -> Array:
-    """Electrons (n,) in the whole PSF: zero_point 10^(-0.4 V) exposure throughput(angle)."""
+    """Electrons (n,) of a `sensor` in the whole PSF: zero_point 10^(-0.4 `v_mag`) `exposure_s` throughput(`angle_rad`).
+
+    The angles (n,) are off the axis.
+    """
     return sensor.zero_point_e_per_s * 10 ** (-0.4 * np.asarray(v_mag)) * exposure_s * sensor.throughput(angle_rad)
 
 

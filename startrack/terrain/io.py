@@ -103,7 +103,10 @@ def files_of_terrain(path: str | Path) -> tuple[Path, ...]:
 
 
 def body_of_terrain(name_or_path: str | Path) -> str:
-    """The body of a terrain file, as `load_terrain` finds it, without reading its maps. Raises BadInput bad_terrain."""
+    """The body of the terrain file that `load_terrain` finds by `name_or_path`; its maps are not read.
+
+    Raises BadInput bad_terrain.
+    """
     path = resolve_named(name_or_path, "terrain", "bad_terrain")
     return str(read_keys(read_text(path, "bad_terrain"))["body"])
 

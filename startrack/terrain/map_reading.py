@@ -46,8 +46,9 @@ def read_map(
     path: str | Path, *, scale: float | None = None, offset_m: float | None = None,
     near: tuple[float, float] | None = None,
 ) -> Raster:  # fmt: skip
-    """The height map of a file. scale and offset_m: height = offset + scale x value, unless the file states them.
+    """The height map of the file `path`.
 
+    scale and offset_m: height = offset + scale x value, unless the file states them.
     near: latitude and longitude [rad] about which large maps are cut. Raises BadInput bad_terrain for a file that is
     missing or damaged, or that is no height map of the Moon near there.
     """

@@ -19,9 +19,10 @@ PROJECTION_CODES = {STEREOGRAPHIC: 14, ORTHOGRAPHIC: 21, EQUIRECTANGULAR: 17}  #
 
 
 def write_map(path: str | Path, raster: Raster, *, step_m: float | None = None, offset_m: float | None = None) -> None:
-    """Write a map as deflated 16-bit steps with scale and offset, as GDAL reads them; the file appears when complete.
+    """Write the map `raster` to `path` as deflated 16-bit steps with scale and offset, as GDAL reads them.
 
-    Heights are rounded to `step_m`, by default a 65,000th of their range. Raises OSError.
+    Heights are rounded to `offset_m`, by default the lowest, plus multiples of `step_m`, by default a 65,000th of
+    their range. The file appears when complete. Raises OSError.
     """
     import tifffile
 
@@ -43,9 +44,9 @@ def write_map(path: str | Path, raster: Raster, *, step_m: float | None = None, 
 
 
 def write_bands(path: str | Path, frame: Raster, bands: Mapping[str, NDArray[np.float32]]) -> None:
-    """Write named bands (rows, columns) at the place of a `frame`'s posts, NaN where there is no value. Raises OSError.
+    """Write named `bands` (rows, columns) to `path`, at the posts of a `frame`; NaN where there is no value.
 
-    The file appears when complete.
+    The file appears when complete. Raises OSError.
     """
     import tifffile
 

@@ -32,7 +32,7 @@ class HorizonPosts:
 
     @classmethod
     def create_empty(cls, rays: int) -> HorizonPosts:
-        """Of ground without posts."""
+        """Of ground without posts, for so many `rays`."""
         return cls(np.full((rays, 4), NO_POST), np.zeros((rays, 4)), np.full(rays, np.nan))
 
 

@@ -54,7 +54,10 @@ class Projection:
         return R_enu_fixed(Site("moon", self.latitude_rad, self.longitude_rad))
 
     def xy_from_latlon(self, latitude_rad: ArrayLike, longitude_rad: ArrayLike) -> tuple[Array, Array]:
-        """Map coordinates x, y (...) [m] of places; not finite where the projection does not reach."""
+        """Map coordinates x, y (...) [m] of places at `latitude_rad` and `longitude_rad` (...).
+
+        They are not finite where the projection does not reach.
+        """
         lat, lon = np.asarray(latitude_rad, dtype=float), np.asarray(longitude_rad, dtype=float)
         fixed = np.stack(np.broadcast_arrays(np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)), -1)
         v = fixed @ self.R_projection_fixed.T
@@ -69,7 +72,7 @@ class Projection:
         return x + self.false_x_m, y + self.false_y_m
 
     def latlon_from_xy(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[Array, Array]:
-        """Latitude and longitude (...) [rad] of map coordinates; inverse of xy_from_latlon."""
+        """Latitude and longitude (...) [rad] of map coordinates `x_m`, `y_m` (...); inverse of xy_from_latlon."""
         x = (np.asarray(x_m, dtype=float) - self.false_x_m) / (self.radius_m * self.scale)
         if self.kind == EQUIRECTANGULAR:
             y = (np.asarray(y_m, dtype=float) - self.false_y_m) / (self.radius_m * self.scale_y)
@@ -167,16 +170,16 @@ class Raster:
         }
 
     def xy(self, row_column: Array) -> tuple[Array, Array]:
-        """Map coordinates x, y (...) [m] of fractional rows and columns (..., 2)."""
+        """Map coordinates x, y (...) [m] of fractional `row_column` (..., 2)."""
         return self.x0_m + self.dx_m * row_column[..., 1], self.y0_m + self.dy_m * row_column[..., 0]
 
     def row_column(self, latitude_rad: Array, longitude_rad: Array) -> Array:
-        """Fractional rows and columns (..., 2) of places."""
+        """Fractional rows and columns (..., 2) of places at `latitude_rad`, `longitude_rad` (...)."""
         x, y = self.projection.xy_from_latlon(latitude_rad, longitude_rad)
         return np.stack([(y - self.y0_m) / self.dy_m, (x - self.x0_m) / self.dx_m], axis=-1)
 
     def sample(self, row_column: Array) -> Array:
-        """Heights (...) [m] at fractional rows and columns (..., 2), bilinear; NaN beyond the outer posts."""
+        """Heights (...) [m] at fractional `row_column` (..., 2), bilinear; NaN beyond the outer posts."""
         row, column = row_column[..., 0], row_column[..., 1]
         rows, columns = self.heights_m.shape
         inside = (row >= 0) & (row <= rows - 1) & (column >= 0) & (column <= columns - 1)
@@ -212,7 +215,7 @@ class Raster:
         )
 
     def window(self, latitude_rad: float, longitude_rad: float, half_m: float) -> tuple[slice, slice]:
-        """Rows and columns within `half_m` of a place, and a little more; empty where the map does not reach there."""
+        """Rows and columns within `half_m` of `latitude_rad`, `longitude_rad`, and a little more; empty off the map."""
         side = np.linspace(-1.0, 1.0, 33) * half_m
         east, north = np.meshgrid(side, side)
         lat, lon = latlon_from_enu(Site("moon", latitude_rad, longitude_rad), east, north, 0.0)
@@ -225,5 +228,5 @@ class Raster:
         return slices[0], slices[1]
 
     def crop_around(self, latitude_rad: float, longitude_rad: float, half_m: float) -> Raster:
-        """The part of the map within about `half_m` of a place; empty where the map does not reach there."""
+        """The part of the map within about `half_m` of `latitude_rad`, `longitude_rad`; empty off the map."""
         return self.crop(*self.window(latitude_rad, longitude_rad, half_m))

@@ -104,7 +104,10 @@ def calibrate_board(
     name: str = "camera",
     progress: Callable[[str], None] = lambda text: None,
 ) -> BoardCalibration:
-    """The camera of pictures of one flat board. Raises BadInput (size_mismatch), NotIdentified (no_stars: no board)."""
+    """The camera called `name`, from `exposures` of one flat `board`. `progress` gets a text for each exposure.
+
+    Raises BadInput (size_mismatch), NotIdentified (no_stars: no board).
+    """
     found: list[Corners] = []
     images: list[str] = []
     refused: list[RefusedImage] = []

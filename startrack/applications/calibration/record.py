@@ -55,7 +55,7 @@ def calibration_dict(calibration: Calibration) -> dict[str, Any]:
 
 
 def board_dict(found: BoardCalibration) -> dict[str, Any]:
-    """The JSON object of a calibration with boards, with the camera only if all checks passed."""
+    """The JSON object of `found`, a calibration with boards, with the camera only if all checks passed."""
     fit = found.fit
     return {
         **_outcome(found, found.camera),
@@ -92,7 +92,10 @@ def _gates(found: Checked) -> list[dict[str, Any]]:
 
 
 def refusal_dict(reason: str, text: str, refused: tuple[RefusedImage, ...] = ()) -> dict[str, Any]:
-    """The JSON object of a calibration without a lens."""
+    """The JSON object of a calibration without a lens.
+
+    `reason` is a value of `Reason`; `text` explains it; `refused` lists the images that could not be used.
+    """
     return {
         "format": CALIBRATION_FORMAT,
         "status": "refused",
@@ -105,7 +108,7 @@ def refusal_dict(reason: str, text: str, refused: tuple[RefusedImage, ...] = ())
 
 
 def summary(calibration: Calibration, name: str) -> str:
-    """Summary in one line."""
+    """Summary of the `calibration` of the camera called `name` in one line."""
     camera, fit = calibration.camera, calibration.joint.fit
     images = len(calibration.joint.frames)
     head = f"{name}  {'ok' if calibration.accepted else 'refused ' + calibration.failed_checks[0].reason}"
@@ -123,7 +126,7 @@ def arcmin_per_px(camera: Camera) -> float:
 
 
 def board_line(found: BoardCalibration, name: str) -> str:
-    """Summary of a calibration with boards in one line."""
+    """Summary of `found`, a calibration of the camera called `name` with boards, in one line."""
     fit, camera = found.fit, found.camera
     verdict = "ok" if found.accepted else f"refused {found.failed_checks[0].reason}"
     return (

@@ -28,9 +28,10 @@ pre{background:#f3f5f8;padding:.8rem;overflow-x:auto} p.lead{font-size:1.05rem}
 
 
 def write_report(camera_path: Path, calibration: Calibration) -> str:
-    """Write NAME.report.html and, where matplotlib is installed, NAME.report.png beside the camera file.
+    """Write NAME.report.html and, where matplotlib is installed, NAME.report.png beside the file `camera_path`.
 
-    The line that explains how to get the picture; empty where it is written.
+    The files show the `calibration`. It returns the line that explains how to get the picture; empty where it is
+    written.
     """
     picture: bytes | None = None
     if find_spec("matplotlib") is not None:

@@ -58,7 +58,9 @@ def verify(
     exposure: Exposure, camera: Camera, catalog: StarCatalog, site: Site | None = None,
     *, file_has_site: bool | None = None,
 ) -> Verification:  # fmt: skip
-    """Fit the lens to the picture and compare the projections where both are calibrated.
+    """Fit the lens to the stars of the `catalog` in the `exposure` and compare it with the `camera`.
+
+    The projections are compared where both are calibrated.
 
     The picture needs a `site` if the camera file was calibrated with one (`file_has_site`, if known): both lenses must
     be without refraction, or both with it. Raises BadInput no_time, NotIdentified where the stars cannot be identified
@@ -100,7 +102,7 @@ def difference_px(one: Camera, other: Camera, rays_cam: Array) -> Array:
 
 
 def verify_dict(found: Verification) -> dict[str, Any]:
-    """The verification's JSON object."""
+    """The JSON object of `found`, a verification."""
     old, new = found.camera, found.fresh
     return {
         "format": "startrack.verification/1",
@@ -120,7 +122,7 @@ def verify_dict(found: Verification) -> dict[str, Any]:
 
 
 def verify_line(found: Verification) -> str:
-    """Summary in one line."""
+    """Summary of `found`, a verification, in one line."""
     verdict = "ok" if found.is_valid else f"refused inconsistent_evidence: {found.message}:"
     return (
         f"{found.image}  {verdict}  {found.stars} stars  map changed by {found.change_px:.2f} px RMS "

@@ -60,7 +60,7 @@ class LeftOut:
 def orient_frames(
     exposures: Sequence[Exposure], catalog: StarCatalog, site: Site, *, camera: Camera | None, fov_rad: float | None
 ) -> tuple[tuple[SkyFrame, ...], tuple[LeftOut, ...]]:
-    """The frames with identified stars, and those without.
+    """The `exposures` at the `site` with identified stars of the `catalog`, and those without.
 
     The lens is that of `camera`, or found from `fov_rad`, and then fitted to the stars of all frames in their apparent
     directions. Raises BadInput (no_time, no_calibration, size_mismatch, bad_terrain of another body,

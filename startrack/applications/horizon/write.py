@@ -34,18 +34,21 @@ def output_files(output: str) -> tuple[Path, ...]:
 
 
 def check_output(output: str, *, overwrite: bool) -> None:
-    """Raise BadOutput if the output has an unknown suffix, exists and may not be replaced, or takes no files."""
+    """Raise BadOutput if `output` has an unknown suffix, takes no files, or exists and `overwrite` is False."""
     for path in output_files(output):
         check_file(path, overwrite=overwrite)
 
 
 def needs_all_azimuths(output: str) -> bool:
-    """Whether the format cannot leave azimuths empty."""
+    """Whether the format of the file `output` cannot leave azimuths empty."""
     return kind_of(output) in (".hrz", "")
 
 
 def write_skyline(output: str, skyline: MeasuredSkyline, site: Site, *, overwrite: bool) -> tuple[Path, ...]:
-    """Write a skyline in the format of the suffix of `output`; the files. Raises BadInput if that is impossible."""
+    """Write the `skyline` of a `site` in the format of the suffix of `output`; the files.
+
+    Existing files are replaced with `overwrite` only. Raises BadInput if the format cannot hold the skyline.
+    """
     files = output_files(output)
     texts = {
         ".csv": lambda: (csv_text(skyline),),

@@ -55,14 +55,20 @@ class Report:
     def begin(
         cls, conditions: Conditions, inputs: tuple[tuple[str, str], ...], points: AreaCells | PathPoints
     ) -> Report:
-        """The report before the draws. Raises BadInput for files that cannot be used."""
+        """The report on `points` under `conditions` before the draws; the record lists the `inputs`.
+
+        Raises BadInput for files that cannot be used.
+        """
         predictor_of(conditions).exposure_s  # noqa: B018 - a camera without a sensor is refused before anything is drawn
         return cls(conditions, load_terrain(conditions.terrain), points, inputs)
 
     def finish(
         self, conditions: Conditions, cells: Cells, others: Mapping[Conditions, Cells], depth: dict[str, Any] | None
     ) -> Report:
-        """The report with the predictions: of the `conditions`, of `others` to compare with, and of a search."""
+        """The report with the predictions: `cells` of the `conditions`, and `others` to compare with.
+
+        `depth` is the record of the search for a depth, if there was one.
+        """
         variants = [variant_record(other, found) for other, found in others.items()]
         return replace(self, conditions=conditions, cells=cells, variants=variants, depth=depth)
 

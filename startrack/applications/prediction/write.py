@@ -40,7 +40,10 @@ PATH_CURVES = {FILTERED: "images so far, and odometry", SMOOTHED: "all images, a
 
 
 def write_report(report: Report, out: Path, *, plots: bool) -> list[Path]:
-    """Write the files; those of an earlier prediction that this one does not make are removed."""
+    """Write the files of a `report` into the folder `out`, with pictures if `plots`; returns their paths.
+
+    Files of an earlier prediction that this one does not make are removed.
+    """
     points, made = report.points, dict[str, bytes]()
     if isinstance(points, AreaCells):  # the quantities as bands, in the projection of the terrain's map
         bands = {one.key: points.band(report.cells[one.key]) for one in CELL_QUANTITIES}

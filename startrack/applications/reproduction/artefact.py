@@ -76,7 +76,11 @@ class Artefact:
     def of_figure(
         cls, name: str, title: str, line: str, picture: Picture, values: Mapping[str, Any], text: str = "", **more: Any
     ) -> Artefact:
-        """The figure `name`, whose number the title begins with; the `text` is its caption unless it is given."""
+        """The figure `name` with one `picture`; the `title` is put after its number.
+
+        The `text` is the caption of the picture unless it is given. `line`, `values` and `more` are
+        fields of the class.
+        """
         title = f"Figure {name.removeprefix('fig')}: {title}"
         return cls(name, title, line, text or picture.caption, values, pictures={name: picture}, **more)
 

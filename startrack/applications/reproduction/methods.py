@@ -69,7 +69,10 @@ def tasks_of(method: str, seed: int, sky: int, count: int, **settings: Any) -> l
 
 
 def fix_store(out: Path, *, jobs: int, progress: Progress, cluster: str | None = None) -> ChunkStore[Task]:
-    """The store of chunks of fixes under the folder `out`, made in `jobs` processes or on a `cluster`."""
+    """The store of chunks of fixes under the folder `out`, made in `jobs` processes or on a `cluster`.
+
+    `progress` makes the bar that shows how many chunks are made.
+    """
     return ChunkStore(
         out / FIX_FOLDER, compute_chunk, lambda task: task.key, jobs=jobs, progress=progress, cluster=cluster
     )  # fmt: skip

@@ -104,7 +104,10 @@ def _round_values(values: Array, decimals: int) -> list[float]:
 def ground_map(
     terrain: Terrain, centre_m: tuple[float, float] = (0.0, 0.0), half_m: float | None = None
 ) -> dict[str, Any]:
-    """`search_m`, the radius of the search area; of a cylinder `rim_m`, else `relief` of `half_m` about `centre_m`."""
+    """`search_m`, the radius of the search area of a `terrain`; of a cylinder `rim_m`, else `relief`.
+
+    The relief shows `half_m` on each side of `centre_m`, east and north.
+    """
     shape: dict[str, Any] = {
         "search_m": terrain.search_radius_m,
         "site": terrain.site.body if terrain.site is not None else None,

@@ -172,7 +172,7 @@ def _legend(value: Inputs, truth: bool) -> list[tuple[str, Colour, str]]:
 
 
 def draw_legend_sample(canvas: Canvas, x: float, y: float, kind: str, colour: Colour) -> None:
-    """A mark of a legend about (x, y): a ring, cross, line, dot, plus or disc."""
+    """A mark of a legend on the `canvas` about (x, y), in a `colour`; `kind`: ring, cross, line, dot, plus or disc."""
     if kind == "ring":
         canvas.circle((x, y), 7.0, colour, 2)
     elif kind == "cross":
@@ -207,7 +207,7 @@ def bare_picture(value: Inputs) -> NDArray[np.uint8]:
 def annotate(
     outcome: Outcome, truth_enu_m: tuple[float, float] | None = None, bare: NDArray[np.uint8] | None = None
 ) -> NDArray[np.uint8]:
-    """The picture (H, W, 3), red, green, blue. Parts that were not reached are left out.
+    """The picture (H, W, 3) of an `outcome`, red, green, blue. Parts that were not reached are left out.
 
     `truth_enu_m` (east, north) [m] is drawn if it is given. `bare`: the `bare_picture`, where a caller has it.
     """

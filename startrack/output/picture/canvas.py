@@ -50,7 +50,7 @@ STATUS: dict[str, Colour] = {"ok": BLUISH_GREEN, "ambiguous": ORANGE, "refused":
 
 
 def mix_colours(a: Colour, b: Colour, part_of_b: float) -> Colour:
-    """Colour between a and b."""
+    """Colour between `a` and `b`: `part_of_b` 0 is a, 1 is b."""
     r, g, blue = (round((1 - part_of_b) * x + part_of_b * y) for x, y in zip(a, b, strict=True))
     return r, g, blue
 
@@ -95,11 +95,11 @@ class Canvas:
         return self.pixels.shape[1], self.pixels.shape[0]
 
     def line(self, points: ArrayLike, colour: Colour, width: int = 1, closed: bool = False) -> None:
-        """A line through the points (n, 2)."""
+        """A line of a `colour` and `width` [px] through the `points` (n, 2); `closed` joins the last to the first."""
         cv2.polylines(self.pixels, [self._to_fixed_point(points)], closed, colour, width, cv2.LINE_AA, SHIFT_BITS)
 
     def dashes(self, points: ArrayLike, colour: Colour, width: int = 1) -> None:
-        """Every other stretch of the line through evenly spaced points (n, 2)."""
+        """Every other stretch of the `line` through evenly spaced points (n, 2), with its `colour` and `width`."""
         places = self._to_fixed_point(points)
         cv2.polylines(
             self.pixels, [places[k : k + 2] for k in range(0, len(places) - 1, 2)], False, colour, width, cv2.LINE_AA,
@@ -107,11 +107,14 @@ class Canvas:
         )  # fmt: skip
 
     def area(self, points: ArrayLike, colour: Colour) -> None:
-        """A filled convex or plain polygon with corners (n, 2)."""
+        """A convex or plain polygon with corners `points` (n, 2), filled with a `colour`."""
         cv2.fillPoly(self.pixels, [self._to_fixed_point(points)], colour, cv2.LINE_AA, SHIFT_BITS)
 
     def curve(self, points: ArrayLike, colour: Colour, width: float, closed: bool = False) -> None:
-        """A smooth curve through the points (n, 2), as a filled ribbon: OpenCV's own thick lines look beaded."""
+        """A smooth curve with the arguments of `line`: `points`, `colour`, `width`, `closed`.
+
+        It is a filled ribbon: OpenCV's own thick lines look beaded.
+        """
         places = np.asarray(points, dtype=float)
         ahead, behind = np.roll(places, -1, axis=0), np.roll(places, 1, axis=0)
         if not closed:
@@ -124,7 +127,7 @@ class Canvas:
         cv2.fillPoly(self.pixels, outline, colour, cv2.LINE_AA, SHIFT_BITS)
 
     def circle(self, centre: ArrayLike, radius: float, colour: Colour, width: int = 1) -> None:
-        """A circle; filled where `width` is negative."""
+        """A circle of `radius` [px] and `colour`; filled where `width` is negative."""
         if not 0 <= radius < FARTHEST_PX:
             return
         if width > 1:
@@ -137,24 +140,28 @@ class Canvas:
         cv2.circle(self.pixels, (x, y), reach, colour, width, cv2.LINE_AA, SHIFT_BITS)
 
     def cross(self, centre: ArrayLike, half: float, colour: Colour, width: int = 1) -> None:
-        """An x of the given half size."""
+        """An x of half size `half` [px], in lines of a `colour` and `width` [px]."""
         for across in ((half, half), (half, -half)):
             self.line(np.asarray(centre, dtype=float) + np.outer((-1.0, 1.0), across), colour, width)
 
     def plus(self, centre: ArrayLike, half: float, colour: Colour, width: int = 1) -> None:
-        """A + of the given half size."""
+        """A + of half size `half` [px], in lines of a `colour` and `width` [px]."""
         for across in ((half, 0.0), (0.0, half)):
             self.line(np.asarray(centre, dtype=float) + np.outer((-1.0, 1.0), across), colour, width)
 
     def rectangle(self, box: Box, colour: Colour, width: int = -1) -> None:
-        """A box; filled where `width` is negative."""
+        """A `box` of a `colour`; filled where `width` is negative."""
         left, top, right, bottom = self._to_fixed_point(np.reshape(box, (2, 2))).ravel().tolist()
         cv2.rectangle(self.pixels, (left, top), (right, bottom), colour, width, cv2.LINE_8, SHIFT_BITS)
 
     def text(
         self, xy: ArrayLike, text: str, size: float, colour: Colour = INK, anchor: str = "ls", halo: bool = False
     ) -> Box:
-        """Write where nothing else may be written by `label`; returns the box. Anchor: l, m, r and t (top), m, s."""
+        """Write `text` of `size` [px] at `xy`, where `label` then writes nothing; returns the box.
+
+        `anchor` is the place of `xy` in the text: l, m or r, and t (top), m or s. `halo` adds a dark edge to
+        letters of any `colour`.
+        """
         text = printable(text)
         x, y = (float(c) for c in np.asarray(xy, dtype=float))
         width, (rise, fall) = text_width(text, size), _height(size)
@@ -166,7 +173,10 @@ class Canvas:
         return box
 
     def label(self, at: ArrayLike, text: str, size: float, colour: Colour, gap: float, within: Box) -> bool:
-        """Write beside the place `at`, at the first of eight sides that is free; False where there is none."""
+        """Write `text` of `size` [px] and `colour` beside the place `at`, a `gap` [px] off, inside the box `within`.
+
+        It stands at the first of eight sides that is free; False where there is none.
+        """
         x, y = (float(c) for c in np.asarray(at, dtype=float))
         width, (rise, fall) = text_width(printable(text), size), _height(size)
         near = 0.75 * gap
@@ -210,7 +220,7 @@ class Canvas:
 
 
 def box_around(centre: ArrayLike, half: float) -> Box:
-    """The box of the given half size about a place."""
+    """The box of half size `half` [px] about the place `centre`."""
     x, y = (float(c) for c in np.asarray(centre, dtype=float))
     return x - half, y - half, x + half, y + half
 
@@ -227,7 +237,7 @@ def text_width(text: str, size: float) -> float:
 
 
 def wrap_text(text: str, size: float, width: float) -> list[str]:
-    """The text's words in lines no wider than `width` [px], but for a word that alone is wider."""
+    """The words of `text` of `size` [px] in lines no wider than `width` [px], but for a word that alone is wider."""
     lines: list[str] = []
     for word in printable(text).split():
         longer = f"{lines[-1]} {word}" if lines else word

@@ -46,7 +46,7 @@ class MapView:
     metres_per_px: float
 
     def canvas_px(self, points_m: ArrayLike) -> Array:
-        """Canvas pixels (..., 2) of points (..., 2), east and north [m]."""
+        """Canvas pixels (..., 2) of `points_m` (..., 2), east and north."""
         offset = (np.asarray(points_m, dtype=float) - self.centre_m) / self.metres_per_px
         return self.middle + offset * [1.0, -1.0]
 
@@ -63,7 +63,7 @@ class MapView:
 
 
 def map_view(box: Box, centre_m: tuple[float, float], half_m: float) -> MapView:
-    """A map that shows `half_m` in every direction from the centre."""
+    """A map in the `box` that shows `half_m` in every direction from `centre_m`, east and north."""
     left, top, right, bottom = box
     return MapView(box, centre_m, 2 * half_m / min(right - left, bottom - top))
 
@@ -71,7 +71,10 @@ def map_view(box: Box, centre_m: tuple[float, float], half_m: float) -> MapView:
 def draw_overview(
     canvas: Canvas, box: Box, terrain: Terrain, fix: Fix | None, ambiguous: bool, truth: ArrayLike | None
 ) -> MapView:
-    """The search area (dashed), the rim of a cylinder or the shape of the ground, and the position or positions."""
+    """Draw the `terrain` as `draw_ground` does, and the position of a `fix`, in the `box` of the `canvas`.
+
+    All positions of the fix are drawn if it is `ambiguous`. `truth` (2,) is the true one, east and north [m].
+    """
     rim = terrain.rim_radius_m or 0.0
     view = map_view(box, (0.0, 0.0), SEARCH_MARGIN * max(min(terrain.search_radius_m, terrain.reach_m), rim))
     window = canvas.window(box)
@@ -93,7 +96,10 @@ def draw_overview(
 
 
 def draw_ground(window: Canvas, view: MapView, terrain: Terrain) -> None:
-    """The shape of the ground, or the rim of a cylinder; the search area (dashed) and a grid."""
+    """The shape of the ground of a `terrain`, or the rim of a cylinder; the search area (dashed) and a grid.
+
+    `window` is the part of the canvas that the `view` fills.
+    """
     rim = terrain.rim_radius_m or 0.0
     window.rectangle(view.box, MAP)
     if rim:
@@ -148,7 +154,7 @@ def draw_leaders(canvas: Canvas, overview: MapView, zoom: MapView) -> None:
 
 
 def distance_text(metres: float) -> str:
-    """A scale bar's length in words."""
+    """A scale bar's length of `metres` in words."""
     return f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m" if metres >= 0.1 else f"{100 * metres:g} cm"
 
 
@@ -158,7 +164,7 @@ def ring(centre_m: tuple[float, float], radius_m: float) -> Array:
 
 
 def ellipse_m(centre_m: tuple[float, float], covariance_m2: Array) -> Array:
-    """Points (n, 2) of the ellipse of one sigma."""
+    """Points (n, 2) [m] of the ellipse of one sigma of `covariance_m2` (2, 2) about `centre_m`."""
     lengths, axes = np.linalg.eigh(covariance_m2)
     half_m = np.sqrt(np.maximum(lengths, 0.0))
     return np.asarray(centre_m) + (ring((0.0, 0.0), 1.0) * half_m) @ axes.T
@@ -181,7 +187,7 @@ def _draw_grid(window: Canvas, view: MapView) -> None:
 
 
 def draw_frame(canvas: Canvas, view: MapView, caption: str) -> None:
-    """Frame, caption and scale bar."""
+    """Frame, `caption` and scale bar of the `view` on the `canvas`."""
     left, top, right, bottom = view.box
     canvas.rectangle(view.box, FAINT_INK, 1)
     canvas.text((left + 12, top + 12), caption, CAPTION_SIZE, DIM_INK, "lt", halo=True)
@@ -215,7 +221,10 @@ def draw_residuals(canvas: Canvas, box: Box, fit: AttitudeFit) -> None:
 
 
 def relief_picture(terrain: Terrain, position_m: tuple[float, float] | None = None) -> NDArray[np.uint8]:
-    """The relief (H, W, 3), lit from the north-west, with contours, the search area (dashed) and the position."""
+    """The relief (H, W, 3) of a `terrain`, lit from the north-west, with contours and the search area (dashed).
+
+    `position_m`, east and north, is marked if it is given.
+    """
     canvas = Canvas(SIZE_PX + round(LEFT_PX), SIZE_PX + round(BELOW_PX))
     box = (LEFT_PX, 8.0, LEFT_PX + SIZE_PX - 9.0, SIZE_PX - 1.0)
     view = draw_overview(canvas, box, terrain, None, False, None)
@@ -235,7 +244,7 @@ def relief_picture(terrain: Terrain, position_m: tuple[float, float] | None = No
 
 
 def draw_distances(canvas: Canvas, view: MapView) -> None:
-    """East and north of the grid's lines, outside of the map."""
+    """East and north of the lines of the grid, on the `canvas` outside of the map `view`."""
     left, _, right, bottom = view.box
     unit, metres = ("km", 1000.0) if float(view.half_m.min()) >= 2000.0 else ("m", 1.0)
     for east_m in grid_lines_m(view, 0):

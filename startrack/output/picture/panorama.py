@@ -93,7 +93,7 @@ class Plot(Axes):
 
 
 def horizon_picture(terrain: Terrain, position_m: tuple[float, float]) -> NDArray[np.uint8]:
-    """The horizon (H, W, 3) of a terrain from north to north, azimuth to the right, seen from a position."""
+    """The horizon (H, W, 3) of a `terrain` from north to north, azimuth to the right, seen from `position_m`."""
     horizon_rad = terrain.horizon_rad(np.array(position_m)[None], AZIMUTHS_RAD)
     title = f"{terrain.name}: horizon seen from E {position_m[0]:.0f} m, N {position_m[1]:.0f} m"
     canvas = Canvas(WIDTH_PX, HEIGHT_PX)

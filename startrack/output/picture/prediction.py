@@ -165,10 +165,10 @@ def path_picture(
     distance_m: Array, radius_m: Array, p_ok: Array, title: str, lines: Sequence[str],
     more: Mapping[str, Array] | None = None,
 ) -> NDArray[np.uint8]:  # fmt: skip
-    """The 95 % radius (k,) against the distance (k,) along a path; points with fewer positions are marked.
+    """The 95 % radius `radius_m` (k,) against `distance_m` (k,) along a path, below the `title` and `lines`.
 
-    A radius is infinite where half of the draws or more have no position. `more` has radii (k,) with odometry, by the
-    names of their curves.
+    A radius is infinite where half of the draws or more have no position. `p_ok` (k,) is the part of the draws that
+    have one; points below LOCATED are marked. `more` has radii (k,) with odometry, by the names of their curves.
     """
     known = np.isfinite(radius_m)
     right_m, top_m = float(distance_m[-1]), 1.15 * float(radius_m[known].max()) if known.any() else 1.0
@@ -195,7 +195,10 @@ def path_picture(
 
 
 def comparison_picture(variants: Sequence[dict[str, Any]], title: str) -> NDArray[np.uint8]:
-    """The median 95 % radius of the places against the exposure, one curve a camera, both scales logarithmic."""
+    """The median 95 % radius of the places against the exposure, one curve a camera, both scales logarithmic.
+
+    `variants` are records of predictions; the `title` stands above.
+    """
     rows = [(one["camera"], one["exposure_s"], one["summary"]["median_radius95_m"]) for one in variants]
     drawn = [row for row in rows if row[2] is not None]
     # From and to nice numbers beyond the values.

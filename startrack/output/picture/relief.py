@@ -27,7 +27,7 @@ LABEL_TRIES = 60  # places along a contour
 
 
 def ground_of_view(view: MapView, terrain: Terrain, shape: tuple[int, int]) -> tuple[Image, Bools]:
-    """Heights [m] of the cells of a map that is `shape` (H, W) pixels large, and where there is ground."""
+    """Heights [m] of a `terrain` at the cells of a map `view` of `shape` (H, W) pixels, and where there is ground."""
     cells = max(2, shape[0] // RELIEF_CELL_PX), max(2, shape[1] // RELIEF_CELL_PX)
     return ground_cells(terrain, view.half_m, cells, view.centre_m)
 
@@ -68,7 +68,10 @@ def draw_relief(window: Canvas, view: MapView, ground_m: Image, known: Bools) ->
 
 
 def draw_contours(canvas: Canvas, window: Canvas, view: MapView, ground_m: Image, known: Bools) -> float | None:
-    """Contours with their heights [m]; their step [m], or None where the ground is flat."""
+    """Contours of `ground_m` where it is `known`, with their heights [m]; their step [m], or None of flat ground.
+
+    Lines are drawn on the `window` that the `view` fills, heights are written on the whole `canvas`.
+    """
     inner = _erode(known)
     if not inner.any():
         return None

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from synthetic_track import odometry_alone, synthetic_track
 
-from startrack.applications.tracking.picture import HEIGHT_PX, WIDTH_PX, draw_graph, draw_track
+from startrack.applications.tracking.picture import TRACK_HEIGHT_PX, TRACK_WIDTH_PX, draw_graph, draw_track
 from startrack.applications.tracking.track_map import ODOMETRY, REFUSED, draw_track_map, half_axes_95_m, track_extent
 from startrack.output import POSITION, SKY_BLUE, Canvas
 from startrack.terrain import load_terrain
@@ -73,7 +73,7 @@ def test_a_map_at_rest_holds_all_ellipses():
 @pytest.mark.parametrize("at_rest", [False, True])
 def test_frames_without_a_position_are_not_drawn(at_rest):
     part, none = (synthetic_track(at_rest=at_rest, unknown=count) for count in (3, 8))
-    assert draw_track(part).shape == draw_track(none).shape == (HEIGHT_PX, WIDTH_PX, 3)
+    assert draw_track(part).shape == draw_track(none).shape == (TRACK_HEIGHT_PX, TRACK_WIDTH_PX, 3)
     assert track_extent(none) == ((0.0, 0.0), none.terrain.search_radius_m)
     assert pixels_like(drawn(part)[0], SKY_BLUE) > pixels_like(drawn(none)[0], SKY_BLUE) == 0
 

@@ -98,7 +98,7 @@ def _measure(located: Located) -> tuple[SkyLight, Bools, ImageErrors]:
     sky = measure_sky_light(pixels, horizon)
     used = sectors_with_step(sky) & located.terrain.is_informative(MIDDLES_RAD, sky.elevation_rad)
     if np.count_nonzero(used) < NEEDED_SECTORS:
-        raise NoSkyLight(_too_few(sky, used))
+        raise NoSkyLight(_too_few_text(sky, used))
     return sky, used, _image_errors(located, sky, used)
 
 
@@ -125,7 +125,7 @@ def _moved_px(before: Located, after: Located, sky: SkyLight) -> float:
     return float(np.quantile(np.abs(moved) * sky.px_per_rad, 0.9))
 
 
-def _too_few(sky: SkyLight, used: Bools) -> str:
+def _too_few_text(sky: SkyLight, used: Bools) -> str:
     """Why too few sectors (SECTORS,) are `used`: the skyline is not in view, has no step, or is not in the map."""
     in_view, on_map, needed = (n * 360.0 / SECTORS for n in (sky.levels.covered.sum(), used.sum(), NEEDED_SECTORS))
     if in_view < needed:
@@ -144,12 +144,12 @@ def measured_skyline(located: Located) -> MeasuredSkyline | None:
     if located.fix.ambiguous or located.fix.search == "approximate":
         return None
     horizon = Skyline.trace(located.position_at_time_m, located.terrain)
-    elevation, sigma = _by_stars(located.evidence(), horizon)
+    elevation, sigma = _skyline_by_stars(located.evidence(), horizon)
     source = np.where(sigma < MOST_SIGMA_RAD, "stars", "").astype("<U9")
     sky, used, errors = located.sky_light, located.sky_used, located.image_errors
     if sky is not None and used is not None and errors is not None:
         used = used if located.blocked is None else used & ~located.blocked.whole
-        by_sky, sky_sigma = _by_sky_light(sky, errors)
+        by_sky, sky_sigma = _skyline_by_sky_light(sky, errors)
         both = used & (sigma < SIMILAR_SIGMAS * sky_sigma)
         share = np.zeros(SECTORS)
         share[both] = 1.0 / (1.0 + np.square(sigma[both] / sky_sigma[both]))
@@ -165,7 +165,7 @@ def measured_skyline(located: Located) -> MeasuredSkyline | None:
     )
 
 
-def _by_stars(rows: Evidence, horizon: Skyline) -> tuple[Array, Array]:
+def _skyline_by_stars(rows: Evidence, horizon: Skyline) -> tuple[Array, Array]:
     """Elevation and sigma (SECTORS,) of the skyline by stars seen and missing, every shift equally likely before."""
     above = rows.elevation_rad - horizon(rows.azimuth_rad)
     column = np.searchsorted(SHIFTS_RAD, above)  # the star is visible at the shifts below its height
@@ -177,7 +177,7 @@ def _by_stars(rows: Evidence, horizon: Skyline) -> tuple[Array, Array]:
     return horizon(MIDDLES_RAD) + mean, np.where(bounded, sigma, np.inf)
 
 
-def _by_sky_light(sky: SkyLight, errors: ImageErrors) -> tuple[Array, Array]:
+def _skyline_by_sky_light(sky: SkyLight, errors: ImageErrors) -> tuple[Array, Array]:
     """Elevation and sigma (SECTORS,) of the skyline by the sky's light, offsets of the image taken out."""
     by_image = np.einsum("ni,ij,nj->n", errors.raised_rad, errors.covariance, errors.raised_rad)
     elevation = sky.elevation_rad + sky.shift_px / sky.px_per_rad - errors.raised_rad @ errors.mean

@@ -135,7 +135,7 @@ def check_camera_output(args: argparse.Namespace) -> Path:
     Without -O nothing is replaced but the record and the report of a calibration that was refused.
     """
     out = _output_path(args, "camera.toml")
-    replaceable = args.overwrite or _recorded(out, "status") == "refused"
+    replaceable = args.overwrite or _value_in_record(out, "status") == "refused"
     for suffix in (RECORD, *REPORTS):
         check_output(out.with_suffix(suffix), overwrite=replaceable)
     for suffix in (MASK, HOT_PIXELS):
@@ -147,11 +147,11 @@ def _has_site(camera_file: Path) -> bool | None:
     """Whether the record beside a camera file states a site on the Earth; None where no record states that."""
     from startrack.applications.calibration import REFRACTION_REMOVED
 
-    refraction = _recorded(camera_file, "lens", "refraction")
+    refraction = _value_in_record(camera_file, "lens", "refraction")
     return None if refraction is None else bool(refraction == REFRACTION_REMOVED)
 
 
-def _recorded(camera_file: Path, *keys: str) -> Any:
+def _value_in_record(camera_file: Path, *keys: str) -> Any:
     """The value in the record beside a camera file; None without a record, or in one of another kind."""
     try:
         found = json.loads(camera_file.with_suffix(RECORD).read_text(encoding="utf-8"))

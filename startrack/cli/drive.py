@@ -38,13 +38,13 @@ def read_drive_flags(args: argparse.Namespace) -> Drive | None:
     if args.every is not None and args.output is not None:
         args.usage_error("--output names one image, but --every makes several: give --dir")
     if args.path is None:
-        lone = _given(args, "speed", "odometry_sigma", "odometry_floor")
+        lone = _given_flags(args, "speed", "odometry_sigma", "odometry_floor")
         if lone:
             args.usage_error(f"{lone[0]} needs --path")
         return None
     if args.every is None or args.speed is None:
         args.usage_error("--path needs --speed and --every")
-    contrary = _given(args, "east", "north", "heading")
+    contrary = _given_flags(args, "east", "north", "heading")
     if contrary:
         args.usage_error(f"{contrary[0]}: positions and headings are those of --path")
     from startrack.rendering import read_drive
@@ -91,6 +91,6 @@ def write_trajectories(args: argparse.Namespace, series: Series, poses: Sequence
     write_atomically(Path(args.dir) / ODOMETRY, (head + measured).encode(), overwrite=args.overwrite)
 
 
-def _given(args: argparse.Namespace, *names: str) -> list[str]:
+def _given_flags(args: argparse.Namespace, *names: str) -> list[str]:
     """Flags among the `names` of arguments that are not None."""
     return [f"--{name.replace('_', '-')}" for name in names if getattr(args, name) is not None]

@@ -201,7 +201,7 @@ class _Pool:
     def submit(self, work: Callable[[Task], Result], task: Task) -> Future[Result]:
         """The future result; in a broken pool a future with BrokenProcessPool."""
         try:
-            with _blocked_signals():  # processes start in here, and inherit this from their first instruction on
+            with _block_signals():  # processes start in here, and inherit this from their first instruction on
                 return self._executor.submit(work, task)
         except BrokenProcessPool as cause:
             broken: Future[Result] = Future()
@@ -222,7 +222,7 @@ class _Pool:
 
 
 @contextmanager
-def _blocked_signals() -> Iterator[None]:
+def _block_signals() -> Iterator[None]:
     """Block SIGINT and SIGTERM: a process started in the block never gets them, this one gets them after the block."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield

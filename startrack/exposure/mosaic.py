@@ -44,7 +44,7 @@ def decode(raw: bytes) -> Decoded:
         raise bad_image("is a camera raw file, which needs rawpy: pip install '.[raw]' in a clone of startrack")
     import rawpy
 
-    with _without_stderr(), rawpy.imread(BytesIO(raw)) as file:
+    with _discard_stderr(), rawpy.imread(BytesIO(raw)) as file:
         check_size(file.sizes.width, file.sizes.height)
         if file.raw_type is not rawpy.RawType.Flat:
             raise bad_image("holds colours in layers; startrack reads mosaics")
@@ -57,7 +57,7 @@ def decode(raw: bytes) -> Decoded:
 
 
 @contextmanager
-def _without_stderr() -> Iterator[None]:
+def _discard_stderr() -> Iterator[None]:
     """Discard what LibRaw, which has no switch for it, prints about a damaged file: the exception has the cause."""
     sys.stderr.flush()
     kept, nowhere = os.dup(STDERR), os.open(os.devnull, os.O_WRONLY)

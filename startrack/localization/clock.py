@@ -27,7 +27,6 @@ TRACKED_NATS = 30.0  # less than the best: a time is not looked at more closely
 TIME_ROUNDS = 6  # in which the rows are turned to the time that they show, at most
 LINEAR_TURN_RAD = np.radians(0.05)  # of the sky: up to it the skyline of a map changes linearly with the time
 GROSS_REACH_SIGMAS = 3.0  # of a gross error of the clock, to the last time that is tried
-APART_RAD = np.radians(0.3)  # of the turn between two times that are sampled
 MOST_TIMES, TIME_NATS = 3, 12.0  # that are sampled; less likely ones than the best by more are not
 
 
@@ -84,7 +83,7 @@ class Track:
         found: list[tuple[float, float, Array]] = []
         for later_s, position_m in self._seeds():
             if all(abs(later_s - other_s) > 0.5 * self.step_s for other_s, _, _ in found):
-                found.append(self._settled(later_s, position_m))
+                found.append(self._settle_time(later_s, position_m))
         later, share, position = zip(*found, strict=True)
         return np.array(later), np.array(share), np.array(position)
 
@@ -120,7 +119,7 @@ class Track:
         found.sort(key=lambda one: -one[0])
         return [(later_s, position) for fit, later_s, position in found if fit > found[0][0] - TRACKED_NATS]
 
-    def _settled(self, later_s: float, position_m: Array) -> tuple[float, float, Array]:
+    def _settle_time(self, later_s: float, position_m: Array) -> tuple[float, float, Array]:
         """The time that the rows show about a time [s later], the logarithm of its share, and the best position."""
         low, high = self.limits_s
         for _ in range(TIME_ROUNDS):
@@ -202,7 +201,7 @@ def _fit(model: SkylineModel) -> float:
 
 def _peaks(later_s: Array, fits: Array, clock: Clock) -> list[int]:
     """The likeliest times that are apart from each other."""
-    apart_s = APART_RAD / float(np.linalg.norm(clock.turn_rad_s))
+    apart_s = TIME_STEP_RAD / float(np.linalg.norm(clock.turn_rad_s))
     chosen: list[int] = []
     for at in np.argsort(-fits):
         if fits[at] < fits.max() - TIME_NATS or len(chosen) == MOST_TIMES:

@@ -10,7 +10,7 @@ import numpy as np
 
 from startrack.core.types import Array, Blocked, ClockError, Fix, Ints, Mode, NotLocated, ShownError, UnstatedFact
 from startrack.localization.hypothesis import Hypothesis
-from startrack.localization.importance_sampling import moments
+from startrack.localization.importance_sampling import ROUNDS, moments
 from startrack.localization.integrity import assess_integrity
 from startrack.localization.search import Explored
 from startrack.localization.summary import camera_at, link_points, require_inside
@@ -21,7 +21,7 @@ AMBIGUOUS_MASS = 0.01
 NEGLIGIBLE_MODE = 2e-3  # of the probability: points apart that hold less belong to the nearest mode
 USELESS_FRACTION = 0.5  # a 95 % circle wider than this part of the search radius says nothing worth having
 SHOWN_SIGMAS = 2.0  # by which an error that nobody states is beyond its default
-SUPPORT = 200  # points of a fix with which a later search of the same image begins
+SUPPORT = ROUNDS[0]  # points of a fix with which a later search of the same image begins
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,12 +103,12 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
     middle, covariance = moments(whole.positions_m[whole.main], whole.share[whole.main])
     radius95, radius999 = whole.radii(whole.positions_m, whole.share, middle)
     modes = _list_modes(whole)
-    ambiguous = len(modes) > 1 and _beyond(whole, middle) > AMBIGUOUS_MASS
+    ambiguous = len(modes) > 1 and _share_beyond_circle(whole, middle) > AMBIGUOUS_MASS
     best, own = whole.best, _own_main(whole)
     parameters, near = moments(best.found.points[own], best.found.share[own])
     clear = best.model.states(parameters)[:, 0]
     if not ambiguous and radius95 > USELESS_FRACTION * terrain.search_radius_m:
-        raise NotLocated(_useless(whole))
+        raise NotLocated(_useless_text(whole))
     integrity = None
     if not best.model.rows.is_first_look:
         require_files(found, parameters, clear)
@@ -119,8 +119,8 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
         position_enu_m=camera_at(middle, terrain), covariance_m2=covariance, radius95_m=radius95, radius999_m=radius999,
         modes=modes, ambiguous=ambiguous, dropped_probability=dropped_probability, search=explored.search,
         horizon_error_rad=_mean_error(best, "bias_rad"), clock=_clock(whole), blocked=blocked if blocked else None,
-        integrity=integrity, unstated=_unstated(whole), raised_rad=best.model.raised_rad(parameters),
-        at_time_m=parameters[:2], shown=_shown(best), samples=_support(whole, explored, dropped_probability),
+        integrity=integrity, unstated=_unstated_facts(whole), raised_rad=best.model.raised_rad(parameters),
+        at_time_m=parameters[:2], shown=_shown_errors(best), samples=_support(whole, explored, dropped_probability),
     )  # fmt: skip
 
 
@@ -132,7 +132,7 @@ def _own_main(whole: Posterior) -> Array:
     return np.asarray(own if own.any() else np.ones(len(own), dtype=bool))
 
 
-def _useless(whole: Posterior) -> str:
+def _useless_text(whole: Posterior) -> str:
     clock = whole.best.model.errors.clock
     if clock is not None and clock.sigma_s > 60.0:
         from startrack.localization.clock import duration
@@ -144,7 +144,7 @@ def _useless(whole: Posterior) -> str:
     return "the rays leave most of the search area open: is the skyline in the picture?"
 
 
-def _beyond(whole: Posterior, middle: Array) -> float:
+def _share_beyond_circle(whole: Posterior, middle: Array) -> float:
     """Part of the core's probability beyond the main mode's own 99.9 % circle."""
     core = whole.share[whole.is_core].sum()
     _, radius = whole.radii(whole.positions_m[whole.main], whole.share[whole.main], middle)
@@ -193,11 +193,11 @@ def _clock(whole: Posterior) -> ClockError | None:
     return ClockError(stated.offset_s + mean, float(np.sqrt(share @ np.square(later - mean))))
 
 
-def _unstated(whole: Posterior) -> tuple[UnstatedFact, ...]:
+def _unstated_facts(whole: Posterior) -> tuple[UnstatedFact, ...]:
     """The facts that no file states, the one that widens the 99.9 % circle most first."""
     found = []
     for fact in whole.best.model.errors.facts:
-        parts = [(_without(one, fact), one.log_weight) for one in whole.hypotheses if one.gross != fact]
+        parts = [(_positions_without_fact(one, fact), one.log_weight) for one in whole.hypotheses if one.gross != fact]
         if not parts:
             continue
         positions, logs = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -206,7 +206,7 @@ def _unstated(whole: Posterior) -> tuple[UnstatedFact, ...]:
     return tuple(sorted(found, key=lambda one: one.radius999_m_if_exact))
 
 
-def _without(one: Hypothesis, fact: str) -> Array:
+def _positions_without_fact(one: Hypothesis, fact: str) -> Array:
     """Positions (n, 2) of a hypothesis's points with the errors of a fact taken out, by linear regression."""
     own = np.flatnonzero([error.fact == fact for error in one.model.errors.listed])
     _, covariance = moments(np.hstack([one.unturned_m, one.values[:, own]]), _share(one))
@@ -216,7 +216,7 @@ def _without(one: Hypothesis, fact: str) -> Array:
     return one.model.errors.turned(one.unturned_m - one.values[:, own] @ drift, values)
 
 
-def _shown(best: Hypothesis) -> tuple[ShownError, ...]:
+def _shown_errors(best: Hypothesis) -> tuple[ShownError, ...]:
     """The errors that nobody states and that the image shows to be larger than their default."""
     mean, covariance = moments(best.values - best.model.errors.mean, _share(best))
     sigma = np.sqrt(np.diag(covariance))

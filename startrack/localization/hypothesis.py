@@ -137,15 +137,15 @@ def sample_gross_error(
     """The hypothesis `other` of one gross error; of the clock on real ground there may be several times."""
     clock = _gross_clock(other)
     if clock is not None and not plain.suits_map:
-        return _at_other_times(plain, other, clock, references_m)
+        return _sample_other_times(plain, other, clock, references_m)
     return [sample_hypothesis(other, references_m, _gross_modes(plain, other), rounds=rounds, enough=FEW)]
 
 
-def _at_other_times(plain: Hypothesis, model: SkylineModel, clock: Clock, references_m: Array) -> list[Hypothesis]:
+def _sample_other_times(plain: Hypothesis, model: SkylineModel, clock: Clock, references_m: Array) -> list[Hypothesis]:
     """The hypotheses of a gross error of the clock at times that are apart from each other."""
     found: list[Hypothesis] = []
     for turned in turned_models(model, clock):
-        one = _at_settled_time(plain, turned, clock, references_m)
+        one = _sample_settled_time(plain, turned, clock, references_m)
         at_s, others_s = one.later_s, [other.later_s for other in found]
         if not any(is_linear(clock, at_s - other_s) for other_s in others_s):
             found.append(one)
@@ -158,7 +158,7 @@ def _gross_clock(model: SkylineModel) -> Clock | None:
     return clock if listed[-1].fact == model.gross and not model.terrain.axisymmetric else None
 
 
-def _at_settled_time(plain: Hypothesis, model: SkylineModel, clock: Clock, references_m: Array) -> Hypothesis:
+def _sample_settled_time(plain: Hypothesis, model: SkylineModel, clock: Clock, references_m: Array) -> Hypothesis:
     """The hypothesis of a gross error of the clock, with the rows turned to the time that it shows."""
     for _ in range(TIME_ROUNDS):
         found = sample_hypothesis(model, references_m, _gross_modes(plain, model))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +28,7 @@ FIRST_REACH_M, LAST_REACH_M, BOXES_ACROSS = 16.0, 256.0, 5  # of boxes about a p
 RIM_NATS = 3.0  # less probability than the whole has the rim of these boxes
 BOXES_AT_ONCE = 2000  # so that memory stays flat
 LOOK_UP_COST = 0.08  # of a bound, in horizons traced
-MANY_BOXES, LAST_MOST_BOXES = 4000, 16_000  # of a level: from which on a better position is sought, and of the last one
+LAST_MOST_BOXES = 16_000  # of a level: it is the last one; from a quarter of it on a better position is sought
 
 
 class Explored(NamedTuple):
@@ -160,7 +160,7 @@ class Search:
     prune_nats: float  # boxes that are less likely than the best by more are dropped
     budget_horizons: float
     log_dropped: float = -np.inf  # logarithm of a bound of the mass [m2]
-    work: float = 0.0  # in horizons traced
+    work: float = field(default=0.0, init=False)  # in horizons traced
     best: float = -np.inf  # log-likelihood known
 
     def run(self) -> Explored:
@@ -174,7 +174,7 @@ class Search:
         while True:
             centres, upper = self._bound(centres, half)
             is_last = 4 * len(centres) > LAST_MOST_BOXES
-            if 4 * len(centres) > MANY_BOXES and self._climb(centres, half):
+            if 16 * len(centres) > LAST_MOST_BOXES and self._climb(centres, half):
                 continue
             if half <= finest_m or is_last:
                 average = self.likelihood.average.score(terrain, centres, half)
@@ -182,8 +182,7 @@ class Search:
                 resolved = average.max() > self.guess.best - self.prune_nats and likely > 0.5
                 if half <= finest_m or resolved:
                     return self._ranked(centres, average, half)
-                if is_last:
-                    return self._about_best(upper, half)
+                return self._about_best(upper, half)
             quarters = split_boxes(centres, half, terrain)
             if not len(quarters):
                 raise NotLocated(

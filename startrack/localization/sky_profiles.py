@@ -13,7 +13,7 @@ from startrack.localization.sector_likelihood import CERTAIN_SIGMAS, EDGE_SIGMAS
 
 KNOT_SIGMAS = 0.2  # of the edge: distance of the knots; a cubic errs by 0.03 nats in a sector of 2e4 nats
 MAP_STEPS = 3.0  # points of the average in a standard deviation, of the map's error or of the sector's likelihood
-LEAST_LIKELIHOOD = 1e-30  # of the best elevation's likelihood: the floor of a sector is far above it
+LEAST_LIKELIHOOD = np.finfo(np.float64).tiny  # the floor of a sector is far above it
 
 
 @dataclass(frozen=True, eq=False)

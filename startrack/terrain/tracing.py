@@ -41,7 +41,7 @@ class Tracer(NamedTuple):
         shape = np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))
         points, azimuths = flatten(points_m, (*shape, 2)).reshape(-1, 2), flatten(azimuths_rad, shape).ravel()
         tan, at, edge = (np.empty(len(azimuths)) for _ in range(3))
-        _run_in_threads(horizons, self._with_table(table), (points, azimuths, tan, at, edge))
+        _run_in_threads(horizons, self._kernel_arguments(table), (points, azimuths, tan, at, edge))
         return tan.reshape(shape), at.reshape(shape), edge.reshape(shape)
 
     def cell_fields(self, centres: Array, half: float, azimuths: Array, turn: float) -> Array:
@@ -81,15 +81,15 @@ class Tracer(NamedTuple):
 
     def _trace_bounds(self, table: HorizonTable, *arrays: Array) -> None:
         """Bounds over small boxes: centres (n, 2), half sides, azimuths and their half widths; results low, high."""
-        fixed = self._with_table(table)
+        fixed = self._kernel_arguments(table)
         table.box_memory.fill(lambda *some: _run_in_threads(box_bounds, fixed, some), *arrays)
 
     def _look_up_bounds(self, table: HorizonTable, *arrays: Array) -> None:
         """Bounds from the table over boxes of one size; arrays as in `_trace_bounds`."""
-        ground, values, *square = self._with_table(table)
+        ground, values, *square = self._kernel_arguments(table)
         many_sector_bounds(ground, values, *table.pyramid[table.level_for(float(arrays[1][0]))], *square, *arrays)
 
-    def _with_table(self, table: HorizonTable | None) -> tuple[Any, ...]:
+    def _kernel_arguments(self, table: HorizonTable | None) -> tuple[Any, ...]:
         """The first arguments of kernels: maps, table, number of its cells and half its side, height of the camera."""
         cells = (NO_VALUES, 0, 0.0) if table is None else (table.values, table.square.across, table.square.reach_m)
         return self.ground, *cells, self.camera_height_m

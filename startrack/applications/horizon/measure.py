@@ -96,7 +96,7 @@ def _skyline(
     elevation = columns.mean(axis=1)
     scatter = np.mean(np.square(marginals.sigma_rad.reshape(SKYLINE_AZIMUTHS, COLUMNS_PER_AZIMUTH)), axis=1)
     half = COLUMNS_PER_AZIMUTH // 2
-    variation = _by_bin(marginals.mean_rad, half).var(axis=1)  # within one degree to either side
+    variation = _columns_of_bins(marginals.mean_rad, half).var(axis=1)  # within one degree to either side
     shared = np.square(_common_sigma_rad(frames, azimuth, elevation, site)) + PLACE_SIGMA_RAD**2
     shared += np.square(_gap_depth(steps, marginals.mean_rad))
     by_stars, by_light = _has_star(stars, azimuth, elevation), _has_step(steps, marginals.mean_rad)
@@ -122,10 +122,10 @@ def _gap_depth(steps: Sequence[list[Steps]], elevation_rad: Array) -> Array:
         light = (one.contrast > GAP_CONTRAST) & (one.significance > GAP_SIGNIFICANCE)
         light &= (below > NEAR_LIGHT_RAD) & (below < DEEPEST_GAP_RAD)
         np.maximum.at(depth, one.column[light], below[light])
-    return np.asarray(_by_bin(depth, 2 * COLUMNS_PER_AZIMUTH).mean(axis=1))
+    return np.asarray(_columns_of_bins(depth, 2 * COLUMNS_PER_AZIMUTH).mean(axis=1))
 
 
-def _by_bin(values: Array, beside: int) -> Array:
+def _columns_of_bins(values: Array, beside: int) -> Array:
     """The values (AZIMUTH_COLUMNS,) of the columns of each bin and of so many `beside` it, (SKYLINE_AZIMUTHS, n)."""
     columns = np.arange(SKYLINE_AZIMUTHS)[:, None] * COLUMNS_PER_AZIMUTH + np.arange(
         -beside, COLUMNS_PER_AZIMUTH + beside

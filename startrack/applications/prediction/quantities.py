@@ -72,7 +72,7 @@ def _rms_or_none(ratio: Array) -> float | None:
     return float(np.sqrt(np.nanmean(np.square(ratio)))) if np.isfinite(ratio).any() else None
 
 
-def _of_cells(key: str, unit: str, value: Callable[[Cells], Any], description: str, **more: Any) -> Quantity:
+def _cells_quantity(key: str, unit: str, value: Callable[[Cells], Any], description: str, **more: Any) -> Quantity:
     """A quantity of the summary of places."""
     return Quantity(key, unit, dict, value, description, **{"schema": CHANCE, "form": "%.6g", **more})
 
@@ -86,15 +86,15 @@ def _mean(name: str) -> Callable[[Cells], float]:
 
 
 SUMMARY_QUANTITIES = (
-    _of_cells("median_radius95_m", "m", lambda cells: median_or_none(cells["radius95_m"]), UNKNOWN,
+    _cells_quantity("median_radius95_m", "m", lambda cells: median_or_none(cells["radius95_m"]), UNKNOWN,
               schema=POSITIVE, before=None),
     *(
-        _of_cells(f"share_below_{bound}_m", "", _share_below(bound),
+        _cells_quantity(f"share_below_{bound}_m", "", _share_below(bound),
                   f"of the places: those with radius95_m below {bound} m")
         for bound in SHARES_M
     ),
-    *(_of_cells(name, "", _mean(name), "mean over the places") for name in ("p_ok", "p_ambiguous", "p_refused")),
-    _of_cells(ERROR_RATIO, "", lambda cells: _rms_or_none(cells[ERROR_RATIO]),
+    *(_cells_quantity(name, "", _mean(name), "mean over the places") for name in ("p_ok", "p_ambiguous", "p_refused")),
+    _cells_quantity(ERROR_RATIO, "", lambda cells: _rms_or_none(cells[ERROR_RATIO]),
               "errors of the draws over the stated ones, root mean square over the places: near 1 where the stated "
               "ones are right; null: no draw has a position", schema=POSITIVE, before=None),
 )  # fmt: skip

@@ -126,7 +126,7 @@ class Report:
     def lines(self) -> list[str]:
         """The summary in words."""
         found, what = summarize_cells(self.cells), "area" if self.points.kind == "area" else "path"
-        radius = _median_text(found["median_radius95_m"])
+        radius = _median_error_text(found["median_radius95_m"])
         shares = ", ".join(f"{100 * found[f'share_below_{bound}_m']:.0f} % below {bound} m" for bound in SHARES_M)
         lines = [
             f"{self.terrain.name}: {len(self.points.position_m)} places, {radius}; of the {what} {shares}",
@@ -138,7 +138,7 @@ class Report:
         if self.depth is not None:
             lines.append(_depth_line(self.depth))
         for one in self.variants:
-            radius = _median_text(one["summary"]["median_radius95_m"])
+            radius = _median_error_text(one["summary"]["median_radius95_m"])
             lines.append(f"{one['camera']}, {one['exposure_s']:.3g} s (V {one['limiting_v_mag']:.1f}): {radius}")
         return lines
 
@@ -150,7 +150,7 @@ def _depth_line(depth: dict[str, Any]) -> str:
     return f"{wanted}: {depth['exposure_s']:.3g} s, limiting magnitude V {depth['limiting_v_mag']:.1f}"
 
 
-def _median_text(radius95_m: float | None) -> str:
+def _median_error_text(radius95_m: float | None) -> str:
     if radius95_m is None:
         return "no position at half of the places"
     return f"median 95 % radius {length_text(radius95_m, 3)}"

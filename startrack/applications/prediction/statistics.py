@@ -67,7 +67,7 @@ def add_odometry(position_m: Array, cells: Cells, *, sigma_1: float, floor_m: fl
     nothing = np.full((len(estimates), 2, 2), np.inf)
     filtered = smoothed = nothing
     if any(one is not None for one in estimates):
-        filtered = _filtered(estimates, steps)
+        filtered = _filter_covariances(estimates, steps)
         smoothed = smooth(Observations.of(estimates, 0.0), steps).covariance_m2
     radii = (radius_holding(covariance_m2, 0.95) for covariance_m2 in (filtered, smoothed))
     found = (np.where(np.isfinite(radius), radius, np.nan) for radius in radii)
@@ -90,7 +90,7 @@ def _estimate(covariance_m2: Array) -> FrameEstimate:
     )  # fmt: skip
 
 
-def _filtered(estimates: list[FrameEstimate | None], steps: Steps) -> Array:
+def _filter_covariances(estimates: list[FrameEstimate | None], steps: Steps) -> Array:
     """Covariances (k, 2, 2) by the images so far; infinite before the first."""
     state, found = TrackFilter(0, 0.0), np.full((len(estimates), 2, 2), np.inf)
     begun = False

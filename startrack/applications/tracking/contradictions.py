@@ -44,9 +44,9 @@ def smooth_robustly(
     slipped = np.zeros(len(modes) - 1, dtype=bool)
     known = np.isfinite(steps.sigma_m)
     placed = np.append(known, False) | np.insert(known, 0, False)  # frames with a known move
-    tried, observations = set(), _chosen(modes, mode, height_sigma_m)
+    tried, observations = set(), _chosen_observations(modes, mode, height_sigma_m)
     for _ in range(MAX_ROUNDS):
-        found = smooth(observations, _without(steps, slipped))
+        found = smooth(observations, _widen_slipped_steps(steps, slipped))
         state = (tuple(mode), tuple(slipped))
         if state in tried:
             break
@@ -64,7 +64,7 @@ def smooth_robustly(
         changed = np.where(now_out[::2], -1, np.where(mode < 0, new_mode, mode))
         if not (changed == mode).all():
             mode = changed
-            observations = _chosen(modes, mode, height_sigma_m)
+            observations = _chosen_observations(modes, mode, height_sigma_m)
     return RobustTrack(found, mode, slipped)
 
 
@@ -102,13 +102,13 @@ def _gain(found: Smoothed, steps: Steps, slipped: Bools, here: int, there: int) 
     touched = np.unique([pair, pair + 1])
     part = difference[:, touched].reshape(4, -1)
     joint = found.joint_m2[touched][:, :, touched].reshape(2 * len(touched), -1)
-    now = np.square(np.repeat(_without(steps, slipped).sigma_m[pair], 2))
+    now = np.square(np.repeat(_widen_slipped_steps(steps, slipped).sigma_m[pair], 2))
     residual: Array = (steps.move_m - np.diff(found.position_m, axis=0))[pair].ravel()
     without = np.asarray(np.linalg.inv(np.linalg.inv(part @ joint @ part.T) - (1.0 - 1e-9) * np.diag(1.0 / now)))
     residual = np.asarray(residual + without @ (residual / now))
     changed = slipped.copy()
     changed[pair] = [False, not slipped[there]]
-    then = np.square(np.repeat(_without(steps, changed).sigma_m[pair], 2))
+    then = np.square(np.repeat(_widen_slipped_steps(steps, changed).sigma_m[pair], 2))
     prior = 2.0 * float(np.log(1.0 / SLIP_PROBABILITY - 1.0)) if slipped[there] else 0.0
     return prior + float(log_normal(residual, without + np.diag(then)) - log_normal(residual, without + np.diag(now)))
 
@@ -179,11 +179,11 @@ def _worst_nearby(doubt: Array) -> Bools:
     return np.asarray((doubt > 0.0) & (doubt >= windows.max(axis=1)))
 
 
-def _without(steps: Steps, slipped: Bools) -> Steps:
+def _widen_slipped_steps(steps: Steps, slipped: Bools) -> Steps:
     return replace(steps, sigma_m=np.where(slipped, np.hypot(steps.sigma_m, SLIP_SIGMA_M), steps.sigma_m))
 
 
-def _chosen(modes: Sequence[Sequence[FrameEstimate]], mode: Ints, height_sigma_m: float) -> Observations:
+def _chosen_observations(modes: Sequence[Sequence[FrameEstimate]], mode: Ints, height_sigma_m: float) -> Observations:
     chosen = [of[k] if k >= 0 else None for of, k in zip(modes, mode, strict=True)]
     if all(one is None for one in chosen):
         raise ValueError("no frame has a single position")

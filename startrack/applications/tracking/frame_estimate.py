@@ -41,17 +41,17 @@ def estimate_frame(
     """
     reference, spread = position_m, covariance_m2
     for _ in range(MAX_NEIGHBOURHOODS):
-        half = max(FRAME_REACH_SIGMAS * _widest(spread) + FRAME_MARGIN_M, LEAST_FRAME_HALF_M)
+        half = max(FRAME_REACH_SIGMAS * _largest_sigma(spread) + FRAME_MARGIN_M, LEAST_FRAME_HALF_M)
         models = [FrameModel.of_evidence(evidence, terrain, errors, reference, half)]
         found = sample_together(models, reference, spread)
         mean, covariance = moments(found.points, found.share)
-        if np.abs(mean[:2] - reference).max() + 3.0 * _widest(covariance[:2, :2]) < half:
+        if np.abs(mean[:2] - reference).max() + 3.0 * _largest_sigma(covariance[:2, :2]) < half:
             break
         reference, spread = mean[:2], covariance[:2, :2]
     return observe_together(models, found)
 
 
-def _widest(covariance: Array) -> float:
+def _largest_sigma(covariance: Array) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
 

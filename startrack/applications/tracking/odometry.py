@@ -60,14 +60,14 @@ class Odometry(Value):
         """
         from scipy.spatial.transform import Rotation, Slerp
 
-        at_s = self._covered(np.asarray(time_s, dtype=np.float64))
+        at_s = self._clip_to_span(np.asarray(time_s, dtype=np.float64))
         position_m = np.stack([np.interp(at_s, self.time_s, axis) for axis in self.position_m.T], axis=-1)
         if len(at_s) < 2:
             return np.zeros((0, 3))
         attitude = Slerp(self.time_s, Rotation.from_quat(self.quat_xyzw))(at_s[:-1])
         return np.asarray(attitude.inv().apply(np.diff(position_m, axis=0)))
 
-    def _covered(self, time_s: Array) -> Array:
+    def _clip_to_span(self, time_s: Array) -> Array:
         """The times (m,), clipped to the span of the poses. Raises BadInput as `increments_body_m`."""
         if time_s.ndim != 1 or not np.isfinite(time_s).all():
             _refuse("the frames' times are not a list of finite numbers")

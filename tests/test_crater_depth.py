@@ -11,7 +11,7 @@ from localization_helpers import locate_or_refuse
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.chain import StarRays, locate_rays
-from startrack.core.types import Fix
+from startrack.core.types import Fix, NotLocated
 from startrack.rendering import Scene, Series
 from startrack.simulation import simulate_rays
 from startrack.terrain import Cylinder, load_terrain
@@ -63,28 +63,24 @@ def test_the_depth_of_the_file_stays_where_it_is_right(series: Series):
 
 
 @pytest.mark.parametrize("steeper", [-0.004, 0.004])
-def test_a_depth_stated_as_exact_is_not_believed_where_the_picture_contradicts_it(series: Series, steeper: float):
-    """The circle is that of a silent file then, or the image is refused; else the error is within the stated circle."""
-    contradicted = 0
+def test_a_depth_stated_as_exact_is_not_estimated(series: Series, steeper: float):
+    """The picture contradicts it, or the error is within the circle."""
+    refused = 0
     for number in range(FRAMES):
         scene, rays = rays_of(series, steeper, number, stated=True)
         fix, reason = locate_or_refuse(rays.evidence(), rays.terrain)
-        contradicted += fix is None or fix.contradicted != ""
         if fix is None:
             assert reason == "inconsistent_evidence"
+            refused += 1
             continue
+        assert fix.shown == fix.unstated == ()
         assert error_m(fix, scene) < fix.radius999_m
-        facts = {one.fact for one in fix.unstated}
-        assert facts >= {"depth_sigma_m", "diameter_sigma_m"} if fix.contradicted else not facts
-    assert contradicted >= FRAMES // 2
+    assert refused >= FRAMES // 2
 
 
 @pytest.mark.parametrize("steeper", [-0.02, 0.02])
-def test_a_stated_depth_that_is_far_off_is_refused_or_right_within_a_wide_circle(series: Series, steeper: float):
+def test_a_stated_depth_that_is_far_off_is_refused(series: Series, steeper: float):
     for number in range(FRAMES):
-        scene, rays = rays_of(series, steeper, number, stated=True)
-        fix, reason = locate_or_refuse(rays.evidence(), rays.terrain)
-        if fix is None:
-            assert reason == "inconsistent_evidence"
-        else:
-            assert fix.contradicted and error_m(fix, scene) < fix.radius999_m
+        with pytest.raises(NotLocated) as refusal:
+            locate_rays(rays_of(series, steeper, number, stated=True)[1])
+        assert refusal.value.reason == "inconsistent_evidence"

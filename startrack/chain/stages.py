@@ -239,8 +239,6 @@ class Located(StarFix, Measured):
         """Those of `Measured`, what blocks the view, and errors beyond the defaults of facts that no file states."""
         blocked = [f"blocked and left out: {self.blocked.text}"] if self.blocked else []
         shown = [f"the image shows {one.text}, which no file states: it is estimated" for one in self.fix.shown]
-        if self.fix.contradicted:
-            shown = [f"the image contradicts {self.fix.contradicted}: the circles are those of a silent terrain file"]
         return [*super().warnings, *blocked, *shown]
 
     @property

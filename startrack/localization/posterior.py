@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from startrack.localization.joint_posterior import sample_posterior
 from startrack.localization.likelihood import SECTOR_RAD, PositionLikelihood
 from startrack.localization.position_prior import SearchedNear, name_prior, weigh_by_prior
 from startrack.localization.search import NATS, Explored, Search, log_sum
-from startrack.localization.wrong_files import UnstatedTerrain, find_contradicted_fact
 from startrack.terrain import Terrain, require_terrain
 
 MIN_ROWS = 8
@@ -58,14 +57,7 @@ class ExactPosterior:
         try:
             parts = self._explore_times(rows, terrain)
             found, explored = _sample(parts, terrain), parts[0][1]
-            fix = conclude(found, terrain, explored, _dropped_probability(explored))
-            wrong = "" if rows.is_first_look else find_contradicted_fact(found)
-            if not wrong:
-                return fix
-            found = _sample(parts, UnstatedTerrain(terrain))
-            find_contradicted_fact(found)
-            fix = conclude(found, UnstatedTerrain(terrain), explored, _dropped_probability(explored))
-            return replace(fix, contradicted=wrong)
+            return conclude(found, terrain, explored, _dropped_probability(explored))
         except NotLocated as refusal:
             raise name_prior(refusal, near) from refusal
 

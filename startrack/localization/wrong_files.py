@@ -10,7 +10,6 @@ from startrack.core.types import Array, Blocked, NotLocated
 from startrack.localization.free_skyline import free_log_likelihood
 from startrack.localization.hypothesis import GROSS_ROUNDS, Hypothesis, sample_gross_error
 from startrack.localization.shared_errors import SharedErrors
-from startrack.terrain import ForwardingTerrain, ShapeError, as_unstated
 
 WRONG_FACT_NATS = 3.0  # by which a gross error of a stated fact must explain the rows better: 1 of 100 clean skies
 MOST_BLOCKED = 0.5  # of the skyline that the rows show: where more is on no map, another place may explain them as well
@@ -41,32 +40,12 @@ def require_files(found: Sequence[Hypothesis], parameters: Array, clear: Array) 
             "or camera file, or something on no map?",
             reason="inconsistent_evidence",
         )
-
-
-class UnstatedTerrain(ForwardingTerrain):
-    """A terrain whose statements about the errors of its shape are not believed."""
-
-    @property
-    def shape_errors(self) -> tuple[ShapeError, ...]:  # type: ignore[override]
-        """Those of the whole terrain, as if nobody stated them."""
-        return tuple(as_unstated(error) for error in self.whole.shape_errors)
-
-
-def find_contradicted_fact(found: Sequence[Hypothesis]) -> str:
-    """The stated fact of the terrain's shape that the rows contradict most; "" where they contradict none.
-
-    Raises NotLocated (inconsistent_evidence) where it is a fact of which no gross error is known: clock, horizon.
-    """
     better, fact = max(((nats, fact) for fact, nats in weigh_wrong_facts(found)), default=(0.0, ""))
-    if better <= WRONG_FACT_NATS:
-        return ""
-    errors = [as_unstated(one) for one in found[0].model.terrain.shape_errors if one.fact == fact]
-    if all(one.is_stated for one in errors):
+    if better > WRONG_FACT_NATS:
         raise NotLocated(
             f"an error beyond what {fact} states explains the image better, by {better:.0f} nats: is it right?",
             reason="inconsistent_evidence",
         )
-    return fact
 
 
 def _log_map(best: Hypothesis, parameters: Array) -> float:

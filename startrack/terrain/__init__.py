@@ -18,7 +18,7 @@ from startrack.terrain.protocol import (
     require_terrain,
 )
 from startrack.terrain.raster import EQUIRECTANGULAR, STEREOGRAPHIC, Projection, Raster
-from startrack.terrain.shape import ShapeError, as_unstated
+from startrack.terrain.shape import ShapeError
 
 if TYPE_CHECKING:
     from startrack.terrain.height_map import HeightMap
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "EQUIRECTANGULAR", "MAKERS", "NO_POST", "STEREOGRAPHIC", "TERRAIN_KEYS", "Cylinder", "ForwardingTerrain",
-    "HeightMap", "HorizonPosts", "Projection", "Raster", "ShapeError", "StateableError", "Terrain", "as_unstated",
+    "HeightMap", "HorizonPosts", "Projection", "Raster", "ShapeError", "StateableError", "Terrain",
     "body_of_terrain", "files_of_terrain", "import_maps", "load_terrain", "read_map", "require_bounds",
     "require_horizons", "require_terrain", "state_errors", "stateable_errors", "terrain_from_dict", "write_bands",
     "write_map",

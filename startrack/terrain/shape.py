@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -79,13 +79,6 @@ VERTICAL = Fact(
 CAMERA_ERROR = Fact(key="camera_height_sigma_m", errors=("camera_height_m",), sigma=0.02)
 CYLINDER_FACTS = (DEPTH, DIAMETER, ELLIPSE, RIM_TILT)
 MAP_FACTS = (BIAS, STRETCH, VERTICAL, CAMERA_ERROR)
-BY_KEY = {fact.key: fact for fact in (*CYLINDER_FACTS, *MAP_FACTS)}
-
-
-def as_unstated(error: ShapeError) -> ShapeError:
-    """What counts for an `error` if its statement is not believed: the default, and a larger sigma that is stated."""
-    fact = BY_KEY[error.fact]
-    return replace(error, sigma=max(error.sigma, fact.sigma), gross_probability=fact.gross_probability)
 
 
 def select_slopes(errors: Sequence[ShapeError], slopes_rad: dict[str, Array], shape: Iterable[int]) -> Array:

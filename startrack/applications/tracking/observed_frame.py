@@ -78,9 +78,6 @@ def observe_frame(outcome: Outcome, errors: TrackErrors | None = None, terrain: 
         return ObservedFrame(name, when, R, (), None, reason=str(outcome.reason), message=outcome.message)
     if not isinstance(value, Located):
         return ObservedFrame(name, when, R, (), None)
-    if value.fix.contradicted:
-        reason, message = "inconsistent_evidence", f"it contradicts {value.fix.contradicted} of the terrain file"
-        return ObservedFrame(name, when, R, (), None, reason=reason, message=message)
     if value.fix.search == "approximate":
         raise ValueError(f"{name}: a track needs the localizer posterior")
     terrain = terrain or value.terrain

@@ -154,3 +154,10 @@ def test_every_kernel_is_compiled_by_the_checked_cache():
     sources = (ROOT / "startrack").rglob("*.py")
     direct = [path.stem for path in sources if "from numba import" in path.read_text(encoding="utf-8")]
     assert direct == ["kernels"]
+
+
+def test_no_kernel_is_in_a_package_whose_changes_keep_the_cache() -> None:
+    package = Path(compilation.__file__).parents[1]
+    assert all((package / name).is_dir() for name in compilation.ABOVE_KERNELS)
+    sources = [path for name in compilation.ABOVE_KERNELS for path in (package / name).rglob("*.py")]
+    assert [path for path in sources if "njit" in path.read_text(encoding="utf-8")] == []

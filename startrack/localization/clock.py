@@ -162,15 +162,9 @@ def explore_times(plain: PositionLikelihood, evidence: Evidence, clock: Clock) -
     found: list[tuple[Evidence, Explored]] = []
     for at in _peaks(later_s, log_share, clock):
         rows = turn_evidence(evidence, float(later_s[at]))
-        likelihood = replace_rows(plain, rows)
-        found.append((rows, local_posterior(likelihood, Guess(way_m[at][None], np.zeros(1)), -np.inf)))
+        guess = Guess(way_m[at][None], np.zeros(1))
+        found.append((rows, local_posterior(plain.with_rows(rows), guess, -np.inf)))
     return found
-
-
-def replace_rows(likelihood: PositionLikelihood, rows: Evidence) -> PositionLikelihood:
-    """The same likelihood of other rows."""
-    sectors = likelihood.sectors
-    return PositionLikelihood.from_evidence(rows, likelihood.terrain, 2 * np.pi / sectors.count, sectors.epsilon)
 
 
 def turned_model(model: SkylineModel, later_s: float, is_rough: bool = False) -> SkylineModel:

@@ -112,8 +112,8 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
     integrity = None
     if not best.model.rows.is_first_look:
         require_files(found, parameters, clear)
-    if not best.model.rows.is_first_look and not ambiguous:
-        integrity = assess_integrity(best.model, parameters, near[:2, :2], clear, covariance, radius999)
+        if not ambiguous:
+            integrity = assess_integrity(best.model, parameters, near[:2, :2], clear, covariance, radius999)
     blocked = Blocked(1.0 - clear)
     return Fix(
         position_enu_m=camera_at(middle, terrain), covariance_m2=covariance, radius95_m=radius95, radius999_m=radius999,

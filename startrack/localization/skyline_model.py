@@ -254,5 +254,5 @@ class SkylineModel:
 
     @cached_property
     def clear(self) -> Array:
-        """(SECTORS,) probability that the map's skyline shows, at the linear solution; see `linear_solution`."""
+        """(SECTORS,) probability that the map's skyline shows, at the linear solution; see `solve_model`."""
         return np.ones(SECTORS)

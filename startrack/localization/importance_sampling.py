@@ -1,4 +1,9 @@
-"""Adaptive importance sampling of a posterior about its modes, with all rounds weighed together."""
+"""Adaptive importance sampling of a posterior about its modes, with all rounds weighed together.
+
+Each round draws from t distributions about the modes, a part of the points farther out in position; the weight of a
+point is the posterior over the mixture of all rounds' distributions. Between rounds the distributions move to the
+weighted points. Source: adaptive multiple importance sampling, Cornuet et al. 2012, Scand. J. Statist. 39, 798.
+"""
 
 from __future__ import annotations
 

@@ -169,6 +169,17 @@ def test_profiles_are_averaged_over_an_error_of_the_map(sigma_deg: float) -> Non
         assert at[near] == pytest.approx(plain[near], abs=0.25)
 
 
+def test_profiles_end_with_the_window_where_the_error_of_the_map_is_wider() -> None:
+    rows, above = rows_of_both(np.random.default_rng(4))
+    found = profiles_of(rows, above, np.radians(np.linspace(0.0, 12.0, SECTORS)))
+    for sector in range(SECTORS):
+        cells = slice(found.first[sector], found.first[sector + 1])
+        assert found.x[cells][[0, -1]] == pytest.approx([LOW_RAD, HIGH_RAD])
+        assert (np.diff(found.x[cells]) >= 0).all()
+        assert (np.diff(found.integral[cells]) >= 0).all()
+        assert found.integral[cells][-1] == pytest.approx(HIGH_RAD - LOW_RAD)
+
+
 def test_stars_are_compared_with_the_skyline_at_their_own_azimuths(obstructed: SkylineModel) -> None:
     """The likelihood about a reference is that of horizons computed for each star and position."""
     rng = np.random.default_rng(5)

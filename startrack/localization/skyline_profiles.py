@@ -210,11 +210,12 @@ def _average_over_map(profiles, sigma, bins):
         weights[q] = 0.5 * (erf(bins[q + 1] / sqrt(2.0)) - erf(bins[q] / sqrt(2.0)))
     weights /= weights.sum()
     sectors, room = len(sigma), len(profiles.x)
-    reach, step = np.zeros(sectors), np.zeros(sectors)
+    low, high, step = np.zeros(sectors), np.zeros(sectors), np.zeros(sectors)
     for s in range(sectors):
-        reach[s] = SOFT_REACH_RAD + EDGE_SIGMAS * sigma[s]
-        step[s] = max(SOFT_STEP * sigma[s], reach[s] / MOST_SOFT_CELLS)
-        room += int(2.0 * reach[s] / step[s]) + 4
+        reach = SOFT_REACH_RAD + EDGE_SIGMAS * sigma[s]
+        low[s], high[s] = max(-reach, LOW_RAD), min(reach, HIGH_RAD)
+        step[s] = max(SOFT_STEP * sigma[s], reach / MOST_SOFT_CELLS)
+        room += int((high[s] - low[s]) / step[s]) + 4
     first = np.zeros(sectors + 1, dtype=np.int64)
     x, left, right, bend = np.zeros(room), np.zeros(room), np.zeros(room), np.zeros(room)
     n = 0
@@ -226,14 +227,14 @@ def _average_over_map(profiles, sigma, bins):
             first[s + 1] = n
             continue
         k, last = profiles.first[s], profiles.first[s + 1] - 1
-        while k < last and profiles.x[k] < -reach[s]:
+        while k < last and profiles.x[k] < low[s]:
             x[n], left[n], right[n], bend[n] = profiles.x[k], profiles.left[k], profiles.right[k], profiles.bend[k]
             n += 1
             k += 1
-        count = int(2.0 * reach[s] / step[s])
-        before = _mean_over(profiles, s, -reach[s], sigma[s], bins, weights)
+        count = int((high[s] - low[s]) / step[s])
+        before = _mean_over(profiles, s, low[s], sigma[s], bins, weights)
         for i in range(count):
-            at = -reach[s] + i * step[s]
+            at = low[s] + i * step[s]
             after = _mean_over(profiles, s, at + step[s], sigma[s], bins, weights)
             middle = _mean_over(profiles, s, at + 0.5 * step[s], sigma[s], bins, weights)
             rise = abs(after - before)
@@ -242,7 +243,7 @@ def _average_over_map(profiles, sigma, bins):
                 bend[n] = min(max(bend[n], -rise), rise)
             before = after
             n += 1
-        end = -reach[s] + count * step[s]
+        end = low[s] + count * step[s]
         k = cell_at(profiles.first, profiles.x, s, end, 0)
         x[n] = end
         left[n] = log_at(profiles, s, end) + profiles.free[s]

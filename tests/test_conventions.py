@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import startrack
 from startrack import frames
 from startrack.camera import Camera
-from startrack.catalog import bodies, solar_system
+from startrack.catalog import bodies, sky
 from startrack.core import types
 from startrack.frames import Site, parse_utc
 
@@ -144,7 +144,7 @@ def test_constants_are_the_published_ones() -> None:
     import erfa
 
     assert frames.SPEED_OF_LIGHT_M_S == erfa.CMPS
-    assert solar_system.ASTRONOMICAL_UNIT_M == erfa.DAU
+    assert sky.ASTRONOMICAL_UNIT_M == erfa.DAU
     assert frames.MOON_RADIUS_M == 1_737_400  # IAU 2015, and the label of every LOLA map
     equatorial_m, flattening = erfa.eform(erfa.WGS84)
     pole = frames.position_fixed_m(Site("earth", np.pi / 2, 0.0))

@@ -7,10 +7,10 @@ from startrack.catalog.sky import (
     airmass,
     apparent_bodies,
     apparent_elevation_rad,
+    bodies,
     is_below_horizon,
     sky_at,
 )
-from startrack.catalog.solar_system import bodies
 from startrack.catalog.stars import (
     StarCatalog,
     has_deep_catalog,

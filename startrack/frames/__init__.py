@@ -3,29 +3,27 @@
 `icrs` -> (R_enu_icrs) -> `enu` of a site. SPICE, ERFA and SciPy are imported at their first use.
 """
 
-from startrack.frames.orientation import R_mcmf_icrs, barycentric_state, et_s
-from startrack.frames.rays import (
-    SPEED_OF_LIGHT_M_S,
-    aberrate,
-    angle_between_rad,
-    azel_from_rays,
-    length_xy,
-    off_axis_rad,
-    rays_from_azel,
-    refract_rad,
-    turn_azel,
-)
-from startrack.frames.rotations import (
+from startrack.frames.directions import (
     ORTHONORMAL_1,
+    SPEED_OF_LIGHT_M_S,
     R_body_enu_from_heading_pitch_roll,
     R_from_quat_xyzw,
     R_from_rotvec,
+    aberrate,
+    angle_between_rad,
+    azel_from_rays,
     heading_pitch_roll_from_R_body_enu,
+    length_xy,
     nearest_rotation,
+    off_axis_rad,
     quat_xyzw_from_R,
+    rays_from_azel,
+    refract_rad,
     tum_line,
+    turn_azel,
     wahba,
 )
+from startrack.frames.orientation import R_mcmf_icrs, barycentric_state, et_s
 from startrack.frames.site import (
     MOON_RADIUS_M,
     R_enu_fixed,

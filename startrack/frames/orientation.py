@@ -143,7 +143,6 @@ def _spice() -> Iterator[Any]:
     with _lock:
         try:
             if not _loaded:
-                _close_before_forks()
                 for path in _kernel_paths():
                     spiceypy.furnsh(path)
                     _loaded.append(path)
@@ -175,16 +174,14 @@ def _coverage_et_s() -> tuple[float, float]:
     return max(span[0] for span in spans) + _DAY_S, min(span[-1] for span in spans)
 
 
-@cache
-def _close_before_forks() -> None:
-    """Registered once, at the first use: parent and child each load the kernels again when they next need them."""
-    if hasattr(os, "register_at_fork"):
-        os.register_at_fork(before=_close_kernels, after_in_parent=_lock.release, after_in_child=_lock.release)
-
-
 def _close_kernels() -> None:
-    import spiceypy
-
+    """Before a fork: parent and child each load the kernels again when they next need them."""
     _lock.acquire()  # held across the fork, so that no other thread is inside SPICE at that moment
     while _loaded:
+        import spiceypy
+
         spiceypy.unload(_loaded.pop())
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_close_kernels, after_in_parent=_lock.release, after_in_child=_lock.release)

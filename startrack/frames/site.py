@@ -21,8 +21,7 @@ from startrack.frames.orientation import (
 )
 
 MOON_RADIUS_M = 1_737_400.0  # sphere of the LOLA maps, IAU 2015
-EARTH_RADIUS_M = 6_378_137.0  # equatorial, WGS 84
-EARTH_FLATTENING_1 = 1 / 298.257223563  # WGS 84
+WGS84 = 1  # ERFA's number of the ellipsoid
 
 
 @dataclass(frozen=True)
@@ -78,12 +77,14 @@ def latlon_from_enu(site: Site, east_m: ArrayLike, north_m: ArrayLike, up_m: Arr
     defined at a pole.
     """
     points_enu_m = np.stack(np.broadcast_arrays(*(np.asarray(c, dtype=float) for c in (east_m, north_m, up_m))), -1)
-    x, y, z = np.moveaxis(points_enu_m @ R_enu_fixed(site) + position_fixed_m(site), -1, 0)
-    axis_distance_m = np.hypot(x, y)
-    longitude_rad = np.arctan2(y, x)
-    if site.body == "moon":
-        return np.arctan2(z, axis_distance_m), longitude_rad
-    return _geodetic_latitude_rad(axis_distance_m, z), longitude_rad
+    points_m = points_enu_m @ R_enu_fixed(site) + position_fixed_m(site)
+    if site.body == "earth":
+        import erfa
+
+        longitude_rad, latitude_rad, _ = erfa.gc2gd(WGS84, points_m)
+        return latitude_rad, longitude_rad
+    x, y, z = np.moveaxis(points_m, -1, 0)
+    return np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)
 
 
 def R_enu_icrs(site: Site, time: datetime) -> Array:
@@ -107,11 +108,11 @@ def sky_rotvec_rad(site: Site, time: datetime, seconds: float) -> Array:
 
     Raises: as R_enu_icrs.
     """
+    from scipy.spatial.transform import Rotation
+
     half = timedelta(seconds=seconds / 2)
-    R = R_enu_icrs(site, time + half) @ R_enu_icrs(site, time - half).T
-    axis = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    sine, cosine = float(np.linalg.norm(axis)), 0.5 * (np.trace(R) - 1)
-    return axis * (np.arctan2(sine, cosine) / sine) if sine > 0 else axis
+    turn = R_enu_icrs(site, time + half) @ R_enu_icrs(site, time - half).T
+    return Rotation.from_matrix(turn).as_rotvec()
 
 
 def observer_velocity_m_s(site: Site, time: datetime) -> Array:
@@ -141,25 +142,9 @@ def observer_state(site: Site, time: datetime) -> tuple[Array, Array]:
 
 def _fixed_from_latlon(body: str, latitude_rad: ArrayLike, longitude_rad: ArrayLike, height_m: ArrayLike) -> Array:
     lat, lon, h = np.broadcast_arrays(*(np.asarray(v, dtype=float) for v in (latitude_rad, longitude_rad, height_m)))
-    if body == "moon":
-        normal_m, polar_1 = np.full(lat.shape, MOON_RADIUS_M), 1.0
-    else:
-        polar_1 = (1 - EARTH_FLATTENING_1) ** 2
-        normal_m = EARTH_RADIUS_M / np.sqrt(np.cos(lat) ** 2 + polar_1 * np.sin(lat) ** 2)
-    x = (normal_m + h) * np.cos(lat) * np.cos(lon)
-    y = (normal_m + h) * np.cos(lat) * np.sin(lon)
-    return np.stack([x, y, (polar_1 * normal_m + h) * np.sin(lat)], axis=-1)
+    if body == "earth":
+        import erfa
 
-
-def _geodetic_latitude_rad(axis_distance_m: Array, z_m: Array) -> Array:
-    """Bowring (1976), Survey Review 23, 323: two rounds leave less than a nanoradian within 100 km of the surface."""
-    squash = 1 - EARTH_FLATTENING_1
-    eccentricity2 = 1 - squash**2
-    reduced_rad = np.arctan2(z_m, squash * axis_distance_m)
-    for _ in range(2):
-        latitude_rad = np.arctan2(
-            z_m + eccentricity2 / squash * EARTH_RADIUS_M * np.sin(reduced_rad) ** 3,
-            axis_distance_m - eccentricity2 * EARTH_RADIUS_M * np.cos(reduced_rad) ** 3,
-        )
-        reduced_rad = np.arctan2(squash * np.sin(latitude_rad), np.cos(latitude_rad))
-    return latitude_rad
+        return np.asarray(erfa.gd2gc(WGS84, lon, lat, h))
+    level_m = (MOON_RADIUS_M + h) * np.cos(lat)
+    return np.stack([level_m * np.cos(lon), level_m * np.sin(lon), (MOON_RADIUS_M + h) * np.sin(lat)], axis=-1)

@@ -155,8 +155,7 @@ def test_bounds_do_not_depend_on_what_was_traced_before(shackleton):
 def test_the_table_is_kept_and_found_again_by_content(shackleton):
     terrain = replace(shackleton, camera_height_m=1.7, search_radius_m=150.0)
     table = terrain.table
-    kept, path = terrain.kept_table, terrain.table_path
-    key = kept.key
+    key, path = terrain.table_key, terrain.table_path
     assert path.is_file()
     assert [p for p in path.parent.iterdir() if p.name.startswith(".")] == []
     cache.TABLES_IN_MEMORY.pop(key)
@@ -166,15 +165,15 @@ def test_the_table_is_kept_and_found_again_by_content(shackleton):
     assert np.array_equal(again.table.values, table.values)
     assert replace(terrain).table is again.table  # variants with the same table share it
     higher = replace(terrain, camera_height_m=3.0)
-    assert higher.kept_table.key != key
+    assert higher.table_key != key
     first = terrain.maps[0]
     other = replace(first, heights_m=first.heights_m + np.float32(0.5))
-    assert replace(terrain, maps=(other, *terrain.maps[1:])).kept_table.key != key
+    assert replace(terrain, maps=(other, *terrain.maps[1:])).table_key != key
     path.write_bytes(path.read_bytes()[:1000])
     cache.TABLES_IN_MEMORY.pop(key)
-    assert kept.load() is None  # a damaged table is made again
-    kept.keep(table)
-    assert kept.load() is table
+    assert cache.load_table(key, terrain.square) is None  # a damaged table is made again
+    cache.keep_table(key, table)
+    assert cache.load_table(key, terrain.square) is table
 
 
 def test_of_two_that_need_a_table_one_makes_it(shackleton, monkeypatch):

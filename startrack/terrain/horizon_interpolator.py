@@ -13,8 +13,7 @@ from startrack.core.types import Array, Bools, Ints
 from startrack.terrain.deformed_map import slopes_of_map
 from startrack.terrain.horizon_kernel import interpolate, interpolate_bounds
 from startrack.terrain.protocol import ForwardingTerrain
-from startrack.terrain.traced_map import TracedMap
-from startrack.terrain.tracing import flatten
+from startrack.terrain.traced_map import TracedMap, flatten_rays
 
 DEFAULT_NODES = 3  # nodes along each side by default
 MAX_BEND_TAN = 8e-5  # of tan H (0.004 degrees): azimuths whose horizon bends by more between the nodes are traced
@@ -117,8 +116,7 @@ class HorizonInterpolator(ForwardingTerrain):
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation [rad]; see `Terrain`."""
-        shape = np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))
-        points, azimuths = flatten(points_m, (*shape, 2)).reshape(-1, 2), flatten(azimuths_rad, shape).ravel()
+        shape, points, azimuths = flatten_rays(points_m, azimuths_rad)
         column, inside = self._inside(points, azimuths, 0.0, self.exact)
         found = np.empty(len(column))
         interpolate(self.whole.ground, self.nodes, points, column, found)
@@ -134,8 +132,7 @@ class HorizonInterpolator(ForwardingTerrain):
         too_wide = half > self.step_m / 2 or 2 * half > self.whole.finest_post_m
         if np.any(azimuth_half_rad) or np.ndim(half_m) or too_wide:
             return self.whole.horizon_bounds_rad(centres_m, half_m, azimuths_rad, azimuth_half_rad)
-        shape = np.broadcast_shapes(np.shape(centres_m)[:-1], np.shape(azimuths_rad))
-        centres, azimuths = flatten(centres_m, (*shape, 2)).reshape(-1, 2), flatten(azimuths_rad, shape).ravel()
+        shape, centres, azimuths = flatten_rays(centres_m, azimuths_rad)
         column, inside = self._inside(centres, azimuths, half, True)
         low, high = np.empty(len(column)), np.empty(len(column))
         interpolate_bounds(self.whole.ground, self.nodes, self.interpolation_error, centres, half, column, low, high)

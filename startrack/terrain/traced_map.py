@@ -2,27 +2,41 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
 from startrack.core.types import Array, BadInput
 from startrack.frames import Site
 from startrack.terrain.ground import Ground, ground_up_m, pack_maps
-from startrack.terrain.horizon_table import HorizonTable, Square
+from startrack.terrain.horizon_kernel import surfaces
+from startrack.terrain.horizon_table import AZIMUTH_BINS, FIELDS, HorizonTable, Square
 from startrack.terrain.protocol import Progress, Terrain
 from startrack.terrain.raster import Projection, Raster
-from startrack.terrain.table_cache import KeptTable
-from startrack.terrain.tracing import Tracer
+from startrack.terrain.table_cache import (
+    TABLES_IN_MEMORY,
+    cpu_count,
+    discard_table,
+    key_of_table,
+    load_or_build_table,
+    path_of_table,
+)
+from startrack.terrain.table_kernel import box_bounds, horizons, many_sector_bounds
 
 CELL_M = 200.0  # cells of the table are no wider
 MAX_CELLS_ACROSS = 128
 REACH_RADII = 1.15  # of the search radius: so far is searched, to notice that the camera left the area
 SLOPE_STEP_M = 5.0
+MIN_RAYS_FOR_THREADS = 1500  # fewer take less time than starting threads
+MAX_THREADS = 8
+MAX_TRACED_TURN_RAD = 0.25 * 2 * np.pi / AZIMUTH_BINS  # half widths of azimuths: bounds over wider ones are looked up
+NO_VALUES = np.zeros((0, AZIMUTH_BINS, FIELDS), dtype=np.uint16)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -59,11 +73,6 @@ class TracedMap(Terrain):
         """The maps packed for tracing."""
         return pack_maps(self.site, self.maps)
 
-    @property
-    def tracer(self) -> Tracer:
-        """The compiled kernels on these maps."""
-        return Tracer(self.ground, self.camera_height_m)
-
     @cached_property
     def finest_post_m(self) -> float:
         """Spacing of the posts of the finest map."""
@@ -72,11 +81,8 @@ class TracedMap(Terrain):
     @cached_property
     def reach_m(self) -> float:
         """The search area and a margin, as far as the maps reach."""
-        return (
-            self.search_radius_m * REACH_RADII
-            if self._covers(self.search_radius_m * REACH_RADII)
-            else self.search_radius_m
-        )
+        wider = self.search_radius_m * REACH_RADII
+        return wider if self._covers(wider) else self.search_radius_m
 
     @cached_property
     def square(self) -> Square:
@@ -87,22 +93,19 @@ class TracedMap(Terrain):
         return Square(self.reach_m, across)
 
     @cached_property
-    def kept_table(self) -> KeptTable:
-        """Where the table of horizons is kept."""
-        return KeptTable(
-            name=self.name, site=self.site, maps=self.maps, camera_height_m=self.camera_height_m,
-            search_radius_m=self.search_radius_m, square=self.square,
-        )  # fmt: skip
+    def table_key(self) -> str:
+        """Name of the table of horizons, by all that it follows from."""
+        return key_of_table(self)
 
     @property
     def table_path(self) -> Path:  # type: ignore[override]
         """File of the table of horizons."""
-        return self.kept_table.path
+        return path_of_table(self.table_key)
 
     @property
     def is_prepared(self) -> bool:
         """Whether the table of horizons is in memory or on disk."""
-        return self.kept_table.in_memory is not None or self.table_path.is_file()
+        return self.table_key in TABLES_IN_MEMORY or self.table_path.is_file()
 
     def prepare(self, progress: Progress | None = None) -> None:
         """Have the table of horizons in memory: from the cache on disk, else computed and cached.
@@ -110,17 +113,17 @@ class TracedMap(Terrain):
         If several processes need the same table, one computes it and the others wait.
         """
         if "table" not in self.__dict__:
-            self.__dict__["table"] = self.kept_table.load_or_build(self.tracer, progress)
+            self.__dict__["table"] = load_or_build_table(self, progress)
 
     @cached_property
     def table(self) -> HorizonTable:
         """The table of horizons; see `prepare`."""
-        return self.kept_table.load_or_build(self.tracer)
+        return load_or_build_table(self)
 
     def discard_table(self) -> None:
         """Remove the table of horizons from memory and disk."""
         self.__dict__.pop("table", None)
-        self.kept_table.discard()
+        discard_table(self.table_key)
 
     def without_table(self) -> Self:
         """The same map whose traces begin at the camera; see `Terrain`."""
@@ -129,8 +132,16 @@ class TracedMap(Terrain):
         return other
 
     def horizons(self, points_m: Array, azimuths_rad: Array) -> tuple[Array, Array, Array]:
-        """tan, distance, and distance of the maps' end, (...) each, of the points (..., 2) at the azimuths (...)."""
-        return self.tracer.horizons(self.kept_table.in_memory if self._uses_table else None, points_m, azimuths_rad)
+        """tan, distance, and distance of the maps' end, (...) each, of the points (..., 2) at the azimuths (...).
+
+        The last is 1e9 beyond the horizon. A table in memory tells a trace where to begin.
+        """
+        shape, points, azimuths = flatten_rays(points_m, azimuths_rad)
+        found = np.empty((3, len(azimuths)))
+        table = TABLES_IN_MEMORY.get(self.table_key) if self._uses_table else None
+        _run_in_threads(horizons, self._kernel_arguments(table), (points, azimuths, *found))
+        tan, distance, edge = found.reshape(3, *shape)
+        return tan, distance, edge
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation [rad], traced. See `Terrain`."""
@@ -140,7 +151,42 @@ class TracedMap(Terrain):
         self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
     ) -> tuple[Array, Array]:
         """Bounds of the horizon over boxes [rad]: from the table, and for single rays and small boxes by tracing."""
-        return self.tracer.horizon_bounds_rad(self.table, centres_m, half_m, azimuths_rad, azimuth_half_rad)
+        shape = np.broadcast_shapes(
+            np.shape(centres_m)[:-1], np.shape(half_m), np.shape(azimuths_rad), np.shape(azimuth_half_rad)
+        )
+        centres = _flatten(centres_m, (*shape, 2)).reshape(-1, 2)
+        half, azimuths, turn = (_flatten(a, shape).ravel() for a in (half_m, azimuths_rad, azimuth_half_rad))
+        low, high = np.empty((2, len(half)))
+        traced = (turn < MAX_TRACED_TURN_RAD) & (half < self.table.square.half_m)
+        if traced.all():
+            self._trace_bounds(centres, half, azimuths, turn, low, high)
+        elif not traced.any() and np.all(half == half[0]):
+            self._look_up_bounds(centres, half, azimuths, turn, low, high)
+        else:
+            parts = [(self._look_up_bounds, ~traced & (half == kind)) for kind in np.unique(half[~traced])]
+            for bounds, which in [*parts, (self._trace_bounds, traced)]:
+                if which.any():
+                    some = [np.ascontiguousarray(a[which]) for a in (centres, half, azimuths, turn)]
+                    results = np.empty((2, len(some[0])))
+                    bounds(*some, *results)
+                    low[which], high[which] = results
+        return low.reshape(shape), high.reshape(shape)
+
+    def _trace_bounds(self, *arrays: Array) -> None:
+        """Bounds over small boxes: centres (n, 2), half sides, azimuths and their half widths; results low, high."""
+        fixed = self._kernel_arguments(self.table)
+        self.table.box_memory.fill(lambda *some: _run_in_threads(box_bounds, fixed, some), *arrays)
+
+    def _look_up_bounds(self, *arrays: Array) -> None:
+        """Bounds from the table over boxes of one size; arrays as in `_trace_bounds`."""
+        ground, values, *square = self._kernel_arguments(self.table)
+        level = self.table.pyramid[self.table.level_for(float(arrays[1][0]))]
+        many_sector_bounds(ground, values, *level, *square, *arrays)
+
+    def _kernel_arguments(self, table: HorizonTable | None) -> tuple[Any, ...]:
+        """The first arguments of kernels: maps, table, number of its cells and half its side, height of the camera."""
+        cells = (NO_VALUES, 0, 0.0) if table is None else (table.values, table.square.across, table.square.reach_m)
+        return self.ground, *cells, self.camera_height_m
 
     def horizon_spread_rad(self, points_m: Array, half_m: float, azimuths_rad: Array) -> tuple[Array, Array]:
         """From the horizon of the middle and its distance d: a move by `half_m` changes tan H by slopes half_m / d."""
@@ -151,8 +197,10 @@ class TracedMap(Terrain):
 
     def ground_m(self, points_m: Array) -> Array:
         """Height of the ground in enu (...) [m]."""
-        points = np.asarray(points_m, dtype=np.float64)
-        return self.tracer.heights_m(points.reshape(-1, 2)).reshape(points.shape[:-1])
+        points = np.ascontiguousarray(points_m, dtype=np.float64)
+        up = np.empty(points.shape[:-1])
+        surfaces(self.ground, points.reshape(-1, 2), up.reshape(-1))
+        return up
 
     def slope_rad(self, points_m: Array) -> Array:
         """Slope of the ground (...) over 10 m."""
@@ -166,3 +214,27 @@ class TracedMap(Terrain):
         line = np.linspace(-half_m, half_m, 65)
         points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
         return not np.isnan(ground_up_m(self.site, self.maps, points)).any()
+
+
+def flatten_rays(points_m: Array, azimuths_rad: Array) -> tuple[tuple[int, ...], Array, Array]:
+    """The shape of points (..., 2) broadcast with azimuths (...), and its n points (n, 2) and azimuths (n,)."""
+    shape = np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))
+    return shape, _flatten(points_m, (*shape, 2)).reshape(-1, 2), _flatten(azimuths_rad, shape).ravel()
+
+
+def _flatten(a: Any, shape: tuple[int, ...]) -> Array:
+    """The values of `a`, broadcast to the shape, in one contiguous array."""
+    return np.ascontiguousarray(np.broadcast_to(np.asarray(a, dtype=np.float64), shape))
+
+
+def _run_in_threads(function: Any, fixed: tuple[Any, ...], arrays: tuple[Array, ...]) -> None:
+    """Call the function with the fixed arguments and parts of the arrays, on all cores where rays are many."""
+    n, cores = len(arrays[-1]), min(cpu_count(), MAX_THREADS)
+    if n < MIN_RAYS_FOR_THREADS or cores == 1:
+        function(*fixed, *arrays)
+        return
+    ends = np.linspace(0, n, cores + 1).astype(int)
+    with ThreadPoolExecutor(cores) as pool:
+        parts = [[a[i:j] for a in arrays] for i, j in pairwise(ends)]
+        for future in [pool.submit(function, *fixed, *part) for part in parts]:
+            future.result()

@@ -25,7 +25,7 @@ from drives import POST_SIGMA_M, RADIUS_M, RAISED_SIGMA_RAD, SLOPE_RAD, mean_err
 from startrack.applications.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.types import Array
 from startrack.estimation.observations import Observations, Steps
-from startrack.estimation.smoother import smooth
+from startrack.estimation.trajectory import smooth
 from startrack.terrain import HeightMap, load_terrain
 
 FRAMES, SPACING_M, EVERY_S = 14, 50.0, 900.0

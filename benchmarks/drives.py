@@ -27,7 +27,7 @@ from startrack.applications.tracking.filtered_positions import filter_positions,
 from startrack.applications.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.types import Array
 from startrack.estimation.observations import FrameEstimate, Observations, Steps
-from startrack.estimation.smoother import smooth
+from startrack.estimation.trajectory import smooth
 from startrack.terrain import HeightMap, load_terrain
 
 POST_SIGMA_M, RAISED_SIGMA_RAD = 5.0, np.radians(0.08)
@@ -119,9 +119,9 @@ def score_track(case: Case, rng: np.random.Generator, pixels: bool, number: int)
     plain = smooth(Observations.of([one and alone(one) for one in single], 0.0), steps)
     found["plain"] = _score(plain.position_m, plain.covariance_m2, course.position_m)
     if case.spacing_m == 0.0:
-        rest = positions_at_rest(frames, course.stated, course.shared)
-        found["filtered"] = _score(rest.position_m[3:4], rest.covariance_m2[3:4], course.position_m[:1])
-        found["smoothed"] = _score(rest.position_m[-1:], rest.covariance_m2[-1:], course.position_m[:1])
+        _, position, covariance = positions_at_rest(frames, course.stated, course.shared)
+        found["filtered"] = _score(position[3:4], covariance[3:4], course.position_m[:1])
+        found["smoothed"] = _score(position[-1:], covariance[-1:], course.position_m[:1])
     else:
         late = slice(SETTLED_FRAMES, None)
         position, covariance = filter_positions(modes, steps, len(course.shared), sigma_m)

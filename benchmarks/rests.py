@@ -86,12 +86,9 @@ def score_rest(case: Case, exact: HeightMap, stated: HeightMap, rng: np.random.G
         at = position + FIRST_ERROR_M * rng.normal(size=2)
         estimate = estimate_frame(rows, stated, shared, at, FIRST_SIGMA_M**2 * np.eye(2))
         frames.append(ObservedFrame(f"frame-{number:03d}", when, None, (estimate,), rows))
-    found = positions_at_rest(frames, stated, shared)
+    _, position, covariance = positions_at_rest(frames, stated, shared)
     used = [count - 1 for count in EXPOSURES]
-    return [
-        mean_error_and_nees(found.position_m[k : k + 1], found.covariance_m2[k : k + 1], course.position_m[:1])
-        for k in used
-    ]
+    return [mean_error_and_nees(position[k : k + 1], covariance[k : k + 1], course.position_m[:1]) for k in used]
 
 
 if __name__ == "__main__":

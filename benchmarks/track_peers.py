@@ -21,7 +21,7 @@ from drives import Case, course_of, odometry
 
 from startrack.applications.tracking.filtered_positions import filter_positions
 from startrack.estimation.observations import Observations
-from startrack.estimation.smoother import smooth
+from startrack.estimation.trajectory import smooth
 
 CASE = Case(40, 50.0, 900.0, degraded=True)
 SEED = 43

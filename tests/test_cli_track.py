@@ -20,7 +20,7 @@ from startrack.applications.tracking import TRACK, read_odometry
 from startrack.applications.tracking.observed_frame import decode_frame, encode_frame
 from startrack.camera import load_camera, save_camera
 from startrack.cli.main import main
-from startrack.estimation.smoother import radius_holding
+from startrack.estimation.trajectory import radius_holding
 from startrack.frames import R_from_quat_xyzw
 
 FRAMES = 5

@@ -10,7 +10,7 @@ from astropy.table import Table
 from jsonschema import Draft202012Validator
 
 from startrack.applications.prediction import PREDICTION
-from startrack.applications.prediction.statistics import add_odometry, ellipse_m2
+from startrack.applications.prediction.run import add_odometry, ellipse_m2
 from startrack.cli.main import main
 
 POSITION_M = np.array([[0.0, 0.0], [300.0, 0.0], [300.0, 400.0], [700.0, 400.0], [700.0, 900.0]])

@@ -9,8 +9,12 @@ import numpy as np
 import pytest
 
 from startrack.applications.tracking.filtered_positions import positions_at_rest
-from startrack.applications.tracking.frame_estimate import MIN_NOISE_SHARE, clipped_noise, estimate_frame
-from startrack.applications.tracking.frame_model import balanced_moments
+from startrack.applications.tracking.frame_estimate import (
+    MIN_NOISE_SHARE,
+    balanced_moments,
+    clipped_noise,
+    estimate_frame,
+)
 from startrack.applications.tracking.observed_frame import (
     ObservedFrame,
     decode_frame,
@@ -21,7 +25,7 @@ from startrack.applications.tracking.observed_frame import (
 from startrack.applications.tracking.track_errors import BIAS, CLOCK, DEPTH, EDGE, TrackErrors
 from startrack.core.types import BadInput, Clock, Evidence, ImageErrors, ShownError
 from startrack.estimation.observations import Observations, Steps
-from startrack.estimation.smoother import smooth
+from startrack.estimation.trajectory import smooth
 from startrack.localization import ExactPosterior
 from startrack.localization.importance_sampling import sample
 from startrack.terrain import Cylinder, HeightMap, load_terrain
@@ -244,14 +248,14 @@ def test_exposures_at_rest_are_one_posterior():
         rng = np.random.default_rng([6, seed])
         place = rng.uniform(-3000, 3000, 2)
         frames = [frame_at(terrain, shared, place, rng, k) for k in range(4)]
-        found = positions_at_rest(frames, terrain, shared)
+        found, position, covariance = positions_at_rest(frames, terrain, shared)
         assert found.mode.tolist() == [0, 0, 0, 0]
         pooled = ExactPosterior()(Evidence.concatenate(*(frame.evidence for frame in frames)), terrain)
-        away = found.position_m[-1] - pooled.position_enu_m[:2]
+        away = position[-1] - pooled.position_enu_m[:2]
         assert away @ np.linalg.solve(pooled.covariance_m2, away) < 0.5
-        np.testing.assert_allclose(found.smoothed.position_m[0], found.position_m[-1])
-        off = found.position_m - place
-        nees.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariance_m2), off))
+        np.testing.assert_allclose(found.smoothed.position_m[0], position[-1])
+        off = position - place
+        nees.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off))
         errors.append(np.linalg.norm(off, axis=1))
     assert np.mean(errors, axis=0)[-1] < 0.6 * np.mean(errors, axis=0)[0]
     assert 0.7 < np.mean(nees) < 4.5
@@ -263,7 +267,7 @@ def test_a_camera_that_moved_is_not_at_rest(apart_m):
     terrain, shared, rng = crater(), TrackErrors.of(crater(), None), np.random.default_rng(12)
     here, there = np.array([1000.0, -500.0]), np.array([1000.0, -500.0 + apart_m])
     frames = [frame_at(terrain, shared, there if k == 2 else here, rng, k) for k in range(5)]
-    assert positions_at_rest(frames, terrain, shared).mode.tolist() == [0, 0, -1, 0, 0]
+    assert positions_at_rest(frames, terrain, shared)[0].mode.tolist() == [0, 0, -1, 0, 0]
     for count in (2, 4):
         moved = [frame_at(terrain, shared, here + k * (there - here), rng, k) for k in range(count)]
         with pytest.raises(BadInput, match="agree on one position") as refusal:

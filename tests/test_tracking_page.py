@@ -13,7 +13,7 @@ from html_helpers import DESKTOP, PHONE, Window
 from synthetic_track import NASTY, odometry_alone, synthetic_track
 
 from startrack.applications.tracking.write import track_page
-from startrack.estimation.smoother import radius_holding
+from startrack.estimation.trajectory import radius_holding
 from startrack.output import png_bytes
 
 PICTURE = png_bytes(np.full((40, 60, 3), 90, dtype=np.uint8))

@@ -8,10 +8,9 @@ from tracking_helpers import HEIGHT_SIGMA_M, STEP_SIGMA_M, Drive, mean_nees, shi
 
 from startrack.applications.tracking.contradictions import smooth_robustly
 from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions
-from startrack.estimation import filter as tracking_filter
-from startrack.estimation.filter import TrackFilter
+from startrack.estimation import trajectory
 from startrack.estimation.observations import Observations, Steps
-from startrack.estimation.smoother import smooth
+from startrack.estimation.trajectory import TrackFilter, smooth
 
 
 def least_squares(drive: Drive, frames: int) -> tuple[np.ndarray, np.ndarray]:
@@ -74,7 +73,7 @@ def test_the_filter_forgets_posts_without_a_jump(monkeypatch):
     drive = simulate_drive(np.random.default_rng(12), 30)
     modes = [(e,) for e in drive.estimates]
     whole, covariance = filter_positions(modes, drive.steps, 1, HEIGHT_SIGMA_M)
-    monkeypatch.setattr(tracking_filter, "MOST_POSTS", 16)  # 12 are kept: a frame depends on 8, of which the next has 6
+    monkeypatch.setattr(trajectory, "MOST_POSTS", 16)  # 12 are kept: a frame depends on 8, of which the next has 6
     state = TrackFilter(1, HEIGHT_SIGMA_M)
     for k, estimate in enumerate(drive.estimates):
         if k:
@@ -168,7 +167,7 @@ def test_three_refused_frames_are_bridged_with_growing_errors():
     traces = []
     for k, of in enumerate(modes):
         online.add(of, drive.steps.move_m[k - 1] if k else np.zeros(2), STEP_SIGMA_M if k else 0.0)
-        traces.append(np.trace(online.covariance_m2))
+        traces.append(np.trace(online.filter.covariance_m2))
     assert traces[4] < traces[5] < traces[6] < traces[7] > traces[8]
     smoothed = np.trace(found.smoothed.covariance_m2, axis1=1, axis2=2)
     assert smoothed[6] > max(smoothed[4], smoothed[8])

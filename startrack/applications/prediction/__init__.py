@@ -3,10 +3,14 @@
 from startrack.applications.prediction.draws import Conditions, Place, Predictor, Status, draw_store, times_between
 from startrack.applications.prediction.places import area_cells, default_spacing_m, path_points
 from startrack.applications.prediction.quantities import CELL_QUANTITIES, PATH_QUANTITIES, PREDICTION, summarize_cells
-from startrack.applications.prediction.report import OdometryErrors, Report
-from startrack.applications.prediction.run import Prediction, Predictions, predict_positions
-from startrack.applications.prediction.statistics import cells_of_draws, share_within
-from startrack.applications.prediction.write import write_report
+from startrack.applications.prediction.report import OdometryErrors, Report, write_report
+from startrack.applications.prediction.run import (
+    Prediction,
+    Predictions,
+    cells_of_draws,
+    predict_positions,
+    share_within,
+)
 
 __all__ = [
     "CELL_QUANTITIES", "PATH_QUANTITIES", "PREDICTION", "Conditions", "OdometryErrors", "Place", "Prediction",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +22,11 @@ LENGTH_ROUNDING_1 = 1e-9  # relative, of a length of whole steps
 PLACES_RING_RAD = np.linspace(0.0, 2 * np.pi, 181)
 
 
+def numbered_places(numbers: Iterable[int], position_m: Array) -> list[Place]:
+    """The places at positions (k, 2) east and north with their `numbers` (k,)."""
+    return [Place(int(k), float(east), float(north)) for k, (east, north) in zip(numbers, position_m, strict=True)]
+
+
 @dataclass(frozen=True, eq=False)
 class PathPoints:
     """Points of a path."""
@@ -37,7 +43,7 @@ class PathPoints:
     @property
     def places(self) -> list[Place]:
         """The points, numbered from the start."""
-        return [Place(k, float(east), float(north)) for k, (east, north) in enumerate(self.position_m)]
+        return numbered_places(range(len(self.position_m)), self.position_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +60,7 @@ class AreaCells:
     @property
     def places(self) -> list[Place]:
         """The middles of the cells, numbered over the whole grid."""
-        numbered = zip(self.cell, self.position_m, strict=True)
-        return [Place(int(number), float(east), float(north)) for number, (east, north) in numbered]
+        return numbered_places(self.cell, self.position_m)
 
     def band(self, values: Array) -> NDArray[np.float32]:
         """The `values` (k,) of the cells on the whole grid (rows, columns), NaN elsewhere."""

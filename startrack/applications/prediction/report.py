@@ -1,4 +1,4 @@
-"""What a prediction found, as a record and as lines of text."""
+"""What a prediction found, as a record, as lines of text, and as files: predict.json, .tif, .ecsv and .png."""
 
 from __future__ import annotations
 
@@ -8,25 +8,45 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from startrack import __version__
 from startrack.applications.prediction.draws import Conditions, predictor_of
 from startrack.applications.prediction.places import AreaCells, PathPoints
 from startrack.applications.prediction.quantities import (
+    CELL_QUANTITIES,
     FILTERED,
     FORMAT,
+    PATH_QUANTITIES,
+    PLACE_QUANTITIES,
     SHARES_M,
     SMOOTHED,
+    SUMMARY_QUANTITIES,
     Cells,
     median_or_none,
     summarize_cells,
 )
-from startrack.applications.prediction.run import variant_record
-from startrack.applications.prediction.statistics import add_odometry
+from startrack.applications.prediction.run import add_odometry
 from startrack.core.errors import BadOutput, length_text
-from startrack.frames import format_utc
-from startrack.terrain import Terrain, load_terrain
+from startrack.core.files import write_atomically
+from startrack.frames import format_utc, latlon_from_enu
+from startrack.output import (
+    Column,
+    TableColumn,
+    comparison_picture,
+    ecsv_text,
+    format_values,
+    path_picture,
+    png_bytes,
+    prediction_picture,
+    quantity_columns,
+)
+from startrack.terrain import Terrain, load_terrain, write_bands
 
-RECORD_FILE = "predict.json"
+RECORD_FILE, MAP, CELL_TABLE, MAP_PICTURE = "predict.json", "predict.tif", "predict.ecsv", "predict.png"
+COMPARISON_TABLE, COMPARISON_PICTURE = "predict-compare.ecsv", "predict-compare.png"
+PREDICTION_FILES = {MAP, CELL_TABLE, RECORD_FILE, MAP_PICTURE, COMPARISON_TABLE, COMPARISON_PICTURE}
+PATH_CURVES = {FILTERED: "images so far, and odometry", SMOOTHED: "all images, and odometry"}
 SETTINGS = ("kind", "terrain", "camera", "first_time_utc", "last_time_utc", "spacing_m", "places")  # of one prediction
 
 
@@ -69,7 +89,11 @@ class Report:
 
         `depth` is the record of the search for a depth, if there was one.
         """
-        variants = [variant_record(other, found) for other, found in others.items()]
+        variants = []
+        for other, found in others.items():
+            known = predictor_of(other)
+            depth_there = {"exposure_s": known.exposure_s, "limiting_v_mag": known.limiting_v_mag}
+            variants.append({"camera": known.camera.name, **depth_there, "summary": summarize_cells(found)})
         return replace(self, conditions=conditions, cells=cells, variants=variants, depth=depth)
 
     def with_odometry(self, odometry: OdometryErrors) -> Report:
@@ -134,20 +158,20 @@ class Report:
             f"{100 * found['p_refused']:.1f} % refused",
         ]
         if self.odometry is not None:
-            lines.append(_odometry_line(self.record["odometry"]))
-        if self.depth is not None:
-            lines.append(_depth_line(self.depth))
+            radii = [self.record["odometry"][f"median_{name}"] for name in (FILTERED, SMOOTHED)]
+            texts = [length_text(one, 3) for one in radii if one is not None]
+            known = f"median 95 % radius {texts[0]} at each place, {texts[-1]} by all images" if len(texts) == 2 else ""
+            lines.append(f"with odometry: {known or 'no position at half of the places'}")
+        if (depth := self.depth) is not None:
+            reached = f"not reached by any exposure to {depth['tried'][-1]['exposure_s']:.3g} s"
+            if depth["exposure_s"] is not None:
+                reached = f"{depth['exposure_s']:.3g} s, limiting magnitude V {depth['limiting_v_mag']:.1f}"
+            wanted = f"{depth['target_radius95_m']:g} m at {100 * depth['share']:.0f} % of the places"
+            lines.append(f"{wanted}: {reached}")
         for one in self.variants:
             radius = _median_error_text(one["summary"]["median_radius95_m"])
             lines.append(f"{one['camera']}, {one['exposure_s']:.3g} s (V {one['limiting_v_mag']:.1f}): {radius}")
         return lines
-
-
-def _depth_line(depth: dict[str, Any]) -> str:
-    wanted = f"{depth['target_radius95_m']:g} m at {100 * depth['share']:.0f} % of the places"
-    if depth["exposure_s"] is None:
-        return f"{wanted}: not reached by any exposure to {depth['tried'][-1]['exposure_s']:.3g} s"
-    return f"{wanted}: {depth['exposure_s']:.3g} s, limiting magnitude V {depth['limiting_v_mag']:.1f}"
 
 
 def _median_error_text(radius95_m: float | None) -> str:
@@ -156,9 +180,72 @@ def _median_error_text(radius95_m: float | None) -> str:
     return f"median 95 % radius {length_text(radius95_m, 3)}"
 
 
-def _odometry_line(found: dict[str, Any]) -> str:
-    radii = [found[f"median_{name}"] for name in (FILTERED, SMOOTHED)]
-    if None in radii:
-        return "with odometry: no position at half of the places"
-    filtered, smoothed = (length_text(one, 3) for one in radii)
-    return f"with odometry: median 95 % radius {filtered} at each place, {smoothed} by all images"
+def write_report(report: Report, out: Path, *, plots: bool) -> list[Path]:
+    """Write the files of a `report` into the folder `out`, with pictures if `plots`; returns their paths.
+
+    Files of an earlier prediction that this one does not make are removed.
+    """
+    points, made = report.points, dict[str, bytes]()
+    if isinstance(points, AreaCells):  # the quantities as bands, in the projection of the terrain's map
+        bands = {one.key: points.band(report.cells[one.key]) for one in CELL_QUANTITIES}
+        write_bands(out / MAP, points.frame, bands)
+    made[CELL_TABLE] = _table(report).encode()
+    if plots:
+        made[MAP_PICTURE] = png_bytes(_picture(report))
+    if report.variants:
+        made[COMPARISON_TABLE] = _comparison_table(report.variants).encode()
+        if plots:
+            title = f"Cameras and exposures at the same places: {report.terrain.name}"
+            made[COMPARISON_PICTURE] = png_bytes(comparison_picture(report.variants, title))
+    made[RECORD_FILE] = (json.dumps(report.record, indent=1) + "\n").encode()
+    for name, data in made.items():
+        write_atomically(out / name, data, overwrite=True)
+    names = [*([MAP] if isinstance(points, AreaCells) else []), *made]
+    for name in PREDICTION_FILES - set(names):
+        (out / name).unlink(missing_ok=True)
+    return [out / name for name in names]
+
+
+def _table(report: Report) -> str:
+    """One row a place; with the distance along the path, if there is one."""
+    points, site, (east_m, north_m) = report.points, report.terrain.site, report.points.position_m.T
+    values = {**report.cells, "east_m": east_m, "north_m": north_m}
+    if isinstance(points, PathPoints):
+        values["distance_m"] = points.distance_m
+    if site is not None:
+        up_m = np.asarray(report.terrain.ground_m(points.position_m)) + report.terrain.camera_height_m
+        values |= zip(
+            ("latitude_deg", "longitude_deg"), np.degrees(latlon_from_enu(site, east_m, north_m, up_m)), strict=True
+        )
+    return ecsv_text(quantity_columns((*PLACE_QUANTITIES, *CELL_QUANTITIES, *PATH_QUANTITIES), values))
+
+
+def _comparison_table(variants: list[dict[str, Any]]) -> str:
+    """One row a camera and exposure: the summary of the same places."""
+    rows = [{**one, **one["summary"]} for one in variants]
+    columns = [
+        TableColumn("camera", "string", None, "%s", ("camera",)),
+        TableColumn("exposure_s", "float64", "s", "%.6g", ("exposure_s",)),
+        TableColumn("limiting_v_mag", "float64", "mag", "%.3f", ("limiting_v_mag",)),
+    ]
+    columns += [column for quantity in SUMMARY_QUANTITIES for column in quantity.table_columns]
+    return ecsv_text([
+        Column(one.name, format_values(one.form, [one.value(row) for row in rows]), one.datatype, one.unit)
+        for one in columns
+    ])  # fmt: skip
+
+
+def _picture(report: Report) -> Any:
+    points, cells = report.points, report.cells
+    radius = np.where(np.isnan(cells["radius95_m"]), np.inf, cells["radius95_m"])
+    title = f"How well one image of the stars gives the position: {report.terrain.name}"
+    s = report.settings
+    times = s["first_time_utc"][:16].replace("T", " ")
+    if s["last_time_utc"] != s["first_time_utc"]:
+        times += f" to {s['last_time_utc'][:16].replace('T', ' ')}"
+    draws = f"{s['draws']} draws every {s['spacing_m']:.4g} m"
+    caption = [f"camera {s['camera']}, {s['exposure_s']:.3g} s, {times} UTC, {draws}"]
+    if isinstance(points, AreaCells):
+        return prediction_picture(report.terrain, points.site, points.raster(radius), title, caption)
+    curves = {words: cells[name] for name, words in PATH_CURVES.items() if name in cells}
+    return path_picture(points.distance_m, radius, cells["p_ok"], title, caption, curves)

@@ -1,4 +1,4 @@
-"""From places to predictions, on a store of draws."""
+"""From places to predictions on a store of draws: the quantities of places, and those along a path with odometry."""
 
 from __future__ import annotations
 
@@ -15,23 +15,112 @@ from startrack.applications.prediction.draws import (
     Conditions,
     Place,
     Predictor,
+    Status,
     Task,
     join_chunks,
-    predictor_of,
     times_between,
 )
-from startrack.applications.prediction.places import area_cells, default_spacing_m
-from startrack.applications.prediction.quantities import Cells, summarize_cells
-from startrack.applications.prediction.statistics import cells_of_draws, share_within
+from startrack.applications.prediction.places import area_cells, default_spacing_m, numbered_places
+from startrack.applications.prediction.quantities import (
+    CELL_QUANTITIES,
+    ERROR_RATIO,
+    FILTERED,
+    SMOOTHED,
+    Cells,
+    summarize_cells,
+)
 from startrack.camera import Camera, load_camera
-from startrack.core.chunk_store import ChunkStore
-from startrack.core.types import Array
+from startrack.core.chunk_store import Chunk, ChunkStore
+from startrack.core.types import Array, Bools
+from startrack.estimation.observations import FrameEstimate, Observations, Steps
+from startrack.estimation.trajectory import TrackFilter, radius_holding, smooth
 from startrack.rendering import exposure_for_snr
 from startrack.terrain import Terrain
 
 DEPTH_V_MAG = 3.0, 9.0  # limiting magnitudes that are tried; beyond, the faintest stars of the simulated sky are missed
 DEPTH_STEP_MAG = 0.1  # to which the depth is found: a tenth of the exposure
 DEPTH_SHARE = 0.9  # of the places that must reach the wanted radius
+
+
+def cells_of_draws(draws: Chunk) -> Cells:
+    """The quantities of places (k,) from their draws (k, n, ...)."""
+    status = draws["status"]
+    located = (status == Status.OK) & np.isfinite(draws["covariance_m2"]).all(axis=(2, 3))
+    shares = [np.mean(status == code, axis=1) for code in Status]
+    radius = np.median(np.where(status == Status.OK, draws["radius95_m"], np.inf), axis=1)
+    radius[~np.isfinite(radius)] = np.nan
+    found = (radius, *shares, *_ellipses(draws["covariance_m2"], located))
+    cells = {one.key: values for one, values in zip(CELL_QUANTITIES, found, strict=True)}
+    return cells | {ERROR_RATIO: _error_ratio(draws, located)}
+
+
+def _error_ratio(draws: Chunk, located: Bools) -> Array:
+    """Root mean square (k,) of the errors of the draws (k, n, ...) that are `located` (k, n), over the stated one."""
+    error_m2 = np.where(located, np.square(draws["offset_m"]).sum(axis=-1), 0.0).sum(axis=1)
+    stated_m2 = np.where(located, np.trace(draws["covariance_m2"], axis1=2, axis2=3), 0.0).sum(axis=1)
+    return np.sqrt(error_m2 / np.where(stated_m2 > 0.0, stated_m2, np.nan))
+
+
+def _ellipses(covariance_m2: Array, located: Bools) -> tuple[Array, Array, Array]:
+    """Standard deviations (k,) [m] on both axes of the mean of the covariances (k, n, 2, 2) of the draws that are
+    `located` (k, n), and the azimuth (k,) of the long one [deg].
+    """
+    count = located.sum(axis=1)
+    total = np.where(located[:, :, None, None], covariance_m2, 0.0).sum(axis=1)
+    major, minor, azimuth = np.full((3, len(count)), np.nan)
+    known = count > 0
+    squares, axes = np.linalg.eigh(total[known] / count[known, None, None])
+    minor[known], major[known] = np.sqrt(np.maximum(squares, 0.0)).T
+    east, north = axes[:, :, 1].T
+    azimuth[known] = np.degrees(np.arctan2(east, north)) % 180.0
+    return major, minor, azimuth
+
+
+def share_within(cells: Cells, radius95_m: float) -> float:
+    """Share of the places in `cells` whose 95 % radius is at most `radius95_m`."""
+    return float(np.mean(cells["radius95_m"] <= radius95_m))
+
+
+def add_odometry(position_m: Array, cells: Cells, *, sigma_1: float, floor_m: float) -> Cells:
+    """The `cells` at points (k, 2) along a path with the 95 % radii by the images and odometry together.
+
+    Each point has one image with its predicted ellipse; of those without a radius the odometry alone counts. Moves err
+    on each axis by `sigma_1` of their length and, in quadrature, by `floor_m`. Radii are NaN where nothing is known.
+    """
+    known = np.isfinite(cells["radius95_m"])
+    estimates = [_estimate(m2) if is_known else None for m2, is_known in zip(ellipse_m2(cells), known, strict=True)]
+    move_m = np.diff(position_m, axis=0)
+    steps = Steps(move_m, np.hypot(sigma_1 * np.linalg.norm(move_m, axis=1), floor_m))
+    filtered = smoothed = np.full((len(known), 2, 2), np.inf)
+    if known.any():
+        state, filtered = TrackFilter(0, 0.0), filtered.copy()
+        for k, estimate in enumerate(estimates):
+            if k:
+                state.predict(move_m[k - 1], float(steps.sigma_m[k - 1]))
+            if estimate is not None:
+                state.update(estimate)
+            if known[: k + 1].any():
+                filtered[k] = state.covariance_m2
+        smoothed = smooth(Observations.of(estimates, 0.0), steps).covariance_m2
+    radii = (radius_holding(covariance_m2, 0.95) for covariance_m2 in (filtered, smoothed))
+    found = (np.where(np.isfinite(radius), radius, np.nan) for radius in radii)
+    return cells | dict(zip((FILTERED, SMOOTHED), found, strict=True))
+
+
+def ellipse_m2(cells: Cells) -> Array:
+    """Covariances (k, 2, 2) of the predicted ellipses, east and north."""
+    azimuth = np.radians(cells["azimuth_deg"])
+    along, across = (np.stack([np.sin(a), np.cos(a)], axis=-1) for a in (azimuth, azimuth + 0.5 * np.pi))
+    long, short = (np.square(cells[name])[:, None, None] for name in ("sigma_major_m", "sigma_minor_m"))
+    return np.asarray(long * along[:, :, None] * along[:, None] + short * across[:, :, None] * across[:, None])
+
+
+def _estimate(covariance_m2: Array) -> FrameEstimate:
+    """An image whose error is its own."""
+    return FrameEstimate(
+        mean=np.zeros(2), covariance=covariance_m2, response=np.eye(2), noise=covariance_m2,
+        post=np.zeros(0, dtype=np.int64), by_post=np.zeros((2, 0)),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -62,12 +151,16 @@ class Predictions:
         have that exposure, or the longest tried.
         """
         low, deepest = DEPTH_V_MAG
-        high = low
+        high, camera = low, load_camera(conditions.camera)
         tried: list[dict[str, float]] = []
 
+        def exposure_s(v_mag: float) -> float:
+            return exposure_for_snr(camera, conditions.sky_v_mag_arcsec2, v_mag=v_mag, snr=LIMIT_SNR)
+
         def reaches(v_mag: float) -> bool:
-            share = share_within(self.cells(at_depth(conditions, v_mag), f"depth V {v_mag:.1f}"), target_m)
-            tried.append({"exposure_s": float(at_depth(conditions, v_mag).exposure_s or 0.0), "share": share})
+            conditions_there = replace(conditions, exposure_s=exposure_s(v_mag))
+            share = share_within(self.cells(conditions_there, f"depth V {v_mag:.1f}"), target_m)
+            tried.append({"exposure_s": exposure_s(v_mag), "share": share})
             return share >= DEPTH_SHARE
 
         while not (found := reaches(high)) and high < deepest:
@@ -75,32 +168,14 @@ class Predictions:
         while found and high - low > DEPTH_STEP_MAG:
             middle = 0.5 * (low + high)
             low, high = (low, middle) if reaches(middle) else (middle, high)
-        best = at_depth(conditions, high)
         record = {
             "target_radius95_m": target_m,
             "share": DEPTH_SHARE,
-            "exposure_s": best.exposure_s if found else None,
+            "exposure_s": exposure_s(high) if found else None,
             "limiting_v_mag": high if found else None,
             "tried": sorted(tried, key=lambda one: one["exposure_s"]),
         }
-        return best, record
-
-
-def at_depth(conditions: Conditions, v_mag: float) -> Conditions:
-    """The conditions with the exposure that reaches `v_mag` on the axis at 5 sigma."""
-    camera, sky = load_camera(conditions.camera), conditions.sky_v_mag_arcsec2
-    return replace(conditions, exposure_s=exposure_for_snr(camera, sky, v_mag=v_mag, snr=LIMIT_SNR))
-
-
-def variant_record(conditions: Conditions, cells: Cells) -> dict[str, Any]:
-    """The summary of the places for one camera and exposure, with both."""
-    predictor = predictor_of(conditions)
-    return {
-        "camera": predictor.camera.name,
-        "exposure_s": predictor.exposure_s,
-        "limiting_v_mag": predictor.limiting_v_mag,
-        "summary": summarize_cells(cells),
-    }
+        return replace(conditions, exposure_s=exposure_s(high)), record
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +210,7 @@ def predict_positions(
             raise ValueError(f"positions_m has shape {points.shape}: finite numbers (k, 2) are needed")
         if not bool(np.all(terrain.allowed(points))):
             raise ValueError("no camera can stand at some of positions_m")
-        places = [Place(k, float(east), float(north)) for k, (east, north) in enumerate(points)]
+        places = numbered_places(range(len(points)), points)
     if draws < 1:
         raise ValueError(f"draws={draws}: at least one is needed")
     times = times_between(*times_utc, draws)

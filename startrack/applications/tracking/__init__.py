@@ -1,11 +1,10 @@
 """Many exposures: tracks of a camera at rest or on a drive; odometry from text and ROS bags."""
 
-from startrack.applications.tracking.follow import follow_images
 from startrack.applications.tracking.observed_frame import FrameStore, ObservedFrame, observe_frame
 from startrack.applications.tracking.odometry import Odometry, read_odometry
 from startrack.applications.tracking.picture import draw_track
 from startrack.applications.tracking.quantities import FRAME_QUANTITIES, TRACK, frame_records
-from startrack.applications.tracking.session import TrackSession
+from startrack.applications.tracking.session import TrackSession, follow_images
 from startrack.applications.tracking.track import (
     ODOMETRY_FLOOR_M,
     ODOMETRY_SIGMA,

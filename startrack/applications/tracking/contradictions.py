@@ -14,7 +14,7 @@ import numpy as np
 
 from startrack.core.types import Array, Bools, Ints
 from startrack.estimation.observations import FrameEstimate, Observations, Steps
-from startrack.estimation.smoother import Smoothed, smooth
+from startrack.estimation.trajectory import Smoothed, smooth
 
 SLIP_PROBABILITY, SLIP_SIGMA_M = 0.05, 20.0  # of a move by wheel slip, and its size on each axis
 WRONG_PROBABILITY, WRONG_SIGMA_M = 1e-3, 200.0  # of a frame, and the error of its position on each axis
@@ -137,22 +137,20 @@ def _frame_doubt(
         residual, covariance = found.frame_residual[number], found.frame_covariance[number]
         doubt[k] = wrong_log_odds(residual, covariance, estimate, placed=bool(placed[k])) + EARLIER_NATS * k
     for k in np.flatnonzero(mode < 0).tolist():
-        odds = [mode_log_odds(e, found, k, observations.height_sigma_m, placed=bool(placed[k])) for e in modes[k]]
+        predicted = [_beside(found, k, one, observations.height_sigma_m) for one in modes[k]]
+        odds = [wrong_log_odds(*r, e, placed=bool(placed[k])) for r, e in zip(predicted, modes[k], strict=True)]
         if odds:
             best[k], doubt[k] = int(np.argmin(odds)), min(odds) + EARLIER_NATS * k
     return best, doubt
 
 
-def mode_log_odds(
-    estimate: FrameEstimate, found: Smoothed, k: int, height_sigma_m: float, *, placed: bool = True
-) -> float:
-    """Logarithm of the odds that a mode of frame k is wrong, beside a track `found` without it."""
+def _beside(found: Smoothed, k: int, estimate: FrameEstimate, height_sigma_m: float) -> tuple[Array, Array]:
+    """Residual of an `estimate` of frame k beside a track `found` without it, and its covariance."""
     known = np.zeros((estimate.parameters, estimate.parameters))
     known[:2, :2], known[2:, 2:] = found.covariance_m2[k], found.shared_covariance
     response, posts = estimate.response, height_sigma_m * estimate.by_post
     covariance = response @ known @ response.T + estimate.noise + posts @ posts.T
-    residual = estimate.mean - response @ np.concatenate([found.position_m[k], found.shared])
-    return wrong_log_odds(residual, covariance, estimate, placed=placed)
+    return estimate.mean - response @ np.append(found.position_m[k], found.shared), covariance
 
 
 def wrong_log_odds(residual: Array, covariance: Array, estimate: FrameEstimate, *, placed: bool = True) -> float:

@@ -1,6 +1,7 @@
 """One frame as an observation of its position and of the errors that it shares with other frames.
 
-The posterior mean m of position and shared errors by one frame, with its prior, depends on the true ones p and on the
+The likelihood of one image in the parameters of a track gives points of the posterior by images of one position. The
+posterior mean m of position and shared errors by one frame, with its prior, depends on the true ones p and on the
 errors h of the map's posts as m = K p + G h + noise. K is what the evidence adds to the prior. G is the covariance of
 the parameters with the slopes of the log-likelihood: the derivative of a posterior mean.
 """
@@ -8,15 +9,26 @@ the parameters with the slopes of the log-likelihood: the derivative of a poster
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
 
 import numpy as np
 
-from startrack.applications.tracking.frame_model import FrameModel, balanced_moments, sample_together
 from startrack.applications.tracking.track_errors import TrackErrors
-from startrack.core.types import MIDDLES_RAD, Array, Evidence, Ints
-from startrack.estimation.observations import FrameEstimate
-from startrack.localization import WeightedPoints, moments
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, Ints
+from startrack.estimation.observations import UNKNOWN_M, FrameEstimate
+from startrack.localization import (
+    NO_IMAGE_ERRORS,
+    ErrorBasis,
+    Gaussian,
+    SkylineModel,
+    WeightedPoints,
+    clear_logs,
+    moments,
+    sample,
+    solve_linear,
+)
 from startrack.terrain import NO_POST, Terrain
 
 FRAME_REACH_SIGMAS, FRAME_MARGIN_M = 6.0, 5.0  # of a Gaussian, to the side of the neighbourhood
@@ -25,33 +37,152 @@ MAX_NEIGHBOURHOODS = 3  # after so many the posterior is taken as it is
 MIN_NOISE_SHARE = 0.3  # of the evidence's covariance: the least noise that a frame has of its own
 NEGLIGIBLE_POST = 1e-4  # part of the variance of a position, by all posts that are left out together
 ROUNDING = 1e-9  # of the covariance, added to the noise so that it can be inverted
+STEP_SIGMAS, LEAST_STEP_RAD = 0.5, 1e-7  # of the skyline's spread, to each side: where the change with it is taken
+LEAST_CORRECTED = 0.1  # of a variance: the correction of moments makes it no smaller
+
+
+@dataclass(eq=False)
+class FrameModel:
+    """Log-likelihoods of parameters (n, 2 + k): a position [m], and the shared errors in their standard deviations."""
+
+    model: SkylineModel
+    errors: TrackErrors
+
+    @classmethod
+    def of_evidence(
+        cls, evidence: Evidence, terrain: Terrain, errors: TrackErrors, reference_m: Array, half_m: float
+    ) -> Self:
+        """Of `evidence` with its errors of the image, for positions within `half_m` of a reference (2,)."""
+        image = errors.of_image(evidence.image_errors)
+        model = SkylineModel(terrain, evidence, reference_m, half_m, errors.listed, image_errors=image)
+        model.basis = ErrorBasis.whole(errors.listed)
+        return cls(model, errors)
+
+    @cached_property
+    def rise_rad(self) -> Array:
+        """(SECTORS, k) rise of the skyline by one standard deviation of each shared error."""
+        edge = np.zeros(SECTORS) if self.model.image_errors is None else self.model.image_rise[:, 0]
+        return self.errors.rise_rad(self.model.slopes_rad, edge)
+
+    def shifts(self, parameters: Array) -> Array:
+        """(n, SECTORS) of the map's skyline, without errors of the image's own."""
+        found = self.model.shifts(self.errors.to_model(parameters, self.model.rows))
+        if self.errors.uses_sky:
+            found = found + np.outer(parameters[:, -1], self.rise_rad[:, -1])
+        return found
+
+    def log_likelihood(self, parameters: Array) -> Array:
+        """(n,) of `parameters`."""
+        shifts, prior = self.model.with_image_errors(self.shifts(parameters))
+        return self.model.log_likelihood_of(shifts) + prior
+
+    def is_allowed(self, parameters: Array) -> Array:
+        """(n,) whether a camera can stand there, in the neighbourhood."""
+        in_units = self.errors.to_model(parameters, self.model.rows)
+        positions = self.model.errors.turned(in_units[:, :2], in_units[:, 2:])
+        near = np.abs(parameters[:, :2] - self.model.reference_m).max(axis=1) < self.model.half_m
+        return near & np.asarray(self.model.terrain.allowed(positions))
+
+    def settle(self, parameters: Array) -> None:
+        """Take the states of the chain, which decide where the circle is cut, at parameters (2 + k,)."""
+        self.clear = self.model.states(self.errors.to_model(parameters[None], self.model.rows)[0])[:, 0]
+
+    def slopes(self, parameters: Array, share: Array) -> Array:
+        """(n, SECTORS) change of the log-likelihood with the skyline [1/rad] at points with `share` (n,) of the weight.
+
+        The edge of a single star is a step: the change is taken over a part of the skyline's spread. Sectors count by
+        their probability to show the map's skyline.
+        """
+        shifts, _ = self.model.with_image_errors(self.shifts(parameters))
+        spread = np.sqrt(share @ np.square(shifts - share @ shifts))
+        step = np.maximum(STEP_SIGMAS * np.hypot(spread, self.model.map_sigma_rad), LEAST_STEP_RAD)
+        all_clear = np.ones(SECTORS)
+        higher, lower = (clear_logs(self.model.profiles, shifts + sign * step, all_clear) for sign in (1.0, -1.0))
+        return np.asarray(self.clear * (higher - lower) / (2 * step))
+
+    def information(self) -> tuple[Array, Array]:
+        """Of a linear model of the sectors: (2 + k, 2 + k), and its product (2 + k,) with the best parameters.
+
+        Positions are relative to the reference. Sets how much each sector counts for the errors of the image.
+        """
+        model, image = self.model, self.model.image_errors or NO_IMAGE_ERRORS
+        design, own = np.hstack([model.position_slopes.T, self.rise_rad]), model.image_rise
+        known, d = np.asarray(np.linalg.inv(image.covariance)), design.shape[1]
+        height = model.moments.mean_rad - self.shifts(np.r_[model.reference_m, np.zeros(d - 2)][None])[0]
+        prior = np.diag(np.r_[np.full(2, UNKNOWN_M**-2), np.ones(d - 2), np.zeros(len(known))])
+        prior[d:, d:] = known
+        left, mean = model.moments._replace(mean_rad=height), np.append(np.zeros(d), image.mean)
+        _, _, model.clear = solve_linear(left, np.hstack([design, own]), mean, prior)
+        weight = model.clear / model.moments.variance_rad2
+        explained = np.linalg.solve((own.T * weight) @ own + known, own.T * weight)  # by the image's own errors
+        weighted = np.asarray(design.T * weight - ((design.T * weight) @ own) @ explained)
+        return weighted @ design, weighted @ (height - own @ image.mean)
+
+
+def sample_together(models: Sequence[FrameModel], position_m: Array, covariance_m2: Array) -> WeightedPoints:
+    """Points of the posterior by exposures of one position, with one reference, from near a position (2,)."""
+    # The position as it is given, and the errors that a linear model gives for it.
+    information, weighted = (np.sum(parts, axis=0) for parts in zip(*(m.information() for m in models), strict=True))
+    information += np.diag(np.r_[np.full(2, UNKNOWN_M**-2), np.ones(len(information) - 2)])
+    covariance = np.linalg.inv(information)
+    best = covariance @ weighted
+    drift = np.linalg.solve(covariance[:2, :2], covariance[:2, 2:]).T  # of the errors with the position
+    alone = covariance[2:, 2:] - drift @ covariance[:2, 2:]
+    wide = covariance[:2, :2] + covariance_m2
+    mean = np.r_[position_m, best[2:] + drift @ (position_m - models[0].model.reference_m - best[:2])]
+    for model in models:
+        model.settle(mean)
+
+    def log_density(points: Array) -> Array:
+        value, inside = np.full(len(points), -np.inf), models[0].is_allowed(points)
+        if inside.any():
+            within = points[inside]
+            value[inside] = np.sum([model.log_likelihood(within) for model in models], axis=0)
+            value[inside] -= 0.5 * np.square(within[:, 2:]).sum(axis=1)
+        return value
+
+    first = mean, np.block([[wide, wide @ drift.T], [drift @ wide, alone + drift @ wide @ drift.T]])
+    return sample(log_density, [first])
+
+
+def balanced_moments(found: WeightedPoints) -> Gaussian:
+    """Mean (d,) and covariance (d, d) of the points, corrected by what the same points give of a known Gaussian.
+
+    What the evidence says nothing about keeps the covariance of its prior, which weighted points have to some percent.
+    """
+    mean, covariance = moments(found.points, found.share)
+    root = np.linalg.cholesky(covariance)
+    size2 = np.square(np.linalg.solve(root, (found.points - mean).T)).sum(axis=0)
+    known = WeightedPoints(found.points, -0.5 * size2 - found.log_drawn, found.log_drawn)
+    shown_mean, shown = moments(found.points, known.share)
+    corrected = 2.0 * covariance - shown
+    if np.linalg.eigvalsh(np.linalg.solve(root, np.linalg.solve(root, corrected).T))[0] < LEAST_CORRECTED:
+        return mean, covariance
+    return 2.0 * mean - shown_mean, corrected
 
 
 def estimate_frame(
     evidence: Evidence, terrain: Terrain, errors: TrackErrors, position_m: Array, covariance_m2: Array
 ) -> FrameEstimate:
-    """The observation by rows of `evidence` and their errors of the image.
+    """The observation by rows of `evidence` of one exposure, with their errors of the image.
 
-    Args:
-        evidence: rows of one exposure.
-        terrain: with the evidence's enu.
-        errors: those that frames share.
-        position_m: (2,) near the posterior's mode that is meant.
-        covariance_m2: (2, 2) about that of the mode.
+    `terrain` has the evidence's enu; the `errors` are those that frames share. `position_m` (2,) is near the
+    posterior's mode that is meant, `covariance_m2` (2, 2) about that of the mode.
     """
     reference, spread = position_m, covariance_m2
     for _ in range(MAX_NEIGHBOURHOODS):
-        half = max(FRAME_REACH_SIGMAS * _largest_sigma(spread) + FRAME_MARGIN_M, LEAST_FRAME_HALF_M)
+        half = max(FRAME_REACH_SIGMAS * largest_sigma(spread) + FRAME_MARGIN_M, LEAST_FRAME_HALF_M)
         models = [FrameModel.of_evidence(evidence, terrain, errors, reference, half)]
         found = sample_together(models, reference, spread)
         mean, covariance = moments(found.points, found.share)
-        if np.abs(mean[:2] - reference).max() + 3.0 * _largest_sigma(covariance[:2, :2]) < half:
+        if np.abs(mean[:2] - reference).max() + 3.0 * largest_sigma(covariance[:2, :2]) < half:
             break
         reference, spread = mean[:2], covariance[:2, :2]
     return observe_together(models, found)
 
 
-def _largest_sigma(covariance: Array) -> float:
+def largest_sigma(covariance: Array) -> float:
+    """Along the longest axis."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
 

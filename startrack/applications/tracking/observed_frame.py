@@ -21,7 +21,7 @@ from startrack.chain import Located, Measured, Outcome, Refused, last_value
 from startrack.core.files import write_atomically
 from startrack.core.types import Array, Clock, Evidence, Fix, ImageErrors, ShownError
 from startrack.estimation.observations import FrameEstimate
-from startrack.estimation.smoother import SIGMAS_95
+from startrack.estimation.trajectory import SIGMAS_95
 from startrack.localization import HIGH_RAD, LOW_RAD, MIN_ROW_NATS, camera_at
 from startrack.terrain import Terrain
 
@@ -142,12 +142,11 @@ def _informative_rows(rows: Evidence, terrain: Terrain, position_m: Array) -> Ev
     return rows.take(kept & (above > LOW_RAD) & (above < HIGH_RAD))
 
 
+@dataclass(frozen=True)
 class FrameStore:
-    """The frames in a folder, by the hash of all that decides them."""
+    """The frames in a folder, which need not exist yet, by the hash of all that decides them."""
 
-    def __init__(self, folder: Path) -> None:
-        """`folder` need not exist yet."""
-        self.folder = folder
+    folder: Path
 
     def read(self, key: str) -> ObservedFrame | None:
         """The frame stored under `key`; None if there is none, or its file is damaged."""

@@ -60,27 +60,24 @@ class Odometry(Value):
         """
         from scipy.spatial.transform import Rotation, Slerp
 
-        at_s = self._clip_to_span(np.asarray(time_s, dtype=np.float64))
+        at_s = np.asarray(time_s, dtype=np.float64)
+        if at_s.ndim != 1 or not np.isfinite(at_s).all():
+            _refuse("the frames' times are not a list of finite numbers")
+        if (np.diff(at_s) < 0).any():
+            _refuse("the frames are not in the order of time")
+        first, last = self.time_s[[0, -1]]
+        outside = (at_s < first - SPAN_TOLERANCE_S) | (at_s > last + SPAN_TOLERANCE_S)
+        if outside.any():
+            _refuse(
+                f"{np.count_nonzero(outside)} of {len(at_s)} frames are outside the odometry, which covers "
+                f"{_utc_text(first)} to {_utc_text(last)}; the first of them is at {_utc_text(at_s[outside][0])}"
+            )
+        at_s = np.clip(at_s, first, last)
         position_m = np.stack([np.interp(at_s, self.time_s, axis) for axis in self.position_m.T], axis=-1)
         if len(at_s) < 2:
             return np.zeros((0, 3))
         attitude = Slerp(self.time_s, Rotation.from_quat(self.quat_xyzw))(at_s[:-1])
         return np.asarray(attitude.inv().apply(np.diff(position_m, axis=0)))
-
-    def _clip_to_span(self, time_s: Array) -> Array:
-        """The times (m,), clipped to the span of the poses. Raises BadInput as `increments_body_m`."""
-        if time_s.ndim != 1 or not np.isfinite(time_s).all():
-            _refuse("the frames' times are not a list of finite numbers")
-        if (np.diff(time_s) < 0).any():
-            _refuse("the frames are not in the order of time")
-        first, last = self.time_s[[0, -1]]
-        outside = (time_s < first - SPAN_TOLERANCE_S) | (time_s > last + SPAN_TOLERANCE_S)
-        if outside.any():
-            _refuse(
-                f"{np.count_nonzero(outside)} of {len(time_s)} frames are outside the odometry, which covers "
-                f"{_utc_text(first)} to {_utc_text(last)}; the first of them is at {_utc_text(time_s[outside][0])}"
-            )
-        return np.clip(time_s, first, last)
 
 
 def odometry_steps(frames: Sequence[ObservedFrame], odometry: Odometry | None, sigma_1: float, floor_m: float) -> Steps:
@@ -127,8 +124,7 @@ def read_odometry(path: FilePath, topic: str | None = None, *, growing: bool = F
 
 
 def _odometry_of_text(path: FilePath, growing: bool) -> Odometry:
-    rows: list[list[float]] = []
-    numbers: list[int] = []
+    rows, numbers = [], []
     text = read_text(path, "bad_odometry", max_bytes=MAX_ODOMETRY_BYTES)
     for number, line in enumerate((_complete_lines(text) if growing else text).splitlines(), start=1):
         words = line.partition("#")[0].split()
@@ -182,24 +178,20 @@ def _first_fault(rows: Array) -> tuple[int, str] | None:
     """Index and fault of the first pose that cannot be used among `rows` (n, 8) of TUM's columns; None: all can."""
     time_s = rows[:, 0]
     with np.errstate(over="ignore", invalid="ignore"):
-        length = np.linalg.norm(rows[:, 4:], axis=1)
-        infinite = np.asarray(~np.isfinite(rows).all(axis=1))
-        off_calendar = ~((time_s >= 0) & (time_s <= LAST_TIME_S))
-        not_unit = ~(np.abs(length - 1) <= QUATERNION_LENGTH_1)
-        early = np.concatenate([[False], np.diff(time_s) <= 0])[: len(time_s)]
-    faulty = np.flatnonzero(infinite | off_calendar | not_unit | early)
-    if not len(faulty):
+        length, step_s = np.linalg.norm(rows[:, 4:], axis=1), np.diff(time_s, prepend=-np.inf)
+        faults = {
+            "a number is NaN or infinite": ~np.isfinite(rows).all(axis=1),
+            "the time {now:.6g} is not in Unix seconds": ~((time_s >= 0) & (time_s <= LAST_TIME_S)),
+            "the quaternion has the length {length:.3g}, not 1": ~(np.abs(length - 1) <= QUATERNION_LENGTH_1),
+            "a second pose at the time {now:.6f}": step_s == 0,
+            "times are not in order: {now:.6f} follows {before:.6f}": step_s < 0,
+        }
+    faulty = np.array(list(faults.values()))
+    if not faulty.any():
         return None
-    k = int(faulty[0])
-    if infinite[k]:
-        return k, "a number is NaN or infinite"
-    if off_calendar[k]:
-        return k, f"the time {time_s[k]:.6g} is not in Unix seconds"
-    if not_unit[k]:
-        return k, f"the quaternion has the length {length[k]:.3g}, not 1"
-    if time_s[k] == time_s[k - 1]:
-        return k, f"a second pose at the time {time_s[k]:.6f}"
-    return k, f"times are not in order: {time_s[k]:.6f} follows {time_s[k - 1]:.6f}"
+    k = int(np.argmax(faulty.any(axis=0)))
+    text = list(faults)[int(np.argmax(faulty[:, k]))]
+    return k, text.format(now=time_s[k], before=time_s[k - 1], length=length[k])
 
 
 def _utc_text(time_s: float) -> str:

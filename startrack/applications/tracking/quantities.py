@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,18 +54,14 @@ def _frame(
     return Quantity(key, unit, FrameValues, value, description, schema, before, form=form)
 
 
-def _element(name: str, field: str, *at: int) -> Value:
-    """An element of an array of a trajectory at the frame; None where it is not finite."""
-    return lambda v: _number(getattr(getattr(v.track, name), field)[(v.k, *at)])
+def _number(array: Callable[[FrameValues], Array], *at: int, convert: Callable[[Any], Any] = float) -> Value:
+    """The element `at` an index of an array at the frame; None where it is not finite."""
 
+    def value(v: FrameValues) -> float | None:
+        found = float(convert(array(v)[(v.k, *at)]))
+        return found if np.isfinite(found) else None
 
-def _number(value: Any) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
-def _angle(axis: int) -> Value:
-    """Latitude or longitude (`axis` 0, 1) [deg]."""
-    return lambda v: _number(np.degrees(v.latlon_rad[v.k, axis]))
+    return value
 
 
 def _quaternion(axis: int) -> Value:
@@ -72,26 +69,18 @@ def _quaternion(axis: int) -> Value:
 
 
 def _trajectory(name: str, prefix: str, when: str) -> list[Quantity]:
-    elements = (("ee", (0, 0)), ("en", (0, 1)), ("nn", (1, 1)))
-    return [
-        *(
-            _frame(
-                f"{prefix}{axis}_m", "m", "%.4f", f"{axis} of the camera, {when}", _element(name, "position_enu_m", k)
-            )
-            for k, axis in enumerate(("east", "north", "up"))
-        ),
-        *(
-            _frame(
-                f"{prefix}covariance_{text}_m2", "m^2", "%.6g", f"covariance ({text}) of that",
-                _element(name, "covariance_m2", *at),
-            )
-            for text, at in elements
-        ),
-        *(
-            _frame(f"{prefix}{key}", "m", "%.4f", f"circle about it that holds {part} %", _element(name, key))
-            for key, part in (("radius95_m", "95"), ("radius999_m", "99.9"))
-        ),
+    elements: list[tuple[Any, ...]] = [
+        *((f"{axis}_m", "m", "%.4f", f"{axis} of the camera, {when}", "position_enu_m", k)
+          for k, axis in enumerate(("east", "north", "up"))),
+        *((f"covariance_{text}_m2", "m^2", "%.6g", f"covariance ({text}) of that", "covariance_m2", *at)
+          for text, *at in (("ee", 0, 0), ("en", 0, 1), ("nn", 1, 1))),
+        *((key, "m", "%.4f", f"circle about it that holds {part} %", key)
+          for key, part in (("radius95_m", "95"), ("radius999_m", "99.9"))),
     ]  # fmt: skip
+    return [
+        _frame(f"{prefix}{key}", unit, form, text, _number(attrgetter(f"track.{name}.{field}"), *at))
+        for key, unit, form, text, field, *at in elements
+    ]
 
 
 FRAME_QUANTITIES = (
@@ -112,8 +101,8 @@ FRAME_QUANTITIES = (
     ),
     *_trajectory("smoothed", "", "by all frames"),
     *_trajectory("filtered", "filtered_", "by the frames up to this one"),
-    _frame("latitude_deg", "deg", "%.8f", "of the smoothed position", _angle(0)),
-    _frame("longitude_deg", "deg", "%.8f", "of the smoothed position", _angle(1)),
+    _frame("latitude_deg", "deg", "%.8f", "of the smoothed position", _number(attrgetter("latlon_rad"), 0, convert=np.degrees)),
+    _frame("longitude_deg", "deg", "%.8f", "of the smoothed position", _number(attrgetter("latlon_rad"), 1, convert=np.degrees)),
     *(
         _frame(f"q{axis}_body_enu", "", "%.9f", "quaternion, enu to body (SciPy's order)", _quaternion(k))
         for k, axis in enumerate("xyzw")

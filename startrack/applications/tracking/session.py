@@ -1,9 +1,10 @@
-"""The images of one track: each is located once, reduced to what the track needs of it, and kept in a folder."""
+"""The images of one track, also as they are written into a folder: each is located once and kept as its track needs."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC
 from pathlib import Path
@@ -40,6 +41,9 @@ if TYPE_CHECKING:
     from startrack.estimation.observations import Steps
     from startrack.terrain import Terrain
 
+STILL_S = 0.1  # since the last change of a file, after which it is complete
+PATIENCE_S = 5.0  # for a file that cannot be read, or whose sidecar is missing
+
 
 @dataclass
 class TrackSession:
@@ -64,52 +68,40 @@ class TrackSession:
     _filtered: list[ObservedFrame] = field(default_factory=list)  # that the filter has
     _online: OnlineTrack | None = None
 
-    def add(self, path: str | Path) -> ObservedFrame:
-        """The frame of the image file at `path`, located unless the store has it.
+    def add_exposure(self, exposure: Exposure, path: str | None = None) -> ObservedFrame:
+        """The frame of an `exposure`, located unless the store has it; `path` (None: not from a file) is its file's.
 
         Raises BadInput where the image, its time, camera or terrain cannot be used, or the terrain is another one.
         """
-        from startrack.exposure import read_exposure
-
-        return self.add_exposure(read_exposure(path, **self.facts), str(path))
-
-    def add_exposure(self, exposure: Exposure, path: str | None = None) -> ObservedFrame:
-        """The frame of an `exposure`; `path` (None: not from a file) is that of its file. Raises as `add`."""
         if exposure.time_utc is None:
             raise BadInput("no_time", "; ".join([NO_TIME, *exposure.warnings]))
         camera, terrain, shared = self._load_references(exposure)
-        self._check_time(exposure)
-        key = None if self.store is None else self._key(exposure, path, shared)
-        frame = None if self.store is None or key is None else self.store.read(key)
+        same = next((frame for frame in self.frames if frame.time_utc == exposure.time_utc), None)
+        if same is not None:  # its evidence would count twice
+            raise BadInput("bad_image", f"{exposure.name} has the time of {same.name}: a track takes an image once")
+        key = "" if self.store is None or path is None else self._key(exposure, path, shared)
+        frame = self.store.read(key) if self.store and key else None
         if frame is None:
             outcome = locate(exposure, camera, terrain, load_catalog(), self.settings)
             frame = observe_frame(outcome, replace(shared, gross=facts_of(outcome, shared)), terrain)
-            if self.store is not None and key is not None:
+            if self.store and key:
                 self.store.write(key, frame)
-        frame = self._share_facts(frame, terrain, shared)
-        self.frames.append(frame)
-        self.frames.sort(key=lambda one: (one.time_utc, one.name))
-        return frame
-
-    def _share_facts(self, frame: ObservedFrame, terrain: Terrain, shared: TrackErrors) -> ObservedFrame:
-        """The new `frame` with the gross errors that all images show; the others anew where it shows another one."""
         together = shared.with_gross(frame.facts)
         if together.gross != shared.gross:
             self.frames = [observe_again(one, together, terrain) for one in self.frames]
             self.shared = together
-        return frame if frame.facts == together.gross else observe_again(frame, together, terrain)
+        frame = frame if frame.facts == together.gross else observe_again(frame, together, terrain)
+        self.frames.append(frame)
+        self.frames.sort(key=lambda one: (one.time_utc, one.name))
+        return frame
 
-    def estimate(
-        self, odometry: Odometry | None = None, *, at_rest: bool = False, covered_only: bool = False
-    ) -> Track:  # fmt: skip
+    def estimate(self, odometry: Odometry | None = None, *, at_rest: bool = False, covered_only: bool = False) -> Track:
         """The track of the frames so far; `odometry` and `at_rest` are those of `estimate_track`.
 
         With `covered_only`, frames after the last pose of the odometry wait for it. Raises BadInput where there is no
         frame, or none has a position, and as `estimate_track`.
         """
-        frames: Sequence[ObservedFrame] = self.frames
-        if covered_only:
-            frames = [one for one in frames if _is_reached(one, odometry)]
+        frames = [one for one in self.frames if not covered_only or _is_reached(one, odometry)]
         if self.terrain is None or self.shared is None or not frames:
             raise BadInput("bad_image", "no image of the track could be read")
         if all(len(frame.modes) != 1 for frame in frames):
@@ -159,12 +151,6 @@ class TrackSession:
     def _steps(self, frames: Sequence[ObservedFrame], odometry: Odometry | None) -> Steps:
         return odometry_steps(frames, odometry, self.odometry_sigma, self.odometry_floor_m)
 
-    def _check_time(self, exposure: Exposure) -> None:
-        """Raise BadInput for a second image of one time: its evidence would count twice."""
-        same = next((frame for frame in self.frames if frame.time_utc == exposure.time_utc), None)
-        if same is not None:
-            raise BadInput("bad_image", f"{exposure.name} has the time of {same.name}: a track takes an image once")
-
     def _load_references(self, exposure: Exposure) -> tuple[Camera, Terrain, TrackErrors]:
         """Camera, terrain and shared errors of the track: those of its first image. Raises BadInput for another's."""
         camera = exposure.camera if self.stated_camera is None else self.stated_camera
@@ -175,8 +161,7 @@ class TrackSession:
             raise BadInput("bad_terrain", "no terrain is known: give -t FILE (terrain=) or a sidecar with terrain")
         if self.camera is None or self.terrain is None or self.shared is None:
             lens, ground = load_camera_input(camera), terrain_input(terrain, None)
-            uses_sky = self.settings.evidence_sources != "stars"
-            self.shared = TrackErrors.of_exposure(ground, exposure, uses_sky)
+            self.shared = TrackErrors.of_exposure(ground, exposure, self.settings.evidence_sources != "stars")
             self.camera, self.terrain, self._references = lens, ground, (camera, terrain)
         first_camera, first_terrain = self._references or (None, None)
         if terrain is not first_terrain and terrain != first_terrain:
@@ -185,18 +170,15 @@ class TrackSession:
             raise BadInput("bad_calibration", f"{exposure.name} is of the camera {camera}, the track of {first_camera}")
         return self.camera, self.terrain, self.shared
 
-    def _key(self, exposure: Exposure, path: str | None, shared: TrackErrors) -> str | None:
-        """Hash of all that decides a frame; None for an image that is not from a file."""
-        if path is None:
-            return None
+    def _key(self, exposure: Exposure, path: str, shared: TrackErrors) -> str:
+        """Hash of all that decides a frame."""
         mask = exposure.mask if isinstance(exposure.mask, str) else None
         files = input_hashes(path, [exposure.camera], exposure.terrain, mask)
         alone = replace(shared, gross=frozenset())  # with the facts that the image itself shows
         clock = None if shared.listed.clock is None else shared.listed.clock.turn_rad_s.tolist()
         errors = [repr(shared.listed.listed), alone.names, alone.sigma.tolist(), clock]
-        job = job_sha256(
-            path, exposure.sha256, self.facts, self.settings.evidence_sources, sorted(files.items()), errors
-        )
+        others = self.settings.evidence_sources, sorted(files.items()), errors
+        job = job_sha256(path, exposure.sha256, self.facts, *others)
         return hashlib.sha256(f"{exposure.name} {job}".encode()).hexdigest()[:32]
 
 
@@ -204,3 +186,46 @@ def _is_reached(frame: ObservedFrame, odometry: Odometry | None) -> bool:
     """Whether the odometry has come as far as the frame."""
     last_s = np.inf if odometry is None else float(odometry.time_s[-1])
     return frame.time_utc.astimezone(UTC).timestamp() <= last_s + SPAN_TOLERANCE_S
+
+
+def follow_images(
+    list_images: Callable[[], Iterable[str]],
+    take: Callable[[str], None],
+    refuse: Callable[[str, BadInput], None],
+    *,
+    until_idle_s: float | None,
+) -> Iterator[str | None]:
+    """Give each path that `list_images` lists to `take`, and yield it after that; None where no image waits.
+
+    Ends when no image came for `until_idle_s` (None: never). An image that `take` refuses with BadInput is tried again
+    for some seconds, since its sidecar may be missing; then `refuse` gets it.
+    """
+    taken: set[str] = set()
+    refused: set[tuple[str, int]] = set()  # with the time of its last change: a file that grows on is tried anew
+    first_try: dict[str, float] = {}
+    idle_since = time.monotonic()
+    while until_idle_s is None or time.monotonic() - idle_since < until_idle_s:
+        waiting = False
+        for path in list_images():
+            try:
+                changed_ns = Path(path).stat().st_mtime_ns
+            except OSError:  # removed since it was listed
+                continue
+            is_still = time.time_ns() - changed_ns > STILL_S * 1e9
+            if path in taken or (path, changed_ns) in refused or not is_still:
+                continue
+            idle_since = time.monotonic()
+            try:
+                take(path)
+            except BadInput as cause:
+                if time.monotonic() - first_try.setdefault(path, time.monotonic()) >= PATIENCE_S:
+                    refuse(path, cause)
+                    refused.add((path, changed_ns))
+                continue
+            taken.add(path)
+            waiting = True
+            yield path
+            idle_since = time.monotonic()
+        if not waiting:
+            yield None
+            time.sleep(0.5 * STILL_S)

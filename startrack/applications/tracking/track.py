@@ -9,14 +9,14 @@ from itertools import pairwise
 
 import numpy as np
 
-from startrack.applications.tracking.contradictions import RobustTrack, smooth_robustly
+from startrack.applications.tracking.contradictions import smooth_robustly
 from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions, positions_at_rest
 from startrack.applications.tracking.observed_frame import ImageFix, ObservedFrame
 from startrack.applications.tracking.odometry import Odometry, odometry_steps
 from startrack.applications.tracking.track_errors import BIAS, CLOCK, DEPTH, TrackErrors
 from startrack.core.types import Array, BadInput, Bools, ClockError, Ints
 from startrack.estimation.observations import UNKNOWN_M
-from startrack.estimation.smoother import Smoothed, radius_holding
+from startrack.estimation.trajectory import Smoothed, radius_holding
 from startrack.frames import quat_xyzw_from_R
 from startrack.localization import camera_at
 from startrack.terrain import Terrain
@@ -115,25 +115,19 @@ def estimate_track(
     times = [frame.time_utc for frame in frames]
     if any(a > b for a, b in pairwise(times)):
         raise BadInput("no_time", "the frames are not in the order of their times")
-    n = len(frames)
+    n, modes = len(frames), [frame.modes for frame in frames]
     if at_rest:
-        rest = positions_at_rest(frames, terrain, shared)
-        robust = RobustTrack(rest.smoothed, rest.mode, np.zeros(max(n - 1, 0), dtype=bool))
-        smoothed = np.repeat(rest.smoothed.position_m, n, 0), np.repeat(rest.smoothed.covariance_m2, n, 0)
-        filtered = rest.position_m, rest.covariance_m2
-        first, second = [*np.flatnonzero(rest.mode >= 0).tolist(), n][:2]
-        known_by_first = range(first, second)
+        robust, position_m, covariance_m2 = positions_at_rest(frames, terrain, shared)
+        first, second = [*np.flatnonzero(robust.mode >= 0).tolist(), n][:2]
     else:
         steps = odometry_steps(frames, odometry, odometry_sigma, odometry_floor_m)
-        modes = [frame.modes for frame in frames]
         robust = smooth_robustly(modes, steps, terrain.height_sigma_m)
-        smoothed = robust.smoothed.position_m, robust.smoothed.covariance_m2
-        filtered = filter_positions(modes, steps, len(shared), terrain.height_sigma_m)
+        position_m, covariance_m2 = filter_positions(modes, steps, len(shared), terrain.height_sigma_m)
         first = next(k for k, of in enumerate(modes) if len(of) == 1)
-        known_by_first = range(first, first + 1)
-    used = np.flatnonzero(robust.mode >= 0).tolist()
+        second = first + 1
+    found, used = robust.smoothed, np.flatnonzero(robust.mode >= 0).tolist()
+    smoothed = np.broadcast_to(found.position_m, (n, 2)), np.broadcast_to(found.covariance_m2, (n, 2, 2))
     by_one = [] if len(used) > 1 else range(n) if at_rest else used
-    found = robust.smoothed
     bias, clock, depth = (_shared_error(found, shared, name) for name in (BIAS, CLOCK, DEPTH))
     crests = None
     if len(found.post):
@@ -141,31 +135,30 @@ def estimate_track(
         crests = CrestHeights(found.post, places_m, found.post_error_m, found.post_sigma_m)
     return Track(
         tuple(_track_frame(frame, mode) for frame, mode in zip(frames, robust.mode, strict=True)),
-        _trajectory(*filtered, terrain, frames[first].fixes, known_by_first),
+        _trajectory(position_m, covariance_m2, terrain, frames[first].fixes, range(first, second)),
         _trajectory(*smoothed, terrain, frames[used[0]].fixes, by_one), *(bias or (0.0, 0.0)),
-        None if clock is None else ClockError(*clock), None if depth is None else DepthError(*depth), crests,
-        robust.slipped, at_rest, terrain,
+        clock and ClockError(*clock), depth and DepthError(*depth), crests, robust.slipped, at_rest, terrain,
     )  # fmt: skip
 
 
 def track_of_newest(frame: ObservedFrame, online: OnlineTrack, terrain: Terrain) -> Track:
     """The last `frame` that `online` has, as a track of its own: by all frames up to it."""
     known_by_one = [0] if online.is_first else []
-    found = _trajectory(online.position_m[None], online.covariance_m2[None], terrain, frame.fixes, known_by_one)
-    none = np.zeros(0, dtype=bool)
+    here = online.filter.position_m[None], online.filter.covariance_m2[None]
+    found, none = _trajectory(*here, terrain, frame.fixes, known_by_one), np.zeros(0, dtype=bool)
     return Track((_track_frame(frame, online.mode),), found, found, 0.0, 0.0, None, None, None, none, False, terrain)
 
 
 def _track_frame(frame: ObservedFrame, mode: int) -> TrackFrame:
-    status, reason, message = "used", "", ""
+    found, count = ("used", "", ""), len(frame.modes)
     if not frame.modes:
-        status, reason, message = "refused", frame.reason, frame.message
-    elif mode < 0 and len(frame.modes) > 1:
-        status, reason, message = "left_out", "ambiguous", f"none of {len(frame.modes)} positions agrees with the track"
+        found = "refused", frame.reason, frame.message
+    elif mode < 0 and count > 1:
+        found = "left_out", "ambiguous", f"none of {count} positions agrees with the track"
     elif mode < 0:
-        status, reason, message = "left_out", "inconsistent_evidence", "its position contradicts the other frames"
+        found = "left_out", "inconsistent_evidence", "its position contradicts the other frames"
     quat = None if frame.R_body_enu is None else quat_xyzw_from_R(frame.R_body_enu)
-    return TrackFrame(frame.name, frame.time_utc, status, reason, message, quat)
+    return TrackFrame(frame.name, frame.time_utc, *found, quat)
 
 
 def _trajectory(

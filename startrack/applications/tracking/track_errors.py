@@ -98,7 +98,6 @@ class TrackErrors:
         See `SharedErrors`: in a round crater the parameters hold the position before its turn and its scaling.
         """
         m, small = len(self.listed), 1e-3
-        found, one = np.zeros((2, len(self))), small * np.diag(self.sigma[:m])
-        points = np.tile(position_m, (m, 1))
-        found[:, :m] = (self.listed.turned(points, one) - self.listed.turned(points, -one)).T / (2 * small)
-        return found
+        points, one = np.tile(position_m, (m, 1)), small * np.diag(self.sigma[:m])
+        found = (self.listed.turned(points, one) - self.listed.turned(points, -one)).T / (2 * small)
+        return np.pad(found, ((0, 0), (0, len(self) - m)))

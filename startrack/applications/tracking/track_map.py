@@ -6,7 +6,7 @@ import numpy as np
 
 from startrack.applications.tracking.track import Track, Trajectory
 from startrack.core.types import Array
-from startrack.estimation.smoother import SIGMAS_95
+from startrack.estimation.trajectory import SIGMAS_95
 from startrack.output import (
     CAPTION_SIZE,
     FAINT_INK,

@@ -104,25 +104,26 @@ def frames_table(records: Sequence[dict[str, Any]]) -> str:
 def crests_table(track: Track) -> str:
     """track.crests.ecsv: a row for each post of the map whose height the track depends on."""
     crests = track.crests or CrestHeights(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
-    number = "number of the post in the terrain's maps"
-    columns = [Column("post", crests.post, "int64", form="%d", description=number)]
-    for axis, values in zip(("east", "north", "up"), crests.position_enu_m.T, strict=True):
-        columns.append(Column(f"{axis}_m", values, unit="m", form="%.3f", description=f"{axis} of the post by the map"))
-    columns.append(
-        Column("error_m", crests.error_m, unit="m", form="%.4f", description="height of the ground less the map's")
+    by_axis = zip(("east", "north", "up"), crests.position_enu_m.T, strict=True)
+    lengths = (
+        *((f"{axis}_m", values, "%.3f", f"{axis} of the post by the map") for axis, values in by_axis),
+        ("error_m", crests.error_m, "%.4f", "height of the ground less the map's"),
+        ("sigma_m", crests.sigma_m, "%.4f", "standard deviation of error_m"),
     )
-    columns.append(
-        Column("sigma_m", crests.sigma_m, unit="m", form="%.4f", description="standard deviation of error_m")
-    )
-    return ecsv_text(columns)
+    post = Column("post", crests.post, "int64", form="%d", description="number of the post in the terrain's maps")
+    return ecsv_text([post, *(Column(name, values, unit="m", form=form, description=text)
+                              for name, values, form, text in lengths)])  # fmt: skip
 
 
 def track_geojson(track: Track, records: Sequence[dict[str, Any]]) -> str:
     """track.geojson: a line through the smoothed positions of a `track`, and a point for each of its `records`."""
-    known = [one for one in records if one["latitude_deg"] is not None]
-    places = [[one["longitude_deg"], one["latitude_deg"]] for one in known]
+    points = [
+        feature("Point", [one["longitude_deg"], one["latitude_deg"]], one)
+        for one in records
+        if one["latitude_deg"] is not None
+    ]
+    places = [point["geometry"]["coordinates"] for point in points]
     line = feature("LineString", places, {"name": "smoothed track", "terrain": track.terrain.name})
-    points = [feature("Point", place, one) for place, one in zip(places, known, strict=True)]
     site = track.terrain.site
     return geojson_text([*([line] if len(places) > 1 else []), *points], "" if site is None else site.body)
 
@@ -136,27 +137,25 @@ def track_page(track: Track, picture_png: bytes, *, title: str, odometry_m: Arra
         title: of the page, plain text.
         odometry_m: positions (n, 2) in enu by odometry alone; None: not known.
     """
-    centre_m, half_m = track_extent(track, odometry_m)
+    (east_m, north_m), half_m = track_extent(track, odometry_m)
+    records = frame_records(track)
     head = {
         "columns": [],
         "title": title,
         "at_rest": track.at_rest,
-        "frames": _frame_columns(track),
+        "frames": {
+            q.key: [_rounded(record[q.key], 8 if q.key in ACCURATE else PAGE_DECIMALS) for record in records]
+            for q in FRAME_QUANTITIES
+            if not q.key.endswith(OFF_PAGE)
+        },
         "odometry": None if odometry_m is None else np.round(known_points(odometry_m), 3).tolist(),
         "terrain": track.terrain.name,
-        "terrains": {track.terrain.name: ground_map(track.terrain, centre_m, RELIEF_MARGIN * half_m)},
-        "world": [centre_m[0] - half_m, centre_m[1] - half_m, centre_m[0] + half_m, centre_m[1] + half_m],
+        "terrains": {track.terrain.name: ground_map(track.terrain, (east_m, north_m), RELIEF_MARGIN * half_m)},
+        "world": [east_m - half_m, north_m - half_m, east_m + half_m, north_m + half_m],
         "picture": f"data:image/png;base64,{base64.b64encode(picture_png).decode('ascii')}",
     }
     style, script = ((HERE / name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
     return filled_frame(f"{title} · startrack", {"results": head}, PAGE_SCRIPTS, style=style, script=script)
-
-
-def _frame_columns(track: Track) -> dict[str, list[Any]]:
-    """The quantities of all frames by their keys."""
-    records = frame_records(track)
-    keys = [q.key for q in FRAME_QUANTITIES if not q.key.endswith(OFF_PAGE)]
-    return {key: [_rounded(record[key], 8 if key in ACCURATE else PAGE_DECIMALS) for record in records] for key in keys}
 
 
 def _rounded(value: Any, decimals: int) -> Any:

@@ -1,20 +1,90 @@
-"""All frames of a track together: generalised least squares with the errors that they share.
+"""Positions of a track and the errors that its frames share: known at each frame's own time, and by all frames.
 
-Given all observations, the estimates of the errors of the map's posts follow.
+The first is a Kalman filter over the last position, the shared errors, and the errors of all posts that a recent
+observation has depended on, in standard deviations. Posts that were not seen for the longest time are left out, so that
+memory stays flat; where they are seen again, they count as new. The second is generalised least squares; given all
+observations, the estimates of the errors of the map's posts follow.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from startrack.core.types import Array, Ints
-from startrack.estimation.observations import Observations, Steps, inverse
+from startrack.estimation.observations import UNKNOWN_M, FrameEstimate, Observations, Steps, inverse
 
+MOST_POSTS = 2000  # in the state; 40 frames 50 m apart depend on 500
 SIGMAS_95 = float(np.sqrt(-2.0 * np.log(0.05)))  # half axes of the ellipse that holds 95 % of a Gaussian
 DIRECTIONS = 256  # over half a turn
-BISECTIONS = 60  # to the last digit
+
+
+@dataclass(eq=False)
+class TrackFilter:
+    """Estimates after the frames so far; `predict` and `update` in the order of time."""
+
+    shared_count: int
+    height_sigma_m: float
+    mean: Array = field(init=False)
+    covariance: Array = field(init=False)
+    posts: dict[int, int] = field(default_factory=dict)  # number of a post to its place in the state
+
+    def __post_init__(self) -> None:
+        self.mean = np.zeros(2 + self.shared_count)
+        self.covariance = np.diag([UNKNOWN_M**2] * 2 + [1.0] * self.shared_count)
+
+    @property
+    def position_m(self) -> Array:
+        """(2,) of the last frame."""
+        return self.mean[:2].copy()
+
+    @property
+    def covariance_m2(self) -> Array:
+        """(2, 2) of the last frame."""
+        return self.covariance[:2, :2].copy()
+
+    def predict(self, move_m: Array, sigma_m: float) -> None:
+        """The camera moved by (2,) in enu, with an error of `sigma_m` on each axis; infinite: anywhere."""
+        if not np.isfinite(sigma_m):
+            self.mean[:2] = 0.0
+            self.covariance[:2], self.covariance[:, :2] = 0.0, 0.0
+            sigma_m = UNKNOWN_M
+        self.mean[:2] += move_m
+        self.covariance[[0, 1], [0, 1]] += sigma_m**2
+
+    def update(self, estimate: FrameEstimate) -> None:
+        """Take in the observation of one frame."""
+        residual, covariance, cross = self.innovation(estimate)
+        gain = np.linalg.solve(covariance, cross.T).T
+        self.mean = self.mean + gain @ residual
+        self.covariance -= gain @ cross.T
+        for number in estimate.post.tolist():  # the last ones of the dictionary are the latest
+            self.posts[number] = self.posts.pop(number)
+        if len(self.posts) > MOST_POSTS:  # those that were not seen for the longest time are left out
+            kept, first = list(self.posts)[-(3 * MOST_POSTS // 4) :], 2 + self.shared_count
+            place = np.append(np.arange(first), [self.posts[number] for number in kept])
+            self.mean, self.covariance = self.mean[place], self.covariance[np.ix_(place, place)]
+            self.posts = {number: first + k for k, number in enumerate(kept)}
+
+    def innovation(self, estimate: FrameEstimate) -> tuple[Array, Array, Array]:
+        """Observation less prediction (p,), its covariance (p, p), and that of the state with it (s, p)."""
+        p, by_post, place = estimate.parameters, self.height_sigma_m * estimate.by_post, self._places(estimate.post)
+        cross = self.covariance[:, :p] @ estimate.response.T + self.covariance[:, place] @ by_post.T
+        predicted = estimate.response @ self.mean[:p] + by_post @ self.mean[place]
+        covariance = estimate.response @ cross[:p] + by_post @ cross[place] + estimate.noise
+        return estimate.mean - predicted, 0.5 * (covariance + covariance.T), cross
+
+    def _places(self, post: Ints) -> Ints:
+        """Places (c,) of posts in the state, which grows by the new ones."""
+        size, new = len(self.mean), [number for number in post.tolist() if number not in self.posts]
+        if new:
+            self.posts.update((number, size + k) for k, number in enumerate(new))
+            self.mean = np.append(self.mean, np.zeros(len(new)))
+            grown = np.eye(len(self.mean))
+            grown[:size, :size] = self.covariance
+            self.covariance = grown
+        return np.array([self.posts[number] for number in post.tolist()], dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,15 +118,12 @@ def smooth(observations: Observations, steps: Steps) -> Smoothed:
         np.add.at(target, right, weight * steps.move_m[:, axis])
     covariance = inverse(information)
     best = covariance @ target
-    blocks = covariance[: 2 * n, : 2 * n].reshape(n, 2, n, 2)
-    frame = np.arange(n)
-    residual, variance = _predicted_steps(best[: 2 * n].reshape(n, 2), blocks, steps, weight)
+    position, blocks = best[: 2 * n].reshape(n, 2), covariance[: 2 * n, : 2 * n].reshape(n, 2, n, 2)
     pull = observations.inverse_covariance @ observations.value - observations.weighted_design @ best
-    pulls, spread = _predicted_frames(observations, pull, covariance)
-    error, sigma = _posts(observations, pull, covariance)
     return Smoothed(
-        best[: 2 * n].reshape(n, 2), blocks[frame, :, frame], best[2 * n :], covariance[2 * n :, 2 * n :], blocks,
-        residual, variance, pulls, spread, observations.posts, error, sigma,
+        position, blocks[range(n), :, range(n)], best[2 * n :], covariance[2 * n :, 2 * n :], blocks,
+        *_predicted_steps(position, blocks, steps, weight), *_predicted_frames(observations, pull, covariance),
+        observations.posts, *_posts(observations, pull, covariance),
     )  # fmt: skip
 
 
@@ -109,7 +176,7 @@ def radius_holding(covariance_m2: Array, probability: float) -> Array:
     angle = np.pi * (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS
     along = np.maximum(variance[:, :1] * np.cos(angle) ** 2 + variance[:, 1:] * np.sin(angle) ** 2, 1e-300)
     low, high = np.zeros(len(variance)), np.sqrt(-2.0 * np.log(1.0 - probability) * np.maximum(variance[:, 1], 1e-300))
-    for _ in range(BISECTIONS):
+    for _ in range(np.finfo(np.float64).nmant):  # to the last digit
         middle = 0.5 * (low + high)
         inside = 1.0 - np.exp(-0.5 * np.square(middle)[:, None] / along).mean(axis=1)
         low, high = np.where(inside < probability, middle, low), np.where(inside < probability, high, middle)

@@ -18,9 +18,9 @@ from startrack.chain.stages import Detected, Inputs, Measured, Oriented, Refused
 from startrack.core.types import Mode
 from startrack.localization.rim_plane import point_fix
 from startrack.output import write_annotated
-from startrack.output.picture.annotate import PANEL_WIDTH, annotate
+from startrack.output.picture.annotate import PANEL_WIDTH, STATUS, annotate
 from startrack.output.picture.backdrop import View, fit_to_canvas, remove_hot_pixels
-from startrack.output.picture.canvas import HIDDEN, IDENTIFIED, POSITION, SKYLINE, STATUS, TRUTH
+from startrack.output.picture.canvas import Ink
 
 
 def has_colour_near(picture, place, colour, reach=2, tolerance=60):
@@ -75,8 +75,8 @@ def test_the_skyline_is_where_the_true_wall_is(picture, view, located):
     rays = np.stack([np.sin(azimuth) * level, np.cos(azimuth) * level, np.sin(elevation)], axis=-1)
     xy_px, inside = camera.project(rays @ located.truth.R_cam_enu.T)
     assert inside.all()
-    assert np.mean([has_colour_near(picture, place, SKYLINE) for place in view.canvas_px(xy_px)]) > 0.9
-    astray = [has_colour_near(picture, place, SKYLINE) for place in view.canvas_px(xy_px + 12.0)]
+    assert np.mean([has_colour_near(picture, place, Ink.SKYLINE) for place in view.canvas_px(xy_px)]) > 0.9
+    astray = [has_colour_near(picture, place, Ink.SKYLINE) for place in view.canvas_px(xy_px + 12.0)]
     assert np.mean(astray) < 0.5
 
 
@@ -86,12 +86,13 @@ def test_identified_stars_have_a_green_ring_and_hidden_ones_a_cross(picture, vie
     for k in np.sort(result.identification.detection)[:40]:  # the brightest: rings of faint ones fade
         at = view.canvas_px(result.detections.xy_px[k])
         ringed.append(
-            any(has_colour_near(picture, at + np.array([0.0, r]), IDENTIFIED, tolerance=120) for r in range(5, 11))
+            any(has_colour_near(picture, at + np.array([0.0, r]), Ink.IDENTIFIED, tolerance=120) for r in range(5, 11))
         )
     assert np.mean(ringed) > 0.8
     hidden = np.flatnonzero(result.light.llr < -3.0)[:10]
     assert (
-        np.mean([has_colour_near(picture, place, HIDDEN) for place in view.canvas_px(result.light.xy_px[hidden])]) > 0.8
+        np.mean([has_colour_near(picture, place, Ink.HIDDEN) for place in view.canvas_px(result.light.xy_px[hidden])])
+        > 0.8
     )
 
 
@@ -129,9 +130,9 @@ def test_detections_beyond_the_image_circle_are_not_drawn(located, view):
 
 
 def test_truth_is_drawn_only_when_given(picture, located):
-    assert count_pixels(picture, TRUTH) == 0
+    assert count_pixels(picture, Ink.TRUTH) == 0
     given = annotate(located.result, tuple(located.truth.position_enu_m[:2]))
-    assert count_pixels(given[:, -PANEL_WIDTH:], TRUTH) > 20
+    assert count_pixels(given[:, -PANEL_WIDTH:], Ink.TRUTH) > 20
 
 
 def test_every_kind_of_result_can_be_drawn(located):
@@ -153,13 +154,13 @@ def test_every_kind_of_result_can_be_drawn(located):
     for name, one in cases.items():
         drawn = annotate(one)
         assert count_pixels(drawn[badge], STATUS[one.status]) > 500, name
-    assert count_pixels(annotate(cases["ambiguous"])[:, -PANEL_WIDTH:], POSITION) > 2 * 60
+    assert count_pixels(annotate(cases["ambiguous"])[:, -PANEL_WIDTH:], Ink.POSITION) > 2 * 60
 
 
 def test_a_position_without_a_circle_is_drawn_without_a_zoom(located, picture):
     result = located.result
     point = annotate(replace(result, fix=point_fix(result.fix.position_enu_m[:2], result.terrain)))
-    drawn, circled = (count_pixels(one[:, -PANEL_WIDTH:], POSITION) for one in (point, picture))
+    drawn, circled = (count_pixels(one[:, -PANEL_WIDTH:], Ink.POSITION) for one in (point, picture))
     assert 60 < drawn < 0.5 * circled
 
 
@@ -182,7 +183,7 @@ def test_a_narrow_camera_that_sees_no_skyline(located):
         lens=Pinhole(),
     )
     result = replace(located.result, camera=camera)
-    assert count_pixels(annotate(result)[:, :1024], SKYLINE) == 0
+    assert count_pixels(annotate(result)[:, :1024], Ink.SKYLINE) == 0
 
 
 def test_a_name_that_the_font_cannot_write(located):

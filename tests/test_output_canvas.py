@@ -13,18 +13,8 @@ from startrack.frames import Site
 from startrack.output import relief_picture
 from startrack.output.picture.axes import nice_step
 from startrack.output.picture.backdrop import View
-from startrack.output.picture.canvas import (
-    MAP,
-    PAPER,
-    POSITION,
-    Canvas,
-    mix_colours,
-    printable,
-    text_width,
-    wrap_text,
-)
-from startrack.output.picture.maps import distance_text, draw_overview, draw_zoom, map_view
-from startrack.output.picture.relief import draw_contours, draw_relief, ground_of_view
+from startrack.output.picture.canvas import Canvas, Ink, mix_colours, printable, text_width, wrap_text
+from startrack.output.picture.maps import Map, distance_text, draw_overview, draw_zoom
 from startrack.terrain import Terrain
 
 WHITE = (255, 255, 255)
@@ -48,7 +38,7 @@ def test_shapes_stand_at_fractions_of_a_pixel(place, draw):
     elif draw == "curve":
         canvas.curve(np.array(place) + np.array([[-20.0, 0.0], [0.0, 0.0], [20.0, 0.0]]), WHITE, 4.0)
     else:
-        getattr(canvas, draw)(place, 10.0, WHITE, 1)
+        canvas.mark(place, draw, 10.0, WHITE, 1)
     # OpenCV rounds the edges of areas to one side: a quarter of a pixel.
     np.testing.assert_allclose(centroid(canvas.pixels), place, atol=0.27 if draw in ("ring", "curve") else 0.1)
 
@@ -67,7 +57,7 @@ def test_a_window_clips_and_keeps_positions():
 def test_labels_keep_apart_and_inside():
     canvas, rng = Canvas(400, 300), np.random.default_rng(3)
     inside = (0.0, 0.0, 399.0, 299.0)
-    put = [canvas.label(rng.uniform((0, 0), (400, 300)), "Canopus", 16.0, WHITE, 10.0, inside) for _ in range(200)]
+    put = [canvas.label(rng.uniform((0, 0), (400, 300)), "Canopus", WHITE, 10.0, inside) for _ in range(200)]
     boxes = canvas._occupied
     assert 10 < sum(put) == len(boxes) < 150
     x0, y0, x1, y1 = np.transpose(boxes)[:, :, None]
@@ -79,7 +69,7 @@ def test_labels_keep_apart_and_inside():
 
 def test_a_text_lies_in_its_box():
     canvas = Canvas(300, 100, (0, 0, 0))
-    left, top, right, bottom = canvas.text((150, 50), "Sagittarius", 30.0, WHITE, "mm")
+    left, top, right, bottom = canvas.text((150, 50), "Sagittarius", WHITE, "mm", 30.0)
     lit = np.argwhere(canvas.rendered_pixels().max(axis=-1) > 60)
     (y0, x0), (y1, x1) = lit.min(axis=0), lit.max(axis=0)
     assert left - 1 <= x0 < left + 4
@@ -109,7 +99,7 @@ def test_the_view_keeps_pixel_centres():
 
 
 def test_north_is_up_and_east_is_right():
-    view = map_view((100, 200, 500, 400), (1000.0, -500.0), 50.0)
+    view = Map.around(Canvas(600, 600), (100, 200, 500, 400), (1000.0, -500.0), 50.0)
     np.testing.assert_allclose(view.canvas_px((1000.0, -500.0)), (300.0, 300.0))
     np.testing.assert_allclose(view.canvas_px((1050.0, -450.0)), (400.0, 200.0))
 
@@ -144,7 +134,7 @@ def fix_at(east, north, covariance):
 )
 def test_the_ellipse_is_one_sigma_wide_and_turned_as_the_covariance(covariance, along):
     """Sigmas of 4 m along the direction (east, north) and of 1 m across it."""
-    canvas, filled = Canvas(601, 601), np.array(mix_colours(MAP, POSITION, 0.35))
+    canvas, filled = Canvas(601, 601), np.array(mix_colours(Ink.PAPER, Ink.POSITION, 0.35))
     view = draw_zoom(canvas, (0, 0, 600, 600), fix_at(30.0, 70.0, covariance), None)
     y, x = np.nonzero(np.abs(canvas.pixels.astype(int) - filled).sum(axis=-1) < 12)
     east_north = np.stack([x - 300.0, 300.0 - y], axis=-1) * view.metres_per_px
@@ -189,8 +179,8 @@ def test_the_edge_of_the_ground_is_smooth():
     terrain = Ramp(0.3)
     object.__setattr__(terrain, "allowed", disc)
     canvas = Canvas(601, 601)
-    view = map_view((0, 0, 600, 600), (0.0, 0.0), 1000.0)
-    draw_relief(canvas, view, *ground_of_view(view, terrain, (601, 601)))
+    view = Map.around(canvas, (0, 0, 600, 600), (0.0, 0.0), 1000.0)
+    view.draw_relief(*view.ground(terrain))
     light = canvas.pixels.max(axis=-1).astype(float)
     half = (light.max() + light[0, 0]) / 2
     radii = []
@@ -204,17 +194,15 @@ def test_the_edge_of_the_ground_is_smooth():
 
 def test_contours_stand_at_their_heights_with_their_names():
     terrain, canvas = Ramp(0.3), Canvas(601, 601)
-    view = map_view((0, 0, 600, 600), (0.0, 0.0), 1000.0)
-    ground_m, known = ground_of_view(view, terrain, (601, 601))
-    step_m = draw_contours(canvas, canvas, view, ground_m, known)
-    assert step_m == 50.0  # from -300 to 300 m
+    view = Map.around(canvas, (0, 0, 600, 600), (0.0, 0.0), 1000.0)
+    assert "each 50 m" in view.draw_heights(terrain)  # from -300 to 300 m
     row = canvas.pixels[200].astype(int).sum(axis=-1)
-    lines = np.flatnonzero((row > sum(PAPER) + 60) & (row >= np.roll(row, 1)) & (row > np.roll(row, -1)))
+    lines = np.flatnonzero((row > sum(Ink.PAPER) + 60) & (row >= np.roll(row, 1)) & (row > np.roll(row, -1)))
     np.testing.assert_allclose(lines[lines > 10], 300 + np.arange(-250, 300, 50), atol=1.0)  # a pixel is 1 m of height
-    assert {text.text for text in canvas._texts} == {str(height) for height in range(-250, 300, 50)}
-    for text in canvas._texts:  # each name stands on its own contour
-        assert text.xy[0] + text_width(text.text, text.size) / 2 == pytest.approx(300 + float(text.text), abs=1.5)
-    assert draw_contours(canvas, canvas, view, np.zeros_like(ground_m), known) is None
+    assert {text for _, text, *_ in canvas._texts} == {str(height) for height in range(-250, 300, 50)}
+    for (x, _), text, size, *_ in canvas._texts:  # each name stands on its own contour
+        assert x + text_width(text, size) / 2 == pytest.approx(300 + float(text), abs=1.5)
+    assert view.draw_heights(Ramp(0.0)) == ""
 
 
 def test_the_relief_picture_has_scales_and_contours():
@@ -226,8 +214,8 @@ def test_the_relief_picture_has_scales_and_contours():
 
 def test_relief_is_lit_from_the_north_west():
     west, east = (Canvas(200, 200) for _ in range(2))
-    draw_overview(west, (0, 0, 199, 199), Ramp(0.3), None, False, None)
-    draw_overview(east, (0, 0, 199, 199), Ramp(-0.3), None, False, None)
+    draw_overview(west, (0, 0, 199, 199), Ramp(0.3))
+    draw_overview(east, (0, 0, 199, 199), Ramp(-0.3))
     spot = np.s_[60:75, 60:75]
     assert west.pixels[spot].mean() > 2 * east.pixels[spot].mean()
     assert west.pixels[180:190, 20:35].mean() < 25  # south of -500 m there is no ground

@@ -12,9 +12,9 @@ from PIL import Image
 from startrack.output import png_bytes, write_results
 from startrack.output.html.details import picture_of
 from startrack.output.html.stars import sectors_of, star_table_of
-from startrack.output.picture.annotate import bare_picture
-from startrack.output.picture.canvas import HIDDEN, IDENTIFIED, SKYLINE
-from startrack.output.picture.overlay import Layers, layers_of
+from startrack.output.picture.annotate import Layers, layers_of
+from startrack.output.picture.backdrop import bare_picture
+from startrack.output.picture.canvas import Ink
 
 RADIUS_M, DEPTH_M = 10_000.0, 2_000.0  # of the thesis's crater
 
@@ -54,7 +54,7 @@ def test_the_file_holds_the_picture_without_marks(folder, layers, located):
     bare = bare_picture(located.result)
     assert layers.bare.shape == bare.shape
     assert np.abs(layers.bare.astype(int) - bare).mean() < 3
-    for colour in (IDENTIFIED, HIDDEN, SKYLINE):
+    for colour in (Ink.IDENTIFIED, Ink.HIDDEN, Ink.SKYLINE):
         assert count_colour(annotated[:, : bare.shape[1]], colour) > 100
         assert count_colour(layers.bare, colour) < 5
 

@@ -22,12 +22,12 @@ from startrack.core.types import MIDDLES_RAD, Exposure
 from startrack.localization import PseudoGradient
 from startrack.output import prepare_folder, write_results
 from startrack.output.picture.axes import GAP_PX
-from startrack.output.picture.canvas import MEASURED
+from startrack.output.picture.canvas import Ink
 from startrack.output.picture.panorama import (
     ABOVE_PX,
     ENLARGED_PX,
     HEIGHT_PX,
-    LEFT_PX,
+    MARGIN_PX,
     RIGHT_PX,
     WIDTH_PX,
     located_picture,
@@ -234,8 +234,8 @@ def test_the_picture_shows_the_skyline_above_the_horizon(by_source: dict[str, Lo
         )  # fmt: skip
         picture = located_picture(found, at)
         assert picture.shape == (HEIGHT_PX + ENLARGED_PX, WIDTH_PX, 3)
-        plot = picture[HEIGHT_PX + int(ABOVE_PX) + 2 : -int(5 * GAP_PX) - 2, int(LEFT_PX) + 2 : -int(RIGHT_PX) - 2]
-        rows = np.flatnonzero((plot == MEASURED).all(axis=-1).sum(axis=1) > 50)
+        plot = picture[HEIGHT_PX + int(ABOVE_PX) + 2 : -int(5 * GAP_PX) - 2, int(MARGIN_PX) + 2 : -int(RIGHT_PX) - 2]
+        rows = np.flatnonzero((plot == Ink.MEASURED).all(axis=-1).sum(axis=1) > 50)
         assert len(rows) > 0
         heights_px.append(plot.shape[0] / 2 - rows.mean())
     half_deg = 0.06  # 0.02 and two sigma

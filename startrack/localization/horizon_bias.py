@@ -15,7 +15,9 @@ from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain
 
 NEARBY_M = 40.0  # horizons are prepared that far about a position
-EXPLAINED_NATS = -0.57  # mean over the sectors with rows; true positions: -0.10 to -0.52, the best false one seen: -0.62
+EXPLAINED_NATS = (
+    -0.57
+)  # mean over the sectors with rows; true positions: -0.10 to -0.52, the best false one seen: -0.62
 
 
 @dataclass(frozen=True, eq=False)

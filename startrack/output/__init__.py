@@ -5,41 +5,23 @@ from startrack.output.geo import feature, geojson_text
 from startrack.output.html.details import ground_map
 from startrack.output.html.rows import Found, result_at, results_under
 from startrack.output.html.write import filled_frame, page_text, write_page
-from startrack.output.picture.annotate import annotate, draw_legend_sample
-from startrack.output.picture.axes import nice_step
+from startrack.output.picture.annotate import annotate
+from startrack.output.picture.axes import Axes, nice_step
 from startrack.output.picture.canvas import (
-    CAPTION_SIZE,
-    DIM_INK,
-    FAINT_INK,
-    GRID,
-    INK,
-    MAP,
-    POSITION,
-    REDDISH_PURPLE,
-    SKY_BLUE,
-    YELLOW,
+    TEXT_PX,
+    TITLE_PX,
     Box,
     Canvas,
     Colour,
+    Ink,
+    Legend,
     box_around,
     mix_colours,
     png_bytes,
-    wrap_text,
 )
-from startrack.output.picture.maps import (
-    MapView,
-    distance_text,
-    draw_distances,
-    draw_frame,
-    draw_ground,
-    draw_overview,
-    ellipse_m,
-    map_view,
-    relief_picture,
-)
+from startrack.output.picture.maps import MARGIN_PX, SIDE_PX, Map, draw_overview, ellipse_m, relief_picture
 from startrack.output.picture.panorama import horizon_picture, skyline_picture
 from startrack.output.picture.prediction import comparison_picture, path_picture, prediction_picture
-from startrack.output.picture.relief import draw_contours, ground_of_view
 from startrack.output.quantities import QUANTITIES, table_columns
 from startrack.output.quantity import (
     ABSENT,
@@ -90,18 +72,16 @@ from startrack.output.write import (
 )
 
 __all__ = [
-    "ABSENT", "ARCSEC_PER_RAD", "CAPTION_SIZE", "CHANCE", "COMPANIONS", "COUNT", "DIM_INK", "FAINT_INK", "FLAG", "GRID",
-    "INK", "MAP", "NUMBER", "PICTURES", "POSITION", "POSITIVE", "QUANTITIES", "REDDISH_PURPLE", "SCHEMAS",
-    "SKYLINE_FILES", "SKY_BLUE", "TEXT", "TIME", "YELLOW", "Box", "Canvas", "Colour", "Column", "Found", "MapView",
-    "Quantity", "R_body_enu", "Rows", "Schema", "TableColumn", "annotate", "at_stage", "boresight_rad",
-    "box_around", "comparison_picture", "detection_dict", "distance_text", "draw_contours", "draw_distances",
-    "draw_frame", "draw_ground", "draw_legend_sample", "draw_overview", "ecsv_text", "ellipse_m", "explain",
-    "feature", "file_schema", "filled_frame", "format_values", "geojson_text", "ground_map", "ground_of_view",
-    "horizon_picture", "identification_dict", "json_text", "lens_text", "map_view", "markdown_table", "mix_colours",
-    "nice_step", "object_schema", "or_null", "page_text", "path_picture", "png_bytes", "prediction_picture",
-    "prepare_folder", "quantity_columns", "record_from", "record_of", "refusal_line", "refused_dict",
-    "relief_picture", "remove_companions", "result_at", "result_dict", "results_under", "rows", "schema_of",
-    "show_everywhere", "skyline_picture", "skyline_table_text", "skyline_texts_deg", "star_table_text",
-    "summary_line", "table_columns", "verbose_text", "wrap_text", "write_annotated", "write_geo", "write_json",
-    "write_page", "write_results", "write_star_table", "write_wcs",
+    "ABSENT", "ARCSEC_PER_RAD", "CHANCE", "COMPANIONS", "COUNT", "FLAG", "MARGIN_PX", "NUMBER", "PICTURES",
+    "POSITIVE", "QUANTITIES", "SCHEMAS", "SIDE_PX", "SKYLINE_FILES", "TEXT", "TEXT_PX", "TIME", "TITLE_PX", "Axes",
+    "Box", "Canvas", "Colour", "Column", "Found", "Ink", "Legend", "Map", "Quantity", "R_body_enu", "Rows", "Schema",
+    "TableColumn", "annotate", "at_stage", "boresight_rad", "box_around", "comparison_picture", "detection_dict",
+    "draw_overview", "ecsv_text", "ellipse_m", "explain", "feature", "file_schema", "filled_frame", "format_values",
+    "geojson_text", "ground_map", "horizon_picture", "identification_dict", "json_text", "lens_text",
+    "markdown_table", "mix_colours", "nice_step", "object_schema", "or_null", "page_text", "path_picture",
+    "png_bytes", "prediction_picture", "prepare_folder", "quantity_columns", "record_from", "record_of",
+    "refusal_line", "refused_dict", "relief_picture", "remove_companions", "result_at", "result_dict",
+    "results_under", "rows", "schema_of", "show_everywhere", "skyline_picture", "skyline_table_text",
+    "skyline_texts_deg", "star_table_text", "summary_line", "table_columns", "verbose_text", "write_annotated",
+    "write_geo", "write_json", "write_page", "write_results", "write_star_table", "write_wcs",
 ]  # fmt: skip

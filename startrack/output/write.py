@@ -13,9 +13,8 @@ from startrack.chain import Located, Measured, Oriented, Outcome, last_value
 from startrack.core.errors import BadInput
 from startrack.core.files import make_folder, write_atomically
 from startrack.output.geo import GEO_FORMATS, geo_text
-from startrack.output.picture.annotate import annotate, bare_picture
+from startrack.output.picture.annotate import annotated_png
 from startrack.output.picture.canvas import png_bytes
-from startrack.output.picture.overlay import Layers, add_layers, overlay_of
 from startrack.output.picture.panorama import located_picture
 from startrack.output.record import record_of
 from startrack.output.tables import skyline_table_text, star_table_text
@@ -171,10 +170,6 @@ def write_annotated(path: FilePath, outcome: Outcome, truth_enu_m: tuple[float, 
     """Write the annotated picture of an `outcome` to `path` (PNG). Raises BadInput where it cannot be written.
 
     `truth_enu_m` (east, north) [m] is drawn if it is given; no stage of the pipeline has it. The file also holds the
-    picture without marks and the marks as coordinates, for the HTML page (`picture/layers.py`).
+    picture without marks and the marks as coordinates, for the HTML page.
     """
-
-    value = last_value(outcome)
-    bare = bare_picture(value)
-    png = png_bytes(annotate(outcome, truth_enu_m, bare))
-    write_atomically(path, add_layers(png, Layers(bare, overlay_of(value))), overwrite=True)
+    write_atomically(path, annotated_png(outcome, truth_enu_m), overwrite=True)

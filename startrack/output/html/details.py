@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from startrack.core.types import Array, BadInput
 from startrack.output.html.stars import Horizon, read_ecsv
+from startrack.output.picture.annotate import layers_of
 from startrack.output.picture.canvas import encoded_bytes
-from startrack.output.picture.overlay import layers_of
 from startrack.output.picture.relief import edge_cover, ground_cells, hill_shading
 from startrack.output.tables import half_range_rad
 from startrack.terrain import Terrain, load_terrain

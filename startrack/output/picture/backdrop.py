@@ -9,25 +9,26 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from startrack.camera import Camera
-from startrack.chain import Detected, Inputs
+from startrack.chain import Detected, Inputs, Located
 from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Bools
-from startrack.output.picture.canvas import PAPER, SKY_BRIGHT, SKY_DARK, STARLIGHT, WALL
+from startrack.frames import azel_from_rays
+from startrack.output.picture.canvas import Box, Ink
+from startrack.output.values import skyline_position_m
 
 Image = NDArray[np.float32]
-LONGEST_SIDE_PX = 1400
-SHORTEST_SIDE_PX = 900
+LONGEST_SIDE_PX, SHORTEST_SIDE_PX = 1400, 900
 SMOOTHING_PX = (0.5, 3.0)  # of the display, as wide as the PSF within these
 CALM_SNR = 2.6  # fainter light than that is treated as noise and left out
 KNEE_SNR, GLARE_SNR = 5.0, 400.0  # where the stretch turns from linear to logarithmic, and where it ends
 STAR_PX = 15  # on the canvas: wider sources are not stars
-RIM_PX = 8.0
 SAMPLE = 4  # levels are taken from every fourth pixel
-FLAT_SNR = 3.0
 WALL_SHADE = 0.75  # how far the wall's colour replaces the sky's
+EDGE_RAD = 0.003  # width of its edge
 SPIKE_SIGMAS = 8.0
 SPIKE_NEIGHBOUR = 0.3  # a star's neighbouring pixel has more of its light where the PSF is MIN_PSF_PX or wider
 MIN_PSF_PX = 0.7
+AZIMUTHS_RAD = np.linspace(0.0, 2 * np.pi, 1441)
 NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=np.uint8)
 
 
@@ -44,7 +45,7 @@ class View:
         return np.asarray(self.origin) + self.scale * (np.asarray(xy_px, dtype=float) + 0.5) - 0.5
 
     @property
-    def box(self) -> tuple[float, float, float, float]:
+    def box(self) -> Box:
         """Left, top, right, bottom on the canvas."""
         x, y = self.origin
         return x, y, x + self.size[0] - 1, y + self.size[1] - 1
@@ -58,27 +59,46 @@ def fit_to_canvas(size_px: tuple[int, int]) -> tuple[float, tuple[int, int]]:
     return scale, (max(1, round(size_px[0] * scale)), max(1, round(size_px[1] * scale)))
 
 
-def backdrop(value: Inputs, size: tuple[int, int], wall: Image | None = None) -> NDArray[np.uint8]:
-    """The exposure as (H, W, 3) of the given size (W, H); beyond the image circle is paper.
+def bare_picture(value: Inputs) -> NDArray[np.uint8]:
+    """The exposure (H, W, 3) as the picture of a stage's `value` shows it, red, green, blue, without any mark.
 
-    `wall` (H, W) is 1 where terrain hides the sky: it is shown darker than in the exposure.
+    Beyond the image circle is paper. Where terrain hides the sky it is shown darker than in the exposure.
     """
+    _, size = fit_to_canvas(value.exposure.size_px)
     inside_px = np.full(size[::-1], np.inf, dtype=np.float32)
     if value.camera is not None and value.camera.size_px == value.exposure.size_px:
         inside_px = _distance_to_edge_px(value.camera, size)
-    sky, light = _background_and_light(value, size, inside_px > RIM_PX)
+    sky, light = _background_and_light(value, size, inside_px > STAR_PX / 2)
     # Next to the circle's edge the background is not known well, and its residual is not light.
-    light *= np.clip(inside_px / np.float32(RIM_PX), 0, 1)
-    shade = None if wall is None else wall * np.float32(WALL_SHADE)
+    light *= np.clip(inside_px / np.float32(STAR_PX / 2), 0, 1)
+    shade = _wall_mask(value, size) * np.float32(WALL_SHADE) if isinstance(value, Located) else np.float32(0.0)
     lit = np.clip(inside_px + np.float32(0.5), 0, 1)
     channels = []
-    for dark, bright, rock, star, paper in zip(SKY_DARK, SKY_BRIGHT, WALL, STARLIGHT, PAPER, strict=True):
+    for dark, bright, rock, star, paper in zip(
+        Ink.SKY_DARK, Ink.SKY_BRIGHT, Ink.WALL, Ink.STARLIGHT, Ink.PAPER, strict=True
+    ):
         channel = dark + sky * np.float32(bright - dark)
-        if shade is not None:
-            channel += shade * (np.float32(rock) - channel)
+        channel += shade * (np.float32(rock) - channel)
         channel += light * (np.float32(star) - channel)
         channels.append((paper + lit * (channel - np.float32(paper))).astype(np.uint8))
     return np.asarray(cv2.merge(channels))
+
+
+def _wall_mask(value: Located, size: tuple[int, int]) -> Image:
+    """1 below the skyline of the fix and 0 above it, (H, W) of a picture of the `size` (W, H)."""
+    cells = [np.arange(0.5, -(-n // SAMPLE)) * n / -(-n // SAMPLE) for n in size]
+    scale = np.array(value.camera.size_px) / size
+    xy_px = np.stack(np.meshgrid(*cells), axis=-1) * scale - 0.5
+    azimuth, elevation = azel_from_rays(value.camera.unproject(xy_px) @ value.R_cam_enu)
+    below = np.interp(azimuth, AZIMUTHS_RAD, horizon_at_fix(value, AZIMUTHS_RAD)) - elevation
+    # The signed distance is what may be interpolated; cut off afterwards, it gives a sharp and smooth edge.
+    below_rad = np.asarray(cv2.resize(below.astype(np.float32), size, interpolation=cv2.INTER_LINEAR))
+    return np.clip(below_rad * np.float32(1 / EDGE_RAD) + np.float32(0.5), 0, 1)
+
+
+def horizon_at_fix(value: Located, azimuth_rad: Array) -> Array:
+    """Elevation (n,) of the horizon at the fix at azimuths (n,) [rad]."""
+    return value.terrain.horizon_rad(np.array([skyline_position_m(value)]), azimuth_rad)
 
 
 def _background_and_light(value: Inputs, size: tuple[int, int], inside: Bools) -> tuple[Image, Image]:
@@ -101,7 +121,7 @@ def _background_and_light(value: Inputs, size: tuple[int, int], inside: Bools) -
     light = np.minimum(light / np.float32(np.arcsinh(GLARE_SNR / KNEE_SNR)), 1)
     dark, bright = np.percentile(smooth[::SAMPLE, ::SAMPLE][known] if known.any() else smooth, [2, 98])
     # A background that is flatter than the noise shall look flat.
-    sky = (smooth - np.float32(dark)) / np.float32(max(bright - dark, FLAT_SNR * noise))
+    sky = (smooth - np.float32(dark)) / np.float32(max(bright - dark, CALM_SNR * noise))
     return np.clip(sky, 0, 1), np.power(light, np.float32(0.75))
 
 

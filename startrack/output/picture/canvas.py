@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import unicodedata
 from copy import copy
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -16,37 +15,23 @@ if TYPE_CHECKING:
     from PIL.ImageFont import FreeTypeFont
 
 Colour = tuple[int, int, int]
+Box = tuple[float, float, float, float]  # left, top, right, bottom
+Legend = list[tuple[str, Colour, str]]  # kind of a mark, its colour, words
 
-BLUISH_GREEN: Colour = (0, 158, 115)
-ORANGE: Colour = (230, 159, 0)
-SKY_BLUE: Colour = (86, 180, 233)
-YELLOW: Colour = (240, 228, 66)
-VERMILLION: Colour = (213, 94, 0)
-REDDISH_PURPLE: Colour = (204, 121, 167)
 
-IDENTIFIED = BLUISH_GREEN
-HIDDEN = ORANGE
-SKYLINE = SKY_BLUE
-BODY = YELLOW
-POSITION = VERMILLION
-TRUTH = REDDISH_PURPLE
+def _rgb(codes: str) -> list[Colour]:
+    return [(code[0], code[1], code[2]) for code in map(bytes.fromhex, codes.split())]
 
-INK: Colour = (236, 240, 245)
-MEASURED = INK  # small dots on the line of the skyline
-DIM_INK: Colour = (151, 163, 180)
-FAINT_INK: Colour = (74, 86, 104)
-GRID: Colour = (44, 53, 68)
-DETECTION = DIM_INK
-PAPER: Colour = (13, 17, 25)  # around the picture
-SKY_DARK: Colour = (14, 20, 33)
-SKY_BRIGHT: Colour = (34, 48, 78)
-WALL: Colour = (19, 17, 18)
-STARLIGHT: Colour = (255, 253, 248)
-PANEL: Colour = (19, 25, 36)
-MAP = PAPER
-FLOOR: Colour = (27, 36, 51)
 
-STATUS: dict[str, Colour] = {"ok": BLUISH_GREEN, "ambiguous": ORANGE, "refused": VERMILLION}
+class Ink:
+    """The colours of all pictures: of writing, of the ground, and of marks (Okabe and Ito's, which all can tell)."""
+
+    PLAIN, DIM, FAINT, GRID = _rgb("ecf0f5 97a3b4 4a5668 2c3544")
+    PAPER, PANEL, FLOOR, WALL = _rgb("0d1119 131924 1b2433 131112")
+    SKY_DARK, SKY_BRIGHT, STARLIGHT, SHADOW = _rgb("0e1421 22304e fffdf8 080b11")
+    GREEN, ORANGE, BLUE, YELLOW, VERMILLION, PURPLE = _rgb("009e73 e69f00 56b4e9 f0e442 d55e00 cc79a7")
+    IDENTIFIED, HIDDEN, DETECTION, BODY = GREEN, ORANGE, DIM, YELLOW
+    SKYLINE, MEASURED, POSITION, TRUTH = BLUE, PLAIN, VERMILLION, PURPLE
 
 
 def mix_colours(a: Colour, b: Colour, part_of_b: float) -> Colour:
@@ -55,30 +40,27 @@ def mix_colours(a: Colour, b: Colour, part_of_b: float) -> Colour:
     return r, g, blue
 
 
-TITLE_PX, TEXT_PX, CAPTION_SIZE = 22.0, 17.0, 16.0  # sizes of writing
+TEXT_PX = 16.0  # size of writing; distances between things are multiples of it
+LARGE_PX, TITLE_PX = 1.25 * TEXT_PX, 1.5 * TEXT_PX
+LINE_PX = 1.5 * TEXT_PX  # from line to line
 SHIFT_BITS = 4  # OpenCV takes sub-pixel places as integers of 1/16 px
 EDGE_PX = 0.4  # added by OpenCV's smoothing to the edge of an area
 FARTHEST_PX = 30_000.0  # beyond any picture, within OpenCV's range
-Box = tuple[float, float, float, float]  # left, top, right, bottom
+RISE_1, FALL_1 = 0.74, 0.22  # of letters above and below the line of writing, as parts of their size
 KNOWN_BEYOND_ASCII = "±°·…"
-
-
-@dataclass(frozen=True)
-class _Text:
-    xy: tuple[float, float]
-    text: str
-    size: float
-    colour: Colour
-    halo: bool
+STROKES: dict[str, Any] = {  # of marks, within half a unit to each side
+    "cross": (((-1, -1), (1, 1)), ((-1, 1), (1, -1))), "plus": (((-1, 0), (1, 0)), ((0, -1), (0, 1))),
+    "line": (((-1, 0), (1, 0)),),
+}  # fmt: skip
 
 
 class Canvas:
     """Pixels (H, W, 3), red, green, blue. Place (0, 0) is the centre of the top-left pixel; texts appear at the end."""
 
-    def __init__(self, width: int, height: int, colour: Colour = PAPER) -> None:
+    def __init__(self, width: int, height: int, colour: Colour = Ink.PAPER) -> None:
         self.pixels: NDArray[np.uint8] = np.full((height, width, 3), colour, dtype=np.uint8)
         self._origin = np.zeros(2)
-        self._texts: list[_Text] = []
+        self._texts: list[tuple[tuple[float, float], str, float, Colour, bool]] = []  # place, text, size, colour, halo
         self._occupied: list[Box] = []
 
     def window(self, box: Box) -> Canvas:
@@ -94,17 +76,16 @@ class Canvas:
         """(W, H)."""
         return self.pixels.shape[1], self.pixels.shape[0]
 
-    def line(self, points: ArrayLike, colour: Colour, width: int = 1, closed: bool = False) -> None:
-        """A line of a `colour` and `width` [px] through the `points` (n, 2); `closed` joins the last to the first."""
-        cv2.polylines(self.pixels, [self._to_fixed_point(points)], closed, colour, width, cv2.LINE_AA, SHIFT_BITS)
+    def line(
+        self, points: ArrayLike, colour: Colour, width: int = 1, closed: bool = False, dashed: bool = False
+    ) -> None:
+        """A line of a `colour` and `width` [px] through the `points` (n, 2); `closed` joins the last to the first.
 
-    def dashes(self, points: ArrayLike, colour: Colour, width: int = 1) -> None:
-        """Every other stretch of the `line` through evenly spaced points (n, 2), with its `colour` and `width`."""
+        `dashed`: every other stretch of it alone.
+        """
         places = self._to_fixed_point(points)
-        cv2.polylines(
-            self.pixels, [places[k : k + 2] for k in range(0, len(places) - 1, 2)], False, colour, width, cv2.LINE_AA,
-            SHIFT_BITS,
-        )  # fmt: skip
+        parts = [places[k : k + 2] for k in range(0, len(places) - 1, 2)] if dashed else [places]
+        cv2.polylines(self.pixels, parts, closed, colour, width, cv2.LINE_AA, SHIFT_BITS)
 
     def area(self, points: ArrayLike, colour: Colour) -> None:
         """A convex or plain polygon with corners `points` (n, 2), filled with a `colour`."""
@@ -139,15 +120,23 @@ class Canvas:
         reach = round(radius * 2**SHIFT_BITS)
         cv2.circle(self.pixels, (x, y), reach, colour, width, cv2.LINE_AA, SHIFT_BITS)
 
-    def cross(self, centre: ArrayLike, half: float, colour: Colour, width: int = 1) -> None:
-        """An x of half size `half` [px], in lines of a `colour` and `width` [px]."""
-        for across in ((half, half), (half, -half)):
-            self.line(np.asarray(centre, dtype=float) + np.outer((-1.0, 1.0), across), colour, width)
+    def mark(self, at: ArrayLike, kind: str, half: float, colour: Colour, width: int = 2) -> None:
+        """A mark of half size `half` [px] at a place, in lines of a `colour` and `width` [px].
 
-    def plus(self, centre: ArrayLike, half: float, colour: Colour, width: int = 1) -> None:
-        """A + of half size `half` [px], in lines of a `colour` and `width` [px]."""
-        for across in ((half, 0.0), (0.0, half)):
-            self.line(np.asarray(centre, dtype=float) + np.outer((-1.0, 1.0), across), colour, width)
+        `kind`: ring, disc, place (both), cross (x), plus, line, box (filled), diamond, or square (a filled diamond).
+        """
+        place = np.asarray(at, dtype=float)
+        if kind in ("ring", "place"):
+            self.circle(place, half, colour, width)
+        if kind in ("disc", "place"):
+            self.circle(place, half if kind == "disc" else half / 2, colour, -1)
+        for stroke in STROKES.get(kind, ()):
+            self.line(place + half * np.array(stroke), colour, width)
+        if kind == "box":
+            self.rectangle(box_around(place, half), colour)
+        if kind in ("diamond", "square"):
+            corners = place + half * np.array([(0, -1), (1, 0), (0, 1), (-1, 0)])
+            self.line(corners, colour, width, closed=True) if kind == "diamond" else self.area(corners, colour)
 
     def rectangle(self, box: Box, colour: Colour, width: int = -1) -> None:
         """A `box` of a `colour`; filled where `width` is negative."""
@@ -155,8 +144,9 @@ class Canvas:
         cv2.rectangle(self.pixels, (left, top), (right, bottom), colour, width, cv2.LINE_8, SHIFT_BITS)
 
     def text(
-        self, xy: ArrayLike, text: str, size: float, colour: Colour = INK, anchor: str = "ls", halo: bool = False
-    ) -> Box:
+        self, xy: ArrayLike, text: str, colour: Colour = Ink.DIM, anchor: str = "ls", size: float = TEXT_PX,
+        halo: bool = False,
+    ) -> Box:  # fmt: skip
         """Write `text` of `size` [px] at `xy`, where `label` then writes nothing; returns the box.
 
         `anchor` is the place of `xy` in the text: l, m or r, and t (top), m or s. `halo` adds a dark edge to
@@ -164,23 +154,40 @@ class Canvas:
         """
         text = printable(text)
         x, y = (float(c) for c in np.asarray(xy, dtype=float))
-        width, (rise, fall) = text_width(text, size), _height(size)
+        width, rise, fall = text_width(text, size), RISE_1 * size, FALL_1 * size
         x -= {"l": 0.0, "m": width / 2, "r": width}[anchor[0]]
         y += {"t": rise, "m": (rise - fall) / 2 + 0.06 * size, "s": 0.0}[anchor[1]]
-        box = x, y - rise, x + width, y + fall
-        self._texts.append(_Text((x, y), text, size, colour, halo))
-        self._occupied.append(box)
-        return box
+        self._texts.append(((x, y), text, size, colour, halo))
+        self._occupied.append((x, y - rise, x + width, y + fall))
+        return self._occupied[-1]
 
-    def label(self, at: ArrayLike, text: str, size: float, colour: Colour, gap: float, within: Box) -> bool:
+    def paragraph(
+        self, left: float, y: float, text: str, width: float, colour: Colour = Ink.DIM, size: float = TEXT_PX
+    ) -> float:
+        """Write `text` of `size` [px] in lines of at most `width` [px] from the first at `y` on; where the next stands.
+
+        `left` and `colour` are those of every line.
+        """
+        for line in wrap_text(text, size, width):
+            self.text((left, y), line, colour, size=size)
+            y += LINE_PX / TEXT_PX * size
+        return y
+
+    def legend(self, left: float, y: float, width: float, entries: Legend) -> None:
+        """Marks and words of a legend's `entries` in `width` [px], one below the other from the line at `y` on."""
+        for kind, colour, words in entries:
+            half = TEXT_PX / (8 if kind == "disc" else 2)
+            self.mark((left + TEXT_PX / 2, y - TEXT_PX / 3), kind, half, colour)
+            y = self.paragraph(left + 2 * TEXT_PX, y, words, width - 2 * TEXT_PX)
+
+    def label(self, at: ArrayLike, text: str, colour: Colour, gap: float, within: Box, size: float = TEXT_PX) -> bool:
         """Write `text` of `size` [px] and `colour` beside the place `at`, a `gap` [px] off, inside the box `within`.
 
         It stands at the first of eight sides that is free; False where there is none.
         """
         x, y = (float(c) for c in np.asarray(at, dtype=float))
-        width, (rise, fall) = text_width(printable(text), size), _height(size)
-        near = 0.75 * gap
-        middle = y + (rise - fall) / 2
+        width, rise, fall = text_width(printable(text), size), RISE_1 * size, FALL_1 * size
+        near, middle = 0.75 * gap, y + (rise - fall) / 2
         sides = [
             (x + gap, middle), (x - gap - width, middle), (x + near, y - near), (x + near, y + near + rise),
             (x - near - width, y - near), (x - near - width, y + near + rise), (x - width / 2, y - gap - fall),
@@ -190,7 +197,7 @@ class Canvas:
             box = left - 2, base - rise, left + width + 2, base + fall
             inside = box[0] >= within[0] and box[1] >= within[1] and box[2] <= within[2] and box[3] <= within[3]
             if inside and self.is_free(box):
-                self.text((left, base), text, size, colour, halo=True)
+                self.text((left, base), text, colour, size=size, halo=True)
                 return True
         return False
 
@@ -213,9 +220,9 @@ class Canvas:
 
         picture = Image.fromarray(self.pixels)
         draw = ImageDraw.Draw(picture)
-        for t in self._texts:
-            stroke = max(1, round(t.size / 10)) if t.halo else 0
-            draw.text(t.xy, t.text, t.colour, _font(t.size), "ls", stroke_width=stroke, stroke_fill=(8, 11, 17))
+        for xy, text, size, colour, halo in self._texts:
+            stroke = max(1, round(size / 10)) if halo else 0
+            draw.text(xy, text, colour, _font(size), "ls", stroke_width=stroke, stroke_fill=Ink.SHADOW)
         return np.asarray(picture)
 
 
@@ -228,7 +235,11 @@ def box_around(centre: ArrayLike, half: float) -> Box:
 def printable(text: str) -> str:
     """The text in the letters that the font has: accents are dropped, other unknown letters become question marks."""
     letters = unicodedata.normalize("NFKD", text.replace("\N{MINUS SIGN}", "-"))
-    return "".join(_ascii_letter(letter) for letter in letters if not unicodedata.combining(letter))
+    return "".join(
+        " " if one.isascii() and not one.isprintable() else one if one.isascii() or one in KNOWN_BEYOND_ASCII else "?"
+        for one in letters
+        if not unicodedata.combining(one)
+    )
 
 
 def text_width(text: str, size: float) -> float:
@@ -241,17 +252,8 @@ def wrap_text(text: str, size: float, width: float) -> list[str]:
     lines: list[str] = []
     for word in printable(text).split():
         longer = f"{lines[-1]} {word}" if lines else word
-        if lines and text_width(longer, size) <= width:
-            lines[-1] = longer
-        else:
-            lines.append(word)
+        lines[-1:] = [longer] if lines and text_width(longer, size) <= width else [*lines[-1:], word]
     return lines
-
-
-def _ascii_letter(letter: str) -> str:
-    if letter.isascii():
-        return letter if letter.isprintable() else " "
-    return letter if letter in KNOWN_BEYOND_ASCII else "?"
 
 
 @lru_cache(maxsize=32)
@@ -262,11 +264,6 @@ def _font(size: float) -> FreeTypeFont:
     if not isinstance(font, ImageFont.FreeTypeFont):
         raise RuntimeError("Pillow was built without FreeType: its default font cannot be scaled")
     return font
-
-
-def _height(size: float) -> tuple[float, float]:
-    """Rise above and fall below the line of writing [px]."""
-    return 0.74 * size, 0.22 * size
 
 
 def png_bytes(picture: NDArray[np.uint8]) -> bytes:

@@ -1,110 +1,157 @@
-"""Marks on the picture: stars, bodies and detections with their names; wall, skyline, compass and the rover's nose."""
+"""Marks on the picture of an exposure: stars, bodies and detections with their names, skyline, compass, the nose.
+
+`overlay_of` has those that no table of a result holds, in pixels of the exposure, for the HTML page also.
+"""
 
 from __future__ import annotations
 
-import cv2
+from typing import Any
+
 import numpy as np
-from numpy.typing import NDArray
 
-from startrack.chain import Detected, Identified, Inputs, Located, Measured
-from startrack.core.types import Array, Ints
-from startrack.frames import azel_from_rays
-from startrack.output.picture.backdrop import SAMPLE, View
-from startrack.output.picture.canvas import (
-    BODY,
-    DETECTION,
-    DIM_INK,
-    FAINT_INK,
-    HIDDEN,
-    IDENTIFIED,
-    INK,
-    MEASURED,
-    SKY_DARK,
-    SKYLINE,
-    TEXT_PX,
-    Canvas,
-    box_around,
-    mix_colours,
-)
-from startrack.output.picture.overlay import (
-    AZIMUTHS_RAD,
-    COMPASS,
-    LETTER_DEG,
-    TICK_DEG,
-    bodies_in_frame,
-    compass_feet,
-    heading_rad,
-    horizon_at_fix,
-    lowest_deg,
-    measured_skyline_px,
-    other_sources,
-    project_azel,
-    skyline_stretches_px,
-)
+from startrack.chain import Detected, Identified, Inputs, Located, Measured, Oriented
+from startrack.core.types import Array, Bools, Ints
+from startrack.frames import azel_from_rays, heading_pitch_roll_from_R_body_enu, rays_from_azel
+from startrack.output.picture.axes import known_runs
+from startrack.output.picture.backdrop import AZIMUTHS_RAD, View, horizon_at_fix
+from startrack.output.picture.canvas import LARGE_PX, TEXT_PX, TITLE_PX, Canvas, Ink, box_around, mix_colours
 from startrack.output.tables import names_of, status_of
+from startrack.output.values import R_body_enu
 
-MAX_CIRCLES = 4000
-MAX_CROSSES = 150  # of hidden stars, the brightest: more would hide the picture
-MAX_NAMES = 20
-MAX_HIDDEN_NAMES = 8
-NAME_SIZE = TEXT_PX + 2.0
-FAINT_RING = 0.6  # how far the ring of the faintest detection fades into the sky
-BRIGHTEST_SNR = 300.0
+DIMMEST_HIDDEN_V_MAG = 3.0  # a fainter planet behind the wall is not missed
+COMPASS_DEG = np.arange(0.0, 60.0, 0.5)  # elevations from the horizontal up at which a tick of the compass may stand
+COMPASS = {0: "N", 90: "E", 180: "S", 270: "W"}
+TICK_RAD = np.radians([0.0, 2.2, 5.0])  # foot and top of a tick of the compass and the middle of its letter
+MAX_CIRCLES, MAX_CROSSES = 4000, 150  # of detections and of hidden stars, the brightest: more would hide the picture
+MAX_NAMES, MAX_HIDDEN_NAMES = 20, 8
+FAINTEST_SNR, BRIGHTEST_SNR = 5.0, 300.0
 
 
-def draw_detections(canvas: Canvas, view: View, value: Inputs) -> None:
+def overlay_of(value: Inputs) -> dict[str, Any]:
+    """Marks of a stage's `value` for JSON: those that no table of the result holds. Pixels of the exposure.
+
+    `size` of the exposure; `others`, point sources that are no named star; `skyline`, its stretches in the frame;
+    `measured`, where the light of the sky shows it; `bodies`; `compass`, [azimuth_deg, foot, top, letter] of each tick;
+    `nose`, [foot, top, letter] of the rover's nose, or None.
+    """
+    found: dict[str, Any] = {
+        "size": list(value.exposure.size_px), "others": [], "skyline": [], "measured": [], "bodies": [], "compass": [],
+        "nose": None,
+    }  # fmt: skip
+    if isinstance(value, Detected):
+        found["others"] = _pairs(value.detections.xy_px[_other_sources(value)])
+    if isinstance(value, Oriented):
+        found["bodies"] = _bodies(value)
+    if isinstance(value, Measured):
+        ticks = ((deg, _tick_px(value, np.radians(deg))) for deg in range(0, 360, 10))
+        found["compass"] = [[deg, *tick] for deg, tick in ticks if tick is not None]
+        found["nose"] = _tick_px(value, heading_pitch_roll_from_R_body_enu(R_body_enu(value))[0])
+    if isinstance(value, Located):
+        xy_px, imaged = _project_azel(value, AZIMUTHS_RAD, horizon_at_fix(value, AZIMUTHS_RAD))
+        found["skyline"] = [_pairs(xy_px[run]) for run in known_runs(imaged)]
+        if value.sky_light is not None and value.skyline is not None:
+            by_sky = value.skyline.known & (value.skyline.source != "stars")
+            angles_rad = value.skyline.azimuth_rad[by_sky], value.skyline.elevation_rad[by_sky]
+            xy_px, imaged = _project_azel(value, *angles_rad)
+            found["measured"] = _pairs(xy_px[imaged])
+    return found
+
+
+def _other_sources(value: Detected) -> Bools:
+    """Which detections (n,) are no identified star, and lie where light of the lens can reach."""
+    xy_px, camera = value.detections.xy_px, value.camera
+    others = np.ones(len(xy_px), dtype=bool)
+    if camera is not None and camera.size_px == value.exposure.size_px:
+        others = camera.angle_rad(xy_px) <= camera.max_angle_rad
+    if isinstance(value, Identified):
+        others[value.identification.detection] = False
+    return others
+
+
+def _bodies(value: Oriented) -> list[list[Any]]:
+    """Name, x, y and whether the terrain hides it, of planets, Moon, Earth and Sun in the frame; of hidden ones only
+    the bright.
+    """
+    found = []
+    for body in value.bodies:
+        xy_px, inside = value.camera.project(body.ray_icrs @ value.attitude.R_cam_icrs.T)
+        hidden = False
+        if isinstance(value, Located):
+            azimuth, elevation = azel_from_rays(value.R_enu_icrs @ body.ray_icrs)
+            hidden = bool(elevation < horizon_at_fix(value, np.array([azimuth]))[0])
+        if inside and not (hidden and body.v_mag > DIMMEST_HIDDEN_V_MAG):
+            found.append([body.name, *_pairs(xy_px), hidden])
+    return found
+
+
+def _tick_px(value: Measured, azimuth_rad: float) -> list[Any] | None:
+    """Foot and top of a tick of the compass, and the middle of its letter: as low as the frame shows the azimuth."""
+    rays_cam = rays_from_azel(azimuth_rad, np.radians(COMPASS_DEG)) @ value.R_cam_enu.T
+    _, inside = value.camera.project(rays_cam)
+    if not inside.any():
+        return None
+    elevation_rad = np.radians(COMPASS_DEG[np.argmax(inside)]) + TICK_RAD
+    return _pairs(_project_azel(value, np.full(3, azimuth_rad), elevation_rad)[0])
+
+
+def _project_azel(value: Measured, azimuth_rad: Array, elevation_rad: Array) -> tuple[Array, Bools]:
+    """Pixels (n, 2), and which directions (n,) the lens images, within the frame or not."""
+    rays_cam = rays_from_azel(azimuth_rad, elevation_rad) @ value.R_cam_enu.T
+    xy_px, _ = value.camera.project(rays_cam)
+    angle = np.arctan2(np.hypot(rays_cam[:, 0], rays_cam[:, 1]), rays_cam[:, 2])
+    return xy_px, angle <= min(value.camera.max_angle_rad, value.camera.lens.max_invertible_rad)
+
+
+def _pairs(xy_px: Array) -> list[Any]:
+    return np.round(xy_px, 1).tolist()
+
+
+def draw_marks(canvas: Canvas, view: View, value: Inputs, overlay: dict[str, Any]) -> None:
+    """Everything on the picture of a stage's `value` in the `view` of the `canvas`; `overlay` is that of the value."""
+    hidden, hidden_px = _hidden_stars(value)
+    if isinstance(value, Detected):
+        _draw_detections(canvas, view, value)
+    places = view.canvas_px(hidden_px[:MAX_CROSSES])
+    for weight, place in zip(np.linspace(1.0, 0.0, len(places)), places, strict=True):
+        colour = mix_colours(Ink.HIDDEN, Ink.SKY_DARK, 0.35 * (1.0 - weight))
+        canvas.mark(place, "cross", 3.5 + 3.0 * weight, colour, 2 if weight > 0.8 else 1)
+    for stretch in overlay["skyline"]:
+        canvas.curve(view.canvas_px(stretch), Ink.SKYLINE, 2.5)
+    for place in overlay["measured"]:
+        canvas.mark(view.canvas_px(place), "disc", 2.0, Ink.MEASURED)
+    _draw_compass(canvas, view, overlay)
+    for name, x, y, behind in overlay["bodies"]:
+        colour = mix_colours(Ink.BODY, Ink.SKY_DARK, 0.4) if behind else Ink.BODY
+        canvas.mark(view.canvas_px((x, y)), "ring", 6.0 if behind else 9.0, colour)
+        words = f"{name} (hidden)" if behind else name
+        canvas.label(view.canvas_px((x, y)), words, colour, TEXT_PX, view.box)
+    if isinstance(value, Identified):
+        order = np.argsort(value.stars.v_mag[value.identification.star], kind="stable")
+        star = value.identification.star[order]
+        xy_px = value.detections.xy_px[value.identification.detection[order]]
+        faded = mix_colours(Ink.HIDDEN, Ink.SKY_DARK, 0.15)
+        for stars, px, most, colour, size in (
+            (star, xy_px, MAX_NAMES, Ink.PLAIN, LARGE_PX), (hidden, hidden_px, MAX_HIDDEN_NAMES, faded, TEXT_PX)
+        ):  # fmt: skip
+            first = names_of(value.stars.hip[stars[: 4 * most]])
+            for place, name in [pair for pair in zip(px, first, strict=False) if pair[1]][:most]:
+                canvas.label(view.canvas_px(place), name, colour, 0.75 * LARGE_PX, view.box, size)
+
+
+def _draw_detections(canvas: Canvas, view: View, value: Detected) -> None:
     """A green circle about each identified star; a grey one about each other detection inside the image circle."""
-    if not isinstance(value, Detected):
-        return
     found = value.detections
     identified = np.zeros(len(found), dtype=bool)
     if isinstance(value, Identified):
         identified[value.identification.detection] = True
-    strength = np.clip(np.log(np.maximum(found.snr, 5.0) / 5.0) / np.log(BRIGHTEST_SNR / 5.0), 0, 1)
-    places = view.canvas_px(found.xy_px)
+    shown = np.flatnonzero((identified | _other_sources(value))[:MAX_CIRCLES])
+    strength = np.log(np.maximum(found.snr, FAINTEST_SNR) / FAINTEST_SNR) / np.log(BRIGHTEST_SNR / FAINTEST_SNR)
     # The bright ones last, on top; the faint ones dim, so that a thousand of them do not drown the stars.
-    shown = identified | other_sources(value)
-    for k in reversed(range(min(len(found), MAX_CIRCLES))):
-        if not shown[k]:
-            continue
-        colour = IDENTIFIED if identified[k] else DETECTION
-        faint = FAINT_RING * (1.0 - float(strength[k]))
-        canvas.circle(places[k], 4.5 + 5.5 * float(strength[k]), mix_colours(colour, SKY_DARK, faint))
-
-
-def draw_hidden(canvas: Canvas, view: View, value: Inputs) -> None:
-    """A cross at each of the brighter stars that the terrain hides."""
-    _, xy_px = _hidden_stars(value)
-    places = view.canvas_px(xy_px[:MAX_CROSSES])
-    for rank, place in enumerate(places):
-        weight = 1.0 - rank / max(len(places), 1)
-        colour = mix_colours(HIDDEN, SKY_DARK, 0.35 * (1.0 - weight))
-        canvas.cross(place, 3.5 + 3.0 * weight, colour, 2 if weight > 0.8 else 1)
-
-
-def draw_bodies(canvas: Canvas, view: View, value: Inputs) -> None:
-    """A ring and the name at each planet, moon or sun in the frame; stars beside it are not evidence."""
-    for body in bodies_in_frame(value):
-        colour = mix_colours(BODY, SKY_DARK, 0.4) if body.hidden else BODY
-        at = view.canvas_px(body.xy_px)
-        canvas.circle(at, 6.0 if body.hidden else 9.0, colour, 2)
-        text, size = (f"{body.name} (hidden)", 0.85 * NAME_SIZE) if body.hidden else (body.name, NAME_SIZE)
-        canvas.label(at, text, size, colour, 13.0, view.box)
-
-
-def name_stars(canvas: Canvas, view: View, value: Inputs) -> None:
-    """Names of the brightest identified stars and of the brightest hidden ones, where there is room."""
-    if not isinstance(value, Identified):
-        return
-    order = np.argsort(value.stars.v_mag[value.identification.star], kind="stable")
-    star = value.identification.star[order]
-    xy_px = value.detections.xy_px[value.identification.detection[order]]
-    seen = _names_at(value, star, xy_px, MAX_NAMES)
-    hidden = _names_at(value, *_hidden_stars(value), MAX_HIDDEN_NAMES)
-    for place, name in seen:
-        canvas.label(view.canvas_px(place), name, NAME_SIZE, INK, 13.0, view.box)
-    for place, name in hidden:
-        canvas.label(view.canvas_px(place), name, 0.9 * NAME_SIZE, mix_colours(HIDDEN, SKY_DARK, 0.15), 11.0, view.box)
+    for k in shown[::-1]:
+        bright = min(float(strength[k]), 1.0)
+        colour = Ink.IDENTIFIED if identified[k] else Ink.DETECTION
+        colour = mix_colours(colour, Ink.SKY_DARK, 0.6 * (1.0 - bright))
+        canvas.circle(view.canvas_px(found.xy_px[k]), 4.5 + 5.5 * bright, colour)
 
 
 def _hidden_stars(value: Inputs) -> tuple[Ints, Array]:
@@ -115,82 +162,33 @@ def _hidden_stars(value: Inputs) -> tuple[Ints, Array]:
     return value.light.star[hidden], value.light.xy_px[hidden]
 
 
-def _names_at(value: Identified, star: Ints, xy_px: Array, most: int) -> list[tuple[Array, str]]:
-    first = names_of(value.stars.hip[star[: 4 * most]])
-    return [(place, name) for place, name in zip(xy_px, first, strict=False) if name][:most]
-
-
-EDGE_RAD = 0.003  # width of its edge
-LETTER_SIZE = 30.0
-SHORT_TICK_DEG = 1.2
-
-
-def wall_mask(value: Inputs, size: tuple[int, int]) -> NDArray[np.float32] | None:
-    """1 below the skyline of the fix and 0 above it, (H, W) of a picture of the size (W, H); None without a fix."""
-    if not isinstance(value, Located):
-        return None
-    cells = [np.arange(0.5, -(-n // SAMPLE)) * n / -(-n // SAMPLE) for n in size]
-    scale = np.array(value.camera.size_px) / size
-    xy_px = np.stack(np.meshgrid(*cells), axis=-1) * scale - 0.5
-    azimuth, elevation = azel_from_rays(value.camera.unproject(xy_px) @ value.R_cam_enu)
-    below = np.interp(azimuth, AZIMUTHS_RAD, horizon_at_fix(value)) - elevation
-    # The signed distance is what may be interpolated; cut off afterwards, it gives a sharp and smooth edge.
-    below_rad = np.asarray(cv2.resize(below.astype(np.float32), size, interpolation=cv2.INTER_LINEAR))
-    return np.clip(below_rad * np.float32(1 / EDGE_RAD) + np.float32(0.5), 0, 1)
-
-
-def draw_skyline(canvas: Canvas, view: View, value: Inputs) -> None:
-    """The skyline that the terrain shows from the fix."""
-    for stretch in skyline_stretches_px(value):
-        canvas.curve(view.canvas_px(stretch), SKYLINE, 2.5)
-
-
-def draw_measured_skyline(canvas: Canvas, view: View, value: Inputs) -> None:
-    """Dots where the light of the sky, and the stars with it, show the skyline."""
-    for place in view.canvas_px(measured_skyline_px(value)):
-        canvas.circle(tuple(place), 2.0, MEASURED, -1)
-
-
-def draw_compass(canvas: Canvas, view: View, value: Inputs) -> None:
+def _draw_compass(canvas: Canvas, view: View, overlay: dict[str, Any]) -> None:
     """The letters of the compass, the rover's nose, and ticks each ten degrees: at the horizontal, or as low as the
-    frame shows."""
-    if not isinstance(value, Measured):
-        return
-    feet = compass_feet(value)
-    for azimuth_deg in sorted(COMPASS.keys() & feet.keys()):
-        at = _canvas_at(view, value, np.radians(azimuth_deg), feet[azimuth_deg] + LETTER_DEG)
-        canvas.text(at, COMPASS[azimuth_deg], LETTER_SIZE, INK, "mm", halo=True)
-    _draw_nose(canvas, view, value)
-    for azimuth_deg, lowest in feet.items():
-        main, letter = azimuth_deg % 30 == 0, azimuth_deg in COMPASS
-        azimuth_rad = np.radians(azimuth_deg)
-        reach_deg = TICK_DEG if main else SHORT_TICK_DEG
-        ends = [_canvas_at(view, value, azimuth_rad, lowest + above) for above in (0.0, reach_deg)]
-        canvas.line(np.array(ends), INK if letter else DIM_INK if main else FAINT_INK, 2 if main else 1)
-        at = _canvas_at(view, value, azimuth_rad, lowest + LETTER_DEG)
-        if main and not letter and canvas.is_free(box_around(at, 24.0)):
-            canvas.text(at, str(azimuth_deg), 15.0, DIM_INK, "mm", halo=True)
+    frame shows.
+    """
+    ticks = [(azimuth_deg, view.canvas_px(tick)) for azimuth_deg, *tick in overlay["compass"]]
+    for azimuth_deg, (_, _, letter) in ticks:
+        if azimuth_deg in COMPASS:
+            canvas.text(letter, COMPASS[azimuth_deg], Ink.PLAIN, "mm", 2 * TEXT_PX, halo=True)
+    if overlay["nose"] is not None:
+        _draw_nose(canvas, *view.canvas_px(overlay["nose"]))
+    for azimuth_deg, (foot, top, letter) in ticks:
+        main, named = azimuth_deg % 30 == 0, azimuth_deg in COMPASS
+        colour = Ink.PLAIN if named else Ink.DIM if main else Ink.FAINT
+        canvas.line([foot, top if main else 0.5 * (foot + top)], colour, 2 if main else 1)
+        if main and not named and canvas.is_free(box_around(letter, TITLE_PX)):
+            canvas.text(letter, str(azimuth_deg), anchor="mm", halo=True)
 
 
-def _draw_nose(canvas: Canvas, view: View, value: Measured) -> None:
+def _draw_nose(canvas: Canvas, foot: Array, top: Array, letter: Array) -> None:
     """An arrow head where the rover's nose points: at the edge of the picture, or further in where a letter stands."""
-    heading = heading_rad(value)
-    lowest = lowest_deg(value, heading)
-    if lowest is None:
-        return
-    for further_in_deg in (0.5, 8.5, 16.5):
-        tip = _canvas_at(view, value, heading, lowest + further_in_deg)
-        along = tip - _canvas_at(view, value, heading, lowest + further_in_deg + 6.0)
-        along /= np.linalg.norm(along)
-        base, name = tip - 26.0 * along, tip - 48.0 * along
-        if canvas.is_free(box_around(base, 20.0)) and canvas.is_free(box_around(name, 20.0)):
+    along = (foot - top) / np.linalg.norm(foot - top)
+    for inwards in (0.0, 1.5, 3.0):
+        tip = foot + inwards * (letter - foot)
+        base, name = tip - 1.5 * TEXT_PX * along, tip - 3.0 * TEXT_PX * along
+        if canvas.is_free(box_around(base, LARGE_PX)) and canvas.is_free(box_around(name, LARGE_PX)):
             break
-    across = np.array([-along[1], along[0]])
-    canvas.area([tip, base + 12.0 * across, base + 5.0 * along, base - 12.0 * across], INK)
-    canvas.reserve(box_around(0.5 * (tip + base), 20.0))
-    canvas.text(name, "forward", TEXT_PX, INK, "mm", halo=True)
-
-
-def _canvas_at(view: View, value: Measured, azimuth_rad: float, elevation_deg: float) -> Array:
-    """Canvas place (2,) of a direction."""
-    return view.canvas_px(project_azel(value, np.array([azimuth_rad]), np.radians([elevation_deg]))[0][0])
+    across = 0.75 * TEXT_PX * np.array([-along[1], along[0]])
+    canvas.area([tip, base + across, base + 0.3 * TEXT_PX * along, base - across], Ink.PLAIN)
+    canvas.reserve(box_around(0.5 * (tip + base), LARGE_PX))
+    canvas.text(name, "forward", Ink.PLAIN, "mm", halo=True)

@@ -26,7 +26,7 @@ from startrack.terrain import (
     load_terrain,
 )
 from startrack.terrain import table_cache as cache
-from startrack.terrain.deformed_map import DeformedMap
+from startrack.terrain.derived_maps import DeformedMap
 from startrack.terrain.ground import ground_up_m
 from startrack.terrain.raster import ORTHOGRAPHIC, polar_stereographic
 

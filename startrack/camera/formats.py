@@ -1,4 +1,4 @@
-"""Camera files of ROS, Kalibr, COLMAP and OpenCV: their texts, and the numbers of a camera that they hold.
+"""Camera files of ROS, Kalibr, COLMAP and OpenCV: their texts from a camera, and our own file's keys from them.
 
 Pixel (0, 0) is the centre of the first pixel, as here and in ROS (REP 104), Kalibr and OpenCV.
 """
@@ -9,14 +9,13 @@ import json
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from startrack.camera.lenses import MAX_COEFFICIENTS
-from startrack.camera.optics import Decentring
-from startrack.core.types import Array, BadInput
+from startrack.camera.camera import Camera
+from startrack.camera.lenses import MAX_COEFFICIENTS, KannalaBrandt, Pinhole
+from startrack.core.types import BadInput
 from startrack.frames import ORTHONORMAL_1, quat_xyzw_from_R
 
 CORNER_PX = 0.5  # COLMAP's origin is the corner of the first pixel
@@ -28,48 +27,22 @@ COLMAP_COUNTS = {
 }  # fmt: skip
 OPENCV_DISTORTION = "distortion_coefficients"
 OPENCV_COUNTS = 4, 5, 8, 12, 14  # of distortion coefficients of OpenCV's models
+NO_DISTORTION = (0.0,) * 5  # of a pinhole
 OPENCV_HEAD = re.compile(r"\A\s*%YAML[: ]1\.0|!!opencv-matrix")  # which YAML itself does not have
+Coefficients = tuple[float, ...] | None  # of a fisheye; None of a pinhole
 
 
-@dataclass(frozen=True, kw_only=True)
-class Intrinsics:
-    """A camera by the numbers that these files have; `k` is None for a pinhole."""
+class Format(NamedTuple):
+    """The camera files of one program.
 
-    name: str = ""
-    size_px: tuple[int, int]
-    focal_px: tuple[float, float]
-    centre_px: tuple[float, float]
-    k: tuple[float, ...] | None
-    decentring: Decentring = Decentring()  # noqa: RUF009 - frozen
-    R_body_cam: Array | None = None
-
-    @property
-    def matrix(self) -> list[float]:
-        """Camera matrix K (9,), row by row."""
-        (fx, fy), (cx, cy) = self.focal_px, self.centre_px
-        return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
-
-    @classmethod
-    def from_matrix(cls, size_px: tuple[Any, Any], matrix: list[float], **others: Any) -> Intrinsics:
-        """The numbers of a camera matrix (9,), row by row. Raises ValueError if it is skewed."""
-        fx, skew, cx, _, fy, cy, *_ = matrix
-        if skew:
-            raise ValueError("a skewed camera matrix has no counterpart")
-        width, height = size_px
-        return cls(size_px=(int(width), int(height)), focal_px=(fx, fy), centre_px=(cx, cy), **others)
-
-    def coefficients(self, count: int) -> list[float]:
-        """The coefficients of a fisheye, or `count` zeros of a pinhole."""
-        return [0.0] * count if self.k is None else list(self.k)
-
-
-@dataclass(frozen=True)
-class Format:
-    """The camera files of one program. `read` raises ValueError, KeyError or TypeError."""
+    `write` takes a camera and the coefficients of its fisheye, None for a pinhole. `read` gives keys of our own camera
+    file, beside them `R_body_cam` where the text has a mount, and no angles; it raises ValueError, KeyError or
+    TypeError.
+    """
 
     title: str
-    write: Callable[[Intrinsics], str]
-    read: Callable[[str], Intrinsics]
+    write: Callable[[Camera, Coefficients], str]
+    read: Callable[[str], dict[str, Any]]
 
 
 def find_program(text: str) -> str | None:
@@ -90,14 +63,14 @@ def find_program(text: str) -> str | None:
     return "opencv" if keys >= {"camera_matrix", OPENCV_DISTORTION} else None
 
 
-def _write_ros(lens: Intrinsics) -> str:
+def _write_ros(camera: Camera, k: Coefficients) -> str:
     """A camera_info file (camera_calibration_parsers): equidistant for fisheyes, plumb_bob for pinholes."""
-    model, coefficients = "plumb_bob" if lens.k is None else "equidistant", lens.coefficients(5)
-    (fx, fy), (cx, cy) = lens.focal_px, lens.centre_px
-    name = json.dumps(lens.name, ensure_ascii=False)  # a JSON string is one of YAML
+    model, coefficients = ("plumb_bob", NO_DISTORTION) if k is None else ("equidistant", k)
+    (fx, fy), (cx, cy) = camera.focal_px, camera.centre_px
+    name = json.dumps(camera.name, ensure_ascii=False)  # a JSON string is one of YAML
     return (
-        f"image_width: {lens.size_px[0]}\nimage_height: {lens.size_px[1]}\ncamera_name: {name}\n"
-        f"camera_matrix:\n  rows: 3\n  cols: 3\n  data: {_yaml_list(lens.matrix)}\n"
+        f"image_width: {camera.size_px[0]}\nimage_height: {camera.size_px[1]}\ncamera_name: {name}\n"
+        f"camera_matrix:\n  rows: 3\n  cols: 3\n  data: {_yaml_list(_matrix_of(camera))}\n"
         f"distortion_model: {model}\n"
         f"distortion_coefficients:\n  rows: 1\n  cols: {len(coefficients)}\n  data: {_yaml_list(coefficients)}\n"
         "rectification_matrix:\n  rows: 3\n  cols: 3\n  data: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]\n"
@@ -106,33 +79,32 @@ def _write_ros(lens: Intrinsics) -> str:
     )
 
 
-def _read_ros(text: str) -> Intrinsics:
+def _read_ros(text: str) -> dict[str, Any]:
     d = _read_yaml(text)
     k = _read_distortion(
         d["distortion_model"], d["distortion_coefficients"]["data"],
         ("equidistant", "fisheye"), ("plumb_bob", "rational_polynomial"),
     )  # fmt: skip
     matrix = _read_numbers(d["camera_matrix"]["data"], 9, "camera_matrix")
-    size_px = d["image_width"], d["image_height"]
-    return Intrinsics.from_matrix(size_px, matrix, k=k, name=str(d.get("camera_name") or ""))
+    return _keys_of_matrix(d, matrix, k) | {"name": str(d.get("camera_name") or "")}
 
 
-def _write_kalibr(lens: Intrinsics) -> str:
+def _write_kalibr(camera: Camera, k: Coefficients) -> str:
     """A camchain of one camera, cam0: pinhole with equidistant distortion for fisheyes; the mount as T_cam_imu.
 
     T_cam_imu takes points of the rover's body (Kalibr's imu) into the camera.
     """
-    model, coefficients = "radtan" if lens.k is None else "equidistant", lens.coefficients(4)
-    rows = "".join(f"  - {_yaml_list([*row, 0.0])}\n" for row in np.asarray(lens.R_body_cam).T.tolist())
+    model, coefficients = ("radtan", NO_DISTORTION[:4]) if k is None else ("equidistant", k)
+    rows = "".join(f"  - {_yaml_list([*row, 0.0])}\n" for row in np.asarray(camera.R_body_cam).T.tolist())
     return (
         f"cam0:\n  cam_overlaps: []\n  camera_model: pinhole\n  distortion_coeffs: {_yaml_list(coefficients)}\n"
-        f"  distortion_model: {model}\n  intrinsics: {_yaml_list([*lens.focal_px, *lens.centre_px])}\n"
-        f"  resolution: [{lens.size_px[0]}, {lens.size_px[1]}]\n"
+        f"  distortion_model: {model}\n  intrinsics: {_yaml_list([*camera.focal_px, *camera.centre_px])}\n"
+        f"  resolution: [{camera.size_px[0]}, {camera.size_px[1]}]\n"
         f"  T_cam_imu:\n{rows}  - [0.0, 0.0, 0.0, 1.0]\n"
     )
 
 
-def _read_kalibr(text: str) -> Intrinsics:
+def _read_kalibr(text: str) -> dict[str, Any]:
     """The first camera of a camchain."""
     chain = _read_yaml(text)
     d = chain.get("cam0", chain)
@@ -143,35 +115,35 @@ def _read_kalibr(text: str) -> Intrinsics:
     k = _read_distortion(
         d["distortion_model"], d.get("distortion_coeffs", []), ("equidistant", "equi"), ("radtan", "none")
     )
-    R_body_cam = None
+    keys = _keys((width, height), (fx, fy), (cx, cy), k)
     if "T_cam_imu" in d:
-        R_body_cam = np.array([_read_numbers(row, 4, "T_cam_imu")[:3] for row in d["T_cam_imu"][:3]]).T
+        keys["R_body_cam"] = R_body_cam = np.array(
+            [_read_numbers(row, 4, "T_cam_imu")[:3] for row in d["T_cam_imu"][:3]]
+        ).T
         if R_body_cam.shape != (3, 3) or np.abs(R_body_cam).max() > 1 + ORTHONORMAL_1:
             raise ValueError("T_cam_imu holds no rotation")
         quat_xyzw_from_R(R_body_cam.T)  # ValueError for what is no proper rotation
-    return Intrinsics(
-        size_px=(int(width), int(height)), focal_px=(fx, fy), centre_px=(cx, cy), k=k, R_body_cam=R_body_cam
-    )
+    return keys
 
 
-def _write_colmap(lens: Intrinsics) -> str:
+def _write_colmap(camera: Camera, k: Coefficients) -> str:
     """A cameras.txt file of one camera: PINHOLE, OPENCV_FISHEYE, or THIN_PRISM_FISHEYE where the lens is decentred."""
-    (fx, fy), (cx, cy), bent = lens.focal_px, lens.centre_px, lens.decentring
+    (fx, fy), (cx, cy), bent = camera.focal_px, camera.centre_px, camera.decentring
     values = [fx, fy, cx + CORNER_PX, cy + CORNER_PX]
     model = "PINHOLE"
     if bent:
-        if lens.k is None:
+        if k is None:
             raise BadInput("bad_calibration", "COLMAP has no decentred pinhole on angles")
         model = "THIN_PRISM_FISHEYE"
-        values += [*lens.k[:2], bent.p1, bent.p2, *lens.k[2:], 0.0, 0.0]
-    elif lens.k is not None:
+        values += [*k[:2], bent.p1, bent.p2, *k[2:], 0.0, 0.0]
+    elif k is not None:
         model = "OPENCV_FISHEYE"
-        values += lens.k
+        values += k
     numbers = " ".join(repr(float(v)) for v in values)
-    return f"{COLMAP_HEAD}# Number of cameras: 1\n1 {model} {lens.size_px[0]} {lens.size_px[1]} {numbers}\n"
+    return f"{COLMAP_HEAD}# Number of cameras: 1\n1 {model} {camera.size_px[0]} {camera.size_px[1]} {numbers}\n"
 
 
-def _read_colmap(text: str) -> Intrinsics:
+def _read_colmap(text: str) -> dict[str, Any]:
     """The first camera of a cameras.txt file."""
     lines = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if not lines or len(lines[0]) < 4:
@@ -183,39 +155,37 @@ def _read_colmap(text: str) -> Intrinsics:
     if model.startswith("SIMPLE") or model == "RADIAL_FISHEYE":
         values = [values[0], *values]
     fx, fy, cx, cy, *rest = values
-    decentring = Decentring()
+    decentring = None
     if model == "THIN_PRISM_FISHEYE":
         k1, k2, p1, p2, k3, k4, sx, sy = rest
         if sx or sy:
             raise ValueError("thin-prism coefficients other than 0 have no counterpart")
-        rest, decentring = [k1, k2, k3, k4], Decentring(p1, p2)
+        rest, decentring = [k1, k2, k3, k4], (p1, p2)
     k = None if model.endswith("PINHOLE") else (*rest, *(MAX_COEFFICIENTS * (0.0,)))[:MAX_COEFFICIENTS]
-    return Intrinsics(
-        size_px=(int(width), int(height)), focal_px=(fx, fy), centre_px=(cx - CORNER_PX, cy - CORNER_PX), k=k,
-        decentring=decentring,
-    )  # fmt: skip
+    keys = _keys((width, height), (fx, fy), (cx - CORNER_PX, cy - CORNER_PX), k)
+    return keys if decentring is None else keys | {"decentring": decentring}
 
 
-def _write_opencv(lens: Intrinsics) -> str:
+def _write_opencv(camera: Camera, k: Coefficients) -> str:
     """OpenCV's FileStorage as YAML, with the keys of its calibration program.
 
     fisheye_model = 1: cv2.fisheye's four coefficients, which are k1 to k4. cv2.fisheye itself mirrors rays past 90
     degrees: the numbers are right, that program's geometry there is not.
     """
 
-    def matrix(rows: int, columns: int, data: list[float]) -> str:
+    def matrix(rows: int, columns: int, data: Sequence[float]) -> str:
         text = ", ".join(repr(float(v)) for v in data)
         return f"!!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: [ {text} ]\n"
 
-    coefficients = lens.coefficients(5)
+    coefficients = NO_DISTORTION if k is None else k
     return (
-        f"%YAML:1.0\n---\nimage_width: {lens.size_px[0]}\nimage_height: {lens.size_px[1]}\n"
-        f"fisheye_model: {int(lens.k is not None)}\ncamera_matrix: {matrix(3, 3, lens.matrix)}"
+        f"%YAML:1.0\n---\nimage_width: {camera.size_px[0]}\nimage_height: {camera.size_px[1]}\n"
+        f"fisheye_model: {int(k is not None)}\ncamera_matrix: {matrix(3, 3, _matrix_of(camera))}"
         f"{OPENCV_DISTORTION}: {matrix(len(coefficients), 1, coefficients)}"
     )
 
 
-def _read_opencv(text: str) -> Intrinsics:
+def _read_opencv(text: str) -> dict[str, Any]:
     """YAML or XML; OpenCV's own parser is not used: damaged files end its process."""
     d = _read_xml(text) if text.lstrip().startswith("<") else _read_yaml(OPENCV_HEAD.sub("", text))
     arrays = []
@@ -226,7 +196,7 @@ def _read_opencv(text: str) -> Intrinsics:
         arrays.append(_read_numbers(d[key]["data"], count, key))
     model = "fisheye" if float(d.get("fisheye_model", 0)) == 1 else "pinhole"
     k = _read_distortion(model, arrays[1], ("fisheye",), ("pinhole",))
-    return Intrinsics.from_matrix((d["image_width"], d["image_height"]), arrays[0], k=k)
+    return _keys_of_matrix(d, arrays[0], k)
 
 
 FOREIGN_FORMATS = {
@@ -235,6 +205,30 @@ FOREIGN_FORMATS = {
     "colmap": Format("COLMAP", _write_colmap, _read_colmap),
     "opencv": Format("OpenCV", _write_opencv, _read_opencv),
 }
+
+
+def _matrix_of(camera: Camera) -> list[float]:
+    """Camera matrix K (9,), row by row."""
+    (fx, fy), (cx, cy) = camera.focal_px, camera.centre_px
+    return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+
+
+def _keys_of_matrix(d: dict[str, Any], matrix: list[float], k: Coefficients) -> dict[str, Any]:
+    """The keys of a camera matrix (9,), and of the image's size in `d`. Raises ValueError if it is skewed."""
+    fx, skew, cx, _, fy, cy, *_ = matrix
+    if skew:
+        raise ValueError("a skewed camera matrix has no counterpart")
+    return _keys((d["image_width"], d["image_height"]), (fx, fy), (cx, cy), k)
+
+
+def _keys(
+    size_px: Sequence[Any], focal_px: tuple[float, float], centre_px: tuple[float, float], k: Coefficients
+) -> dict[str, Any]:
+    """The keys of a camera file."""
+    keys = {"size_px": tuple(map(int, size_px)), "focal_px": focal_px, "centre_px": centre_px}
+    if k is None:
+        return {**keys, "model": Pinhole.model}
+    return {**keys, "model": KannalaBrandt.model, **({"k": k} if any(k) else {})}
 
 
 def _read_numbers(values: Any, count: int, key: str) -> list[float]:
@@ -273,7 +267,7 @@ def _read_yaml(text: str) -> dict[str, Any]:
     return value
 
 
-def _yaml_list(values: list[float]) -> str:
+def _yaml_list(values: Sequence[float]) -> str:
     """A list in one line of YAML, numbers to the last digit."""
     import yaml
 

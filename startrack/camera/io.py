@@ -25,13 +25,14 @@ CAMERA_PARAMETERS = ("fx", "fy", "cx", "cy", "p1", "p2")  # beside those of the 
 SENSOR = Table(closed=True, keys={
     "zero_point_e_per_s": Number(low=1e-6, high=1e15, required=True,
                                  description="electrons per second of a V = 0 star on the axis, whole PSF"),
-    "gain_e_per_adu": Number(low=1e-6, high=1e6, default=1.0),
-    "bias_adu": Number(low=-1e9, high=1e9, default=0.0),
-    "read_noise_e": Number(low=0, high=1e6, default=0.0),
-    "dark_e_per_s": Number(low=0, high=1e9, default=0.0, description="per pixel"),
-    "saturation_adu": Number(low=1, high=1e12, default=65535.0),
-    "psf_sigma_px": Number(low=0.01, high=50, default=1.0, description="before integration over the pixel"),
-    "vignetting": List(each=Number(low=-100, high=100), count=2, default=(0.0, 0.0),
+    "gain_e_per_adu": Number(low=1e-6, high=1e6, default=Sensor.gain_e_per_adu),
+    "bias_adu": Number(low=-1e9, high=1e9, default=Sensor.bias_adu),
+    "read_noise_e": Number(low=0, high=1e6, default=Sensor.read_noise_e),
+    "dark_e_per_s": Number(low=0, high=1e9, default=Sensor.dark_e_per_s, description="per pixel"),
+    "saturation_adu": Number(low=1, high=1e12, default=Sensor.saturation_adu),
+    "psf_sigma_px": Number(low=0.01, high=50, default=Sensor.psf_sigma_px,
+                           description="before integration over the pixel"),
+    "vignetting": List(each=Number(low=-100, high=100), count=2, default=Sensor.vignetting,
                        description="relative throughput 1 + v1 a^2 + v2 a^4"),
 })  # fmt: skip
 MOUNT = Table(keys={

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from startrack.camera.camera import Camera, cap_grid
-from startrack.camera.formats import FOREIGN_FORMATS, Intrinsics, find_program
+from startrack.camera.formats import FOREIGN_FORMATS, find_program
 from startrack.camera.io import camera_from_dict
 from startrack.camera.optics import Decentring
 from startrack.core.files import (
@@ -77,14 +77,7 @@ def foreign_text(camera: Camera, program: str) -> str:
     if distortion is None:
         raise BadInput("bad_calibration", f"no other program's format has the {camera.lens.model} lens")
     model, coefficients = distortion
-    fx, fy, cx, cy = (float(v) for v in (*camera.focal_px, *camera.centre_px))
-    return FOREIGN_FORMATS[program].write(
-        Intrinsics(
-            name=camera.name, size_px=camera.size_px, focal_px=(fx, fy), centre_px=(cx, cy),
-            k=None if model == "pinhole" else coefficients, decentring=camera.decentring,
-            R_body_cam=camera.R_body_cam,
-        )
-    )  # fmt: skip
+    return FOREIGN_FORMATS[program].write(camera, None if model == "pinhole" else coefficients)
 
 
 def camera_from_foreign_text(text: str, program: str, name: str, calibrated_angle_rad: float | None = None) -> Camera:
@@ -105,25 +98,17 @@ def camera_from_foreign_text(text: str, program: str, name: str, calibrated_angl
         raise BadInput("bad_calibration", f"{refusal}: {' '.join(str(cause)[:MAX_CAUSE_CHARS].split())}") from error
 
 
-def _camera(numbers: Intrinsics, name: str) -> Camera:
+def _camera(keys: dict[str, Any], name: str) -> Camera:
     """A camera whose image circle ends at the frame's farthest corner, or where the radius stops rising.
 
     Raises BadInput bad_calibration for numbers beyond the limits of our own camera files.
     """
-    keys: dict[str, Any] = {
-        "name": numbers.name or name, "model": "pinhole" if numbers.k is None else "kannala_brandt",
-        "size_px": numbers.size_px, "focal_px": numbers.focal_px, "centre_px": numbers.centre_px,
-        "max_angle_deg": SMALL_ANGLE_DEG,
-    }  # fmt: skip
-    if numbers.k and any(numbers.k):
-        keys["k"] = numbers.k
-    if numbers.decentring:
-        keys["decentring"] = numbers.decentring.p1, numbers.decentring.p2
-    camera = camera_from_dict(keys)  # the limits are checked here
-    if numbers.R_body_cam is not None:
-        camera = replace(camera, R_body_cam=numbers.R_body_cam)
-    corners = np.stack(np.meshgrid(*_frame_edges(camera)), axis=-1)
-    edge = float(np.max(camera.angle_rad(corners)))
+    R_body_cam = keys.pop("R_body_cam", None)
+    named = {"name": keys.get("name") or name, "max_angle_deg": SMALL_ANGLE_DEG}
+    camera = camera_from_dict(keys | named)  # the limits are checked here
+    if R_body_cam is not None:
+        camera = replace(camera, R_body_cam=R_body_cam)
+    edge = float(np.max(camera.angle_rad(np.stack(np.meshgrid(*_frame_edges(camera)), axis=-1))))
     return replace(camera, max_angle_rad=edge, calibrated_angle_rad=edge)
 
 

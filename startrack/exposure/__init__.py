@@ -1,19 +1,22 @@
 """One image with the facts that travel with it: read, validate, write.
 
 `decoding.py` opens a file and picks its decoder (`png.py`, `tiff.py`, `jpeg.py`, `fits.py`, `mosaic.py` for camera
-raw files); `bag.py` and `bag_images.py` read images from ROS bags; `correction.py` reads which pixels count and applies
+raw files); `bag.py` reads images from ROS bags; `correction.py` reads which pixels count and applies
 dark frame and flat field; `facts.py` finds the other facts, in flags, the sidecar (`sidecar.py`) and the header;
 `write.py` writes images and sidecars.
 A file that cannot be used raises `startrack.core.errors.BadInput` and no other exception.
 """
 
-from startrack.exposure.bag import BAG_SUFFIXES, ODOMETRY_TYPES, is_bag, read_messages
-from startrack.exposure.bag_images import (
+from startrack.exposure.bag import (
+    BAG_SUFFIXES,
+    ODOMETRY_TYPES,
     BagImage,
     choose_bag_image,
+    is_bag,
     list_bag_images,
     read_bag_exposures,
     read_bag_image,
+    read_messages,
     split_bag_path,
 )
 from startrack.exposure.correction import (

@@ -1,20 +1,36 @@
-"""Messages of ROS 1 and ROS 2 bags, read with the package rosbags (extra `ros`)."""
+"""ROS 1 and ROS 2 bags, read with rosbags (extra `ros`): their messages, and exposures from their images."""
 
 from __future__ import annotations
 
 import hashlib
+import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from startrack.core.errors import BadInput
 from startrack.core.files import MAX_CAUSE_CHARS, FilePath, printable
+from startrack.core.types import Exposure
+from startrack.exposure.decoding import Decoded, bad_image, check_size, decode_bytes, grey_float32, largest_value
+from startrack.exposure.facts import Facts
+from startrack.exposure.read import exposure_of_decoded
 
 BAG_SUFFIXES = (".bag", ".db3", ".mcap")
 ODOMETRY_TYPES = ("nav_msgs/msg/Odometry",)
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+READING = {"reason": "bad_image", "flag": "--image-topic"}
+UNIX_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+NUMBERED = re.compile(r"(?P<bag>.+)#(?P<number>\d{1,9})")
+# Encodings of sensor_msgs/Image (image_encodings.h) of one channel.
+RAW_ENCODING = re.compile(r"(?:mono|bayer_(?P<pattern>rggb|bggr|gbrg|grbg))(?P<bits>8|16)")
+BAYER_IN_FORMAT = re.compile(r"\s*bayer_(?P<pattern>rggb|bggr|gbrg|grbg)(?:8|16)\b")
 
 
 class Message(NamedTuple):
@@ -40,9 +56,30 @@ class StoredMessage(NamedTuple):
     sha256: str  # of its bytes
 
 
+@dataclass(frozen=True)
+class BagImage:
+    """One image message of a bag; small, so that it is cheap to send to another process."""
+
+    bag: str  # path of the file or folder
+    number: int  # among the images of its topic, from 0, in the bag's order
+    message: StoredMessage
+
+    @property
+    def path(self) -> str:
+        """The text that names the image: BAG#NUMBER."""
+        return f"{self.bag}#{self.number:06d}"
+
+
 def is_bag(path: FilePath) -> bool:
     """Whether a path is that of a ROS bag: a file .bag, .db3 or .mcap, or a folder with metadata.yaml."""
     return Path(path).suffix.lower() in BAG_SUFFIXES or (Path(path) / "metadata.yaml").is_file()
+
+
+def split_bag_path(path: str) -> tuple[str, int | None] | None:
+    """The bag and the number of an image, of a `path` BAG or BAG#NUMBER; None where the path is of no bag."""
+    found = None if os.path.exists(path) else NUMBERED.fullmatch(path)
+    bag, number = (found["bag"], int(found["number"])) if found else (path, None)
+    return (bag, number) if is_bag(bag) else None
 
 
 def read_messages(
@@ -61,28 +98,107 @@ def read_messages(
             yield _message(reader, connection, raw)
 
 
-def list_messages(
-    path: FilePath, kinds: tuple[str, ...], topic: str | None, *, reason: str, flag: str
-) -> list[StoredMessage]:
-    """Where the messages of one topic are, in the bag's order, without their content. Arguments: `read_messages`.
+def list_bag_images(path: FilePath, topic: str | None = None) -> list[BagImage]:
+    """The images of a `topic` of the bag at `path`, without their pixels. None: its only topic of images.
 
-    Raises BadInput as `read_messages`, but for a header without time.
+    Raises BadInput bad_image.
     """
-    with _refusals(path, reason), _open(Path(path), kinds, topic, flag) as (reader, connections):
-        return [
+    with _refusals(path, READING["reason"]), _open(Path(path), IMAGE_TYPES, topic, READING["flag"]) as bag:
+        messages = (
             StoredMessage(connection.topic, log_time_ns, hashlib.sha256(raw).hexdigest())
-            for connection, log_time_ns, raw in reader.messages(connections=connections)
-        ]
+            for connection, log_time_ns, raw in bag[0].messages(connections=bag[1])
+        )
+        return [BagImage(os.fspath(path), number, message) for number, message in enumerate(messages)]
 
 
-def read_message(path: FilePath, kinds: tuple[str, ...], stored: StoredMessage, *, reason: str) -> Message:
-    """The one message, found by its time and hash. Raises BadInput as `read_messages`, and if it is not there."""
-    start = stored.log_time_ns
-    with _refusals(path, reason), _open(Path(path), kinds, stored.topic, "") as (reader, connections):
-        for connection, _, raw in reader.messages(connections=connections, start=start, stop=start + 1):
-            if hashlib.sha256(raw).hexdigest() == stored.sha256:
-                return _message(reader, connection, raw)
-        raise _Fault(f"topic {stored.topic} has changed since its messages were listed")
+def choose_bag_image(path: FilePath, number: int | None, topic: str | None = None) -> BagImage:
+    """The image `number` (None: the only one) of a `topic` of the bag at `path`.
+
+    Raises BadInput bad_image where there is no such image, or several.
+    """
+    images, name = list_bag_images(path, topic), printable(path)
+    if number is None and len(images) != 1:
+        raise BadInput(
+            "bad_image",
+            f"{name}: holds {len(images)} images: choose one, {name}#0 to {name}#{len(images) - 1}, or locate all with "
+            f"startrack batch {name}",
+        )
+    if number is not None and number >= len(images):
+        raise BadInput("bad_image", f"{name}: has no image {number}: it holds {len(images)}, from 0")
+    return images[number or 0]
+
+
+def read_bag_image(image: BagImage, **given: Any) -> Exposure:
+    """The exposure of one `image` with the facts `given`. Time and exceptions are as of `read_bag_exposures`.
+
+    The message is found by its time and hash.
+    """
+    topic, start, sha256 = image.message
+    with (
+        _refusals(image.bag, READING["reason"]),
+        _open(Path(image.bag), IMAGE_TYPES, topic, "") as (reader, connections),
+    ):
+        stored = reader.messages(connections=connections, start=start, stop=start + 1)
+        found = next((one for one in stored if hashlib.sha256(one[2]).hexdigest() == sha256), None)
+        if found is None:
+            raise _Fault(f"topic {topic} has changed since its messages were listed")
+        message = _message(reader, found[0], found[2])
+    where = f"{printable(image.bag)}: image {image.number} of {topic}"
+    return _exposure_of(message, where, Path(image.path).name, image.path, given)
+
+
+def read_bag_exposures(path: FilePath, topic: str | None = None, **given: Any) -> Iterator[Exposure]:
+    """The exposures of a bag's image `topic` (None: its only one), one by one, in the bag's order.
+
+    sensor_msgs/Image in mono8, mono16 or a Bayer encoding, and sensor_msgs/CompressedImage of PNG or JPEG. The time
+    of a message's header is taken as the middle of the exposure. The exposures are named BAG-0000, BAG-0001, ...
+    `path` is a file or the folder of a ROS 2 bag. A bag does not have `exposure_s`, `time_sigma_s`, `camera`,
+    `terrain`, `mask`, `dark` and `flat`: they are `given`, as in `read_exposure`.
+
+    Raises:
+        BadInput: bad_image with the file and the cause, in one line.
+        ValueError: `time_sigma_s` is no usable number of seconds.
+    """
+    for number, message in enumerate(read_messages(path, IMAGE_TYPES, topic, **READING)):
+        where = f"{printable(path)}: image {number} of {message.topic}"
+        yield _exposure_of(message, where, f"{Path(path).stem}-{number:04d}", str(path), given)
+
+
+def _exposure_of(message: Message, where: str, name: str, path: str, given: dict[str, Any]) -> Exposure:
+    """The exposure of a message with the facts `given`; a refusal names `where` it is."""
+    try:
+        decoded, pattern = _decode(message)
+        time_utc = UNIX_EPOCH + timedelta(microseconds=message.stamp_ns // 1000)
+        facts = Facts(**{"time_utc": time_utc, "bayer_pattern": pattern, **given})
+        return exposure_of_decoded(decoded, facts, raw=message.raw, name=name, path=path)
+    except BadInput as cause:
+        raise BadInput(cause.reason, f"{where}: {cause}") from cause
+
+
+def _decode(message: Message) -> tuple[Decoded, str | None]:
+    """Pixels of a message, and the pattern of its mosaic. Raises BadInput bad_image.
+
+    Rows of sensor_msgs/Image may be padded to `step` bytes.
+    """
+    content = message.content
+    if message.kind == "sensor_msgs/msg/CompressedImage":
+        bayer = BAYER_IN_FORMAT.match(str(content.format))
+        return decode_bytes(bytes(content.data)), bayer["pattern"].upper() if bayer else None
+    form = RAW_ENCODING.fullmatch(str(content.encoding))
+    if form is None:
+        raise bad_image(f"encoding {content.encoding!r}; startrack reads mono8, mono16, bayer_rggb8 and the like")
+    dtype = np.dtype(f"{'>' if content.is_bigendian else '<'}u{int(form['bits']) // 8}")
+    width, height, step, data = int(content.width), int(content.height), int(content.step), np.asarray(content.data)
+    check_size(width, height)
+    row_bytes = width * dtype.itemsize
+    if step < row_bytes or data.size != step * height:
+        raise bad_image(
+            f"{width} x {height} pixels of {dtype.itemsize} bytes, {step} bytes a row, in {data.size} bytes"
+        )
+    rows = np.ascontiguousarray(data.reshape(height, step)[:, :row_bytes])
+    stored = rows.view(dtype).astype(dtype.newbyteorder("="))
+    decoded = Decoded(pixels_adu=grey_float32(stored)[0], saturation_adu=largest_value(stored.dtype))
+    return decoded, form["pattern"].upper() if form["pattern"] else None
 
 
 @contextmanager

@@ -159,10 +159,8 @@ def _read_bytes(path: FilePath) -> bytes:
         if status.st_size > MAX_FILE_BYTES:
             raise bad_image(f"is {status.st_size / 1e9:.1f} GB, more than any image startrack reads")
         return Path(path).read_bytes()
-    except OSError as error:
-        raise bad_image(f"cannot be opened ({error.strerror or error})") from error
-    except ValueError as error:  # a NUL in the name
-        raise bad_image(f"cannot be opened ({error})") from error
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise bad_image(f"cannot be opened ({getattr(error, 'strerror', None) or error})") from error
 
 
 def decode_bytes(raw: bytes, *, camera_raw: bool = False) -> Decoded:

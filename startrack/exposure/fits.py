@@ -42,7 +42,7 @@ def decode(raw: bytes) -> Decoded:
         with fits.open(BytesIO(raw), memmap=False, checksum=True) as units:
             _check_complete(units, raw)
             unit = _only_image(units)
-            shape = _plane_shape(unit)
+            shape = unit.shape[-2:]
             check_size(*shape[::-1])
             header = _metadata(units, unit)
             saturation = _saturation(unit.header)
@@ -112,35 +112,25 @@ def _check_headers(raw: bytes) -> None:
 
 
 def _only_image(units: Any) -> Any:
-    """The one unit with image data, plain or tile-compressed."""
+    """The one unit with image data, plain or tile-compressed; axes of length 1 beyond the second are no cube."""
     images = [unit for unit in units if unit.is_image and unit.shape]
+    sizes = [" x ".join(str(n) for n in reversed(unit.shape)) for unit in images]
     if not images:
         raise bad_image("FITS holds no image")
     if len(images) > 1:
-        names = ", ".join(f"{unit.name or 'unnamed'} {_text_shape(unit)}" for unit in images)
+        names = ", ".join(f"{unit.name or 'unnamed'} {size}" for unit, size in zip(images, sizes, strict=True))
         raise bad_image(f"FITS holds {len(images)} images ({names}); startrack reads files with one")
-    return images[0]
-
-
-def _plane_shape(unit: Any) -> tuple[int, int]:
-    """(H, W); axes of length 1 beyond the second are no cube."""
-    shape = unit.shape
+    shape = images[0].shape
     if len(shape) < 2 or any(n != 1 for n in shape[:-2]):
         kind = "a spectrum" if len(shape) < 2 else "a cube"
-        raise bad_image(f"FITS holds {kind} ({_text_shape(unit)}); startrack reads flat grey images")
-    return shape[-2], shape[-1]
-
-
-def _text_shape(unit: Any) -> str:
-    return " x ".join(str(n) for n in reversed(unit.shape))
+        raise bad_image(f"FITS holds {kind} ({sizes[0]}); startrack reads flat grey images")
+    return images[0]
 
 
 def _check_complete(units: Any, raw: bytes) -> None:
     """Check that the file holds every unit with its padding, and nothing else: astropy only warns."""
-    end = 0
-    for index in range(len(units)):
-        span = units.fileinfo(index)
-        end = max(end, span["datLoc"] + span["datSpan"])
+    spans = [units.fileinfo(index) for index in range(len(units))]
+    end = max((span["datLoc"] + span["datSpan"] for span in spans), default=0)
     if end > len(raw):
         raise bad_image("truncated FITS: the file ends before its data do")
     if raw[end:].strip(b"\0 "):
@@ -150,8 +140,7 @@ def _check_complete(units: Any, raw: bytes) -> None:
 def _metadata(units: Any, unit: Any) -> dict[str, Any]:
     """The metadata in the image's own header, else in the primary one."""
     headers = (unit.header, units[0].header)
-    keys = set(HEADER_KEYS.values())
-    found = {key: next((h[key] for h in headers if key in h), None) for key in sorted(keys)}
+    found = {key: next((h[key] for h in headers if key in h), None) for key in sorted({*HEADER_KEYS.values()})}
     return {key: value for key, value in found.items() if isinstance(value, str | int | float)}  # not Undefined
 
 

@@ -29,6 +29,7 @@ CHANNELS = {MINISBLACK: 1, MOSAIC: 1, RGB: 3}
 UNCOMPRESSED = 1
 WITHOUT_IMAGECODECS = {UNCOMPRESSED, 8, 32946, 32773}  # deflate twice, PackBits: tifffile needs nothing more for these
 HORIZONTAL = 2  # the predictor that it has itself
+NOWHERE = logging.NullHandler()  # added once
 READ = "integers of 8, 16 or 32 bits and floating point"
 TYPES = {"uint8", "uint16", "uint32", "int8", "int16", "int32", "float16", "float32", "float64"}
 
@@ -41,7 +42,7 @@ def decode(raw: bytes) -> Decoded:
     """
     import tifffile
 
-    _silence_logger(logging.getLogger("tifffile"))
+    logging.getLogger("tifffile").addHandler(NOWHERE)  # the exception has the cause of what it prints
     with tifffile.TiffFile(BytesIO(raw)) as tiff:
         _check_chain(tiff, raw)
         page = _only_page(tiff)
@@ -58,12 +59,6 @@ def decode(raw: bytes) -> Decoded:
         warnings=orientation_warnings(None if orientation is None else int(orientation.value)) + colour,
         mosaic=mosaic or None,
     )
-
-
-def _silence_logger(logger: logging.Logger) -> None:
-    """Keep tifffile from printing about a damaged file: the exception has the cause."""
-    if not any(isinstance(h, logging.NullHandler) for h in logger.handlers):
-        logger.addHandler(logging.NullHandler())
 
 
 def _check_chain(tiff: Any, raw: bytes) -> None:
@@ -125,21 +120,18 @@ def _pixels(page: Any, raw: bytes) -> NDArray[Any]:
         if page.axes == "SYX":  # channels in separate planes
             stored = np.moveaxis(stored, 0, -1)
     else:
-        stored = _pixels_by_opencv(raw, page.compression)
+        import cv2
+
+        with _silence_opencv(cv2):
+            decoded = cv2.imdecode(np.frombuffer(raw, np.uint8), cv2.IMREAD_UNCHANGED)
+        if decoded is None:
+            cause = f"TIFF is damaged or its compression ({page.compression!r}) is unknown here"
+            raise bad_image(f"{cause}; save it uncompressed")
+        stored = np.asarray(decoded)
     want = (page.imagelength, page.imagewidth, 3)[: 3 if page.samplesperpixel == 3 else 2]
     if stored.shape != want or stored.dtype.newbyteorder("=") != page.dtype.newbyteorder("="):
         raise bad_image(f"damaged TIFF: decodes to {stored.shape} of {stored.dtype}")
     return stored
-
-
-def _pixels_by_opencv(raw: bytes, compression: Any) -> NDArray[Any]:
-    import cv2
-
-    with _silence_opencv(cv2):
-        stored = cv2.imdecode(np.frombuffer(raw, np.uint8), cv2.IMREAD_UNCHANGED)
-    if stored is None:
-        raise bad_image(f"TIFF is damaged or its compression ({compression!r}) is unknown here; save it uncompressed")
-    return np.asarray(stored)
 
 
 @contextmanager

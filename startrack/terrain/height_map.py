@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.types import Array, Bools, Ints
-from startrack.terrain.deformed_map import DeformedMap, slopes_of_map
+from startrack.terrain.derived_maps import DEFAULT_NODES, DeformedMap, HorizonInterpolator
 from startrack.terrain.ground import cell_posts, post_positions
-from startrack.terrain.horizon_interpolator import DEFAULT_NODES, HorizonInterpolator
 from startrack.terrain.horizon_table import AZIMUTH_BINS, HorizonSigma
 from startrack.terrain.protocol import HorizonPosts, Terrain
-from startrack.terrain.shape import BIAS, CAMERA_ERROR, STRETCH, VERTICAL, ShapeError, by_name
+from startrack.terrain.shape import BIAS, CAMERA_ERROR, STRETCH, VERTICAL, ShapeError, by_name, select_slopes
 from startrack.terrain.traced_map import TracedMap
 
 COMMON_PER_POST = 3.0
@@ -66,9 +65,18 @@ class HeightMap(TracedMap):
         )  # fmt: skip
 
     def shape_slopes_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
-        """From the traced horizon and the distance of its crest; see `Terrain`."""
+        """From the traced horizon and the distance of its crest; see `Terrain`.
+
+        Of a tilt the change of elevation alone: that of azimuth moves the skyline by its slope times tan H times the
+        tilt, which is left out.
+        """
         tan, distance, _ = self.horizons(points_m, azimuths_rad)
-        return slopes_of_map(self.shape_errors, tan, 1.0 / distance, azimuths_rad)
+        flat = 1.0 / (1.0 + np.square(tan))  # cos^2 H
+        slopes = {
+            "bias_rad": np.ones(1), "stretch_1": tan * flat, "vertical_east_rad": np.sin(azimuths_rad),
+            "vertical_north_rad": np.cos(azimuths_rad), "camera_height_m": -(1.0 / distance) * flat,
+        }  # fmt: skip
+        return select_slopes(self.shape_errors, slopes, np.shape(tan))
 
     def with_shape(self, values: Array) -> DeformedMap:
         """The ground with these errors; see `Terrain`."""

@@ -211,7 +211,7 @@ def bilinear(nodes, k, x, y):
 
 @njit(cache=True, nogil=True)
 def interpolate(ground, near, points, column, found):
-    """Fill found (n,) with the horizon [rad] at points (n, 2) and columns (n,); near: `horizon_interpolator.Nodes`."""
+    """Fill found (n,) with the horizon [rad] at points (n, 2) and columns (n,); near: `derived_maps.Nodes`."""
     nodes, per_height, middle, east, north, half = near
     scale = (nodes.shape[1] - 1) / (2 * half)
     up = np.empty(1)
@@ -221,35 +221,3 @@ def interpolate(ground, near, points, column, found):
         x, y = (points[k, 0] - east + half) * scale, (points[k, 1] - north + half) * scale
         c = column[k]
         found[k] = np.arctan(bilinear(nodes, c, x, y) - (up[0] - middle) * per_height[c])
-
-
-@njit(cache=True, nogil=True)
-def interpolate_bounds(ground, near, rough, centres, box_half, column, low, high):
-    """Fill low and high (n,) [rad] with bounds over boxes no wider than a step of the nodes or a cell of the map.
-
-    A bilinear sheet has its extremes at its corners. The ground's kinks bend it by no more than the second differences
-    of its heights over the box, the nodes' own bends count twice: within a sheet, and between two that the box touches.
-    """
-    nodes, per_height, middle, east, north, half = near
-    scale = (nodes.shape[1] - 1) / (2 * half)
-    points, up = np.empty((9, 2)), np.empty(9)
-    bend = 0.0
-    for k in range(len(low)):
-        if k == 0 or centres[k, 0] != centres[k - 1, 0] or centres[k, 1] != centres[k - 1, 1]:
-            for a in range(9):
-                points[a, 0] = centres[k, 0] + box_half * (a // 3 - 1)
-                points[a, 1] = centres[k, 1] + box_half * (a % 3 - 1)
-            surfaces(ground, points, up)
-            along, across = 0.0, 0.0
-            for a in range(3):
-                along = max(along, abs(up[a] - 2 * up[3 + a] + up[6 + a]))
-                across = max(across, abs(up[3 * a] - 2 * up[3 * a + 1] + up[3 * a + 2]))
-            bend = along + across
-        c = column[k]
-        least, most = np.inf, -np.inf
-        for a in (0, 2, 6, 8):
-            x, y = (points[a, 0] - east + half) * scale, (points[a, 1] - north + half) * scale
-            value = bilinear(nodes, c, x, y) - (up[a] - middle) * per_height[c]
-            least, most = min(least, value), max(most, value)
-        slack = 2 * rough[c] + bend * per_height[c]
-        low[k], high[k] = np.arctan(least - slack), np.arctan(most + slack)

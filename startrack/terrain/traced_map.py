@@ -74,11 +74,6 @@ class TracedMap(Terrain):
         return pack_maps(self.site, self.maps)
 
     @cached_property
-    def finest_post_m(self) -> float:
-        """Spacing of the posts of the finest map."""
-        return min(m.post_m for m in self.maps)
-
-    @cached_property
     def reach_m(self) -> float:
         """The search area and a margin, as far as the maps reach."""
         wider = self.search_radius_m * REACH_RADII

@@ -1,22 +1,25 @@
-"""Height maps with errors that all azimuths share: the ground exactly, and what each error changes to first order."""
+"""Terrains made of a height map: its ground with errors of its shape, and its horizons interpolated near one point."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
-from startrack.core.types import Array
+from startrack.core.types import Array, Bools
 from startrack.frames import R_from_rotvec
+from startrack.terrain.horizon_kernel import interpolate
 from startrack.terrain.protocol import ForwardingTerrain, HorizonPosts, Terrain
-from startrack.terrain.shape import ShapeError, select_slopes
-from startrack.terrain.traced_map import TracedMap
+from startrack.terrain.traced_map import TracedMap, flatten_rays
 
 TILT_ROUNDS = 2  # of the azimuth towards that of the turned skyline: each leaves a thousandth of the difference
 WIDER_RAD = 0.1  # by which azimuths are widened to find the highest skyline that a tilt may turn into a direction
+DEFAULT_NODES = 3  # nodes along each side by default
+MAX_BEND_TAN = 8e-5  # of tan H (0.004 degrees): azimuths whose horizon bends by more between the nodes are traced
+MAX_BEND_SIGMAS = 0.5  # or by more than that part of the map's own error
 
 
 class DeformedMap(ForwardingTerrain):
@@ -110,18 +113,74 @@ class DeformedMap(ForwardingTerrain):
         return replace(posts, horizon_rad=self.horizon_rad(point_m, azimuths_rad))
 
 
-def slopes_of_map(errors: Sequence[ShapeError], tan: Array, per_m: Array, azimuths_rad: Array) -> Array:
-    """Change (k, ...) of the horizon [rad] by one unit of each error, where its tangent is `tan` (...).
+class Nodes(NamedTuple):
+    """Horizons at n azimuths, traced at nodes."""
 
-    `per_m` (...) is one over the distance of the crest [1/m]. Of a tilt the change of elevation alone: that of azimuth
-    moves the skyline by its slope times tan H times the tilt, which is left out.
+    tan: Array  # (n, across, across) of the horizon, east first, were the ground at all nodes as high as in the middle
+    per_height: Array  # (n,) decrease of tan of the horizon per metre of the camera's height [1/m]
+    middle_up_m: float  # height of the ground in the middle
+    east_m: float  # of the middle
+    north_m: float
+    half_m: float  # from the middle to the outer nodes
+
+
+@dataclass(frozen=True, eq=False)
+class HorizonInterpolator(ForwardingTerrain):
+    """The terrain near a centre, with fast horizons at the azimuths that it was made for; else as `whole`.
+
+    A crest at the distance d is seen higher as the camera's own ground falls: tan H + z / d bends much less from point
+    to point than tan H, and is bilinear between traced nodes. Azimuths where it is not are traced.
     """
-    flat = 1.0 / (1.0 + np.square(tan))  # cos^2 H
-    slopes = {
-        "bias_rad": np.ones(1),
-        "stretch_1": tan * flat,
-        "vertical_east_rad": np.sin(azimuths_rad),
-        "vertical_north_rad": np.cos(azimuths_rad),
-        "camera_height_m": -per_m * flat,
-    }
-    return select_slopes(errors, slopes, np.shape(tan))
+
+    whole: TracedMap
+    centre_m: Array  # (2,)
+    half_m: float
+    azimuths_rad: Array  # (n,) ascending
+    across: int = DEFAULT_NODES
+    exact: bool = True  # azimuths with a large interpolation error are traced
+
+    @cached_property
+    def nodes(self) -> Nodes:
+        """The horizons traced at the nodes."""
+        line = np.linspace(-self.half_m, self.half_m, self.across)
+        points = np.asarray(self.centre_m + np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1), dtype=np.float64)
+        tan, distance, _ = self.whole.horizons(points[:, :, None, :], self.azimuths_rad)
+        middle = float(self.whole.ground_m(self.centre_m))
+        near = 1.0 / np.maximum(np.median(distance, axis=(0, 1)), 2 * self.half_m / (self.across - 1))
+        level = tan + (self.whole.ground_m(points) - middle)[:, :, None] * near
+        tan = np.ascontiguousarray(np.moveaxis(level, -1, 0))
+        return Nodes(tan, near, middle, float(self.centre_m[0]), float(self.centre_m[1]), float(self.half_m))
+
+    @cached_property
+    def _smooth(self) -> Bools:
+        """(n,) whether the largest error between the nodes, which they themselves show, is small.
+
+        A smooth bend errs by an eighth of the second differences, a change from one crest to another by all of one.
+        """
+        bends = [np.abs(np.diff(self.nodes.tan, 2, axis=axis)).max(axis=(1, 2), initial=0.0) for axis in (1, 2)]
+        sigma_rad = self.whole.horizon_sigma_rad(self.centre_m, self.azimuths_rad)
+        return np.asarray(bends[0] + bends[1] < np.maximum(MAX_BEND_TAN, MAX_BEND_SIGMAS * sigma_rad))
+
+    def interpolated(self) -> HorizonInterpolator:
+        """The same nodes, between which all azimuths are interpolated; see `Terrain`."""
+        nodes, other = self.nodes, copy(self)
+        other.__dict__.update(nodes=nodes, exact=False)
+        return other
+
+    def without_table(self) -> TracedMap:
+        """The whole map: nothing is interpolated; see `Terrain`."""
+        return self.whole.without_table()
+
+    def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """Horizon elevation [rad]; see `Terrain`."""
+        shape, points, azimuths = flatten_rays(points_m, azimuths_rad)
+        column = np.minimum(np.searchsorted(self.azimuths_rad, azimuths), len(self.azimuths_rad) - 1)
+        inside = np.abs(points - self.centre_m).max(axis=-1) <= self.half_m * (1 + 1e-9)
+        inside &= self.azimuths_rad[column] == azimuths
+        if self.exact:
+            inside &= self._smooth[column]
+        found = np.empty(len(column))
+        interpolate(self.whole.ground, self.nodes, points, column, found)
+        if not inside.all():
+            found[~inside] = self.whole.horizon_rad(points[~inside], azimuths[~inside])
+        return found.reshape(shape)

@@ -9,7 +9,7 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.core.types import Array, Bools, Ints
 from startrack.estimation.false_alarm import PATTERN_MATCHES
-from startrack.identification.lens_guesses import LensGuess, RadialFamily, family_angle
+from startrack.identification.lens_guesses import LensGuess, RadialFamily, family_angle, unknown_camera
 from startrack.identification.region_growing import LensHypothesis
 from startrack.identification.similar_triangles import MAX_DETECTIONS, ShapePatterns
 from startrack.identification.triangles import Triangles, triad_attitude, triangles
@@ -17,8 +17,8 @@ from startrack.identification.triangles import Triangles, triad_attitude, triang
 LOCAL_SIDES = 1.2  # of the longest side, about the triangle: within it an imperfect lens still fits
 CANDIDATES_AT_ONCE = 20_000
 MAX_HYPOTHESES = 6  # of one lens and window; the true one is nearly always the likeliest
-VERIFICATION_STAGES = ((24, -1.5), (48, -4.0))  # detections tested; log p-value below which the test goes on
-MAX_VERIFIED = 80
+# Detections tested, and the log p-value below which the test goes on; random skies reach -15 in a whole search.
+VERIFICATION_STAGES = ((24, -1.5), (48, -4.0), (80, -11.0))
 MAX_VOTED = 150  # triangles with the most votes whose attitudes are compared
 SAME_VIEW_RAD, SAME_FOCAL_1 = 0.02, 0.01  # differences of views that agree
 MIN_AGREEING = 3
@@ -56,16 +56,14 @@ class HypothesisSearch:
         self.xy_px, self.size_px = xy_px[:MAX_DETECTIONS], size_px
         self.tried = 0
 
-    def likely_hypotheses(
-        self, patterns: ShapePatterns, guess: LensGuess, window: Window, most_log_p: float
-    ) -> list[LensHypothesis]:
-        """The likeliest hypotheses from the window's triangles, with a log p-value below `most_log_p`."""
+    def likely_hypotheses(self, patterns: ShapePatterns, guess: LensGuess, window: Window) -> list[LensHypothesis]:
+        """The likeliest hypotheses from the window's triangles, by the bright stars near which detections lie."""
         image, left, right = self._similar_triangles(patterns, guess, window)
         xy = self.xy_px[window.first :]
         found: list[LensHypothesis] = []
         for part in np.array_split(np.arange(len(left)), len(left) // CANDIDATES_AT_ONCE + 1) if len(left) else ():
             pairs = image.take(left[part]), patterns.triangles.triangles.take(right[part])
-            found += self._rank_by_stars(patterns, guess, xy, *pairs, most_log_p)
+            found += self._rank_by_stars(patterns, guess, xy, *pairs)
         return sorted(found, key=lambda hypothesis: hypothesis.log_p)[:MAX_HYPOTHESES]
 
     def voted_hypotheses(self, patterns: ShapePatterns, guess: LensGuess, window: Window) -> list[LensHypothesis]:
@@ -93,7 +91,7 @@ class HypothesisSearch:
             best = int(np.argmax(count))
             if count[best] < MIN_AGREEING:
                 break
-            camera = self._camera(guess, focal[best], bool(mirrored[best]))
+            camera = self._camera(guess, focal[best], mirrored[best])
             found.append(LensHypothesis(camera, R[best], cam[best].mean(axis=0), 0.0))
             free &= ~same[best]
         return found
@@ -110,16 +108,14 @@ class HypothesisSearch:
         return image, left, right
 
     def _rank_by_stars(
-        self, patterns: ShapePatterns, guess: LensGuess, xy_px: Array, image: Triangles, catalogue: Triangles,
-        most_log_p: float,
-    ) -> list[LensHypothesis]:  # fmt: skip
-        """Hypotheses from pairs of an image triangle and a catalogue triangle, by the stars near which others lie."""
+        self, patterns: ShapePatterns, guess: LensGuess, xy_px: Array, image: Triangles, catalogue: Triangles
+    ) -> list[LensHypothesis]:
         focal, mirrored, cam, R = _solve_triangles(patterns, guess, xy_px, image, catalogue)
         middle = cam.sum(axis=1)
         middle /= np.linalg.norm(middle, axis=1, keepdims=True)
         alive = np.arange(len(R))
         log_p = np.zeros(len(R))
-        for verified, limit in (*VERIFICATION_STAGES, (MAX_VERIFIED, most_log_p)):
+        for verified, limit in VERIFICATION_STAGES:
             deeper = _log_p_value(
                 patterns, xy_px[:verified], R[alive], guess, focal[alive], mirrored[alive], middle[alive]
             )
@@ -127,17 +123,12 @@ class HypothesisSearch:
             alive, log_p = alive[log_p < limit], log_p[log_p < limit]
         best = np.argsort(log_p, kind="stable")[:MAX_HYPOTHESES]
         return [
-            LensHypothesis(self._camera(guess, focal[i], bool(mirrored[i])), R[i], middle[i], float(value))
+            LensHypothesis(self._camera(guess, focal[i], mirrored[i]), R[i], middle[i], float(value))
             for i, value in zip(alive[best], log_p[best], strict=True)
         ]
 
     def _camera(self, guess: LensGuess, focal: float, mirrored: bool) -> Camera:
-        lens = RadialFamily(guess.shape)
-        widest = lens.max_invertible_rad
-        return Camera(
-            name="unknown", size_px=self.size_px, focal_px=(float(focal), float(focal)), centre_px=guess.centre_px,
-            max_angle_rad=widest, calibrated_angle_rad=widest, lens=lens, mirrored=mirrored,
-        )  # fmt: skip
+        return unknown_camera(self.size_px, float(focal), guess.centre_px, RadialFamily(guess.shape), bool(mirrored))
 
 
 def _solve_triangles(

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.camera import Lens
+from startrack.camera import Camera, Lens
 from startrack.core.types import Array
 
 PINHOLE = 1.0  # shape
@@ -45,6 +45,17 @@ class LensGuess:
     focal_px: float
     shape: float
     centre_px: tuple[float, float]
+
+
+def unknown_camera(
+    size_px: tuple[int, int], focal_px: float, centre_px: tuple[float, float], lens: Lens, mirrored: bool
+) -> Camera:
+    """A camera of a frame (W, H), as wide as its lens."""
+    widest = lens.max_invertible_rad
+    return Camera(
+        name="unknown", size_px=size_px, focal_px=(focal_px, focal_px), centre_px=centre_px, max_angle_rad=widest,
+        calibrated_angle_rad=widest, lens=lens, mirrored=mirrored,
+    )  # fmt: skip
 
 
 def guess_lenses(size_px: tuple[int, int], fov_rad: float, shapes: tuple[float, ...]) -> list[LensGuess]:

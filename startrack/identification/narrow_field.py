@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,10 +18,8 @@ from startrack.estimation.false_alarm import (
 from startrack.estimation.match import CandidatePairs, PhotometricScale, match_nearest
 from startrack.identification.attitude_search import GATE_PX, INLIER_PX, agreement_of
 from startrack.identification.hypotheses import SAME_VIEW_RAD, HypothesisSearch, Window
-from startrack.identification.index import PerObject
 from startrack.identification.lens_guesses import PINHOLE, guess_lenses
-from startrack.identification.pinhole_view import PinholeView
-from startrack.identification.region_growing import FEWEST, GATE_OVER_SIGMA
+from startrack.identification.region_growing import FEWEST, GATE_OVER_SIGMA, PinholeView
 from startrack.identification.similar_triangles import narrow_sizes, patterns_for
 from startrack.identification.verify_unknown_lens import (
     MATCHES_FOR_SCALE,
@@ -47,24 +44,6 @@ SMALLEST_ERROR_PX = 0.1  # of a centroid against the lens
 MIN_FOR_DISTORTION, DISTORTED_RMS_1 = 25, 0.7  # a distorted lens leaves less than this part of the residual
 
 
-def _star_tree(stars: Stars) -> Any:
-    from scipy.spatial import cKDTree
-
-    return cKDTree(stars.rays_icrs, balanced_tree=False)
-
-
-_star_tree_of = PerObject(_star_tree)
-
-
-class _NearStars(NamedTuple):
-    """Catalogue stars near a view."""
-
-    number: Ints  # (n,) indices into the catalogue
-    rays_icrs: Array  # (n, 3)
-    v_mag: Array  # (n,)
-    v_sigma_mag: Array  # (n,)
-
-
 class NarrowField:
     """The detections of a narrow field, brightest first, and the views that are looked for among the stars."""
 
@@ -72,24 +51,17 @@ class NarrowField:
         self, centroids: Centroids, search: HypothesisSearch, fov_rad: float, field_sr: float, stars: Stars
     ) -> None:
         """`field_sr`: solid angle of the frame, rounded so that indexes serve many fields."""
-        self.centroids, self.search, self.fov_rad, self.field_sr, self.stars = (
-            centroids,
-            search,
-            fov_rad,
-            field_sr,
-            stars,
-        )
-        self._trees: dict[int, Any] = {}
+        self.centroids, self.search, self.fov_rad, self.stars = centroids, search, fov_rad, stars
+        self.patterns = patterns_for(stars, narrow_sizes(field_sr, STARS_IN_FIELD, SIDE_OF_FIELD))
 
     def lenses(self) -> Iterator[VerifiedLens]:
         """Lenses that most of the bright stars support, likely ones first."""
-        patterns = patterns_for(self.stars, narrow_sizes(self.field_sr, STARS_IN_FIELD, SIDE_OF_FIELD))
         (guess,) = guess_lenses(self.search.size_px, self.fov_rad, (PINHOLE,))
         seen: list[Array] = []
         for window in VOTING_ROUNDS:
             if window.first and len(self.search.xy_px) <= window.first + 4:
                 continue
-            for found in self.search.voted_hypotheses(patterns, guess, window):
+            for found in self.search.voted_hypotheses(self.patterns, guess, window):
                 R, camera = found.R_cam_icrs, found.camera
                 if any(np.trace(other.T @ R) > 3.0 - SAME_VIEW_RAD**2 for other in seen):
                     continue
@@ -100,19 +72,18 @@ class NarrowField:
 
     def _grow(self, view: PinholeView) -> VerifiedLens | None:
         """The view fitted with more stars and smaller gates, and verified; None where too few stars agree."""
+        from scipy.spatial import cKDTree
+
         width, height = view.size_px
         corner = np.arctan(0.5 * VIEW_MARGIN * np.hypot(width, height) / view.focal_px)
-        near = _star_tree_of(self.stars).query_ball_point(view.R_cam_icrs[2], 2 * np.sin(0.5 * corner))
-        number = np.sort(np.asarray(near, dtype=np.int64))
-        stars = _NearStars(
-            number, *(q[number] for q in (self.stars.rays_icrs, self.stars.v_mag, self.stars.v_sigma_mag))
-        )
+        number = np.flatnonzero(self.stars.rays_icrs @ view.R_cam_icrs[2] > np.cos(corner))
+        stars = self.stars.take(number)
         for count, per_detection, fraction, least_px, most_log_p in VIEW_STAGES:
             gate_px = max(fraction * width, least_px)
             xy = self.centroids.xy_px[:count]
             px, inside = view.project(stars.rays_icrs)
             some = np.flatnonzero(inside)[: int(per_detection * len(xy)) + 5]
-            detection, star, distance = match_nearest(self._tree(count), px[some], gate_px)
+            detection, star, distance = match_nearest(cKDTree(xy), px[some], gate_px)
             bound = log_p_value_bound(distance, gate_px, len(some), len(xy) / (width * height))
             if len(star) < FEWEST or bound > most_log_p:
                 return None
@@ -120,24 +91,16 @@ class NarrowField:
             view = view.fit(
                 xy[detection], stars.rays_icrs[some[star]], gate_px / GATE_OVER_SIGMA, distorted, VIEW_STEPS
             )
-        return self._verify(view, stars)
+        lens = self._verify(view, stars)
+        return None if lens is None else replace(lens, star=number[lens.star])
 
-    def _tree(self, count: int) -> Any:
-        """cKDTree of the first detections."""
-        from scipy.spatial import cKDTree
-
-        count = min(count, len(self.centroids))
-        if count not in self._trees:
-            self._trees[count] = cKDTree(self.centroids.xy_px[:count])
-        return self._trees[count]
-
-    def _verify(self, view: PinholeView, stars: _NearStars) -> VerifiedLens | None:
-        """The view refined with stars of the right brightness, with its p-value; None where too few agree."""
+    def _verify(self, view: PinholeView, stars: Stars) -> VerifiedLens | None:
+        """The view refined with the stars near it of the right brightness, with its p-value; None where few agree."""
         centroids = self.centroids
         pairs = self._candidate_pairs(view, stars)
         if pairs is None:
             return None
-        chosen = self._select_unambiguous(pairs, _pairs_in_place(pairs))
+        chosen = self._select_unambiguous(pairs, _pairs_on_place(pairs))
         if len(chosen) < FEWEST:
             return None
         view = _fit_lens(view, centroids.xy_px[pairs.detection[chosen]], stars.rays_icrs[pairs.star[chosen]])
@@ -149,11 +112,20 @@ class NarrowField:
         trusted_px = trusted_radius(off_axis_px[pairs.detection[near]], pairs.distance_px[near] < INLIER_PX)
         if trusted_px is None:
             return None
-        chosen = _pairs_in_place(pairs)
+        chosen = _pairs_on_place(pairs)
         chosen = chosen[off_axis_px[pairs.detection[chosen]] <= trusted_px]
         if len(chosen) < FEWEST:
             return None
-        log_p = self._log_p_value(view, pairs, chosen, stars, trusted_px) + log_trials(self.search.tried)
+        radius_px = coincidence_radius_px(pairs.distance_px[chosen])
+        hits = int(np.count_nonzero((pairs.detection[chosen] < TESTED) & (pairs.distance_px[chosen] < radius_px)))
+        measured = pairs.scale.measured_mag[:TESTED]
+        px, inside = view.project(stars.rays_icrs)
+        inside &= np.linalg.norm(px - view.centre_px, axis=1) <= trusted_px
+        bright = stars.v_mag[inside & (stars.v_mag < measured.max())]
+        known_px = centroids.xy_px[:TESTED][off_axis_px[:TESTED] <= trusted_px]
+        expected = density_per_px2(known_px, view.size_px) * np.pi * radius_px**2
+        each = float(coincidence_probability(expected)) * agreement_of(centroids, bright, measured)
+        log_p = significance(hits, max(len(bright), hits), each, PATTERN_MATCHES)
         chosen = self._select_unambiguous(pairs, chosen)
         camera = view.camera()
         trusted_rad = float(camera.angle_rad(view.centre_px + np.array([trusted_px, 0.0])))
@@ -161,19 +133,20 @@ class NarrowField:
             camera=replace(camera, calibrated_angle_rad=min(trusted_rad, camera.max_angle_rad)),
             R_cam_icrs=view.R_cam_icrs,
             detection=pairs.detection[chosen],
-            star=stars.number[pairs.star[chosen]],
-            log_p=log_p,
+            star=pairs.star[chosen],
+            log_p=log_p + log_trials(self.search.tried),
             unexplained=pairs.count_unexplained(centroids.snr, INLIER_PX),
         )
 
-    def _candidate_pairs(self, view: PinholeView, stars: _NearStars) -> CandidatePairs | None:
+    def _candidate_pairs(self, view: PinholeView, stars: Stars) -> CandidatePairs | None:
         """All pairs of a detection and a star near it; None where they are too few for a photometric scale."""
         from scipy.spatial import cKDTree
 
         centroids = self.centroids
         px, inside = view.project(stars.rays_icrs)
         seen = np.flatnonzero(inside)
-        found = self._tree(len(centroids)).sparse_distance_matrix(cKDTree(px[seen]), GATE_PX, output_type="ndarray")
+        tree = cKDTree(centroids.xy_px)
+        found = tree.sparse_distance_matrix(cKDTree(px[seen]), GATE_PX, output_type="ndarray")
         found = found[np.lexsort((found["j"], found["i"]))]
         detection, star, distance = found["i"].astype(np.int64), seen[found["j"]], found["v"]
         close = np.flatnonzero(distance < INLIER_PX)
@@ -192,24 +165,8 @@ class NarrowField:
         variance_px2 = 0.5 * (some[:, 0, 0] + some[:, 1, 1]) + SMALLEST_ERROR_PX**2
         return pairs.select_unambiguous(which, variance_px2, blend_radius_px(self.centroids))
 
-    def _log_p_value(
-        self, view: PinholeView, pairs: CandidatePairs, chosen: Ints, stars: _NearStars, trusted_px: float
-    ) -> float:
-        """Log p-value of the pairs `chosen` of the brightest detections, up to `trusted_px` from the centre."""
-        xy_px = self.centroids.xy_px[:TESTED]
-        radius_px = coincidence_radius_px(pairs.distance_px[chosen])
-        hits = int(np.count_nonzero((pairs.detection[chosen] < len(xy_px)) & (pairs.distance_px[chosen] < radius_px)))
-        measured = pairs.scale.measured_mag[: len(xy_px)]
-        px, inside = view.project(stars.rays_icrs)
-        inside &= np.linalg.norm(px - view.centre_px, axis=1) <= trusted_px
-        bright = stars.v_mag[inside & (stars.v_mag < measured.max())]
-        known = np.linalg.norm(xy_px - view.centre_px, axis=1) <= trusted_px
-        expected = density_per_px2(xy_px[known], view.size_px) * np.pi * radius_px**2
-        each = float(coincidence_probability(expected)) * agreement_of(self.centroids, bright, measured)
-        return significance(hits, max(len(bright), hits), each, PATTERN_MATCHES)
 
-
-def _pairs_in_place(pairs: CandidatePairs) -> Ints:
+def _pairs_on_place(pairs: CandidatePairs) -> Ints:
     """Indices of the one-to-one pairs whose star lies on its predicted pixel."""
     return pairs.one_to_one_pairs[pairs.distance_px[pairs.one_to_one_pairs] < INLIER_PX]
 

@@ -1,4 +1,4 @@
-"""Growth of a lens hypothesis: from the triangle where it fits to the whole field, with ever smaller gates."""
+"""Growth of a lens hypothesis: from the triangle where it fits to the whole field; the view of a narrow field."""
 
 from __future__ import annotations
 
@@ -6,23 +6,26 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.camera import Camera, default_lens, lens_kinds
-from startrack.core.types import Array, Ints
+from startrack.camera import Camera, Pinhole, default_lens, lens_kinds
+from startrack.core.types import Array, Bools, Ints
 from startrack.estimation.adjust import Prior, Scheme, State, adjust, cauchy_loss
 from startrack.estimation.false_alarm import log_p_value_bound
 from startrack.estimation.match import match_mutual
-from startrack.estimation.normal_equations import observations_of_image
+from startrack.estimation.normal_equations import Observations, Terms, observations_of_image
+from startrack.frames import R_from_rotvec
 from startrack.identification.attitude_search import INLIER_PX
+from startrack.identification.lens_guesses import unknown_camera
 
 REGION_ROUNDS = 2  # of matching and fitting within a stage
 FEWEST = 5  # matches
 GATE_OVER_SIGMA = 4.0  # the gate over the sigma of the loss
 MATCH_LOSS = cauchy_loss(4.0)  # chi-square of a match whose weight is halved
-SHAPE_SIGMA = 0.5  # prior of the family's shape
-FOCAL_SIGMA, CENTRE_SIGMA = 0.1, 0.06  # priors, in focal lengths
-K_SIGMA = (0.1, 0.1, 0.05, 0.02)  # priors of the polynomial's coefficients
+LENGTH_SIGMAS = {"f": 0.1, "cx": 0.06, "cy": 0.06}  # prior sigmas in focal lengths
+PRIOR_SIGMAS = {"shape": 0.5, "k1": 0.1, "k2": 0.1, "k3": 0.05, "k4": 0.02}  # of the family, of the polynomial
 STARS_PER_DETECTION = 1.5
 SAME_RADIUS_1 = 1e-12  # relative difference of the radii of lenses that are the same
+TANGENT = (1 / 3, 2 / 15, 17 / 315, 62 / 2835)  # series of tan a beyond a: to 1e-7 up to 20 degrees
+LONGEST_STEP = 0.1  # of a view: radians, logarithm of the focal length, distortion
 WHOLE_LENS = ("f", "shape", "cx", "cy")
 FIT = Scheme(loss=MATCH_LOSS, steps=4, settled_px=1e-3)
 
@@ -57,23 +60,15 @@ class LensHypothesis:
     log_p: float
 
 
-@dataclass(frozen=True)
-class GrownLens:
-    """Camera and attitude after the growth, with the matches that they rest on."""
-
-    camera: Camera
-    R_cam_icrs: Array
-    detection: Ints
-    star: Ints
-
-
 def grow(
     hypothesis: LensHypothesis, xy_px: Array, rays_icrs: Array, stages: tuple[GrowthStage, ...]
-) -> GrownLens | None:
-    """The hypothesis after all stages; None where it is given up. Detections (n, 2), stars (m, 3): brightest first."""
+) -> tuple[Camera, Array, int] | None:
+    """Camera, attitude and number of matches after all stages; None where the hypothesis is given up.
+
+    The detections (n, 2) and the stars (m, 3) are sorted, brightest first.
+    """
     camera, R = hypothesis.camera, hypothesis.R_cam_icrs
     middle_icrs = hypothesis.middle_cam @ R
-    grown = None
     for stage in stages:
         some = xy_px[: stage.detections]
         for _ in range(REGION_ROUNDS):
@@ -85,12 +80,11 @@ def grow(
             camera, R, distance = fit_camera(
                 camera, R, some[detection], rays_icrs[star], stage.free, gate_px / GATE_OVER_SIGMA, hypothesis.camera
             )
-            grown = GrownLens(camera, R, detection, star)
         # The detections' density in the rectangle between their 5th and 95th percentiles.
         area_px2 = float(np.prod(np.ptp(np.percentile(some, (5, 95), axis=0), axis=0)) / 0.81) + 1.0
         if log_p_value_bound(distance, gate_px, predicted, len(some) / area_px2) > stage.most_log_p:
             return None
-    return grown
+    return camera, R, len(star)
 
 
 def match_in_view(
@@ -131,9 +125,7 @@ def fit_camera(
 
 def prior_of(camera: Camera, prior: Camera, free: tuple[str, ...]) -> Prior:
     """Prior of the free parameters: expected at the camera `prior`, the adjustment starting at `camera`."""
-    focal = prior.focal_px[0]
-    sigma = {"f": FOCAL_SIGMA * focal, "cx": CENTRE_SIGMA * focal, "cy": CENTRE_SIGMA * focal, "shape": SHAPE_SIGMA}
-    sigma |= {f"k{n + 1}": value for n, value in enumerate(K_SIGMA)}
+    sigma = PRIOR_SIGMAS | {name: part * prior.focal_px[0] for name, part in LENGTH_SIGMAS.items()}
     now, expected = (
         {"f": c.focal_px[0], "cx": c.centre_px[0], "cy": c.centre_px[1], **c.lens.parameters} for c in (camera, prior)
     )
@@ -154,3 +146,114 @@ def with_file_lens(camera: Camera, size: int, widest_rad: float) -> Camera:
     lens, scale = default_lens().fit_curve(a, rho, size)
     focal = scale * camera.focal_px[0]
     return replace(camera, lens=lens, focal_px=(focal, focal))
+
+
+@dataclass(frozen=True)
+class PinholeView:
+    """Attitude, focal length and one distortion term of a narrow field's frame (W, H), the axis in its centre.
+
+    A state for `startrack.estimation.adjust` with closed-form derivatives in the tangential plane, an order of
+    magnitude cheaper than those of a general lens.
+    """
+
+    R_cam_icrs: Array
+    focal_px: float
+    mirrored: bool
+    size_px: tuple[int, int]
+    distortion: float  # of the radius [focal lengths] per cube of the angle off the axis, beyond the tangent
+
+    @property
+    def centre_px(self) -> Array:
+        """(2,)"""
+        return 0.5 * (np.array(self.size_px) - 1.0)
+
+    @property
+    def rotations(self) -> Array:
+        """R_cam_icrs (1, 3, 3)."""
+        return self.R_cam_icrs[None]
+
+    @property
+    def is_valid(self) -> bool:
+        """Always: the focal length is fitted by its logarithm."""
+        return True
+
+    def project(self, rays_icrs: Array) -> tuple[Array, Bools]:
+        """Pixels (n, 2) of rays (n, 3) less than 90 degrees off the axis, and which lie in the frame."""
+        cam = rays_icrs @ self.R_cam_icrs.T
+        plane = cam[:, :2] / np.maximum(cam[:, 2], 1e-6)[:, None]
+        px = self._pixels(plane)
+        half = 0.5 * np.array(self.size_px)
+        return px, (np.abs(px - self.centre_px) <= half).all(axis=1) & (cam[:, 2] > 0)
+
+    def fit(self, xy_px: Array, rays_icrs: Array, sigma_px: float, distorted: bool, steps: int = 1) -> PinholeView:
+        """The view fitted to the stars (n, 3) at the pixels (n, 2), some of them wrong, with a loss of this scale.
+
+        `distorted`: whether the lens may differ from a pinhole.
+        """
+        covariance = np.broadcast_to(sigma_px**2 * np.eye(2), (len(xy_px), 2, 2))
+        points = observations_of_image(xy_px, covariance, rays_icrs)
+        free = ("log_focal", "distortion") if distorted else ("log_focal",)
+        scheme = Scheme(loss=MATCH_LOSS, steps=steps, settled_px=0.0, damped=False)
+        found: PinholeView = adjust(self, points, free, scheme).state
+        return found
+
+    def rays_cam(self, points: Observations) -> Array:
+        """Positions (n, 2) [focal lengths] of the observations in the pinhole's image plane."""
+        cam = points.rays_icrs @ self.R_cam_icrs.T
+        return np.asarray(cam[:, :2] / cam[:, 2:])
+
+    def residual_px(self, points: Observations, plane: Array) -> Array:
+        """Measured minus predicted pixels (n, 2)."""
+        return points.xy_px - self._pixels(plane)
+
+    def terms(self, points: Observations, plane: Array, free: tuple[str, ...]) -> Terms:
+        """Derivatives by the logarithm of the focal length, the distortion, and rotations about the camera's axes.
+
+        The rotation's effect on the distortion itself is left out.
+        """
+        (u, v), (fx, fy) = plane.T, self._signed_focal_px
+        pose = np.empty((len(u), 2, 3))
+        pose[:, 0, 0], pose[:, 0, 1], pose[:, 0, 2] = -fx * u * v, fx * (1 + u * u), -fx * v
+        pose[:, 1, 0], pose[:, 1, 1], pose[:, 1, 2] = -fy * (1 + v * v), fy * u * v, fy * u
+        signed = plane * self._signed_focal_px
+        by_lens = np.empty((len(u), 2, len(free)))
+        by_lens[:, :, 0] = signed * self._radius_ratio(plane)[:, None]
+        if len(free) > 1:
+            by_lens[:, :, 1] = signed * _cube(plane)[:, None]
+        return Terms(by_lens, pose, points.image, 1)
+
+    def step(self, free: tuple[str, ...], lens: Array, poses: Array) -> PinholeView:
+        """The view after a step of the free parameters and of the attitude (1, 3) [rad]."""
+        lens, poses = np.clip(lens, -LONGEST_STEP, LONGEST_STEP), np.clip(poses, -LONGEST_STEP, LONGEST_STEP)
+        return replace(
+            self,
+            R_cam_icrs=R_from_rotvec(poses[0]) @ self.R_cam_icrs,
+            focal_px=float(self.focal_px * np.exp(lens[0])),
+            distortion=self.distortion + (float(lens[1]) if len(free) > 1 else 0.0),
+        )
+
+    def camera(self) -> Camera:
+        """The camera, as wide as its frame."""
+        tangent = (TANGENT[0] + self.distortion, *TANGENT[1:])
+        lens = default_lens()(tangent) if self.distortion else Pinhole()
+        x, y = self.centre_px.tolist()
+        camera = unknown_camera(self.size_px, self.focal_px, (x, y), lens, self.mirrored)
+        corner = float(camera.angle_rad(np.array([-0.5, -0.5])))
+        return replace(camera, max_angle_rad=corner, calibrated_angle_rad=corner)
+
+    @property
+    def _signed_focal_px(self) -> Array:
+        return np.array([-self.focal_px if self.mirrored else self.focal_px, self.focal_px])
+
+    def _pixels(self, plane: Array) -> Array:
+        return np.asarray(plane * self._radius_ratio(plane)[:, None] * self._signed_focal_px + self.centre_px)
+
+    def _radius_ratio(self, plane: Array) -> Array:
+        """Radius over that of a pinhole (n,), at positions (n, 2) of the pinhole's plane."""
+        return 1.0 + self.distortion * _cube(plane) if self.distortion else np.ones(len(plane))
+
+
+def _cube(plane: Array) -> Array:
+    """Cube of the angle off the axis over the radius (n,) at positions (n, 2) of a pinhole's plane."""
+    radius = np.sqrt(np.einsum("ni,ni->n", plane, plane))
+    return np.asarray(np.arctan(radius) ** 3 / np.maximum(radius, 1e-12))

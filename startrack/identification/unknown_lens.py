@@ -46,7 +46,6 @@ NARROW_WINDOWS = (
     Window(0, 0, 8), Window(0, 8, 14), Window(14, 14, 26), Window(0, 14, 22), Window(26, 26, 40), Window(0, 22, 32),
 )  # fmt: skip
 NARROW_PATTERNS = ((10, 0.8, 2), (18, 0.5, 6), (48, 0.28, 6))  # stars in the field, longest side over it, windows
-LOG_PLAUSIBLE = -11.0  # log p-value of a hypothesis that is grown: random skies reach -15 in a whole search
 LOG_FALSE_ALARM = float(np.log(MAX_FALSE_ALARM))
 MAX_TRIED = 600_000  # patterns; a search without an answer ends here, after some seconds
 MAX_TRIED_IN_CIRCLE = 250_000  # where the image circle is seen: real photographs take 1000 to 110,000
@@ -183,7 +182,7 @@ class _Search:
                 continue
             for guess in guesses:
                 seen: list[Array] = []
-                for hypothesis in search.likely_hypotheses(patterns, guess, window, LOG_PLAUSIBLE):
+                for hypothesis in search.likely_hypotheses(patterns, guess, window):
                     R = hypothesis.R_cam_icrs
                     if any(np.trace(other.T @ R) > 1 + 2 * np.cos(SAME_LENS_RAD) for other in seen):
                         continue
@@ -191,9 +190,9 @@ class _Search:
                     around = None if self.wide else np.flatnonzero(self.stars.rays_icrs @ R[2] > nearest_1)
                     stars = self.stars if around is None else self.stars.take(around)
                     grown = grow(hypothesis, self.xy_px, stars.rays_icrs, stages)
-                    if grown is None or (self.wide and len(grown.star) < self.min_matches):
+                    if grown is None or (self.wide and grown[2] < self.min_matches):
                         continue
-                    lens = verify(grown, self.centroids, stars, search.tried, self.widest_rad)
+                    lens = verify(*grown, self.centroids, stars, search.tried, self.widest_rad)
                     if lens is not None:
                         yield lens if around is None else replace(lens, star=around[lens.star])
                 if search.tried > max_tried:

@@ -28,14 +28,13 @@ from startrack.identification.attitude_search import GATE_PX, INLIER_PX, ONE_SOU
 from startrack.identification.region_growing import (
     FEWEST,
     GATE_OVER_SIGMA,
-    GrownLens,
     fit_camera,
     match_in_view,
     with_file_lens,
 )
 
-FITS = ((4.0, 200), (2.5, 500), (1.8, 3000))  # gate [px] and number of brightest detections
-FIRST_BRIGHTNESS_GATE_PX = 2.0  # of the matches by brightness; the last one is INLIER_PX
+# Gate [px] and number of brightest detections; None: all, which match by brightness too.
+FITS = ((4.0, 200), (2.5, 500), (1.8, 3000), (2.0, None), (INLIER_PX, None))
 TESTED = 400  # brightest detections that the p-value rests on
 SMALLEST_COINCIDENCE_PX, RADIUS_SIGMAS = 0.6, 2.5
 ON_PLACE_FRACTION = 0.5  # of the stars near their predicted pixels, where the lens is right
@@ -85,9 +84,6 @@ def match_by_flux(
     """
     from scipy.spatial import cKDTree
 
-    none = np.zeros(0, dtype=np.int64)
-    if not len(centroids):
-        return FluxMatches(none, none, np.zeros(0), 0.0, 0, np.zeros(0), 1.0)
     tree, brightness = cKDTree(centroids.xy_px), instrumental_mag(centroids.flux_e)
     px, inside = camera.project(stars.rays_icrs[:STARS_FOR_SCALE] @ R_cam_icrs.T)
     seen = np.flatnonzero(inside)
@@ -97,6 +93,7 @@ def match_by_flux(
     usable[hit] = ~centroids.saturated[nearest[hit]]
     first = np.flatnonzero(usable if np.count_nonzero(usable) >= MIN_UNSATURATED else hit)[:MATCHES_FOR_SCALE]
     if len(first) < MIN_UNSATURATED:
+        none = np.zeros(0, dtype=np.int64)
         return FluxMatches(none, none, np.zeros(0), 0.0, len(seen), np.zeros(0), 1.0)
     zero_mag = float(np.median(stars.v_mag[seen[first]] - brightness[nearest[first]]))
     faintest = zero_mag + float(np.max(brightness))
@@ -117,12 +114,15 @@ def match_by_flux(
     )  # fmt: skip
 
 
-def verify(grown: GrownLens, centroids: Centroids, stars: Stars, tried: int, widest_rad: float) -> VerifiedLens | None:
+def verify(
+    camera: Camera, R: Array, matched: int, centroids: Centroids, stars: Stars, tried: int, widest_rad: float
+) -> VerifiedLens | None:
     """The grown lens refined with all stars and verified; None where too few stars agree.
 
-    `tried`: number of hypotheses so far. `widest_rad`: half the field of view, its tolerance added.
+    `camera`, `R` and the number `matched` are the result of `grow`. `tried`: number of hypotheses so far. `widest_rad`:
+    half the field of view, its tolerance added.
     """
-    refined = _refine(grown, centroids, stars, widest_rad)
+    refined = _refine(camera, R, matched, centroids, stars, widest_rad)
     if refined is None:
         return None
     camera, R = refined
@@ -131,17 +131,17 @@ def verify(grown: GrownLens, centroids: Centroids, stars: Stars, tried: int, wid
     trusted_rad = trusted_radius(camera.angle_rad(centroids.xy_px[near.detection]), near.distance_px < INLIER_PX)
     if trusted_rad is None:
         return None
-    camera = replace(camera, calibrated_angle_rad=min(trusted_rad, camera.max_angle_rad))
+    trusted_rad = min(trusted_rad, camera.max_angle_rad)
+    camera = replace(camera, calibrated_angle_rad=trusted_rad)
     matches = match_by_flux(centroids, camera, stars, R, INLIER_PX, blend_radius_px(centroids))
-    inside = camera.angle_rad(centroids.xy_px[matches.detection]) <= camera.calibrated_angle_rad
+    inside = camera.angle_rad(centroids.xy_px[matches.detection]) <= trusted_rad
     if np.count_nonzero(inside) < FEWEST:
         return None
-    trusted = replace(camera, max_angle_rad=camera.calibrated_angle_rad)
-    some = match_by_flux(tested, trusted, stars, R, INLIER_PX, 0.0)
+    some = match_by_flux(tested, replace(camera, max_angle_rad=trusted_rad), stars, R, INLIER_PX, 0.0)
     radius_px = coincidence_radius_px(matches.distance_px[inside])
     hits = int(np.count_nonzero(some.coincident_px < radius_px))
-    rays = camera.unproject(tested.xy_px[camera.angle_rad(tested.xy_px) <= camera.calibrated_angle_rad])
-    radius_rad = radius_px * float(camera.mean_scale_rad_per_px(np.array(camera.calibrated_angle_rad / 2)))
+    rays = camera.unproject(tested.xy_px[camera.angle_rad(tested.xy_px) <= trusted_rad])
+    radius_rad = radius_px * float(camera.mean_scale_rad_per_px(np.array(trusted_rad / 2)))
     each = some.agreement * float(coincidence_probability(density_per_sr(rays) * np.pi * radius_rad**2))
     free = FREE_MATCHES if camera.lens.parameters else PATTERN_MATCHES
     return VerifiedLens(
@@ -177,37 +177,27 @@ def significance(hits: int, predicted: int, each: float, free: int) -> float:
     return float(log_p_value(hits, predicted, each, free))
 
 
-def _refine(grown: GrownLens, centroids: Centroids, stars: Stars, widest_rad: float) -> tuple[Camera, Array] | None:
+def _refine(
+    camera: Camera, R: Array, matched: int, centroids: Centroids, stars: Stars, widest_rad: float
+) -> tuple[Camera, Array] | None:
     """Camera and attitude after smaller gates and longer lists; the last matches are by brightness too."""
-    order = next(order for fewest, order in ORDERS if len(grown.star) >= fewest)
-    prior = camera = _limit_angles(with_file_lens(grown.camera, order, widest_rad), widest_rad)
-    R = grown.R_cam_icrs
-
-    def fit_again(detection: Ints, star: Ints, gate_px: float) -> tuple[Camera, Array]:
-        free = _free_parameters(camera, len(star))
-        xy, rays = centroids.xy_px[detection], stars.rays_icrs[star]
-        fitted, attitude, _ = fit_camera(camera, R, xy, rays, free, gate_px / GATE_OVER_SIGMA, prior)
-        return _limit_angles(fitted, widest_rad), attitude
-
+    order = next(order for fewest, order in ORDERS if matched >= fewest)
+    prior = camera = _limit_angles(with_file_lens(camera, order, widest_rad), widest_rad)
     for gate_px, count in FITS:
-        detection, star, _ = match_in_view(camera, R, centroids.xy_px[:count], stars.rays_icrs, gate_px)
+        if count is None:
+            by_flux = match_by_flux(centroids, camera, stars, R, gate_px, blend_radius_px(centroids))
+            detection, star = by_flux.detection, by_flux.star
+        else:
+            detection, star, _ = match_in_view(camera, R, centroids.xy_px[:count], stars.rays_icrs, gate_px)
         if len(star) < FEWEST:
             return None
-        camera, R = fit_again(detection, star, gate_px)
-    for gate_px in (FIRST_BRIGHTNESS_GATE_PX, INLIER_PX):
-        matches = match_by_flux(centroids, camera, stars, R, gate_px, blend_radius_px(centroids))
-        if len(matches.star) < FEWEST:
-            return None
-        camera, R = fit_again(matches.detection, matches.star, gate_px)
+        # Of a lens of fixed shape the focal length alone is free.
+        centre = ("cx", "cy") if camera.lens.parameters and len(star) >= MIN_FOR_CENTRE else ()
+        free = ("f", *camera.lens.parameters, *centre)
+        xy_px, sigma_px = centroids.xy_px[detection], gate_px / GATE_OVER_SIGMA
+        camera, R, _ = fit_camera(camera, R, xy_px, stars.rays_icrs[star], free, sigma_px, prior)
+        camera = _limit_angles(camera, widest_rad)
     return camera, R
-
-
-def _free_parameters(camera: Camera, matched: int) -> tuple[str, ...]:
-    """Those of the lens and, with enough matches, its centre; only the focal length of a lens of fixed shape."""
-    if not camera.lens.parameters:
-        return ("f",)
-    centre = ("cx", "cy") if matched >= MIN_FOR_CENTRE else ()
-    return ("f", *camera.lens.parameters, *centre)
 
 
 def _limit_angles(camera: Camera, widest_rad: float) -> Camera:

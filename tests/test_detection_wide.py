@@ -55,7 +55,7 @@ def test_binned_frames_keep_flux_and_noise() -> None:
 def test_touching_pixels_are_grouped_as_opencv_groups_them() -> None:
     dead = np.random.default_rng(3).random((90, 120)) < 0.2
     row, column = np.nonzero(dead)
-    count, label = _group_touching(row, column, dead.shape[1])
+    count, label = _group_touching(row, column)
     expected_count, expected = cv2.connectedComponents(dead.astype(np.uint8))
     assert count == expected_count - 1 > 20
     assert len(set(zip(label.tolist(), expected[row, column].tolist(), strict=True))) == count

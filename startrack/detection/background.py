@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import cv2
@@ -21,6 +21,9 @@ LOW_QUANTILE, HIGH_QUANTILE = 0.05, 0.65  # quantiles of the pixels between whic
 COARSE_PX = 4  # the local level is a mean over squares of this side
 CLIPPED_SIGMA = 2.5
 Image = NDArray[np.float32]
+# From -1/2 to 1/2 evenly, in an order without a pattern: 101 is a prime, so that each number comes once.
+ORDER = np.arange(BLOCK_PX**2) * 101 % BLOCK_PX**2
+PART_STEPS = ((ORDER - 0.5 * (len(ORDER) - 1)) / len(ORDER)).astype(np.float32).reshape(BLOCK_PX, BLOCK_PX)
 
 
 def background_and_noise(image: Image, quantum: float, sigma_px: float) -> tuple[Image, Image]:
@@ -121,7 +124,7 @@ def _measure_blocks(
 
 def _median_and_spread(ordered: Image) -> tuple[Image, Image]:
     middle = ordered.shape[1] // 2
-    return np.float32(0.5) * (ordered[:, middle - 1] + ordered[:, middle]), ordered @ _scale_weights(ordered.shape[1])
+    return np.float32(0.5) * (ordered[:, middle - 1] + ordered[:, middle]), ordered @ _scale_weights()
 
 
 def _blocks(image: Image, side: int, quantum: float) -> Image:
@@ -136,9 +139,8 @@ def _blocks(image: Image, side: int, quantum: float) -> Image:
     below, right = -height % side, -width % side
     if below or right:
         image = np.asarray(cv2.copyMakeBorder(image, 0, below, 0, right, cv2.BORDER_REFLECT_101), dtype=np.float32)
-    part_steps = (np.float32(quantum) * _dither_steps(BLOCK_PX**2)).reshape(BLOCK_PX, BLOCK_PX)
     blocks = np.empty((image.shape[0] // side, image.shape[1] // side, BLOCK_PX, BLOCK_PX), dtype=np.float32)
-    _fill_blocks(np.ascontiguousarray(image), side, part_steps, blocks)
+    _fill_blocks(np.ascontiguousarray(image), side, np.float32(quantum) * PART_STEPS, blocks)
     return blocks.reshape(-1, BLOCK_PX**2)
 
 
@@ -154,23 +156,16 @@ def _fill_blocks(image, side, part_steps, blocks):  # type: ignore[no-untyped-de
                     blocks[i, j, r, c] = image[row, left + c // 2 * apart + c % 2] + part_steps[r, c]
 
 
-@lru_cache(maxsize=8)
-def _dither_steps(count: int) -> Image:
-    """Values (count,) spread evenly from -1/2 to 1/2, in an order without a pattern."""
-    order = np.arange(count) * 101 % count  # 101 is a prime: each number once
-    return ((order - 0.5 * (count - 1)) / count).astype(np.float32)
-
-
-@lru_cache(maxsize=8)
-def _scale_weights(count: int) -> Image:
-    """Weights (count,) of ordered values whose sum is the standard deviation of the noise.
+@cache
+def _scale_weights() -> Image:
+    """Weights of the ordered pixels of a block whose sum is the standard deviation of the noise.
 
     The slope of the normal quantile plot between two quantiles, by least squares: as sharp as the median absolute
     deviation, and half as much misled by stars, which are all on one side.
     """
     from scipy.special import ndtri
 
-    part = (np.arange(count) + 0.625) / (count + 0.25)
+    part = (np.arange(BLOCK_PX**2) + 0.625) / (BLOCK_PX**2 + 0.25)
     expected = np.where((part > LOW_QUANTILE) & (part < HIGH_QUANTILE), ndtri(part), 0.0)
     inside = expected != 0.0
     expected[inside] -= expected[inside].mean()

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.types import Array, Bools, Ints
-from startrack.detection.deblend import Fitted, own_signal
+from startrack.detection.deblend import Fitted, source_signal
 from startrack.detection.fit import FIT_ROUNDS_AGAIN, PointFits, Stamps, fit_points
 from startrack.detection.frame import Frame, Pixels, SourceNoise
 from startrack.detection.psf_width import MIN_BRIGHT_SOURCES, WIDTH_SNR
 
-THRESHOLD_WIDTHS_PX = (0.6, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0)
-HEIGHTS = (5.80, 5.70, 5.54, 5.43, 5.33, 5.18, 5.09)  # measured at USUAL_SKEWNESS: equal rates of false stars
+# Of stars of a width [px]; measured at USUAL_SKEWNESS: equal rates of false stars.
+HEIGHTS = {0.6: 5.80, 0.8: 5.70, 1.0: 5.54, 1.2: 5.43, 1.5: 5.33, 2.0: 5.18, 3.0: 5.09}
 NOMINAL_HEIGHT = 5.42
 USUAL_SKEWNESS, LARGEST_SKEWNESS = 0.088, 0.3  # the first: 100 photons and 3 electrons of read noise
 FILTERED_SKEWNESS = 0.376  # 2 / (3 sqrt(pi)): fraction that remains after a matched filter of 1 px
@@ -132,7 +132,7 @@ def detection_threshold(threshold_snr: float, sigma_px: float, skewness: float) 
     heavier than a Gaussian's (first term of the Cornish-Fisher expansion with the skewness after filtering), and its
     quantiles below the median, from which the noise is measured, lie closer together.
     """
-    height = float(np.interp(np.log(sigma_px), np.log(THRESHOLD_WIDTHS_PX), HEIGHTS))
+    height = float(np.interp(np.log(sigma_px), np.log(list(HEIGHTS)), list(HEIGHTS.values())))
     filtered = FILTERED_SKEWNESS / np.sqrt(sigma_px**2 + 1.0 / 12.0)
     height += (skewness - USUAL_SKEWNESS) * (filtered * (height**2 - 1.0) / 6.0 + NOISE_TOO_SMALL * height)
     return float(np.sqrt(max(height**2 + threshold_snr**2 - NOMINAL_HEIGHT**2, 9.0)))
@@ -154,7 +154,7 @@ def _psf_and_edge_misfit(s: Stamps, fits: PointFits, width_px: Array, own: Sourc
     The misfit is the root of the squared residual beyond the noise over the squared signal: 0 for a perfect star, about
     0.6 for a single bright pixel.
     """
-    signal = own_signal(s.centres, fits, width_px, s.data.shape[1] // 2)
+    signal = source_signal(fits.xy_px - s.centres, fits.flux, width_px, s.data.shape[1] // 2)
     noise = s.variance + np.float32(own.per_unit) * signal
     excess = np.square(s.data - signal - fits.level[:, None, None].astype(np.float32)) - noise
     weights = 1.0 / (noise + np.square(np.float32(own.model_error) * signal))

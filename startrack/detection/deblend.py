@@ -12,7 +12,6 @@ from startrack.detection.fit import (
     FIT_ROUNDS_AGAIN,
     PointFits,
     Stamps,
-    concatenate_fits,
     fit_points,
     measure_source_noise,
 )
@@ -44,14 +43,14 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = 
     refined = 0 if known is None else len(known.flux)
     if known is not None and frame.found is not None:
         last = frame.found_signal(centres, radius)
-        last[:refined] -= own_signal(centres[:refined], known, sigma, radius)
+        last[:refined] -= source_signal(known.xy_px - centres[:refined], known.flux, sigma, radius)
         last[np.square(last).max(axis=(1, 2)) <= NEIGHBOUR_SIGMA**2 * variance[:, radius, radius]] = 0.0
     cleaned = _subtract_neighbours(stamps, last)
-    fits = concatenate_fits([
+    fits = PointFits.concatenate(*(
         fit_points(cleaned.take(which), peaks.start_xy_px[which], sigma, frame.source_noise, peaks.own_part, rounds)
         for which, rounds in ((slice(0, refined), FIT_ROUNDS_AGAIN), (slice(refined, None), FIT_ROUNDS))
         if len(centres[which])
-    ])  # fmt: skip
+    ))  # fmt: skip
     star, other = _find_pairs(centres, 1.5 * radius + 3.0 * sigma)
     alone = np.ones(len(centres), dtype=bool)
     alone[star[_are_relevant(stamps, fits, star, other, sigma)]] = False
@@ -113,11 +112,7 @@ def _sum_neighbour_signal(s: Stamps, fits: PointFits, star: Ints, other: Ints, s
         end = np.searchsorted(firsts, firsts[0] + pairs_at_a_time)
         last = firsts[end] if end < len(firsts) else len(star)
         here = slice(firsts[0], last)
-        offset = fits.xy_px[other[here]] - s.centres[star[here]]
-        px, _ = pixel_profile_single(offset[:, 0], sigma, radius)
-        py, _ = pixel_profile_single(offset[:, 1], sigma, radius)
-        py *= np.maximum(fits.flux[other[here]], 0.0)[:, None].astype(np.float32)
-        each = py[:, :, None] * px[:, None, :]
+        each = source_signal(fits.xy_px[other[here]] - s.centres[star[here]], fits.flux[other[here]], sigma, radius)
         sums = np.add.reduceat(each, firsts[:end] - firsts[0], axis=0)
         who = star[firsts[:end]]
         matters = (np.square(sums) > NEIGHBOUR_SIGMA**2 * s.variance[who]).any(axis=(1, 2))
@@ -137,12 +132,11 @@ def _are_relevant(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: fl
     return np.asarray(fits.flux[other] * top * wing > 0.3 * NEIGHBOUR_SIGMA * noise)
 
 
-def own_signal(centres: Ints, fits: PointFits, sigma: float | Array, radius: int) -> Pixels:
-    """Signal (n, s, s) of each source in its own stamp."""
-    offset = fits.xy_px - centres
-    px, _ = pixel_profile_single(offset[:, 0], sigma, radius)
-    py, _ = pixel_profile_single(offset[:, 1], sigma, radius)
-    py *= np.maximum(fits.flux, 0.0)[:, None].astype(np.float32)
+def source_signal(offset_px: Array, flux: Array, sigma: float | Array, radius: int) -> Pixels:
+    """Signal (n, s, s) of sources of these fluxes (n,) at offsets (n, 2) from the middle of their stamps."""
+    px, _ = pixel_profile_single(offset_px[:, 0], sigma, radius)
+    py, _ = pixel_profile_single(offset_px[:, 1], sigma, radius)
+    py *= np.maximum(flux, 0.0)[:, None].astype(np.float32)
     return np.asarray(py[:, :, None] * px[:, None, :])
 
 
@@ -155,7 +149,7 @@ def paint_sources(fits: PointFits, sigma: float, shape: tuple[int, int]) -> Pixe
     size = max(1, BATCH_PIXELS // (side * side))
     for at in range(0, len(centres), size):
         here = np.arange(at, min(at + size, len(centres)))
-        signals = own_signal(centres[here], fits.take(here), sigma, radius)
+        signals = source_signal(fits.xy_px[here] - centres[here], fits.flux[here], sigma, radius)
         for (column, row), signal in zip(centres[here] + side - radius, signals, strict=True):
             image[row : row + side, column : column + side] += signal
     return image[side:-side, side:-side]

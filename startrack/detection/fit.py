@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from startrack.core.types import Array, Bools, Ints
+from startrack.core.values import Rows, array
 from startrack.detection.frame import MODEL_ERROR, Pixels, SourceNoise
 from startrack.psf import pixel_profile
 
@@ -22,27 +23,23 @@ MIN_MODEL_ERROR = 0.005
 
 
 @dataclass(frozen=True, kw_only=True)
-class PointFits:
-    """Fitted point sources (n) and how well they fit."""
+class PointFits(Rows):
+    """Fitted point sources and how well they fit."""
 
-    xy_px: Array  # (n, 2)
-    flux: Array  # (n,)
-    level: Array  # (n,) local background
-    covariance: Array  # (n, 4, 4) of x, y, flux, level
-    chi2: Array  # (n,) of the point source
-    chi2_pixel: Array  # (n,) of a single bright pixel instead
-    dof: Array  # (n,)
-    surround: Array  # (n,) level of the wider surroundings
-    significance: Array  # (n,) matched-filter SNR against background noise alone
-    snr: Array  # (n,) matched-filter SNR, the source's own photon noise included
-
-    def take(self, which: Ints) -> PointFits:
-        """The fits selected by indices."""
-        return PointFits(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
+    xy_px: Array = array("n", 2, may_be_nan=True)
+    flux: Array = array("n", may_be_nan=True)
+    level: Array = array("n", may_be_nan=True)  # local background
+    covariance: Array = array("n", 4, 4, may_be_nan=True)  # of x, y, flux, level
+    chi2: Array = array("n", may_be_nan=True)  # of the point source
+    chi2_pixel: Array = array("n", may_be_nan=True)  # of a single bright pixel instead
+    dof: Array = array("n")
+    surround: Array = array("n", may_be_nan=True)  # level of the wider surroundings
+    significance: Array = array("n", may_be_nan=True)  # matched-filter SNR against background noise alone
+    snr: Array = array("n", may_be_nan=True)  # matched-filter SNR, the source's own photon noise included
 
     def with_rows(self, which: Ints, others: PointFits) -> PointFits:
         """These fits with `others` at the indices `which`."""
-        values = {f.name: getattr(self, f.name).copy() for f in fields(self)}
+        values = {name: values.copy() for name, values in vars(self).items()}
         for name, value in values.items():
             value[which] = getattr(others, name)
         return PointFits(**values)
@@ -97,11 +94,6 @@ def fit_points(
         significance=above / undiluted,
         snr=flux * np.sqrt(own),
     )
-
-
-def concatenate_fits(parts: list[PointFits]) -> PointFits:
-    """The fits of all parts in one value."""
-    return PointFits(**{f.name: np.concatenate([getattr(b, f.name) for b in parts]) for f in fields(PointFits)})
 
 
 def unbin_fits(fits: PointFits, side: int) -> PointFits:

@@ -164,7 +164,7 @@ def _saturated_blobs(dead: NDArray[np.bool_] | None, margin: int) -> Array:
         label = labels[row, column].astype(np.int64) - 1
         count -= 1
     else:
-        count, label = _group_touching(row, column, width)
+        count, label = _group_touching(row, column)
     area = np.bincount(label, minlength=count)
     middle = np.stack([np.bincount(label, q, count) / np.maximum(area, 1) for q in (column, row)], axis=1)
     inside = (middle >= margin).all(axis=1) & (middle[:, 0] < width - margin) & (middle[:, 1] < height - margin)
@@ -173,18 +173,14 @@ def _saturated_blobs(dead: NDArray[np.bool_] | None, margin: int) -> Array:
     return np.asarray(middle[chosen], dtype=np.float64)
 
 
-def _group_touching(row: Ints, column: Ints, width: int) -> tuple[int, Ints]:
+def _group_touching(row: Ints, column: Ints) -> tuple[int, Ints]:
     """Number of groups of touching pixels (corners count) among a few, and the group (n,) of each pixel."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
 
-    position = row * (width + 2) + column + 1  # a border keeps the rows' ends apart; ascending
-    pairs = []
-    for step in (1, width + 1, width + 2, width + 3):
-        at = np.minimum(np.searchsorted(position, position + step), len(position) - 1)
-        hit = np.flatnonzero(position[at] == position + step)
-        pairs.append(np.stack([hit, at[hit]]))
-    i, j = np.concatenate(pairs, axis=1)
-    graph = coo_matrix((np.ones(len(i), dtype=np.int8), (i, j)), shape=(len(position), len(position)))
+    pixels = np.stack([row, column], axis=1)
+    i, j = cKDTree(pixels).query_pairs(1.5, output_type="ndarray").T
+    graph = coo_matrix((np.ones(len(i), dtype=np.int8), (i, j)), shape=(len(pixels), len(pixels)))
     count, label = connected_components(graph, directed=False)
     return int(count), label.astype(np.int64)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from startrack.core.types import Array, Bools, Ints
+from startrack.core.values import Rows, array
 from startrack.detection.fit import BRIGHT_STAR_SNR
 from startrack.detection.frame import Frame
 from startrack.detection.psf_width import MAX_BRIGHT_SOURCES
@@ -24,14 +25,14 @@ IN_LINE_FRACTION = 0.45
 STREAKED_FRACTION = 0.6  # of the bright blobs
 
 
-@dataclass(frozen=True)
-class Streaks:
-    """Streaks (n), brightest first."""
+@dataclass(frozen=True, kw_only=True)
+class Streaks(Rows):
+    """Streaks, brightest first."""
 
-    xy_px: Array  # (n, 2) centroids
-    covariance_px2: Array  # (n, 2, 2)
-    flux: Array
-    flux_sigma: Array
+    xy_px: Array = array("n", 2)  # centroids
+    covariance_px2: Array = array("n", 2, 2)
+    flux: Array = array("n")
+    flux_sigma: Array = array("n")
     length_px: float  # typical
     width_px: float  # typical standard deviation across
 
@@ -39,11 +40,6 @@ class Streaks:
     def psf_sigma_px(self) -> float:
         """Standard deviation of the whole streak, the typical one."""
         return float(np.hypot(self.width_px, self.length_px / np.sqrt(12.0)))
-
-    def take(self, which: Bools) -> Streaks:
-        """The streaks that a mask (n,) selects."""
-        rows = {name: getattr(self, name)[which] for name in ("xy_px", "covariance_px2", "flux", "flux_sigma")}
-        return replace(self, **rows)
 
 
 def are_elongated(frame: Frame, centres: Ints) -> bool:

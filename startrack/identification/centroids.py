@@ -103,7 +103,7 @@ def identify_centroids(
         _require_in_frame(sources.xy_px, camera.size_px)
         found = (identifier or Identifier())(sources, camera, stars)
     elif fov_rad is not None and size_px is not None:
-        _require_in_frame(sources.xy_px, _frame_size_px(size_px))
+        _require_in_frame(sources.xy_px, size_px)
         solution = identify_unknown_lens(sources, size_px, fov_rad, stars)
         camera, found = solution.camera, solution.identification
     else:
@@ -155,8 +155,11 @@ def sorted_centroids(
     ), order
 
 
-def _frame_size_px(size_px: Any) -> tuple[int, int]:
-    """The size (W, H) of a frame as given. Raises ValueError where it is no pair of numbers of at least 1."""
+def _require_in_frame(xy_px: Array, size_px: Any) -> None:
+    """Raise NotIdentified where there are centroids (n, 2), but none in the frame of `size_px` (W, H).
+
+    Raises ValueError for a size that is no pair of numbers of at least 1.
+    """
     try:
         width, height = size_px
         possible = width >= 1 and height >= 1
@@ -164,15 +167,10 @@ def _frame_size_px(size_px: Any) -> tuple[int, int]:
         possible = False
     if not possible:
         raise ValueError(f"size_px= is {size_px!r}: give width and height [px]")
-    return width, height
-
-
-def _require_in_frame(xy_px: Array, size_px: tuple[int, int]) -> None:
-    """Raise NotIdentified where there are centroids (n, 2), but none in the frame of `size_px` (W, H)."""
-    in_frame = np.all((xy_px >= -0.5) & (xy_px <= np.array(size_px) - 0.5), axis=1)
+    in_frame = np.all((xy_px >= -0.5) & (xy_px <= np.array([width, height]) - 0.5), axis=1)
     if len(xy_px) and not in_frame.any():
         raise NotIdentified(
-            f"none of the {len(xy_px)} centroids lies in the frame of {size_px[0]} x {size_px[1]} px: give x and y in "
+            f"none of the {len(xy_px)} centroids lies in the frame of {width} x {height} px: give x and y in "
             "px of this frame, from the centre of its top-left pixel",
             detected=0,
         )

@@ -122,9 +122,23 @@ class CatalogPatterns:
             self._trees[level] = cKDTree(self.stars.rays_icrs[:level])
         return self._trees[level]
 
-    def neighbours(self, rays_icrs: Array, radius_rad: float, count: int) -> Neighbours:
-        """All pairs of a ray (n, 3) and a star closer than the radius, of the `count` brightest stars and some more."""
-        return _neighbours(self.tree(count), rays_icrs, 2 * np.sin(radius_rad / 2), NEIGHBOURS_OF_RAY)
+    def neighbours(self, rays_icrs: Array, radius_rad: float, count: int, most: int = NEIGHBOURS_OF_RAY) -> Neighbours:
+        """All pairs of a ray (n, 3) and a star closer than the radius, of the `count` brightest stars and some more.
+
+        `most`: stars of each ray that are looked up at first.
+        """
+        tree, chord = self.tree(count), 2 * np.sin(radius_rad / 2)
+        distance, star = tree.query(rays_icrs, most, distance_upper_bound=chord)
+        close = np.flatnonzero(distance < chord)  # a missing neighbour is infinitely far
+        near = close // most, star.ravel()[close], distance.ravel()[close]
+        crowded = np.flatnonzero(distance[:, -1] < chord)  # in star clusters
+        if len(crowded):
+            more = self.neighbours(rays_icrs[crowded], radius_rad, count, 4 * most)
+            plain = np.isin(near[0], crowded, invert=True)
+            found = crowded[more.ray], more.star, more.chord
+            order = np.argsort(np.concatenate([near[0][plain], found[0]]), kind="stable")
+            near = tuple(np.concatenate([a[plain], b])[order] for a, b in zip(near, found, strict=True))  # type: ignore[assignment]
+        return Neighbours(*near, tree.n)
 
 
 @dataclass(frozen=True)
@@ -137,26 +151,10 @@ class Neighbours:
     depth: int  # number of the brightest stars that were searched
 
 
-def _neighbours(tree: Any, rays_icrs: Array, chord: float, most: int) -> Neighbours:
-    distance, star = tree.query(rays_icrs, most, distance_upper_bound=chord)
-    close = np.flatnonzero(distance < chord)  # a missing neighbour is infinitely far
-    ray = close // most
-    near = Neighbours(ray, star.ravel()[close], distance.ravel()[close], tree.n)
-    crowded = np.flatnonzero(distance[:, -1] < chord)
-    if not len(crowded):
-        return near
-    more = _neighbours(tree, rays_icrs[crowded], chord, 4 * most)  # in star clusters
-    plain = np.isin(ray, crowded, invert=True)
-    ray = np.concatenate([ray[plain], crowded[more.ray]])
-    order = np.argsort(ray, kind="stable")
-    star = np.concatenate([near.star[plain], more.star])
-    distance = np.concatenate([near.chord[plain], more.chord])
-    return Neighbours(ray[order], star[order], distance[order], near.depth)
-
-
 def patterns_of(stars: Stars, field_sr: float) -> CatalogPatterns:
     """The patterns of these stars; patterns of the last few catalogues and fields are kept."""
-    return keep_last_few(_KEPT, (_fingerprint_of(stars), field_sr), lambda: CatalogPatterns(stars, field_sr))
+    key = (len(stars), stars.rays_icrs[:2000].tobytes(), field_sr)
+    return keep_last_few(_KEPT, key, lambda: CatalogPatterns(stars, field_sr))
 
 
 def keep_last_few(kept: OrderedDict[Any, Computed], key: Hashable, compute: Callable[[], Computed]) -> Computed:
@@ -170,4 +168,3 @@ def keep_last_few(kept: OrderedDict[Any, Computed], key: Hashable, compute: Call
 
 
 _KEPT: OrderedDict[Any, CatalogPatterns] = OrderedDict()
-_fingerprint_of = PerObject(lambda stars: (stars.rays_icrs.shape, stars.rays_icrs[:2000].tobytes()))

@@ -22,9 +22,8 @@ from startrack.identification.attitude_search import INLIER_PX
 from startrack.identification.lost_in_space import Identifier
 
 LEAST_UNEXPLAINED = 12  # significant sources; untouched frames have 0 to 4
-LEAST_UNEXPLAINED_PART = (
-    0.03  # of them, to the identified stars: second exposures of 30 to 50 % had 0.11 to 0.39, ghosts to 0.015
-)
+# Of them, to the identified stars: second exposures of 30 to 50 % had 0.11 to 0.39, ghosts to 0.015.
+LEAST_UNEXPLAINED_PART = 0.03
 LEAST_STARS = 8  # of a second field
 FAINTER_MAG = 1.0  # predicted stars fainter than the faintest identified one explain sources, too
 MOST_SOURCES = 150  # brightest ones that are identified
@@ -109,8 +108,8 @@ def find_second_field(centroids: Centroids, camera: Camera, stars: Stars, first:
 def _light(sources: Centroids, camera: Camera, stars: Stars, found: Identification) -> float:
     """Median light [e] of the stars found, for a star of magnitude 0 on the axis."""
     clear = ~sources.saturated[found.detection]
-    clear = clear if clear.any() else np.ones(len(clear), dtype=bool)
-    detection, star = found.detection[clear], found.star[clear]
+    some = clear if clear.any() else ~clear
+    detection, star = found.detection[some], found.star[some]
     throughput = 1.0 if camera.sensor is None else camera.sensor.throughput(camera.angle_rad(sources.xy_px[detection]))
     light = sources.flux_e[detection] / np.maximum(throughput, 1e-3)
     return float(np.median(light * 10 ** (0.4 * stars.v_mag[star])))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from startrack.core.types import Array, Bools, Ints, Stars
 from startrack.estimation.false_alarm import log_p_value
 from startrack.identification.index import keep_last_few
-from startrack.identification.triangles import Triangles, separate_bright_stars, triangles
+from startrack.identification.triangles import Triangles, number_runs, separate_bright_stars, triangles
 
 CELL_LENGTH = 16.0  # range of the logarithm of the size within a cell of the key
 SMALLEST_LOG = -12.0
@@ -45,9 +45,7 @@ class ShapeIndex:
         keys = _key(cells, log_size[:, None], self.shape_tolerance).ravel()
         first = np.searchsorted(self.key, keys - self.size_tolerance)
         count = np.searchsorted(self.key, keys + self.size_tolerance) - first
-        total = np.cumsum(count)
-        left = np.repeat(np.arange(len(keys)) // 4, count)
-        right = np.arange(total[-1] if len(total) else 0) + np.repeat(first - (total - count), count)
+        left, right = np.repeat(np.arange(len(keys)) // 4, count), number_runs(first, count)
         off = np.abs(self.ratios[right] - ratios.astype(np.float32)[left])
         agree = np.maximum(off[:, 0], off[:, 1]) < self.shape_tolerance
         return left[agree], right[agree]

@@ -33,9 +33,7 @@ class Triangles:
 
     def take(self, which: Any) -> Triangles:
         """The triangles selected by a mask or index array."""
-        return Triangles(
-            vertices=self.vertices[which], sides_rad=self.sides_rad[which], handedness=self.handedness[which]
-        )
+        return Triangles(**{name: values[which] for name, values in vars(self).items()})
 
 
 def triangles(rays: Array, longest_rad: float, most: int = 2_000_000) -> Triangles:
@@ -101,12 +99,8 @@ def _triples(rays: Array, chord: float, most: int) -> Ints:
     pairs = np.sort(pairs, axis=1)
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
     n = len(rays)
-    starts = np.searchsorted(pairs[:, 0], np.arange(n + 1))
     # Each pair (i, j) is extended by every later partner k of i, and kept where (j, k) is a pair too.
-    own = np.arange(len(pairs))
-    later = starts[pairs[:, 0] + 1] - own - 1
-    first = np.repeat(own, later)
-    second = np.arange(later.sum()) - np.repeat(np.cumsum(later) - later, later) + first + 1
+    first, second = _later_partners(pairs[:, 0])
     j, k = pairs[first, 1], pairs[second, 1]
     keys = pairs[:, 0] * n + pairs[:, 1]
     wanted = j * n + k
@@ -116,6 +110,18 @@ def _triples(rays: Array, chord: float, most: int) -> Ints:
     if len(triples) > most:
         triples = triples[np.argsort(triples.max(axis=1), kind="stable")[:most]]
     return triples
+
+
+def number_runs(first: Ints, count: Ints) -> Ints:
+    """The numbers of all runs, one after another; run i begins at `first` (m,) and has `count` (m,) of them."""
+    return np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
+
+
+def _later_partners(pivot: Ints) -> tuple[Ints, Ints]:
+    """All pairs of indices (m,), (m,), one before the other, of equal ones among ascending numbers (n,)."""
+    own = np.arange(len(pivot))
+    later = np.searchsorted(pivot, pivot, side="right") - own - 1
+    return np.repeat(own, later), number_runs(own + 1, later)
 
 
 def _angle(a: Array, b: Array) -> Array:
@@ -202,14 +208,10 @@ class PairIndex:
         wide = np.flatnonzero((chords[0] > self.narrowest) & (chords[0] < self.sides[-1] + tolerance))
         first = np.searchsorted(self.sides, chords[0, wide] - tolerance)
         count = np.searchsorted(self.sides, chords[0, wide] + tolerance) - first
-        at = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
-        end, pair = np.repeat(wide, count), self.pairs[at]
+        end, pair = np.repeat(wide, count), self.pairs[number_runs(first, count)]
         order = np.argsort(pair[:, 0], kind="stable")
         end, pair = end[order], pair[order]
-        own = np.arange(len(pair))
-        later = np.searchsorted(pair[:, 0], pair[:, 0], side="right") - own - 1
-        one = np.repeat(own, later)
-        other = np.arange(later.sum()) - np.repeat(np.cumsum(later) - later, later) + one + 1
+        one, other = _later_partners(pair[:, 0])
         wanted = chords[end[one], end[other]]  # 0 for an end and itself
         apart = self.rays_icrs[pair[one, 1]] - self.rays_icrs[pair[other, 1]]
         found = np.sqrt(np.einsum("ij,ij->i", apart, apart))

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from _results import table, write_section
@@ -24,7 +25,7 @@ from startrack.camera import load_camera
 from startrack.catalog import load_catalog, load_deep_catalog
 from startrack.chain import Located, Measured, Settings, last_value, locate
 from startrack.core.types import Array, Evidence, Fix, NoSolution
-from startrack.evidence import StarEvidence, StarPhotometry, flux_scale
+from startrack.evidence import StarEvidence, StarPhotometry, flux_scale, star_evidence
 from startrack.localization import ExactPosterior
 from startrack.rendering import Series, exposure_for_snr, render
 from startrack.terrain import load_terrain
@@ -139,8 +140,9 @@ def _ablations(result: Measured) -> Iterator[tuple[str, Evidence, ExactPosterior
     lonely = _photometry(result, visible=np.zeros(len(result.stars)))  # neighbours that are never visible
     yield "without crowding", lonely.evidence(), full
     yield "without flux uncertainty", _photometry(result, certain=True).evidence(), full
-    plain = _photometry(result, settings=StarEvidence(capped=False))
-    yield "without caps", plain.evidence(), full
+    with patch.multiple(star_evidence, MISSING_PROBABILITY=0.0, ANOMALY_PROBABILITY=0.0, CAP=np.inf):
+        plain = _photometry(result).evidence()
+    yield "without caps", plain, full
 
 
 def _list_evidence(photometry: StarPhotometry, threshold: float) -> Evidence:
@@ -160,16 +162,14 @@ def _list_evidence(photometry: StarPhotometry, threshold: float) -> Evidence:
     )
 
 
-def _photometry(
-    result: Measured, *, visible: Array | None = None, certain: bool = False, settings: StarEvidence | None = None
-) -> StarPhotometry:
+def _photometry(result: Measured, *, visible: Array | None = None, certain: bool = False) -> StarPhotometry:
     """The frame's evidence once more, with a part left out."""
     stars, scale = result.stars, flux_scale(result.detections, result.camera, result.stars, result.identification)
     extra_px = result.attitude_fit.extra_sigma_px
     if certain:
         stars, scale = replace(stars, v_sigma_mag=np.zeros(len(stars))), replace(scale, scatter=0.0)
         extra_px = 0.0
-    return (settings or StarEvidence())(
+    return StarEvidence()(
         result.detections, result.camera, stars, list(result.bodies),
         result.attitude_fit.attitude.R_cam_icrs, result.R_enu_icrs, scale, extra_px, visible,
     )  # fmt: skip

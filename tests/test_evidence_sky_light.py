@@ -14,9 +14,18 @@ from sky_helpers import EDGE_PX, ELEVATION_RAD, GROUND_E, NOISE_E, PX_PER_RAD, l
 from startrack.core.kernels import normal_cdf
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array
 from startrack.evidence import BAND_PX, Skyline
-from startrack.evidence.sky_levels import GROUND, LEVEL_SECTORS, SKY, SkyLevels, measure_levels, sector_of
 from startrack.evidence.sky_light import CELL_PX, LEVELS, SkyLight, measure_sky_light, sectors_with_step
-from startrack.evidence.sky_pixels import SkyPixels, pixels_near_skyline, scale_across
+from startrack.evidence.sky_pixels import (
+    GROUND,
+    LEVEL_SECTORS,
+    SKY,
+    SkyLevels,
+    SkyPixels,
+    measure_levels,
+    pixels_near_skyline,
+    scale_across,
+    sector_of,
+)
 from startrack.frames import rays_from_azel
 
 STEPS_E = (7.0, 90.0)

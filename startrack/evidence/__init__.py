@@ -1,11 +1,15 @@
 """Exposure, attitude and catalogue to rays, each with the log-likelihood ratio of sky against ground."""
 
-from startrack.evidence.damaged_response import DamagedResponse, measure_noise, measure_response
 from startrack.evidence.double_exposure import check_single_skyline
 from startrack.evidence.expected_stars import SURE_SIGMAS, FluxScale, expect_stars, expected_flux_scale, flux_scale
-from startrack.evidence.photometry import Photometry, Sources, half_width, neighbour_profiles, order_by_cell
-from startrack.evidence.photometry_kernel import profiles_of
-from startrack.evidence.sky_levels import sector_of
+from startrack.evidence.photometry import (
+    Photometry,
+    Sources,
+    half_width,
+    neighbour_profiles,
+    order_by_cell,
+    profiles_of,
+)
 from startrack.evidence.sky_light import (
     CLIP_SHIFT_PX,
     NEEDED_SECTORS,
@@ -14,7 +18,7 @@ from startrack.evidence.sky_light import (
     measure_sky_light,
     sectors_with_step,
 )
-from startrack.evidence.sky_pixels import pixels_near_skyline
+from startrack.evidence.sky_pixels import pixels_near_skyline, sector_of
 from startrack.evidence.sky_step import (
     BAND_PX,
     Horizon,
@@ -25,7 +29,16 @@ from startrack.evidence.sky_step import (
     reliable_azimuths,
     subtract_sky_step,
 )
-from startrack.evidence.star_evidence import DECIDABLE_SNR, SEEN_LLR, StarEvidence, StarPhotometry, filtered_noise_e
+from startrack.evidence.star_evidence import (
+    DECIDABLE_SNR,
+    SEEN_LLR,
+    DamagedResponse,
+    StarEvidence,
+    StarPhotometry,
+    filtered_noise_e,
+    measure_noise,
+    measure_response,
+)
 from startrack.evidence.star_offsets import measure_star_offsets, offset_terms
 
 __all__ = [

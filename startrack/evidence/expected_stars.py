@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from startrack.camera import Camera
 from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Body, Detections, Identification, Ints, Mask, Stars
-from startrack.evidence.photometry import Sources, half_width
-from startrack.evidence.photometry_kernel import SURE_SIGMAS
+from startrack.evidence.photometry import SURE_SIGMAS, Sources, half_width
 from startrack.exposure import touch_masked
 from startrack.frames import angle_between_rad, azel_from_rays, off_axis_rad
 from startrack.psf import noise_area_px

@@ -19,7 +19,7 @@ from startrack.core.statistics import NORMAL_BY_MEDIAN
 from startrack.core.types import Array, Bools, Exposure, Ints, TooFewStars
 from startrack.detection.background import BLOCK_PX, CLIPPED_SIGMA, MIN_NOISE_STEPS, Image, smallest_step
 
-PROBE_PX, STRIDE_PX = 8, 64  # of the tiles that are looked at first: dead parts of 72 px and more hold one
+PROBE_PX, STRIDE_PX = BLOCK_PX // 2, 4 * BLOCK_PX  # of the tiles looked at first: dead parts of 72 px hold one
 MOST_EQUAL = 0.8  # of the tiles: with more of one value the noise is removed
 MIN_SIDE_PX = PROBE_PX + 1  # of a rectangle of noise no 81 pixels are equal
 MIN_PART = 0.004  # of the image; smaller constant blocks occur behind JPEG compression
@@ -65,7 +65,7 @@ def find_damage(exposure: Exposure, camera: Camera | None = None) -> Damage | No
     tiles, corners = tiles[~equal], corners[~equal]
     if len(tiles) < TILES:
         return None
-    ordered, middle, sigma = _order_values(tiles)
+    ordered, _, sigma = _order_values(tiles)
     lowest = ordered[:, 0].min()
     clipped = float(np.mean(ordered == lowest))
     steps = np.diff(ordered[:: max(1, len(ordered) // 16)], axis=1)
@@ -76,11 +76,7 @@ def find_damage(exposure: Exposure, camera: Camera | None = None) -> Damage | No
     if np.count_nonzero(noisy) < len(tiles) / 2:
         cause = f"the noise is removed: most pixels of {100 * np.mean(~noisy):.0f} % of the image are equal"
         return Damage(cause, False)
-    if exposure.correction is not None:
-        tiles = _tiles_at(exposure.pixels_adu, corners)
-        _, middle, sigma = _order_values(tiles)
-        noisy &= sigma > 0
-    correlation = _neighbour_correlation(tiles[noisy], middle[noisy], sigma[noisy])
+    correlation = _neighbour_correlation(_tiles_at(exposure.pixels_adu, corners[noisy]))
     if correlation > CORRELATION:
         cause = f"the image is filtered or compressed: neighbouring pixels correlate by {correlation:.2f}"
         return Damage(cause, correlation < FILTERED_CORRELATION)
@@ -112,12 +108,15 @@ def _order_values(tiles: NDArray[np.float32]) -> tuple[NDArray[np.float32], Arra
     return ordered, np.asarray(middle), np.asarray(0.5 * NORMAL_BY_MEDIAN * (high - low))
 
 
-def _neighbour_correlation(tiles: NDArray[np.float32], middle: Array, sigma: Array) -> float:
+def _neighbour_correlation(tiles: NDArray[np.float32]) -> float:
     """Correlation of pixels with the next ones in rows and columns: that of the tiles with few stars.
 
     Stars, on one side of the noise, are clipped; what pixels seven apart share (slopes) is taken out.
     """
-    z = np.clip((tiles - middle[:, None, None]) / sigma[:, None, None], -CLIPPED_SIGMA, HIGHEST_SIGMAS)
+    _, middle, sigma = _order_values(tiles)
+    noisy = sigma > 0
+    z = (tiles[noisy] - middle[noisy, None, None]) / sigma[noisy, None, None]
+    z = np.clip(z, -CLIPPED_SIGMA, HIGHEST_SIGMAS)
     z -= z.mean(axis=(1, 2), keepdims=True)
     near, far = (
         0.5 * ((z[:, :, d:] * z[:, :, :-d]).mean(axis=(1, 2)) + (z[:, d:] * z[:, :-d]).mean(axis=(1, 2)))
@@ -160,9 +159,8 @@ def fill_masked(image: Image, masked: Bools) -> Image:
     """
     from scipy.ndimage import distance_transform_edt
 
-    shape = tuple(-(-length // BLOCK_PX) for length in image.shape)
-    good = np.empty(shape, dtype=np.int64)
-    _count_good(masked, good)
+    rows, columns = (np.arange(0, length, BLOCK_PX) for length in image.shape)
+    good = np.add.reduceat(np.add.reduceat(~masked, rows, axis=0, dtype=np.int64), columns, axis=1)
     poor = good < MIN_GOOD_PX
     if poor.all():
         raise TooFewStars("the mask leaves too few pixels of the frame")
@@ -170,16 +168,6 @@ def fill_masked(image: Image, masked: Bools) -> Image:
     filled = np.array(image)
     _fill_from_blocks(filled, masked, good, source.astype(np.int64))
     return filled
-
-
-@njit(cache=True, nogil=True)
-def _count_good(masked, good) -> None:  # type: ignore[no-untyped-def]
-    """Fill good (rows, columns) with the number of pixels of each block that are not masked."""
-    good[:] = 0
-    for y in range(masked.shape[0]):
-        row = y // BLOCK_PX
-        for x in range(masked.shape[1]):
-            good[row, x // BLOCK_PX] += not masked[y, x]
 
 
 @njit(cache=True, nogil=True)

@@ -15,14 +15,13 @@ from startrack.detection.fit import (
     fit_points,
     measure_source_noise,
 )
-from startrack.detection.frame import RESIDUAL_FRACTION, Frame, Pixels, SourceNoise, radius_for
-from startrack.detection.peaks import Peaks
+from startrack.detection.frame import RESIDUAL_FRACTION, Frame, Pixels, SourceNoise, cut_stamps, radius_for
+from startrack.detection.peaks import MAX_STAMP_PIXELS, Peaks
 from startrack.psf import pixel_profile_single
 
 CROWDED_ROUNDS = 3  # of subtracting neighbours and fitting again
 NEIGHBOUR_SIGMA = 0.1  # of a pixel's noise: a neighbour's signal above this is subtracted
 NEIGHBOUR_ERROR = np.float32(RESIDUAL_FRACTION)  # relative error of that signal: fits, and the PSF's wings
-BATCH_PIXELS = 2_000_000  # of neighbours' stamps at a time
 
 
 @dataclass(frozen=True)
@@ -36,13 +35,15 @@ class Fitted:
 
 def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = None) -> Fitted:
     """Fits of all candidates. `known`: earlier fits of the first peaks, refined once; `frame.found` contains them."""
+    from scipy.spatial import cKDTree
+
     radius, centres = radius_for(sigma), peaks.centres
     data, variance = frame.data(centres, radius), frame.variance(centres, radius)
     stamps = Stamps(data, variance, frame.usable_pixels(centres, radius), centres, peaks.surround)
     last = np.zeros_like(data)  # neighbours' signal subtracted in the last fit
     refined = 0 if known is None else len(known.flux)
     if known is not None and frame.found is not None:
-        last = frame.found_signal(centres, radius)
+        last = cut_stamps(frame.found, centres, radius)
         last[:refined] -= source_signal(known.xy_px - centres[:refined], known.flux, sigma, radius)
         last[np.square(last).max(axis=(1, 2)) <= NEIGHBOUR_SIGMA**2 * variance[:, radius, radius]] = 0.0
     cleaned = _subtract_neighbours(stamps, last)
@@ -51,7 +52,9 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = 
         for which, rounds in ((slice(0, refined), FIT_ROUNDS_AGAIN), (slice(refined, None), FIT_ROUNDS))
         if len(centres[which])
     ))  # fmt: skip
-    star, other = _find_pairs(centres, 1.5 * radius + 3.0 * sigma)
+    pairs = cKDTree(centres).query_pairs(1.5 * radius + 3.0 * sigma, output_type="ndarray")  # stamps that overlap
+    pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    star, other = pairs[np.argsort(pairs[:, 0], kind="stable")].T
     alone = np.ones(len(centres), dtype=bool)
     alone[star[_are_relevant(stamps, fits, star, other, sigma)]] = False
     source_noise = measure_source_noise(stamps, fits, alone, sigma, frame.source_noise)
@@ -88,16 +91,6 @@ def _find_reweighted(fits: PointFits, sigma: float, variance: Pixels, was: Sourc
     return np.flatnonzero(np.abs(after - before) > 0.1 * before)
 
 
-def _find_pairs(centres: Ints, reach_px: float) -> tuple[Ints, Ints]:
-    """Pairs (m,), (m,) of a candidate and a neighbour whose stamps overlap, sorted by the candidate."""
-    from scipy.spatial import cKDTree
-
-    pairs = cKDTree(centres).query_pairs(reach_px, output_type="ndarray")
-    both = np.concatenate([pairs, pairs[:, ::-1]])
-    both = both[np.argsort(both[:, 0], kind="stable")]
-    return both[:, 0], both[:, 1]
-
-
 def _sum_neighbour_signal(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> tuple[Ints, Pixels]:
     """The candidates (k,) whose stamps contain relevant signal of neighbours, and that signal (k, s, s)."""
     side = s.data.shape[1]
@@ -106,7 +99,7 @@ def _sum_neighbour_signal(s: Stamps, fits: PointFits, star: Ints, other: Ints, s
     star, other = star[counts], other[counts]
     crowded, signal = [np.zeros(0, dtype=np.int64)], [np.zeros((0, side, side), dtype=np.float32)]
     firsts = np.flatnonzero(np.diff(star, prepend=-1))
-    pairs_at_a_time = max(1, BATCH_PIXELS // (side * side))
+    pairs_at_a_time = max(1, MAX_STAMP_PIXELS // (side * side))
     while len(firsts):
         # Whole stars at a time, at least one: all pairs up to the first of a later star.
         end = np.searchsorted(firsts, firsts[0] + pairs_at_a_time)
@@ -146,7 +139,7 @@ def paint_sources(fits: PointFits, sigma: float, shape: tuple[int, int]) -> Pixe
     side = 2 * radius + 1
     image = np.zeros((shape[0] + 2 * side, shape[1] + 2 * side), dtype=np.float32)
     centres = np.clip(np.rint(fits.xy_px).astype(np.int64), -radius, np.array([shape[1], shape[0]]) + radius)
-    size = max(1, BATCH_PIXELS // (side * side))
+    size = max(1, MAX_STAMP_PIXELS // (side * side))
     for at in range(0, len(centres), size):
         here = np.arange(at, min(at + size, len(centres)))
         signals = source_signal(fits.xy_px[here] - centres[here], fits.flux[here], sigma, radius)

@@ -181,17 +181,14 @@ class _FrameSource:
 
     def __init__(
         self, image: Image, quantum: float, dead: Bools | None, source_noise: SourceNoise, masked: Bools | None
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.image, self.quantum, self.dead, self.source_noise, self.masked = image, quantum, dead, source_noise, masked
         self._kept: dict[int, tuple[Image, Image]] = {}
 
     def frame(self, sigma: float, found: Image | None = None) -> Frame:
         """The prepared frame; stars in `found` are excluded from background and noise."""
         side = block_side(sigma)
-        if found is not None:
-            maps = background_and_noise(self.image - found, self.quantum, sigma)
-        elif side in self._kept:
-            maps = self._kept[side]
-        else:
-            maps = self._kept[side] = background_and_noise(self.image, self.quantum, sigma)
+        if found is None and side not in self._kept:
+            self._kept[side] = background_and_noise(self.image, self.quantum, sigma)
+        maps = self._kept[side] if found is None else background_and_noise(self.image - found, self.quantum, sigma)
         return Frame(self.image, *maps, self.dead, self.source_noise, self.masked, found)

@@ -57,21 +57,15 @@ class Frame:
 
     def data(self, centres: Ints, radius: int) -> Image:
         """Stamps (n, s, s) without their background."""
-        return stamps(self.image, centres, radius) - stamps(self.background, centres, radius)
-
-    def found_signal(self, centres: Ints, radius: int) -> Image:
-        """Stamps (n, s, s) of the signal of the known stars."""
-        if self.found is None:
-            return np.zeros((len(centres), 2 * radius + 1, 2 * radius + 1), dtype=np.float32)
-        return stamps(self.found, centres, radius)
+        return cut_stamps(self.image, centres, radius) - cut_stamps(self.background, centres, radius)
 
     def variance(self, centres: Ints, radius: int) -> Image:
         """Stamps (n, s, s) of the pixels' variance without the sources' own signal."""
-        return np.square(stamps(self.noise, centres, radius))
+        return np.square(cut_stamps(self.noise, centres, radius))
 
     def usable_pixels(self, centres: Ints, radius: int) -> Bools | None:
         """Stamps (n, s, s) of the pixels that may be used; None where all may."""
-        return None if self.dead is None else ~stamps(self.dead, centres, radius)
+        return None if self.dead is None else ~cut_stamps(self.dead, centres, radius)
 
 
 def electrons(exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray[np.bool_]]:
@@ -96,7 +90,7 @@ def electrons(exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray
     return image, saturated
 
 
-def stamps(image: NDArray[Any], centres: Ints, radius: int) -> NDArray[Any]:
+def cut_stamps(image: NDArray[Any], centres: Ints, radius: int) -> NDArray[Any]:
     """Cut-outs (n, 2r+1, 2r+1) of the image around the integer pixels (n, 2) (x, y), which must be `radius` inside."""
     side = 2 * radius + 1
     height, width = image.shape

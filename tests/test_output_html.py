@@ -23,7 +23,8 @@ from startrack.core.errors import Reason
 from startrack.localization.rim_plane import point_fix
 from startrack.output import page_text, result_at, result_dict, results_under, write_json, write_results
 from startrack.output.html.details import SOURCES, ground_map, skyline_of
-from startrack.output.html.rows import COLUMNS, facts_of, folder_of
+from startrack.output.html.rows import COLUMNS, facts_of
+from startrack.output.record import at_record
 from startrack.terrain import load_terrain
 
 VOID = {"meta", "link", "input", "br", "img"}
@@ -131,7 +132,7 @@ def test_a_position_without_a_circle_has_an_error_only(located, tmp_path):
     assert [row[key] for key in ("radius95_m", "radius999_m", "cov_ee", "nees")] == [None] * 4
     assert row["error_m"] == pytest.approx(np.linalg.norm(located_at - [6010.0, -2507.0]), abs=0.01)
     assert head["errors"]["inside95"] is head["errors"]["mean_nees"] is None
-    facts = dict(dict(facts_of(result_dict(point)))["Position"])
+    facts = dict(dict(facts_of(at_record(result_dict(point))))["Position"])
     assert facts["95 % within"] == "no circle" and facts["Search"] == "approximate"
     assert not {"Sigma", "99.9 % within"} & set(facts)
 
@@ -316,7 +317,7 @@ def test_links_are_relative_to_the_page(results, tmp_path):
         assert main(["report", str(results), "-q", "-o", str(page)]) == 0
         base = unquote(data_of(page.read_text(encoding="utf-8"), "results")["base"])
         assert (page.parent / base).samefile(results)
-    assert all(folder_of(one) == results for one in found)
+    assert all(one.folder == results for one in found)
     inside = results / "night 1/two.fix.json"
     assert main(["report", str(inside), "-q", "-o", str(tmp_path / "one.html")]) == 0
     base = unquote(data_of((tmp_path / "one.html").read_text(encoding="utf-8"), "results")["base"])

@@ -10,8 +10,7 @@ from astropy.table import Table
 from PIL import Image
 
 from startrack.output import png_bytes, write_results
-from startrack.output.html.details import picture_of
-from startrack.output.html.stars import sectors_of, star_table_of
+from startrack.output.html.details import picture_of, sectors_of, star_table_of
 from startrack.output.picture.annotate import Layers, layers_of
 from startrack.output.picture.backdrop import bare_picture
 from startrack.output.picture.canvas import Ink
@@ -96,8 +95,8 @@ def test_without_layers_the_page_shows_the_annotated_picture(folder, tmp_path, d
 def test_stars_near_the_skyline_are_counted_by_azimuth(folder, located):
     table = Table.read(folder / "small.stars.ecsv", format="ascii.ecsv")
     east, north, _ = located.result.fix.position_enu_m
-    read = star_table_of(folder / "small.stars.ecsv", 10)
-    sectors = sectors_of(read.measured, horizon_from(east, north))
+    shown, stars = star_table_of(folder / "small.stars.ecsv", 10)
+    sectors = sectors_of(stars, horizon_from(east, north))
     above = np.radians(table["elevation_deg"]) - horizon_from(east, north)(np.radians(table["azimuth_deg"]))
     near = np.abs(np.degrees(above)) < sectors["near_deg"]
     known = ~np.ma.getmaskarray(table["evidence"])
@@ -109,12 +108,12 @@ def test_stars_near_the_skyline_are_counted_by_azimuth(folder, located):
         sign = np.where(above[chosen] > 0, 1.0, -1.0) * table["evidence"][chosen]
         assert sectors["supports"][k] == pytest.approx(sign[sign > 0].sum(), abs=0.02)
         assert sectors["opposes"][k] == pytest.approx(-sign[sign < 0].sum(), abs=0.02)
-    assert len(read.shown["columns"]["id"]) == 10 and read.shown["total"] == len(table)
+    assert len(shown["columns"]["id"]) == 10 and shown["total"] == len(table)
 
 
 def test_a_wrong_position_is_contradicted_by_its_sectors(folder, located):
     east, north, _ = located.result.fix.position_enu_m
-    stars = star_table_of(folder / "small.stars.ecsv", 0).measured
+    stars = star_table_of(folder / "small.stars.ecsv", 0)[1]
 
     def contradicted(shift_m: float) -> int:
         found = sectors_of(stars, horizon_from(east + shift_m, north))

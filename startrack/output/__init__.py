@@ -1,10 +1,9 @@
 """Results for people and programs: JSON, tables, pictures, pages, one-line summaries, and the table of quantities."""
 
-from startrack.output.explain import explain
 from startrack.output.geo import feature, geojson_text
+from startrack.output.html import filled_frame, page_text, write_page
 from startrack.output.html.details import ground_map
 from startrack.output.html.rows import Found, result_at, results_under
-from startrack.output.html.write import filled_frame, page_text, write_page
 from startrack.output.picture.annotate import annotate
 from startrack.output.picture.axes import Axes, nice_step
 from startrack.output.picture.canvas import (
@@ -54,7 +53,7 @@ from startrack.output.tables import (
     skyline_texts_deg,
     star_table_text,
 )
-from startrack.output.text import Rows, lens_text, refusal_line, rows, summary_line, verbose_text
+from startrack.output.text import Rows, explain, lens_text, refusal_line, rows, summary_line, verbose_text
 from startrack.output.values import ARCSEC_PER_RAD, R_body_enu, boresight_rad
 from startrack.output.write import (
     COMPANIONS,

@@ -13,11 +13,7 @@ from startrack.output.quantities import BY_PATH, QUANTITIES
 from startrack.output.quantity import Schema, record_from
 from startrack.output.values import At
 
-FORMATS = {
-    "fix": "startrack.fix/1",
-    "identification": "startrack.identification/1",
-    "detection": "startrack.detection/1",
-}
+FORMATS = {kind: f"startrack.{kind}/1" for kind in ("fix", "identification", "detection")}
 OF_A_POSITION = ("position", "modes", "search", "evidence", "sky", "clock")  # sections of a fix alone
 
 

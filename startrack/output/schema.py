@@ -102,7 +102,7 @@ HORIZON = object_schema(
         "images": {"type": "array", "items": TEXT},
         "left_out": {
             "type": "array",
-            "items": object_schema({"image": TEXT, "reason": {"enum": REFUSALS}, "message": TEXT}),
+            "items": LEFT_OUT_IMAGE,
         },
         "azimuths": object_schema(dict.fromkeys(("known", "stars", "sky_light", "both"), COUNT)),
         "median_sigma_deg": or_null(POSITIVE, "of the known azimuths"),

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.catalog import star_names
-from startrack.chain import Identified, Inputs, Measured, Oriented
-from startrack.core.types import Array, Ints, MeasuredSkyline, Stars
+from startrack.chain import Inputs, Measured, Oriented
+from startrack.core.types import Array, Ints, MeasuredSkyline
 from startrack.evidence import SEEN_LLR
 from startrack.output.quantity import Quantity
 
@@ -29,13 +29,13 @@ LEAST_HALF_RAD, MOST_HALF_RAD = np.radians(0.02), np.radians(5.0)
 
 @dataclass(frozen=True)
 class Column:
-    """One column: its heading and its values, None (or an empty text) where there is none."""
+    """One column: its heading and its values, None, nan or an empty text where there is none."""
 
     name: str
     values: Iterable[Any]
     datatype: str = "float64"  # or int64, string, bool
     unit: str | None = None  # as astropy spells it
-    form: str = "%s"  # of a value; of one in a sparse column with None in it, use `format_values`
+    form: str = "%s"  # of a value
     description: str = ""
 
 
@@ -44,15 +44,14 @@ def ecsv_text(columns: Sequence[Column]) -> str:
     head = ["# %ECSV 1.0", "# ---", "# delimiter: ','", "# datatype:"]
     head += [_yaml_line(column) for column in columns]
     head += ["# schema: astropy-2.0", ",".join(column.name for column in columns)]
-    row = ",".join(column.form for column in columns)
-    values = [_column_values(column) for column in columns]
-    return "\n".join([*head, *map(row.__mod__, zip(*values, strict=True))]) + "\n"
+    values = [_field_texts(column) for column in columns]
+    return "\n".join([*head, *map(",".join, zip(*values, strict=True))]) + "\n"
 
 
 def quantity_columns(quantities: Iterable[Quantity], values: Mapping[str, Iterable[Any]]) -> list[Column]:
     """Columns of the `quantities` that have `values`, by the names of the columns; empty for None and nan."""
     return [
-        Column(one.name, format_values(one.form, values[one.name]), one.datatype, one.unit, description=one.description)
+        Column(one.name, values[one.name], one.datatype, one.unit, one.form, one.description)
         for quantity in quantities
         for one in quantity.table_columns
         if one.name in values
@@ -69,9 +68,10 @@ def quote_texts(texts: Iterable[str]) -> list[str]:
     return ['"' + text.replace('"', '""') + '"' if "," in text or '"' in text else text for text in texts]
 
 
-def _column_values(column: Column) -> list[Any]:
-    values = column.values.tolist() if isinstance(column.values, np.ndarray) else list(column.values)
-    return quote_texts(values) if column.datatype == "string" else values
+def _field_texts(column: Column) -> list[str]:
+    values = column.values.tolist() if isinstance(column.values, np.ndarray) else column.values
+    texts = format_values(column.form, values)
+    return quote_texts(texts) if column.datatype == "string" else texts
 
 
 def _yaml_line(column: Column) -> str:
@@ -88,17 +88,44 @@ def star_table_text(value: Inputs) -> str:
     """
     if not isinstance(value, Oriented):
         raise ValueError("no star table without identified stars")
-    if not isinstance(value, Measured):
-        star, xy_px = stars_in_view(value)
-        return ecsv_text([*_catalog_columns(value.stars, star), *_place_columns(value, star, xy_px)])
-    light = value.light
-    return ecsv_text([
-        *_catalog_columns(value.stars, light.star),
-        Column("azimuth_deg", np.degrees(light.azimuth_rad), "float64", "deg", "%.5f", "north through east, in enu"),
-        Column("elevation_deg", np.degrees(light.elevation_rad), "float64", "deg", "%.5f", "in enu"),
-        *_place_columns(value, light.star, light.xy_px),
-        *_light_columns(light, "electron" if value.camera.sensor is not None else "adu"),
-    ])  # fmt: skip
+    light = value.light if isinstance(value, Measured) else None
+    star, xy_px = stars_in_view(value) if light is None else (light.star, light.xy_px)
+    stars, hips = value.stars, value.stars.hip[star]
+    measured_px = np.full((len(star), 2), np.nan)
+    _, row, match = np.intersect1d(star, value.identification.star, return_indices=True)
+    measured_px[row] = value.detections.xy_px[value.identification.detection[match]]
+    columns = [
+        Column("catalog_id", stars.catalog_id[star], "string", description="source and number"),
+        Column("hip", [hip or None for hip in hips.tolist()], "int64", description="Hipparcos number"),
+        Column("name", names_of(hips), "string", description="proper name, or Bayer, Flamsteed or variable"),
+        Column("v_mag", stars.v_mag[star], "float64", "mag", "%.3f", "Johnson V of the catalogue"),
+    ]
+    if light is not None:
+        north = "north through east, in enu"
+        columns += [
+            Column("azimuth_deg", np.degrees(light.azimuth_rad), "float64", "deg", "%.5f", north),
+            Column("elevation_deg", np.degrees(light.elevation_rad), "float64", "deg", "%.5f", "in enu"),
+        ]
+    origin, centroid = "(0, 0) is the centre of the top-left pixel", "centroid of the detection identified as it"
+    columns += [
+        Column("x_px", xy_px[:, 0], "float64", "pix", "%.3f", f"predicted; {origin}"),
+        Column("y_px", xy_px[:, 1], "float64", "pix", "%.3f", "predicted"),
+        Column("x_measured_px", measured_px[:, 0], "float64", "pix", "%.3f", centroid),
+        Column("y_measured_px", measured_px[:, 1], "float64", "pix", "%.3f", centroid),
+    ]
+    if light is not None:
+        flux_e, sigma_e, llr = (np.where(light.usable, one, np.nan) for one in (light.flux_e, light.sigma_e, light.llr))
+        unit = "electron" if value.camera.sensor is not None else "adu"
+        odds = "ln p(light | visible) - ln p(light | hidden)"
+        columns += [
+            Column("expected_e", light.expected_e, "float64", unit, "%.6g", "flux if nothing hides it"),
+            Column("flux_e", flux_e, "float64", unit, "%.6g", "measured at the predicted position"),
+            Column("sigma_e", sigma_e, "float64", unit, "%.6g", "of flux_e without a star"),
+            Column("evidence", llr, "float64", None, "%.3f", odds),
+            Column("status", status_of(light), "string", description="seen, hidden, uncertain or unusable"),
+            Column("cause", light.cause, "string", description="why it is unusable"),
+        ]
+    return ecsv_text(columns)
 
 
 def status_of(light: StarPhotometry) -> NDArray[np.str_]:
@@ -120,58 +147,6 @@ def stars_in_view(value: Oriented) -> tuple[Ints, Array]:
     candidates = np.flatnonzero(stars.v_mag <= faintest)
     xy_px, inside = value.camera.project(stars.rays_icrs[candidates] @ value.attitude.R_cam_icrs.T)
     return candidates[inside], xy_px[inside]
-
-
-def _catalog_columns(stars: Stars, star: Ints) -> list[Column]:
-    hips = stars.hip[star]
-    return [
-        Column("catalog_id", stars.catalog_id[star], "string", description="source and number"),
-        Column("hip", ["" if hip == 0 else hip for hip in hips.tolist()], "int64", description="Hipparcos number"),
-        Column("name", names_of(hips), "string", description="proper name, or Bayer, Flamsteed or variable"),
-        Column("v_mag", stars.v_mag[star], "float64", "mag", "%.3f", "Johnson V of the catalogue"),
-    ]
-
-
-def _place_columns(value: Identified, star: Ints, xy_px: Array) -> list[Column]:
-    measured = _measured_px_texts(value, star)
-    origin = "(0, 0) is the centre of the top-left pixel"
-    return [
-        Column("x_px", xy_px[:, 0], "float64", "pix", "%.3f", f"predicted; {origin}"),
-        Column("y_px", xy_px[:, 1], "float64", "pix", "%.3f", "predicted"),
-        Column("x_measured_px", measured[0], "float64", "pix", "%s", "centroid of the detection identified as it"),
-        Column("y_measured_px", measured[1], "float64", "pix", "%s", "centroid of the detection identified as it"),
-    ]
-
-
-def _measured_px_texts(value: Identified, star: Ints) -> tuple[list[str], list[str]]:
-    """Measured pixels of the stars as texts, empty where no detection was identified as the star."""
-    x: list[float | None] = [None] * len(star)
-    y: list[float | None] = [None] * len(star)
-    _, row, match = np.intersect1d(star, value.identification.star, return_indices=True)
-    xy_px = value.detections.xy_px[value.identification.detection[match]]
-    for at, (px, py) in zip(row.tolist(), xy_px.tolist(), strict=True):
-        x[at], y[at] = px, py
-    return format_values("%.3f", x), format_values("%.3f", y)
-
-
-def _light_columns(light: StarPhotometry, unit: str) -> Sequence[Column]:
-    usable = light.usable.tolist()
-
-    def format_usable(form: str, values: Array) -> list[str]:
-        return [form % value if known else "" for value, known in zip(values.tolist(), usable, strict=True)]
-
-    return [
-        Column("expected_e", light.expected_e, "float64", unit, "%.6g", "flux if nothing hides it"),
-        Column(
-            "flux_e", format_usable("%.6g", light.flux_e), "float64", unit, "%s", "measured at the predicted position"
-        ),
-        Column("sigma_e", format_usable("%.6g", light.sigma_e), "float64", unit, "%s", "of flux_e without a star"),
-        Column(
-            "evidence", format_usable("%.3f", light.llr), description="ln p(light | visible) - ln p(light | hidden)"
-        ),
-        Column("status", status_of(light), "string", description="seen, hidden, uncertain or unusable"),
-        Column("cause", light.cause, "string", description="why it is unusable"),
-    ]
 
 
 def skyline_table_text(skyline: MeasuredSkyline) -> str:
@@ -199,10 +174,8 @@ def half_range_rad(raised_rad: Array, sigma_rad: Array) -> float:
 
 def skyline_texts_deg(skyline: MeasuredSkyline) -> tuple[list[str], list[str], list[str]]:
     """Azimuth, elevation and sigma [deg] of a `skyline` as texts, the last two empty where they are not known."""
-    known = skyline.known.tolist()
     elevation, sigma = (
-        [value if ok else None for value, ok in zip(np.degrees(values).tolist(), known, strict=True)]
-        for values in (skyline.elevation_rad, skyline.sigma_rad)
+        np.where(skyline.known, np.degrees(values), np.nan) for values in (skyline.elevation_rad, skyline.sigma_rad)
     )
     azimuth = [f"{value:g}" for value in np.round(np.degrees(skyline.azimuth_rad), 6)]
-    return azimuth, format_values("%.4f", elevation), format_values("%.4f", sigma)
+    return azimuth, format_values("%.4f", elevation.tolist()), format_values("%.4f", sigma.tolist())

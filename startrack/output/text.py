@@ -1,24 +1,37 @@
-"""Results as text: rows of names and texts, one line for a terminal, and some more lines for -v."""
+"""Results as text: rows of names and texts, lines for a terminal, and what an image would need."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from startrack.chain import STAGES, Outcome, Refused, last_value
+from startrack.chain import STAGES, Detected, Identified, Located, Measured, Outcome, Refused, last_value
+from startrack.core.errors import Reason, length_text
 from startrack.core.files import printable
+from startrack.core.types import Array, Blocked
+from startrack.evidence import DECIDABLE_SNR
+from startrack.frames import rays_from_azel
+from startrack.localization import duration
 from startrack.output.quantities import QUANTITIES
 from startrack.output.quantity import TURN
 from startrack.output.record import at_stage, image_name
-from startrack.output.values import Angle, At
+from startrack.output.values import DOMINANT, Angle, At
 
 if TYPE_CHECKING:
     from startrack.camera import Camera
 
 NAME_LETTERS = 11  # width of the names in the detailed text
+WIDE_PART = 1e-3  # of the search radius: an answer with a smaller 95 % circle needs nothing
+LONGER = 4.0  # times the exposure; stars of half the signal-to-noise ratio are in the star table
+NEAR_SKYLINE_RAD = np.radians(2.0)  # stars this near it show where it stands
+STAR_GROWTH = 0.6  # the number of stars grows with this power of the exposure: tenfold for 2 mag, SNR with its root
+ENOUGH_STARS = 30  # point sources with which nearly every image is identified
+GAINS_PART = 0.8  # a fact is named where the circle with it stated is smaller by this factor
+LEAST_HIDDEN_RAD = np.radians(15.0)  # of the skyline out of view
+AZIMUTHS_RAD = np.radians(np.arange(0.75, 360.0, 1.5))
 Rows = list[tuple[str, str]]
 
 
@@ -81,3 +94,122 @@ def verbose_text(result: Outcome) -> str:
     lines += [("ms", f"{', '.join(spent)}; all stages {sum(result.timing_ms.values()):.0f}")] if spent else []
     lines += [("warning", warning) for warning in result.warnings]
     return "\n".join(f"  {name:<{NAME_LETTERS}}{text}" for name, text in lines)
+
+
+def explain(outcome: Outcome) -> list[str]:
+    """What the image of an `outcome` would need, one statement an entry; empty where a position has a small circle.
+
+    The gain of a longer exposure is an estimate: with stars alone the circle falls as the number of stars near the
+    skyline grows whose own light decides whether they are visible, with the sky's light as its noise does.
+    """
+    return [*_needs_of(outcome)]
+
+
+def _needs_of(outcome: Outcome) -> Iterator[str]:
+    value, reason = last_value(outcome), outcome.reason
+    if isinstance(outcome, Located):
+        yield from _needs_of_located(outcome)
+    elif reason is Reason.INCONSISTENT_EVIDENCE and isinstance(value, Measured):
+        yield from _doubtful(value)
+    elif isinstance(value, Measured) and isinstance(outcome, Refused):
+        yield _longer_exposure(value)
+        yield from _more_skyline(value)
+        clock = ["time_sigma_s"] if value.clock.gross_probability > 0.0 else []
+        shape = [error.fact for error in value.terrain.shape_errors if not error.is_stated]
+        silent = list(dict.fromkeys([*shape, *clock]))
+        if silent:  # no position shows what each would gain
+            yield f"facts: {', '.join(silent)} are not stated and count as uncertain ({_statement_of(silent[0])})"
+    elif isinstance(value, Detected) and reason is Reason.NOT_IDENTIFIED:
+        count = len(value.detections)
+        if isinstance(value, Identified) or count >= ENOUGH_STARS:
+            file = "but they fit no attitude; --fov needs no file"
+            yield f"the right camera file: {count} point sources are enough, {file}"
+        else:
+            longer = (ENOUGH_STARS / max(count, 1)) ** (1.0 / STAR_GROWTH)
+            yield f"{longer:.1g} times the exposure: it has {count} point sources, and {ENOUGH_STARS} are enough"
+    elif isinstance(outcome, Refused):
+        yield outcome.reason.advice
+
+
+def _needs_of_located(located: Located) -> Iterator[str]:
+    fix, radius_m = located.fix, located.fix.radius999_m
+    by_a_fact = any(DOMINANT * one.radius999_m_if_exact < radius_m for one in fix.unstated)
+    if not (fix.ambiguous or by_a_fact or not fix.radius95_m < WIDE_PART * located.terrain.search_radius_m):
+        return
+    if fix.ambiguous:
+        first, second = (np.array([mode.east_m, mode.north_m]) for mode in fix.modes[:2])
+        apart_m = float(np.linalg.norm(first - second))
+        yield (
+            f"another position: the two likeliest are {length_text(apart_m)} apart; --near with a sigma of "
+            f"{length_text(apart_m / 5)} or less, or a second image from elsewhere, decides"
+        )
+    for one in fix.unstated:
+        if one.radius999_m_if_exact < GAINS_PART * radius_m:
+            yield (
+                f"a fact: with {one.fact} stated and exact the 99.9 % circle would be "
+                f"{one.radius999_m_if_exact:.1f} m, not {radius_m:.1f} m ({_statement_of(one.fact)})"
+            )
+    yield _longer_exposure(located)
+    yield from _more_skyline(located)
+
+
+def _statement_of(fact: str) -> str:
+    if fact == "time_sigma_s":
+        return "--time-sigma, or time_sigma_s in the sidecar"
+    return "startrack terrain state FILE writes it"
+
+
+def _longer_exposure(measured: Measured) -> str:
+    """How much a longer exposure would gain, by the stars near the skyline."""
+    now, then = _deciding_stars(measured, 1.0), _deciding_stars(measured, LONGER)
+    seconds = measured.exposure.exposure_s
+    longer = f"{LONGER:g} times the exposure" + ("" if seconds is None else f" ({LONGER * seconds:.3g} s)")
+    seen_from = "" if isinstance(measured, Located) else " of the search area's middle"
+    text = f"{longer}: {then} stars near the skyline{seen_from}, in place of {now}, would show whether they are visible"
+    if not isinstance(measured, Located) or measured.fix.ambiguous or not np.isfinite(measured.fix.radius95_m):
+        return text
+    gain = LONGER**0.5 if measured.sky_light is not None else max(then, 1) / max(now, 1)
+    stated = " if all facts were stated" if measured.fix.unstated else ""
+    return f"{text}, a 95 % circle of about {measured.fix.radius95_m / gain:.1f} m{stated}"
+
+
+def _deciding_stars(measured: Measured, longer: float) -> int:
+    """Usable stars near the skyline that an exposure longer by a factor shows, by the noise of the background."""
+    light, skyline_rad = measured.light, _skyline(measured)
+    above = light.elevation_rad - np.interp(light.azimuth_rad, AZIMUTHS_RAD, skyline_rad, period=2 * np.pi)
+    decides = light.expected_e * np.sqrt(longer) > DECIDABLE_SNR * light.sigma_e
+    return int(np.count_nonzero(light.usable & decides & (np.abs(above) < NEAR_SKYLINE_RAD)))
+
+
+def _more_skyline(measured: Measured) -> Iterator[str]:
+    """Azimuths in which the skyline is not in view, or blocked."""
+    rays_cam = rays_from_azel(AZIMUTHS_RAD, _skyline(measured)) @ measured.R_cam_enu.T
+    xy_px, inside = measured.camera.project(rays_cam)
+    known = inside & (measured.camera.angle_rad(xy_px) <= measured.camera.calibrated_angle_rad)
+    hidden = Blocked(np.where(known, 0.0, 1.0))
+    if 2 * np.pi * np.mean(hidden.whole) > LEAST_HIDDEN_RAD:
+        yield f"more of the skyline: azimuths {hidden.text} are not in view; look up more steeply, or take a wider lens"
+    if isinstance(measured, Located) and measured.blocked is not None:
+        yield f"a free view: something on no map stands at azimuths {measured.blocked.text}; drive on some metres"
+
+
+def _skyline(measured: Measured) -> Array:
+    """Elevation (n,) of the map's skyline at the position, or in the middle of the search area without one."""
+    position_m = measured.position_at_time_m if isinstance(measured, Located) else np.zeros(2)
+    return np.asarray(measured.terrain.horizon_rad(position_m[None], AZIMUTHS_RAD)).ravel()
+
+
+def _doubtful(measured: Measured) -> Iterator[str]:
+    """The facts of which one is wrong, where they contradict the image."""
+    sigma = f"stated to {duration(measured.clock.sigma_s)}"
+    if measured.clock.gross_probability > 0.0:
+        sigma = "nobody states its error"
+    yield f"the right time: {measured.exposure.time_utc:%Y-%m-%dT%H:%M:%S} UTC, {sigma}; --time-sigma widens it"
+    stated = dict.fromkeys(error.fact for error in measured.terrain.shape_errors if error.is_stated)
+    trusted = f" and trusted in {', '.join(stated)}" if stated else ""
+    yield f"the right terrain: {measured.terrain.name} is compared with the image{trusted}"
+    lens = "startrack calibrate verify compares it with an image of the stars"
+    if measured.camera.covariance is None:
+        lens = "its lens counts as exact; startrack calibrate states a covariance"
+    yield f"the right camera file: {measured.camera.name}, residuals of {measured.attitude_fit.rms_px:.2f} px; {lens}"
+    yield "a free view: a mask (--mask) leaves out what stands in view and is on no map"

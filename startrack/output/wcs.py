@@ -6,7 +6,7 @@ has a FITS projection or a polynomial with its error; a decentred one needs the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from io import BytesIO
 from typing import Any
@@ -74,6 +74,8 @@ def matches_bytes(value: Oriented) -> bytes:
     Columns as astrometry.net's: field_x, field_y, field_ra, field_dec, index_x, index_y, index_ra, index_dec, and
     index_id, FLUX, MAG.
     """
+    from astropy.io import fits
+
     camera, R = value.camera, _R_cam_catalog(value)
     found, stars = value.identification, value.stars.take(value.identification.star)
     velocity = _velocity_m_s(value)
@@ -81,17 +83,24 @@ def matches_bytes(value: Oriented) -> bytes:
     measured = value.detections.xy_px[found.detection]
     predicted, _ = camera.project(stars.rays_icrs @ value.attitude.R_cam_icrs.T)
     field_deg, index_deg = _radec_deg(camera.unproject(measured) @ R), _radec_deg(still)
-    return _table_file(
-        [
-            ("field_x", "pix", measured[:, 0] + 1), ("field_y", "pix", measured[:, 1] + 1),
-            ("field_ra", "deg", field_deg[:, 0]), ("field_dec", "deg", field_deg[:, 1]),
-            ("index_x", "pix", predicted[:, 0] + 1), ("index_y", "pix", predicted[:, 1] + 1),
-            ("index_ra", "deg", index_deg[:, 0]), ("index_dec", "deg", index_deg[:, 1]),
-            ("index_id", "", np.asarray(stars.catalog_id)), ("FLUX", "", value.detections.flux_e[found.detection]),
-            ("MAG", "mag", stars.v_mag),
-        ],
-        "CORR",
-    )  # fmt: skip
+    columns: list[tuple[str, str, NDArray[Any]]] = [
+        ("field_x", "pix", measured[:, 0] + 1), ("field_y", "pix", measured[:, 1] + 1),
+        ("field_ra", "deg", field_deg[:, 0]), ("field_dec", "deg", field_deg[:, 1]),
+        ("index_x", "pix", predicted[:, 0] + 1), ("index_y", "pix", predicted[:, 1] + 1),
+        ("index_ra", "deg", index_deg[:, 0]), ("index_dec", "deg", index_deg[:, 1]),
+        ("index_id", "", np.asarray(stars.catalog_id)), ("FLUX", "", value.detections.flux_e[found.detection]),
+        ("MAG", "mag", stars.v_mag),
+    ]  # fmt: skip
+    made = [
+        fits.Column(
+            name=key, unit=unit or None, array=values,
+            format=f"{max(values.dtype.itemsize // 4, 1)}A" if values.dtype.kind == "U" else "D",
+        )
+        for key, unit, values in columns
+    ]  # fmt: skip
+    file = BytesIO()
+    fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns(made, name="CORR")]).writeto(file)
+    return file.getvalue()
 
 
 def header_block(cards: Mapping[str, Card]) -> bytes:
@@ -105,22 +114,6 @@ def header_block(cards: Mapping[str, Card]) -> bytes:
         else:
             header[key] = value
     return bytes(header.tostring().encode("ascii"))
-
-
-def _table_file(columns: Sequence[tuple[str, str, NDArray[Any]]], name: str) -> bytes:
-    """A FITS file with one binary table: columns as (name, unit, values), floats or texts."""
-    from astropy.io import fits
-
-    made = [
-        fits.Column(
-            name=key, unit=unit or None, array=values,
-            format=f"{max(values.dtype.itemsize // 4, 1)}A" if values.dtype.kind == "U" else "D",
-        )
-        for key, unit, values in columns
-    ]  # fmt: skip
-    file = BytesIO()
-    fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns(made, name=name)]).writeto(file)
-    return file.getvalue()
 
 
 def _velocity_m_s(value: Oriented) -> Array | None:

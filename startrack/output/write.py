@@ -62,17 +62,13 @@ def prepare_folder(path: Path, sha256: str, *, overwrite: bool, remedy: str) -> 
         raise BadInput("bad_image", f"{path}: cannot be read, nor replaced: {cause.strerror}") from cause
     except (ValueError, RecursionError):  # no JSON: not ours
         before = {}
-    if before is not None and not _is_of(before, sha256):
+    provenance = before.get("provenance") if isinstance(before, dict) else None
+    if before is not None and not (isinstance(provenance, dict) and provenance.get("image_sha256") == sha256):
         raise BadInput("bad_image", f"{path} is not a result of this image: {remedy}")
     try:
         remove_companions(path)
     except OSError as cause:
         raise BadInput("bad_image", f"{cause.filename}: cannot be replaced: {cause.strerror}; {remedy}") from cause
-
-
-def _is_of(record: Any, sha256: str) -> bool:
-    provenance = record.get("provenance", {}) if isinstance(record, dict) else {}
-    return isinstance(provenance, dict) and provenance.get("image_sha256") == sha256
 
 
 def _stem_and_kind(record: Path) -> tuple[str, str]:
@@ -107,9 +103,8 @@ def _write_companions(outcome: Outcome, path: Path, *, plots: bool) -> None:
         write_star_table(companion(path, ".stars.ecsv"), value)
         write_wcs(companion(path, ".wcs"), companion(path, ".corr"), value)
     if isinstance(value, Located) and value.skyline is not None:
-        write_atomically(
-            companion(path, SKYLINE_TABLE), skyline_table_text(value.skyline).encode("utf-8"), overwrite=True
-        )
+        table = skyline_table_text(value.skyline).encode("utf-8")
+        write_atomically(companion(path, SKYLINE_TABLE), table, overwrite=True)
         if plots:
             panorama = png_bytes(located_picture(value, value.skyline))
             write_atomically(companion(path, SKYLINE_PICTURE), panorama, overwrite=True)
@@ -122,7 +117,6 @@ def write_geo(record: Path, outcome: Outcome, kinds: Sequence[str]) -> None:
 
     `kinds`: which of the two. A former file of another outcome is removed. Raises BadInput where one cannot be written.
     """
-
     for kind in GEO_FORMATS:
         path = record.with_name(f"{_stem_and_kind(record)[0]}.{kind}")
         if kind in kinds and isinstance(outcome, Located):
@@ -157,7 +151,6 @@ def write_wcs(path: FilePath, corr_path: FilePath, value: Oriented) -> None:
 
     No NAME.wcs is left if no FITS projection describes the lens. Raises BadInput where they cannot be written.
     """
-
     header = wcs_bytes(value)
     if header is None:
         Path(path).unlink(missing_ok=True)

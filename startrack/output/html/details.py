@@ -1,57 +1,158 @@
-"""Details of one image on a page: ground, horizon and skyline, and the picture with the marks to be drawn on it."""
+"""Details of one image on a page: ground, picture, stars, their evidence by sectors of azimuth, and skyline."""
 
 from __future__ import annotations
 
 import base64
-import math
+import csv
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.types import Array, BadInput
-from startrack.output.html.stars import Horizon, read_ecsv
+from startrack.catalog import proper_name_designations
+from startrack.core.types import Array, Bools, Evidence
+from startrack.localization import Sectors
 from startrack.output.picture.annotate import layers_of
 from startrack.output.picture.canvas import encoded_bytes
 from startrack.output.picture.relief import edge_cover, ground_cells, hill_shading
 from startrack.output.tables import half_range_rad
-from startrack.terrain import Terrain, load_terrain
+from startrack.terrain import Terrain
 
 RELIEF_CELLS = 420
 MAP_MARGIN = 1.03  # beyond the map, for its edge
 BRIGHTEST = 215.0
-
-
-def load_or_none(name: str) -> Terrain | None:
-    """The terrain of a name or path; None where its file is not here."""
-    try:
-        return load_terrain(name)
-    except BadInput:  # the page needs only the results: it states what is missing
-        return None
-
-
-def horizon_from(terrain: Terrain, east_m: float, north_m: float) -> Horizon:
-    """The horizon seen from a position."""
-
-    def horizon_rad(azimuth_rad: Array) -> Array:
-        place = np.broadcast_to([east_m, north_m], (len(azimuth_rad), 2))
-        return np.asarray(terrain.horizon_rad(place, azimuth_rad))
-
-    return horizon_rad
-
-
-def horizon_line(horizon: Horizon, count: int) -> list[float] | None:
-    """Elevation of the `horizon` [deg] at `count` azimuths, evenly from 0 to 360 degrees, both ends included.
-
-    None from where it is not known: a position off the map.
-    """
-    elevation = horizon(np.linspace(0.0, 2 * np.pi, count))
-    return _round_values(np.degrees(elevation), 3) if np.isfinite(elevation).all() else None
-
-
+WEBP_QUALITY = 82
+Horizon = Callable[[Array], Array]  # azimuths (n,) to elevations (n,) [rad]
+# name on the page, column of NAME.stars.ecsv, decimals (None: a text)
+STAR_COLUMNS: tuple[tuple[str, str, int | None], ...] = (
+    ("id", "catalog_id", None), ("name", "name", None), ("mag", "v_mag", 2), ("az", "azimuth_deg", 3),
+    ("el", "elevation_deg", 3), ("x", "x_px", 2), ("y", "y_px", 2), ("mx", "x_measured_px", 2),
+    ("my", "y_measured_px", 2), ("exp", "expected_e", 0), ("flux", "flux_e", 0), ("sigma", "sigma_e", 0),
+    ("ev", "evidence", 2), ("status", "status", None), ("cause", "cause", None),
+)  # fmt: skip
+DIRECTION_COLUMNS = ("azimuth_deg", "elevation_deg", "evidence")
+PAGE_SECTORS = 72  # of 5 degrees: wide enough for some stars near the skyline, narrow enough to show a boulder
+NEAR_RAD = np.radians(3.0)  # to either side of the skyline
+COARSE_AZIMUTHS = 10 * PAGE_SECTORS + 1
+COARSE_ERROR_RAD = NEAR_RAD / 3  # a ridge between two coarse azimuths: nearer stars get their own horizon
+SURE_LLR = 4.0  # of stars that decide; of weaker ones some level skyline always fits the noise better
+CONTRADICTED_NATS = -3.0  # of one sector
 SOURCES = ("", "stars", "sky light", "both")  # of a skyline; the page has their places in this list
+
+
+class MeasuredStars(NamedTuple):
+    """All stars of a table with evidence."""
+
+    azimuth_rad: Array  # (n,)
+    elevation_rad: Array  # (n,)
+    llr: Array  # (n,) ln p(light | visible) - ln p(light | hidden)
+    status: NDArray[np.str_]  # (n,)
+
+
+def star_table_of(path: Path, most: int) -> tuple[dict[str, Any] | None, MeasuredStars]:
+    """What a page shows of the star table at `path`, None where there is none, and all its stars with evidence.
+
+    Shown are the `most` brightest stars as columns, designations of named ones, and how many have each status.
+    """
+    head, rows = read_ecsv(path)
+    columns = {
+        name: [_text_or_number(row.get(column) or "", decimals) for row in rows[:most]]
+        for name, column, decimals in STAR_COLUMNS
+    }
+    names = proper_name_designations()
+    shown = {
+        "total": len(rows),
+        "counts": dict(Counter(row.get("status", "") for row in rows)),
+        "unit": "ADU" if any("'expected_e'" in line and "unit: adu" in line for line in head) else "e",
+        "columns": {key: values for key, values in columns.items() if any(one not in (None, "") for one in values)},
+        "designations": {name: known for name in columns["name"] if (known := names.get(name))},
+    }
+    measured = [row for row in rows if row.get("evidence")]
+    azimuth, elevation, llr = (np.array([float(row[name]) for row in measured]) for name in DIRECTION_COLUMNS)
+    status = np.array([row.get("status", "") for row in measured], dtype=np.str_)
+    stars = MeasuredStars(np.radians(azimuth), np.radians(elevation), llr, status)
+    return (shown if head else None), stars
+
+
+def read_ecsv(path: Path) -> tuple[list[str], list[dict[str, str]]]:
+    """The comment lines and the rows of an ECSV file; both empty where there is none."""
+    lines = path.read_text(encoding="utf-8").split("\n") if path.is_file() else []
+    return [one for one in lines if one.startswith("#")], [
+        *csv.DictReader(one for one in lines if not one.startswith("#"))
+    ]
+
+
+def _text_or_number(text: str, decimals: int | None) -> Any:
+    if decimals is None:
+        return text
+    try:
+        number = round(float(text), decimals)
+    except ValueError:  # an empty field: nothing was measured
+        return None
+    return int(number) if decimals == 0 or number == int(number) else number
+
+
+def sectors_of(stars: MeasuredStars, horizon: Horizon) -> dict[str, Any] | None:
+    """What the `stars` near the `horizon` show in PAGE_SECTORS sectors from north through east; None without stars.
+
+    `near_deg`: how near. `above` and `below` the horizon: numbers of stars there that are `seen` and `hidden`.
+    `supports` and `opposes`: sums of |evidence| [nats] of near stars that agree with the horizon and that do not.
+    `nats`: log-likelihood of the horizon beside the best one that is shifted up or down in this sector alone, from the
+    stars whose evidence is sure; 0 is perfect, None without such stars. A sector below `contradicted_nats`
+    contradicts the position.
+    """
+    above_rad = _heights_rad(stars, horizon)
+    near = np.abs(above_rad) < NEAR_RAD  # False where it is not known
+    if not near.any():
+        return None
+    sector = (stars.azimuth_rad / (2 * np.pi) * PAGE_SECTORS).astype(int) % PAGE_SECTORS
+    above, agrees = above_rad > 0, (above_rad > 0) == (stars.llr > 0)
+
+    def count(side: Bools, status: str) -> list[int]:
+        chosen = near & side & (stars.status == status)
+        return [int(number) for number in np.bincount(sector[chosen], minlength=PAGE_SECTORS)]
+
+    def total(chosen: Bools) -> list[float]:
+        chosen = near & chosen
+        weights = np.abs(stars.llr[chosen])
+        return rounded(np.bincount(sector[chosen], weights=weights, minlength=PAGE_SECTORS))
+
+    sure = np.isfinite(above_rad) & (np.abs(stars.llr) > SURE_LLR)
+    return {
+        "near_deg": round(float(np.degrees(NEAR_RAD)), 3),
+        "contradicted_nats": CONTRADICTED_NATS,
+        "above": {status: count(above, status) for status in ("seen", "hidden")},
+        "below": {status: count(~above, status) for status in ("seen", "hidden")},
+        "supports": total(agrees),
+        "opposes": total(~agrees),
+        "nats": rounded(_nats_by_sector(stars.azimuth_rad[sure], above_rad[sure], stars.llr[sure])),
+    }
+
+
+def _heights_rad(stars: MeasuredStars, horizon: Horizon) -> Array:
+    """Heights (n,) of the stars above the horizon; of stars far from it to COARSE_ERROR_RAD."""
+    azimuth = np.linspace(0.0, 2 * np.pi, COARSE_AZIMUTHS)
+    above_rad = stars.elevation_rad - np.interp(stars.azimuth_rad, azimuth, horizon(azimuth))
+    near = np.abs(above_rad) < NEAR_RAD + COARSE_ERROR_RAD
+    above_rad[near] = stars.elevation_rad[near] - horizon(stars.azimuth_rad[near])
+    return above_rad
+
+
+def _nats_by_sector(azimuth_rad: Array, above_rad: Array, llr: Array) -> Array:
+    """Log-likelihood (PAGE_SECTORS,) of the horizon beside the best shifted one; nan where a sector has no row.
+
+    Elevations are counted from the horizon, so that the best level skyline of a sector is the horizon shifted.
+    """
+    evidence = Evidence(azimuth_rad=azimuth_rad, elevation_rad=np.clip(above_rad, -np.pi / 2, np.pi / 2), llr=llr)
+    sectors = Sectors(evidence, PAGE_SECTORS, epsilon=0.0)
+    visible = np.where(above_rad > 0, llr, 0.0)
+    sums = np.bincount(sectors.sector, weights=visible, minlength=PAGE_SECTORS).astype(np.float64)
+    occupied = np.bincount(sectors.sector, minlength=PAGE_SECTORS) > 0
+    return np.where(occupied, sectors.by_sector(sums), np.nan)
 
 
 def skyline_of(path: Path, horizon: Horizon | None, stars: dict[str, Any] | None) -> dict[str, Any] | None:
@@ -60,19 +161,16 @@ def skyline_of(path: Path, horizon: Horizon | None, stars: dict[str, Any] | None
     Of a known `horizon` also `above`, the heights above it, `half`, the range of them to
     be shown, and `near`: the indices of the `stars` within that range, and their heights above the horizon.
     """
-    if not path.is_file():
-        return None
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = [row for row in read_ecsv(file)[1] if row.get("source") in SOURCES[1:]]
+    rows = [row for row in read_ecsv(path)[1] if row.get("source") in SOURCES[1:]]
     if not rows:
         return None
     azimuth, elevation, sigma = (
         np.radians([float(row[f"{name}_deg"]) for row in rows]) for name in ("azimuth", "elevation", "sigma")
     )
     found: dict[str, Any] = {
-        "az": _round_values(np.degrees(azimuth), 2),
-        "el": _round_values(np.degrees(elevation), 3),
-        "sigma": _round_values(np.degrees(sigma), 4),
+        "az": rounded(np.degrees(azimuth), 2),
+        "el": rounded(np.degrees(elevation), 3),
+        "sigma": rounded(np.degrees(sigma), 4),
         "source": [SOURCES.index(row["source"]) for row in rows],
     }
     if horizon is None:
@@ -81,8 +179,8 @@ def skyline_of(path: Path, horizon: Horizon | None, stars: dict[str, Any] | None
     half = half_range_rad(above, sigma)
     return {
         **found,
-        "above": _round_values(np.degrees(above), 4),
-        "half": round(math.degrees(half), 3),
+        "above": rounded(np.degrees(above), 4),
+        "half": round(float(np.degrees(half)), 3),
         "near": _stars_near(stars, horizon, half),
     }
 
@@ -94,11 +192,7 @@ def _stars_near(stars: dict[str, Any] | None, horizon: Horizon, half_rad: float)
         return []
     above = np.radians(columns["el"]) - horizon(np.radians(columns["az"]))
     near = np.flatnonzero(np.abs(above) < half_rad)
-    return [list(pair) for pair in zip(near.tolist(), _round_values(np.degrees(above[near]), 3), strict=True)]
-
-
-def _round_values(values: Array, decimals: int) -> list[float]:
-    return [round(value, decimals) for value in values.tolist()]
+    return [list(pair) for pair in zip(near.tolist(), rounded(np.degrees(above[near]), 3), strict=True)]
 
 
 def ground_map(
@@ -127,9 +221,6 @@ def _relief(terrain: Terrain, centre_m: tuple[float, float], half_m: float) -> s
     return data_uri(np.stack([grey, grey, grey, cover], axis=-1))
 
 
-QUALITY = 82
-
-
 def picture_of(picture: Path, longest_px: int) -> dict[str, Any] | None:
     """`src` (a data URI), `width`, `height` [px of the picture], `scale` and `marks`; None without a picture.
 
@@ -156,5 +247,10 @@ def _shown(sky: NDArray[np.uint8], longest_px: int) -> dict[str, Any]:
 
 def data_uri(pixels: NDArray[np.uint8]) -> str:
     """A picture (H, W, 3), blue first, or (H, W, 4) with its cover, as a WebP data URI: a fifth of the PNG."""
-    data = encoded_bytes(".webp", pixels, cv2.IMWRITE_WEBP_QUALITY, QUALITY)
+    data = encoded_bytes(".webp", pixels, cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY)
     return f"data:image/webp;base64,{base64.b64encode(data).decode('ascii')}"
+
+
+def rounded(values: NDArray[Any], decimals: int = 2) -> list[Any]:
+    """Values for JSON, None for nan."""
+    return [round(value, decimals) + 0.0 if np.isfinite(value) else None for value in values.tolist()]

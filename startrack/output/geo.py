@@ -41,22 +41,15 @@ def features(value: Located) -> list[dict[str, Any]]:
     record, site = result_dict(value), value.site
     common = {key: record[key] for key in ("image", "status")} | {"time_utc": record["provenance"]["time_utc"]}
     common |= {key: record["attitude"].get(key) for key in ATTITUDE_KEYS}
-    if "position" not in record:
-        up_m = float(value.fix.position_enu_m[2])
-        return [
-            one for mode in record["modes"] for one in _point_and_circle(site, mode | {"up_m": up_m}, common | mode)
-        ]
-    position = record["position"]
-    return _point_and_circle(site, position, common | {key: position.get(key) for key in POSITION_KEYS})
-
-
-def _point_and_circle(site: Site, at: dict[str, Any], properties: dict[str, Any]) -> list[dict[str, Any]]:
-    """A point with `properties` at a position or mode, and the polygon of its 95 % circle."""
-    middle_m, radius_m = np.array([at["east_m"], at["north_m"], at["up_m"]]), at["radius95_m"]
-    point = feature("Point", _lonlat(site, middle_m[None])[0], properties)
-    ring = None if radius_m is None else _circle(site, middle_m, radius_m)
-    circle = {"image": properties["image"], "circle": "95 %", "radius_m": radius_m}
-    return [point, *([] if ring is None else [feature("Polygon", [ring], circle)])]
+    position, up_m, found = record.get("position"), float(value.fix.position_enu_m[2]), list[dict[str, Any]]()
+    for at in record["modes"] if position is None else [{key: position.get(key) for key in POSITION_KEYS}]:
+        middle_m, radius_m = np.array([at["east_m"], at["north_m"], up_m]), at["radius95_m"]
+        found.append(feature("Point", _lonlat(site, middle_m[None])[0], common | at))
+        ring = None if radius_m is None else _circle(site, middle_m, radius_m)
+        if ring is not None:
+            circle = {"image": common["image"], "circle": "95 %", "radius_m": radius_m}
+            found.append(feature("Polygon", [ring], circle))
+    return found
 
 
 def _circle(site: Site, middle_m: Array, radius_m: float) -> list[list[float]] | None:
@@ -110,17 +103,11 @@ def _placemark(feature: dict[str, Any]) -> str:
         if text is not None
     )
     name = f"{properties['image']} {properties.get('circle', '')}".strip()
-    if geometry["type"] == "Point":
-        shape = f"<Point><coordinates>{_kml_points([geometry['coordinates']])}</coordinates></Point>"
+    is_point, rings = geometry["type"] == "Point", geometry["coordinates"]
+    places = " ".join(f"{lon!r},{lat!r}" for lon, lat in ([rings] if is_point else rings[0]))
+    shape = f"<coordinates>{places}</coordinates>"
+    if is_point:
+        shape = f"<Point>{shape}</Point>"
     else:
-        ring = _kml_points(geometry["coordinates"][0])
-        shape = (
-            f"<Polygon><outerBoundaryIs><LinearRing><coordinates>{ring}</coordinates></LinearRing></outerBoundaryIs>"
-            "</Polygon>"
-        )
-    extended = f"<ExtendedData>{data}</ExtendedData>"
-    return f"<Placemark><name>{escape(name)}</name>{extended}{shape}</Placemark>\n"
-
-
-def _kml_points(points: list[list[float]]) -> str:
-    return " ".join(f"{lon!r},{lat!r}" for lon, lat in points)
+        shape = f"<Polygon><outerBoundaryIs><LinearRing>{shape}</LinearRing></outerBoundaryIs></Polygon>"
+    return f"<Placemark><name>{escape(name)}</name><ExtendedData>{data}</ExtendedData>{shape}</Placemark>\n"

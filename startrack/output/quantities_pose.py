@@ -28,8 +28,6 @@ from startrack.output.quantity import (
 from startrack.output.values import (
     ARCSEC_PER_RAD,
     R_body_enu,
-    ambiguous_modes,
-    arcsec_text,
     body_deg,
     body_sigmas_deg,
     boresight_deg,
@@ -82,9 +80,9 @@ POSITION_QUANTITIES: tuple[Quantity, ...] = (
       "2 x 2, (east, north); this and the circles are null of a method that states none",
       {"type": "array", "items": numbers(2), "minItems": 2, "maxItems": 2}, nullable=True, form="%.6g",
       columns={"cov_east_east_m2": (0, 0), "cov_east_north_m2": (0, 1), "cov_north_north_m2": (1, 1)}),
-    Q("position.sigma_east_m", "m", Located, sigma_m(0), "standard deviation of east", derived=True,
+    Q("position.sigma_east_m", "m", Located, lambda at: sigma_m(at, 0), "standard deviation of east", derived=True,
       shown=(Show("notebook", "east", " ± {:.2f} m"),)),
-    Q("position.sigma_north_m", "m", Located, sigma_m(1), "standard deviation of north", derived=True,
+    Q("position.sigma_north_m", "m", Located, lambda at: sigma_m(at, 1), "standard deviation of north", derived=True,
       shown=(Show("notebook", "north", " ± {:.2f} m"),)),
     Q("position.ellipse", "m, m, deg", Located, ellipse, "one sigma: semi-axes, azimuth of the larger", derived=True,
       shown=(Show("text", "error", "sigma {0[0]:.2f} m by {0[1]:.2f} m"),
@@ -151,7 +149,8 @@ POSITION_QUANTITIES: tuple[Quantity, ...] = (
       "weights sum to 1. The circles about each hold 95 and 99.9 % of that mode: the true position is in them if it is "
       "in this mode; null: not stated. Ambiguous: modes outside the main mode's 99.9 % circle hold more than 1 %",
       {"type": "array", "items": MODE, "minItems": 1}),
-    Q("modes.text", "", Located, ambiguous_modes, "the positions that fit", derived=True,
+    Q("modes.text", "", Located, lambda at: at("modes") if at("position.east_m") is None else None,
+      "the positions that fit", derived=True,
       shown=(Show("summary", "modes", lambda m: f"{len(m)} positions fit: {modes_text(m)}"),
              Show("text", "places", modes_text))),
     Q("search.outcome", "", Located, lambda v: v.fix.search, "as `position.search`; also where several positions fit: "
@@ -161,6 +160,7 @@ POSITION_QUANTITIES: tuple[Quantity, ...] = (
     Q("search.dropped_probability", "", Located, lambda v: v.fix.dropped_probability,
       "as `position.dropped_probability`", CHANCE, nullable=True),
 )  # fmt: skip
+_ARCSEC = "{0[0]:.2f}, {0[1]:.2f}, {0[2]:.2f} arcsec about"
 _HEADING = "attitude.heading_deg"
 ATTITUDE_QUANTITIES: tuple[Quantity, ...] = (
     Q("attitude.quat_xyzw_cam_icrs", "", Oriented, lambda v: quat_xyzw_from_R(v.attitude.R_cam_icrs).tolist(),
@@ -184,9 +184,9 @@ ATTITUDE_QUANTITIES: tuple[Quantity, ...] = (
       lambda v: (np.sqrt(np.diag(v.attitude.covariance_rad2)) * ARCSEC_PER_RAD).tolist(),
       "of rotations about cam x, y, z: the errors of the stars, and of the lens where the camera has a `covariance`",
       numbers(3), form="%.4f", columns={f"sigma_{axis}_arcsec": (i,) for i, axis in enumerate("xyz")},
-      shown=(Show("text", "boresight", lambda s: f"; sigma {arcsec_text(s)} x, y, z"),
-             Show("notebook", "sigma", lambda s: f"{arcsec_text(s)} cam x, y, z"),
-             Show("page", "Sigma", lambda s: f"{arcsec_text(s)} x, y, z"))),
+      shown=(Show("text", "boresight", f"; sigma {_ARCSEC} x, y, z"),
+             Show("notebook", "sigma", f"{_ARCSEC} cam x, y, z"),
+             Show("page", "Sigma", f"{_ARCSEC} x, y, z"))),
     Q("attitude.lens_error_included", "", Oriented, lambda v: v.camera.covariance is not None,
       "whether the camera has one; without it the lens is taken as exact, and the true error of the attitude is larger "
       "by the rotation that a wrong centre or focal length causes", FLAG, optional=True,

@@ -23,7 +23,6 @@ from startrack.output.values import DOMINANT, Angle, At
 if TYPE_CHECKING:
     from startrack.camera import Camera
 
-NAME_LETTERS = 11  # width of the names in the detailed text
 WIDE_PART = 1e-3  # of the search radius: an answer with a smaller 95 % circle needs nothing
 LONGER = 4.0  # times the exposure; stars of half the signal-to-noise ratio are in the star table
 NEAR_SKYLINE_RAD = np.radians(2.0)  # stars this near it show where it stands
@@ -93,7 +92,8 @@ def verbose_text(result: Outcome) -> str:
     spent = [f"{stage} {result.timing_ms[stage]:.0f}" for stage in STAGES if stage in result.timing_ms]
     lines += [("ms", f"{', '.join(spent)}; all stages {sum(result.timing_ms.values()):.0f}")] if spent else []
     lines += [("warning", warning) for warning in result.warnings]
-    return "\n".join(f"  {name:<{NAME_LETTERS}}{text}" for name, text in lines)
+    width = 1 + max(len(show.row) for one in QUANTITIES for show in one.shown if show.place == "text")
+    return "\n".join(f"  {name:<{width}}{text}" for name, text in lines)
 
 
 def explain(outcome: Outcome) -> list[str]:

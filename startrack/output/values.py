@@ -53,7 +53,8 @@ def boresight_rad(R_cam_icrs: Array) -> tuple[float, float, float]:
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
     north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
     roll = np.arctan2(up @ east, up @ north)
-    return positive_turn(float(ra)), float(dec), positive_turn(float(roll))
+    ra, roll = (angle if angle < 2 * np.pi else 0.0 for angle in np.mod([ra, roll], 2 * np.pi).tolist())
+    return ra, float(dec), roll  # a tiny negative angle leaves the modulo as 2 pi itself
 
 
 def carrying_azimuths(value: Located) -> list[list[float]] | None:
@@ -103,12 +104,6 @@ def chance_text(probability: float) -> str:
     return f"{probability:.0e}" if probability >= SMALLEST_CHANCE else f"below {SMALLEST_CHANCE:.0e}"
 
 
-def positive_turn(angle_rad: float) -> float:
-    """The angle within [0, 2 pi)."""
-    turned = angle_rad % (2 * np.pi)
-    return turned if turned < 2 * np.pi else 0.0  # a tiny negative angle leaves the modulo as 2 pi itself
-
-
 def boresight_deg(axis: int) -> Callable[[Oriented], float]:
     """Right ascension, declination or roll (`axis` 0 to 2) of the camera [deg]."""
     return lambda v: float(np.degrees(boresight_rad(v.attitude.R_cam_icrs)[axis]))
@@ -150,19 +145,10 @@ def caution_text(at: At) -> str | None:
     return ", ".join(part for part in parts if part) or None
 
 
-def sigma_m(axis: int) -> Callable[[At], float | None]:
+def sigma_m(at: At, axis: int) -> float | None:
     """Standard deviation of east or north (`axis` 0, 1) [m]."""
-
-    def sigma(at: At) -> float | None:
-        covariance = at("position.covariance_m2")
-        return None if covariance is None else float(np.sqrt(covariance[axis][axis]))
-
-    return sigma
-
-
-def ambiguous_modes(at: At) -> Any:
-    """The modes where no single position is stated."""
-    return at("modes") if at("position.east_m") is None else None
+    covariance = at("position.covariance_m2")
+    return None if covariance is None else float(np.sqrt(covariance[axis][axis]))
 
 
 def modes_record(fix: Fix) -> list[dict[str, Any]]:
@@ -185,11 +171,6 @@ def mode_text(mode: dict[str, Any]) -> str:
 def modes_text(modes: list[dict[str, Any]]) -> str:
     """Every mode of a record with its probability."""
     return "; ".join(f"{mode_text(mode)}, probability {100 * mode['weight']:.0f} %" for mode in modes)
-
-
-def arcsec_text(sigma: list[float]) -> str:
-    """Three standard deviations in one unit."""
-    return f"{sigma[0]:.2f}, {sigma[1]:.2f}, {sigma[2]:.2f} arcsec about"
 
 
 def exact_lens_text(included: bool) -> str:

@@ -11,7 +11,7 @@ from startrack.core.files import check_output as check_file
 from startrack.core.files import write_atomically
 from startrack.core.types import Array, BadInput, MeasuredSkyline
 from startrack.frames import Site
-from startrack.output import png_bytes, skyline_table_text, skyline_texts_deg
+from startrack.output import png_bytes, skyline_picture, skyline_table_text, skyline_texts_deg
 
 SKYLINE_SUFFIXES = (".csv", ".ecsv", ".hrz", ".png")  # and none: the folder of a Stellarium landscape
 LANDSCAPE, HORIZON_LIST = "landscape.ini", "horizon.txt"
@@ -49,15 +49,14 @@ def write_skyline(output: str, skyline: MeasuredSkyline, site: Site, *, overwrit
 
     Existing files are replaced with `overwrite` only. Raises BadInput if the format cannot hold the skyline.
     """
-    files = output_files(output)
-    texts = {
-        ".csv": lambda: (csv_text(skyline),),
-        ".ecsv": lambda: (skyline_table_text(skyline),),
-        ".hrz": lambda: (nina_text(skyline),),
-        "": lambda: (landscape_text(Path(output).name, site), horizon_list_text(skyline)),
-    }
-    kind = kind_of(output)
-    data = (_picture(skyline),) if kind == ".png" else tuple(text.encode("utf-8") for text in texts[kind]())
+    files, kind = output_files(output), kind_of(output)
+    if kind == ".png":
+        data = [png_bytes(skyline_picture(skyline))]
+    elif kind:
+        text_of = {".csv": csv_text, ".ecsv": skyline_table_text, ".hrz": nina_text}[kind]
+        data = [text_of(skyline).encode("utf-8")]
+    else:
+        data = [landscape_text(Path(output).name, site).encode("utf-8"), horizon_list_text(skyline).encode("utf-8")]
     for path, content in zip(files, data, strict=True):
         write_atomically(path, content, overwrite=overwrite)
     return files
@@ -72,16 +71,14 @@ def csv_text(skyline: MeasuredSkyline) -> str:
 
 def nina_text(skyline: MeasuredSkyline) -> str:
     """Lines "azimuth altitude" in degrees from 0 to 360, as N.I.N.A. reads them (# begins a comment)."""
-    azimuth, elevation = _closed_deg(skyline)
-    rows = [f"{a:g} {e:.3f}" for a, e in zip(azimuth, elevation, strict=True)]
-    return "# azimuth altitude\n" + "\n".join(rows) + "\n"
+    first = horizon_list_text(skyline, "{:g} {:.3f}\n")
+    return first + f"{360.0:g} {np.degrees(interpolate_unknown(skyline)[0]):.3f}\n"
 
 
-def horizon_list_text(skyline: MeasuredSkyline) -> str:
-    """The list of azimuth and altitude of a polygonal landscape."""
-    azimuth, elevation = _closed_deg(skyline)
-    rows = [f"{a:.1f} {e:.3f}" for a, e in zip(azimuth[:-1], elevation[:-1], strict=True)]
-    return "# azimuth altitude\n" + "\n".join(rows) + "\n"
+def horizon_list_text(skyline: MeasuredSkyline, form: str = "{:.1f} {:.3f}\n") -> str:
+    """The list of azimuth and altitude of a polygonal landscape, each in the format `form`."""
+    places_deg = np.degrees([skyline.azimuth_rad, interpolate_unknown(skyline)])
+    return "# azimuth altitude\n" + "".join(form.format(*place) for place in places_deg.T)
 
 
 def landscape_text(name: str, site: Site) -> str:
@@ -116,15 +113,3 @@ def interpolate_unknown(skyline: MeasuredSkyline) -> Array:
         raise BadInput("bad_image", "the skyline is unknown at all azimuths")
     at, elevation = skyline.azimuth_rad[known], skyline.elevation_rad[known]
     return np.asarray(np.interp(skyline.azimuth_rad, at, elevation, period=2 * np.pi))
-
-
-def _closed_deg(skyline: MeasuredSkyline) -> tuple[Array, Array]:
-    elevation = np.degrees(interpolate_unknown(skyline))
-    return np.append(np.degrees(skyline.azimuth_rad), 360.0), np.append(elevation, elevation[0])
-
-
-def _picture(skyline: MeasuredSkyline) -> bytes:
-    """The panorama as PNG."""
-    from startrack.output import skyline_picture
-
-    return png_bytes(skyline_picture(skyline))

@@ -17,7 +17,7 @@ from startrack.catalog import proper_name_designations
 from startrack.core.types import Array, Bools, Evidence
 from startrack.localization import Sectors
 from startrack.output.picture.annotate import layers_of
-from startrack.output.picture.canvas import encoded_bytes
+from startrack.output.picture.canvas import QUALITY, encoded_bytes
 from startrack.output.picture.relief import edge_cover, ground_cells, hill_shading
 from startrack.output.tables import half_range_rad
 from startrack.terrain import Terrain
@@ -25,7 +25,6 @@ from startrack.terrain import Terrain
 RELIEF_CELLS = 420
 MAP_MARGIN = 1.03  # beyond the map, for its edge
 BRIGHTEST = 215.0
-WEBP_QUALITY = 82
 Horizon = Callable[[Array], Array]  # azimuths (n,) to elevations (n,) [rad]
 # name on the page, column of NAME.stars.ecsv, decimals (None: a text)
 STAR_COLUMNS: tuple[tuple[str, str, int | None], ...] = (
@@ -247,7 +246,7 @@ def _shown(sky: NDArray[np.uint8], longest_px: int) -> dict[str, Any]:
 
 def data_uri(pixels: NDArray[np.uint8]) -> str:
     """A picture (H, W, 3), blue first, or (H, W, 4) with its cover, as a WebP data URI: a fifth of the PNG."""
-    data = encoded_bytes(".webp", pixels, cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY)
+    data = encoded_bytes(".webp", pixels, cv2.IMWRITE_WEBP_QUALITY, QUALITY)
     return f"data:image/webp;base64,{base64.b64encode(data).decode('ascii')}"
 
 

@@ -21,6 +21,7 @@ from startrack.output.picture.backdrop import View, bare_picture, fit_to_canvas
 from startrack.output.picture.canvas import (
     LARGE_PX,
     LINE_PX,
+    QUALITY,
     TEXT_PX,
     TITLE_PX,
     Box,
@@ -44,7 +45,6 @@ STATUS = {"ok": Ink.GREEN, "ambiguous": Ink.ORANGE, "refused": Ink.VERMILLION}
 OVERVIEW_PART = 0.58  # of the height left for maps
 MAX_MODES, MAX_LINES = 4, 8  # of positions that fit, and of a message
 BARE_CHUNK, MARKS_CHUNK = b"stPX", b"stOV"  # a JPEG; compressed JSON
-JPEG_QUALITY = 88  # 270 kB of 1400 x 1400 px, in 10 ms; WebP has 150 kB and takes 200 ms
 EastNorth = tuple[float, float] | None  # east and north [m] of the true position, where a caller knows it
 
 
@@ -74,7 +74,7 @@ class Layers:
 
 def add_layers(png: bytes, layers: Layers) -> bytes:
     """The PNG file with the layers before its picture data."""
-    jpeg = encoded_bytes(".jpg", layers.bare[:, :, ::-1], cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
+    jpeg = encoded_bytes(".jpg", layers.bare[:, :, ::-1], cv2.IMWRITE_JPEG_QUALITY, QUALITY)
     text = json.dumps(layers.overlay, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     return insert_png_chunks(png, [(BARE_CHUNK, jpeg), (MARKS_CHUNK, zlib.compress(text.encode("utf-8")))])
 

@@ -19,8 +19,8 @@ from startrack.output.values import skyline_position_m
 Image = NDArray[np.float32]
 LONGEST_SIDE_PX, SHORTEST_SIDE_PX = 1400, 900
 SMOOTHING_PX = (0.5, 3.0)  # of the display, as wide as the PSF within these
-CALM_SNR = 2.6  # fainter light than that is treated as noise and left out
 KNEE_SNR, GLARE_SNR = 5.0, 400.0  # where the stretch turns from linear to logarithmic, and where it ends
+CALM_SNR = KNEE_SNR / 2  # fainter light than that is treated as noise and left out
 STAR_PX = 15  # on the canvas: wider sources are not stars
 SAMPLE = 4  # levels are taken from every fourth pixel
 WALL_SHADE = 0.75  # how far the wall's colour replaces the sky's

@@ -22,8 +22,8 @@ DIMMEST_HIDDEN_V_MAG = 3.0  # a fainter planet behind the wall is not missed
 COMPASS_DEG = np.arange(0.0, 60.0, 0.5)  # elevations from the horizontal up at which a tick of the compass may stand
 COMPASS = {0: "N", 90: "E", 180: "S", 270: "W"}
 TICK_RAD = np.radians([0.0, 2.2, 5.0])  # foot and top of a tick of the compass and the middle of its letter
-MAX_CIRCLES, MAX_CROSSES = 4000, 150  # of detections and of hidden stars, the brightest: more would hide the picture
-MAX_NAMES, MAX_HIDDEN_NAMES = 20, 8
+MAX_CROSSES = 150  # of hidden stars, the brightest: more would hide the picture
+MAX_NAMES = 20  # of stars, and half as many of hidden ones
 FAINTEST_SNR, BRIGHTEST_SNR = 5.0, 300.0
 
 
@@ -131,7 +131,7 @@ def draw_marks(canvas: Canvas, view: View, value: Inputs, overlay: dict[str, Any
         xy_px = value.detections.xy_px[value.identification.detection[order]]
         faded = mix_colours(Ink.HIDDEN, Ink.SKY_DARK, 0.15)
         for stars, px, most, colour, size in (
-            (star, xy_px, MAX_NAMES, Ink.PLAIN, LARGE_PX), (hidden, hidden_px, MAX_HIDDEN_NAMES, faded, TEXT_PX)
+            (star, xy_px, MAX_NAMES, Ink.PLAIN, LARGE_PX), (hidden, hidden_px, MAX_NAMES // 2, faded, TEXT_PX)
         ):  # fmt: skip
             first = names_of(value.stars.hip[stars[: 4 * most]])
             for place, name in [pair for pair in zip(px, first, strict=False) if pair[1]][:most]:
@@ -144,7 +144,7 @@ def _draw_detections(canvas: Canvas, view: View, value: Detected) -> None:
     identified = np.zeros(len(found), dtype=bool)
     if isinstance(value, Identified):
         identified[value.identification.detection] = True
-    shown = np.flatnonzero((identified | _other_sources(value))[:MAX_CIRCLES])
+    shown = np.flatnonzero(identified | _other_sources(value))
     strength = np.log(np.maximum(found.snr, FAINTEST_SNR) / FAINTEST_SNR) / np.log(BRIGHTEST_SNR / FAINTEST_SNR)
     # The bright ones last, on top; the faint ones dim, so that a thousand of them do not drown the stars.
     for k in shown[::-1]:

@@ -18,7 +18,8 @@ from startrack.output.record import image_name
 from startrack.output.tables import half_range_rad, status_of
 from startrack.terrain import Terrain
 
-WIDTH_PX, HEIGHT_PX, ENLARGED_PX = 1440, 420, 300
+WIDTH_PX = 1440
+HEIGHT_PX, ENLARGED_PX = 3 * WIDTH_PX // 10, 2 * WIDTH_PX // 10  # of both plots
 ABOVE_PX, RIGHT_PX = 2 * TEXT_PX, TEXT_PX  # about a plot
 AZIMUTHS_RAD = np.radians(np.linspace(0.0, 360.0, 3601))
 MAX_STARS = 1500  # the brightest

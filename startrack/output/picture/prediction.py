@@ -14,7 +14,7 @@ from startrack.core.errors import length_text
 from startrack.core.types import Array, Bools, Ints
 from startrack.frames import Site, latlon_from_enu
 from startrack.output.picture.axes import NICE, Axes
-from startrack.output.picture.canvas import LINE_PX, TEXT_PX, TITLE_PX, Canvas, Colour, Ink
+from startrack.output.picture.canvas import LINE_PX, TEXT_PX, TITLE_PX, Canvas, Colour, Ink, rgb_colours
 from startrack.output.picture.maps import BELOW_PX, MARGIN_PX, SEARCH_MARGIN, SIDE_PX, Map, ring
 from startrack.output.picture.relief import cell_points, edge_cover, extrapolate, hill_shading
 
@@ -22,11 +22,9 @@ if TYPE_CHECKING:
     from startrack.terrain import Raster, Terrain
 
 HEAD_PX, KEY_PX = 6 * TEXT_PX, 16 * TEXT_PX  # above a picture, for its title; beside a map, for its legend
-CURVES_PX = 1100, 620
-MIN_BOUNDS = 2
 LEAST_SPREAD = 0.05  # of the radii, relative: less is one class
 # Light to dark, of even steps in lightness (viridis, van der Walt and Smith 2015): the smaller the radius, the lighter.
-COLOURS: tuple[Colour, ...] = ((253, 231, 37), (94, 201, 98), (33, 145, 140), (59, 82, 139), (88, 40, 110))
+COLOURS = rgb_colours("fde725 5ec962 21918c 3b528b 58286e")
 SHADE = 0.55  # of a colour in the darkest shadow of the relief
 CURVES = (Ink.BLUE, Ink.ORANGE, Ink.GREEN, Ink.PURPLE)
 LOCATED = 0.9  # share of the draws below which a point is marked
@@ -75,7 +73,7 @@ def class_bounds_m(radius_m: NDArray[np.floating[Any]]) -> list[float]:
         return []
     low, high = (float(bound) for bound in np.percentile(known, [2, 98]))
     bounds = [bound for bound in NICE if low < bound < high]
-    if len(bounds) < MIN_BOUNDS and high > low * (1.0 + LEAST_SPREAD):
+    if len(bounds) < 2 and high > low * (1.0 + LEAST_SPREAD):
         step = next(one for one in NICE if one >= (high - low) / len(COLOURS))
         bounds = [float(bound) for bound in step * np.arange(np.floor(low / step) + 1, np.ceil(high / step))]
     return bounds[: len(COLOURS) - 1] or [next(bound for bound in NICE if bound >= high)]
@@ -166,8 +164,8 @@ def _curve_axes(
     names: Iterable[tuple[str, Colour]], logarithmic: str = "",
 ) -> Axes:  # fmt: skip
     """Axes of radii with their scales and the `names` of their curves, on a canvas of their own."""
-    canvas = _headed_canvas(*CURVES_PX, title, lines)
-    box = (MARGIN_PX, HEAD_PX + TEXT_PX, CURVES_PX[0] - 2 * TEXT_PX, CURVES_PX[1] - 4 * TEXT_PX)
+    box = (MARGIN_PX, HEAD_PX + LINE_PX, MARGIN_PX + 1.2 * SIDE_PX, HEAD_PX + LINE_PX + SIDE_PX / 2)
+    canvas = _headed_canvas(round(box[2] + BELOW_PX), round(box[3] + MARGIN_PX), title, lines)
     axes = Axes(canvas, box, x, y, logarithmic)
     axes.draw_scales("95 % radius [m]", across, names)
     return axes

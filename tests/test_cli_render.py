@@ -10,7 +10,7 @@ import pytest
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog, load_deep_catalog
-from startrack.cli import render as command
+from startrack.cli.study_commands import COMMANDS
 from startrack.core.types import BadInput
 from startrack.exposure import read_exposure
 from startrack.frames import (
@@ -46,8 +46,8 @@ def folder(tmp_path, monkeypatch):
 
 def render(*flags):
     parser = argparse.ArgumentParser("startrack")
-    command.COMMANDS[0].add_to(parser.add_subparsers())
-    return command.run(
+    COMMANDS[0].add_to(parser.add_subparsers())
+    return COMMANDS[0].run(
         parser.parse_args(["render", "-c", "small.toml", "--faint-stars", "8", "--stars", "hipparcos", *flags])
     )
 

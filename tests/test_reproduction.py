@@ -41,9 +41,9 @@ from startrack.applications.reproduction.simulator import (
     star_count,
     visible_stars,
 )
-from startrack.cli import reproduce as cli
+from startrack.cli.console import Progress, progress
 from startrack.cli.main import main
-from startrack.cli.progress import Progress, progress
+from startrack.cli.study_commands import ARTEFACT_NAMES
 from startrack.core import chunk_store, runner
 from startrack.core.files import hold_lock
 from startrack.localization import ExactPosterior, Hull, PseudoGradient
@@ -208,7 +208,7 @@ def test_distances_between_changes_are_the_thesis_s():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", cli.NAMES)
+@pytest.mark.parametrize("name", ARTEFACT_NAMES)
 def test_each_table_and_figure_is_written(small_run, name):
     artefact, files = small_run[name]
     pictures = [path for path in files if path.suffix == ".png"]
@@ -239,7 +239,7 @@ def test_tables_are_read_by_astropy(small_run):
 
 
 def test_names_of_the_command_are_those_that_can_be_made():
-    assert tuple(ARTEFACTS) == cli.NAMES
+    assert tuple(ARTEFACTS) == ARTEFACT_NAMES
     assert FULL.skies * FULL.per_sky == FULL.one_sky == 100_000  # as in the thesis
     assert QUICK.per_sky < FULL.per_sky
     fewer = FULL.limit_ours(700)

@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC
 from functools import cached_property
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.api.values import (
-    ClockOffset,
-    Orientation,
-    Position,
-    clock_of,
-    html_table,
-    orientation_of,
-    position_of,
-)
-from startrack.chain import Located, Oriented, Outcome, last_value
-from startrack.output import boresight_rad, prepare_folder, record_of, summary_line, write_results
+import numpy as np
+
+from startrack import output
+from startrack.api.values import ClockOffset, Orientation, Position, html_table
+from startrack.chain import Located, Measured, Oriented, Outcome, last_value
+from startrack.frames import heading_pitch_roll_from_R_body_enu, latlon_from_enu
 
 if TYPE_CHECKING:
     from astropy.coordinates import Angle, SkyCoord
@@ -58,17 +53,53 @@ class Solution:
     @cached_property
     def position(self) -> Position | None:
         """East, north, up, their sigma and ellipse, latitude and longitude, with units; None unless located."""
-        return position_of(last_value(self.result))
+        result = self.result
+        if not isinstance(result, Located) or result.fix.ambiguous:
+            return None
+        from astropy import units as u
+        from astropy.coordinates import Angle
+
+        fix = result.fix
+        east, north, up = fix.position_enu_m * u.m
+        latlon_rad = latlon_from_enu(result.site, *fix.position_enu_m)
+        latitude, longitude = (Angle(np.degrees(angle), u.deg) for angle in latlon_rad)
+        return Position(
+            east, north, up, fix.covariance_m2 * u.m**2, fix.radius95_m * u.m, fix.radius999_m * u.m, latitude,
+            longitude, result.terrain.name, self._shown("position", "sky", "clock"),
+        )  # fmt: skip
 
     @cached_property
     def attitude(self) -> Orientation | None:
         """Rotation, right ascension, declination and roll of the camera, heading and pitch of the rover."""
-        return orientation_of(last_value(self.result))
+        result = last_value(self.result)
+        if not isinstance(result, Oriented):
+            return None
+        from astropy import units as u
+        from astropy.coordinates import Angle
+        from scipy.spatial.transform import Rotation
+
+        attitude = result.attitude
+        ra, dec, roll = (Angle(np.degrees(angle), u.deg) for angle in output.boresight_rad(attitude.R_cam_icrs))
+        sigma = np.sqrt(np.diag(attitude.covariance_rad2)) * output.ARCSEC_PER_RAD * u.arcsec
+        has_lens_error = result.camera.covariance is not None
+        rotation = Rotation.from_matrix(attitude.R_cam_icrs)
+        found = Orientation(rotation, ra, dec, roll, sigma, has_lens_error, self._shown("attitude"))
+        if not isinstance(result, Measured):
+            return found
+        body = output.R_body_enu(result)
+        angles_rad = heading_pitch_roll_from_R_body_enu(body)
+        heading, pitch, roll_body = (Angle(np.degrees(angle), u.deg) for angle in angles_rad)
+        return replace(found, body=Rotation.from_matrix(body), heading=heading, pitch=pitch, roll_body=roll_body)
 
     @cached_property
     def clock(self) -> ClockOffset | None:
         """Offset (true minus stated time) and its sigma, with units; None where it is not estimated."""
-        return clock_of(last_value(self.result))
+        if not isinstance(self.result, Located) or self.result.fix.clock is None:
+            return None
+        from astropy import units as u
+
+        clock = self.result.fix.clock
+        return ClockOffset(clock.offset_s * u.s, clock.sigma_s * u.s, self._shown("clock"))
 
     @property
     def heading(self) -> Angle | None:
@@ -97,6 +128,10 @@ class Solution:
     @property
     def _fix(self) -> Fix | None:
         return self.result.fix if isinstance(self.result, Located) and self else None
+
+    def _shown(self, *groups: str) -> output.Rows:
+        """The rows of the notebook's table of these groups of quantities."""
+        return output.rows("notebook", output.at_stage(last_value(self.result)), groups)
 
     @cached_property
     def modes(self) -> QTable | None:
@@ -131,7 +166,7 @@ class Solution:
             return None
         from astropy.coordinates import SkyCoord
 
-        ra, dec, _ = boresight_rad(value.attitude.R_cam_icrs)
+        ra, dec, _ = output.boresight_rad(value.attitude.R_cam_icrs)
         return SkyCoord(ra, dec, unit="rad", frame="icrs")
 
     @cached_property
@@ -142,9 +177,7 @@ class Solution:
             return None
         from astropy.table import QTable
 
-        from startrack.output import star_table_text
-
-        return QTable.read(star_table_text(value), format="ascii.ecsv")
+        return QTable.read(output.star_table_text(value), format="ascii.ecsv")
 
     @cached_property
     def skyline(self) -> QTable | None:
@@ -153,9 +186,7 @@ class Solution:
             return None
         from astropy.table import QTable
 
-        from startrack.output import skyline_table_text
-
-        return QTable.read(skyline_table_text(self.result.skyline), format="ascii.ecsv")
+        return QTable.read(output.skyline_table_text(self.result.skyline), format="ascii.ecsv")
 
     @property
     def warnings(self) -> list[str]:
@@ -164,7 +195,7 @@ class Solution:
 
     def to_dict(self) -> dict[str, Any]:
         """Content of `NAME.fix.json`, or `NAME.identification.json`, or `NAME.detections.json`."""
-        return record_of(self.result, self.kind)
+        return output.record_of(self.result, self.kind)
 
     def write(self, folder: str | os.PathLike[str], *, plots: bool = True, overwrite: bool = False) -> Path:
         """Write the files of the command (record, star table, world coordinates, picture); returns the record's path.
@@ -182,12 +213,12 @@ class Solution:
         """
         path = Path(folder) / f"{self.result.exposure.name or 'image'}.{self.kind}.json"
         remedy = "write elsewhere, or with overwrite=True"
-        prepare_folder(path, self.result.exposure.sha256, overwrite=overwrite, remedy=remedy)
-        write_results(self.result, path, plots=plots)
+        output.prepare_folder(path, self.result.exposure.sha256, overwrite=overwrite, remedy=remedy)
+        output.write_results(self.result, path, plots=plots)
         return path
 
     def __repr__(self) -> str:
-        return summary_line(self.result)
+        return output.summary_line(self.result)
 
     __str__ = __repr__
 
@@ -195,4 +226,4 @@ class Solution:
         tables = [part._repr_html_() for part in (self.position, self.attitude) if part is not None]
         notes = [("warning", text) for text in self.warnings]
         tables += [html_table("Warnings", notes)] if notes else []
-        return f"<p>{escape(summary_line(self.result))}</p>" + "".join(tables)
+        return f"<p>{escape(output.summary_line(self.result))}</p>" + "".join(tables)

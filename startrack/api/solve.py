@@ -8,14 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from startrack import chain
 from startrack.api.solution import Solution
-from startrack.applications.tracking import (
-    ODOMETRY_FLOOR_M,
-    ODOMETRY_SIGMA,
-    Odometry,
-    Track,
-    TrackSession,
-    read_odometry,
-)
+from startrack.applications import tracking
+from startrack.applications.tracking import Odometry, Track
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
 from startrack.chain import Image, Outcome, Refused, Settings, Time, stars_at
@@ -71,8 +65,8 @@ def track(
     camera: str | Camera | None = None,
     terrain: str | Terrain | None = None,
     odometry: str | Odometry | None = None,
-    odometry_sigma: float = ODOMETRY_SIGMA,
-    odometry_floor_m: float = ODOMETRY_FLOOR_M,
+    odometry_sigma: float = tracking.ODOMETRY_SIGMA,
+    odometry_floor_m: float = tracking.ODOMETRY_FLOOR_M,
     at_rest: bool = False,
     settings: Settings | None = None,
 ) -> Track:
@@ -97,13 +91,13 @@ def track(
             first refused image where none has a single position.
     """
     settings = chain.settings_input(settings) or Settings()
-    session = TrackSession(
+    session = tracking.TrackSession(
         settings=settings, stated_camera=camera, stated_terrain=terrain, odometry_sigma=odometry_sigma,
         odometry_floor_m=odometry_floor_m,
     )  # fmt: skip
     for image in images:
         session.add_exposure(chain.exposure_input(image, None))
-    moves = odometry if odometry is None or isinstance(odometry, Odometry) else read_odometry(odometry)
+    moves = odometry if odometry is None or isinstance(odometry, Odometry) else tracking.read_odometry(odometry)
     return session.estimate(moves, at_rest=at_rest)
 
 

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from startrack.chain import Located, Measured, Oriented
-from startrack.frames import heading_pitch_roll_from_R_body_enu, latlon_from_enu
-from startrack.output import ARCSEC_PER_RAD, R_body_enu, Rows, at_stage, boresight_rad, rows
+from startrack.output import Rows
 
 if TYPE_CHECKING:
     from astropy.coordinates import Angle
     from astropy.units import Quantity
     from scipy.spatial.transform import Rotation
-
-    from startrack.chain import Inputs
 
 
 class Shown:
@@ -120,50 +116,3 @@ class ClockOffset(Shown):
     offset: Quantity  # [s] true minus stated time
     sigma: Quantity  # [s] standard deviation of the offset
     shown: Rows  # name and text of each quantity of the table
-
-
-def clock_of(result: Inputs) -> ClockOffset | None:
-    """Error of the clock of a result with a fix; None where it is not estimated."""
-    if not isinstance(result, Located) or result.fix.clock is None:
-        return None
-    from astropy import units as u
-
-    clock = result.fix.clock
-    return ClockOffset(clock.offset_s * u.s, clock.sigma_s * u.s, rows("notebook", at_stage(result), ("clock",)))
-
-
-def position_of(result: Inputs) -> Position | None:
-    """Position of a result whose status is ok."""
-    if not isinstance(result, Located) or result.fix.ambiguous:
-        return None
-    fix, terrain = result.fix, result.terrain
-    from astropy import units as u
-    from astropy.coordinates import Angle
-
-    east, north, up = fix.position_enu_m * u.m
-    latitude, longitude = (Angle(np.degrees(a), u.deg) for a in latlon_from_enu(result.site, *fix.position_enu_m))
-    return Position(
-        east, north, up, fix.covariance_m2 * u.m**2, fix.radius95_m * u.m, fix.radius999_m * u.m, latitude, longitude,
-        terrain.name, rows("notebook", at_stage(result), ("position", "sky", "clock")),
-    )  # fmt: skip
-
-
-def orientation_of(result: Inputs) -> Orientation | None:
-    """Orientation of a result whose stars were identified."""
-    if not isinstance(result, Oriented):
-        return None
-    attitude = result.attitude
-    from astropy import units as u
-    from astropy.coordinates import Angle
-    from scipy.spatial.transform import Rotation
-
-    ra, dec, roll = (Angle(np.degrees(angle), u.deg) for angle in boresight_rad(attitude.R_cam_icrs))
-    sigma = np.sqrt(np.diag(attitude.covariance_rad2)) * ARCSEC_PER_RAD * u.arcsec
-    rotation = Rotation.from_matrix(attitude.R_cam_icrs)
-    shown = rows("notebook", at_stage(result), ("attitude",))
-    found = Orientation(rotation, ra, dec, roll, sigma, result.camera.covariance is not None, shown)
-    if not isinstance(result, Measured):
-        return found
-    body = R_body_enu(result)
-    heading, pitch, roll_body = (Angle(np.degrees(a), u.deg) for a in heading_pitch_roll_from_R_body_enu(body))
-    return replace(found, body=Rotation.from_matrix(body), heading=heading, pitch=pitch, roll_body=roll_body)

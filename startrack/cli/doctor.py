@@ -11,7 +11,6 @@ from importlib import metadata
 from typing import Any
 
 from startrack import __version__
-from startrack.cli.flags import JSON, MORE, Command, flag
 
 REQUIRED = (
     "numpy", "scipy", "opencv-contrib-python-headless", "scikit-image", "astropy", "isal", "pillow", "tifffile",
@@ -107,7 +106,7 @@ def _ephemeris() -> str:
 
 def _kernels(args: argparse.Namespace) -> str:
     """Compile the kernels of the cylinder, and of the terrain of the flag, with its horizons."""
-    from startrack.cli.progress import compile_kernels, prepare
+    from startrack.cli.images import compile_kernels, prepare
     from startrack.terrain import load_terrain
 
     names = dict.fromkeys(["shackleton-thesis", *([args.terrain] if args.terrain else [])])
@@ -155,25 +154,3 @@ def run_schema(args: argparse.Namespace) -> int:
     else:
         args.usage_error(f"no schema is called {args.name!r}; there are: {', '.join(schemas)}")
     return 0
-
-
-COMMANDS = (
-    Command(
-        "doctor", run, "versions, data files, compiled kernels, self-test",
-        "Check the installation: versions, extras, data files, and one rendered exposure located from its pixels, for "
-        "which the kernels are compiled (once for each installation). Exit code 0 if all is well, 1 otherwise.",
-        {
-            "input": (
-                flag("-t --terrain FILE", "compute this terrain's horizons and compile its kernels ahead of time"),
-            ),
-            "more": (JSON, *MORE),
-        },
-        "startrack doctor",
-    ),
-    Command(
-        "schema", run_schema, "JSON schemas of the files",
-        "Print the JSON schema of one kind of file, or without a name the list of kinds.",
-        {"input": (flag("name KIND", "such as fix, identification, camera, terrain", nargs="?"),)},
-        "startrack schema fix",
-    ),
-)  # fmt: skip

@@ -11,6 +11,7 @@ from startrack.core import MAX_EXPOSURE_S
 from startrack.core.declaration import LARGEST, SHOWN_CHARS
 
 T = TypeVar("T")
+SCHEMES = ("", "tcp", "tls", "ucx", "ws", "wss")  # of Dask's addresses
 MAX_COUNT = 1_000_000
 MAX_MAGNITUDE = 100.0
 FIELD_TOLERANCE_1 = 0.1  # as startrack.identification.unknown_lens has it; written here so that help is quick
@@ -118,3 +119,20 @@ def position_prior(text: str) -> tuple[float, float, float]:
     if len(words) != 3:
         raise argparse.ArgumentTypeError(f"{text[:SHOWN_CHARS]!r} is not EAST,NORTH,SIGMA in metres, as -3000,1500,200")
     return number(words[0]), number(words[1]), positive_number(words[2])
+
+
+def exposure_times(text: str) -> list[float]:
+    """Exposure times [s] with commas between them."""
+    found = [seconds(word) for word in text.split(",")]
+    if len(set(found)) != len(found):
+        raise argparse.ArgumentTypeError(f"{text!r} names an exposure twice")
+    return found
+
+
+def cluster_address(text: str) -> str:
+    """Address of a Dask scheduler."""
+    scheme, _, address = text.rpartition("://")
+    host, _, port = address.rpartition(":")
+    if scheme not in SCHEMES or not host or not port.isdecimal() or not 0 < int(port) < 2**16:
+        raise argparse.ArgumentTypeError(f"{text!r} is not the address of a Dask scheduler such as tcp://host:8786")
+    return text

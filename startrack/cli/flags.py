@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from startrack.cli.flag_types import amount, position_prior, positive_count, seconds, time_sigma_s
+
+if TYPE_CHECKING:
+    from startrack.core.declaration import Key
 
 DEFAULT_LOCALIZER = "posterior"
 
@@ -90,12 +94,29 @@ class _Formatter(argparse.HelpFormatter):
         return text if "\n" in text else super()._fill_text(text, width, indent)
 
 
+def run(path: str) -> Callable[[argparse.Namespace], int]:
+    """The function at `path` in startrack.cli, as "module.function"; its module is loaded when the function is called.
+
+    So the help, which needs no result, is printed without numpy.
+    """
+    module, _, name = path.partition(".")
+    return lambda args: int(getattr(importlib.import_module(f"startrack.cli.{module}"), name)(args))
+
+
 def _add_flags(parser: Any, flags: Group) -> None:
     for one in flags:
         if isinstance(one, Either):
             _add_flags(parser.add_mutually_exclusive_group(required=one.required), one.flags)
         else:
             parser.add_argument(*one.names, **one.options)
+
+
+def checked_flag(args: argparse.Namespace, key: Key, value: Any, flag: str) -> Any:
+    """The value of a `flag` as the `key` of a file would have it; else a usage error."""
+    try:
+        return key.check(value, flag)
+    except ValueError as cause:
+        args.usage_error(str(cause))
 
 
 def check_localizer(args: argparse.Namespace) -> None:

@@ -4,28 +4,16 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from startrack.cli import flags
-from startrack.cli.flag_types import field_of_view_rad
-from startrack.cli.flags import Command, flag
-from startrack.cli.images import (
-    Outcome,
-    approximate_camera,
-    check_fov,
-    check_one_time,
-    print_outcome,
-    read,
-    refusal,
-    site_of,
-)
-from startrack.cli.progress import progress
+import numpy as np
+
+from startrack.applications import horizon
+from startrack.catalog import load_catalog
+from startrack.cli.console import Outcome, print_left_out, print_outcome, progress, refusal
+from startrack.cli.images import approximate_camera, check_fov, check_one_time, read, site_of
 from startrack.core.errors import BadInput, BadOutput, NoSolution
-
-if TYPE_CHECKING:
-    from startrack.applications.horizon import SkylineResult
 
 FORMAT = "startrack.horizon/1"
 
@@ -39,22 +27,12 @@ def run(args: argparse.Namespace) -> int:
     except BadOutput:
         raise
     except (BadInput, NoSolution) as cause:
-        record = refusal(cause.reason, str(cause), format=FORMAT)
-        return print_outcome(args, record, f"{Path(args.output).name}  refused {cause.reason}: {cause}")
+        return print_outcome(args, *refusal(cause, Path(args.output).name, format=FORMAT))
 
 
 def _measure(args: argparse.Namespace) -> Outcome:
     """The record and the line of a skyline that was measured and written."""
-    from startrack.applications.horizon import (
-        check_output,
-        measure_frames,
-        needs_all_azimuths,
-        orient_frames,
-        write_skyline,
-    )
-    from startrack.catalog import load_catalog
-
-    check_output(args.output, overwrite=args.overwrite)
+    horizon.check_output(args.output, overwrite=args.overwrite)
     exposures = [read(path, args) for path in args.images]
     site = site_of(args, exposures)
     if site is None:
@@ -64,14 +42,13 @@ def _measure(args: argparse.Namespace) -> Outcome:
     camera = approximate_camera(args, exposures)
     with progress("horizon", 2, shown=not (args.quiet or args.json)) as bar:
         bar.advance(0, text="identifying the stars")
-        frames, left_out = orient_frames(exposures, load_catalog(), site, camera=camera, fov_rad=args.fov)
-        for one in left_out if frames else ():  # else the refusal names them
-            print(f"{one.name}: left out, {one.reason}: {one.message}", file=sys.stderr, flush=True)
+        frames, left_out = horizon.orient_frames(exposures, load_catalog(), site, camera=camera, fov_rad=args.fov)
+        print_left_out(left_out if frames else ())  # else the refusal names them
         bar.advance(text="measuring the skyline")
-        found = measure_frames(frames, left_out, site)
-    write_skyline(args.output, found.skyline, site, overwrite=args.overwrite)
+        found = horizon.measure_frames(frames, left_out, site)
+    horizon.write_skyline(args.output, found.skyline, site, overwrite=args.overwrite)
     unknown = int((~found.skyline.known).sum())
-    note = f"{unknown} of them interpolated" if needs_all_azimuths(args.output) and unknown else ""
+    note = f"{unknown} of them interpolated" if horizon.needs_all_azimuths(args.output) and unknown else ""
     record, skyline = _record(args, found, note), found.skyline
     words = [f"{record['azimuths']['known']} of {len(skyline)} azimuths"]
     if record["median_sigma_deg"] is not None:
@@ -83,9 +60,7 @@ def _measure(args: argparse.Namespace) -> Outcome:
     return record, line
 
 
-def _record(args: argparse.Namespace, found: SkylineResult, note: str) -> dict[str, Any]:
-    import numpy as np
-
+def _record(args: argparse.Namespace, found: horizon.SkylineResult, note: str) -> dict[str, Any]:
     skyline, known = found.skyline, found.skyline.known
     return {
         "format": FORMAT,
@@ -103,27 +78,3 @@ def _record(args: argparse.Namespace, found: SkylineResult, note: str) -> dict[s
         "lowest_deg": math.degrees(skyline.elevation_rad[known].min()) if known.any() else None,
         "highest_deg": math.degrees(skyline.elevation_rad[known].max()) if known.any() else None,
     }
-
-
-COMMANDS = (
-    Command(
-        "horizon", run, "the horizon of a fixed camera from photographs of the night sky",
-        "Measure the skyline (obstruction profile) of a fixed camera on the Earth from one or several photographs of "
-        "the night sky: from stars seen, stars missing, and the place where the sky's light stops. The suffix of -o "
-        "chooses the format: .csv, .ecsv, .hrz (N.I.N.A.), .png (panorama), none (folder of a Stellarium landscape).",
-        {
-            "input": (
-                flags.PHOTOGRAPHS, *flags.FACTS, flags.SITE, flags.TERRAIN,
-                flag(
-                    "--fov DEG",
-                    "no camera file: field of view, good to 10 %%; below 100 across the width, from 100 up of the "
-                    "image circle",
-                    field_of_view_rad,
-                ),
-            ),
-            "output": (flag("-o --output FILE", "the skyline", required=True), *flags.OUTPUT),
-            "more": (flags.NO_SEED, *flags.MORE),
-        },
-        "startrack horizon NIGHT.jpg... --fov 180 --site 34.74,-111.42 -o horizon.csv",
-    ),
-)  # fmt: skip

@@ -17,23 +17,18 @@ from contextlib import contextmanager
 from typing import Any
 
 from startrack import __version__
+from startrack.cli.console import discard_stdout, print_advice
 from startrack.cli.flags import Command
-from startrack.cli.images import discard_stdout, print_advice
-from startrack.core.errors import (
-    EXIT_BAD_INPUT,
-    EXIT_INTERNAL_ERROR,
-    EXIT_REFUSED,
-    EXIT_STOPPED,
-    BadInput,
-    BadOutput,
-    NoSolution,
-)
+from startrack.core import errors
+from startrack.core.errors import BadInput, BadOutput, NoSolution
 from startrack.core.files import FULL_DISK
 
-COMMANDS = {  # name to the module of startrack.cli that has it
-    "locate": "locate", "batch": "batch", "track": "track", "identify": "locate", "detect": "locate",
-    "render": "render", "calibrate": "calibrate", "horizon": "horizon", "predict": "predict", "report": "report",
-    "reproduce": "reproduce", "terrain": "terrain", "doctor": "doctor", "schema": "doctor", "demo": "report",
+COMMANDS = {  # name to the module of startrack.cli that declares it
+    "locate": "image_commands", "batch": "image_commands", "track": "image_commands", "identify": "image_commands",
+    "detect": "image_commands", "render": "study_commands", "calibrate": "input_commands",
+    "horizon": "input_commands", "predict": "study_commands", "report": "image_commands",
+    "reproduce": "study_commands", "terrain": "input_commands", "doctor": "study_commands",
+    "schema": "study_commands", "demo": "image_commands",
 }  # fmt: skip
 USAGE, INTERRUPTED = 2, 130
 EPILOG = """exit codes: 0 every image solved; 1 internal error; 2 usage; 3 an image ambiguous or refused; 4 bad input;
@@ -53,10 +48,15 @@ star identification  startrack identify SKY.png --fov 60             which stars
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
     try:
-        _write_any_text()
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):  # LC_ALL=C and a name beyond ASCII: escaped, no failure
+                stream.reconfigure(errors="backslashreplace")
         with _ended_by_interrupt():
             parser, commands = _parser()
-        _offer_completion(parser)
+        if "_ARGCOMPLETE" in os.environ and importlib.util.find_spec("argcomplete") is not None:
+            import argcomplete  # of the extra `completion`: the shell requests words
+
+            argcomplete.autocomplete(parser)
         words = list(sys.argv[1:] if argv is None else argv)
         if words and not words[0].startswith("-") and words[0] not in COMMANDS:
             parser.error(f"no command is called {words[0]!r}; there are: {', '.join(COMMANDS)}")
@@ -85,22 +85,21 @@ def _run(args: argparse.Namespace) -> int:
         print(f"startrack {args.command}: error: {cause.command_message}", file=sys.stderr)
         return USAGE
     except (BadInput, NoSolution) as cause:
-        code = EXIT_BAD_INPUT if isinstance(cause, BadInput) else EXIT_REFUSED
+        code = errors.EXIT_BAD_INPUT if isinstance(cause, BadInput) else errors.EXIT_REFUSED
         _report_failure(f"{cause.reason}: {cause}", code)
         print_advice(cause.reason, str(cause), args)
         return code
     except BrokenPipeError:
         discard_stdout()
-        return EXIT_STOPPED
+        return errors.EXIT_STOPPED
     except Exception as cause:
         if isinstance(cause, OSError) and cause.errno in FULL_DISK and cause.filename is None:
             discard_stdout()
-            return _report_failure(f"the output cannot be written ({cause.strerror})", EXIT_BAD_INPUT)
+            return _report_failure(f"the output cannot be written ({cause.strerror})", errors.EXIT_BAD_INPUT)
         if getattr(args, "verbose", 0):
             raise
-        return _report_failure(
-            f"internal error: {type(cause).__name__}: {cause} (-v shows the traceback)", EXIT_INTERNAL_ERROR
-        )
+        message = f"internal error: {type(cause).__name__}: {cause} (-v shows the traceback)"
+        return _report_failure(message, errors.EXIT_INTERNAL_ERROR)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -152,21 +151,6 @@ def _parser() -> tuple[argparse.ArgumentParser, dict[str, Command]]:
                 command.add_to(subparsers)
                 commands[command.name] = command
     return parser, commands
-
-
-def _offer_completion(parser: argparse.ArgumentParser) -> None:
-    """Complete words in the shell, if it requests that and the extra `completion` is installed."""
-    if "_ARGCOMPLETE" in os.environ and importlib.util.find_spec("argcomplete") is not None:
-        import argcomplete
-
-        argcomplete.autocomplete(parser)
-
-
-def _write_any_text() -> None:
-    """Escape characters that the terminal's encoding lacks (LC_ALL=C and a name beyond ASCII) instead of failing."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
 
 
 def _report_failure(message: str, code: int) -> int:

@@ -1,60 +1,51 @@
-"""`startrack render`: synthetic exposures with the truth beside them."""
+"""`startrack render`: synthetic exposures with the truth beside them, one by one or as a series along a path."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from startrack.cli import flags
-from startrack.cli.drive import (
-    DRIVE_FLAGS,
-    count_images,
-    read_drive_flags,
-    trajectory_paths,
-    write_trajectories,
-)
-from startrack.cli.flag_types import (
-    amount,
-    clock_offset_s,
-    count,
-    limited_count,
-    magnitude,
-    number,
-    positive_count,
-    seconds,
-    time_sigma_s,
-)
-from startrack.cli.flags import Command, Either, flag
-from startrack.cli.progress import progress
-from startrack.core.files import check_output
-
-if TYPE_CHECKING:
-    from startrack.rendering import Drive, Scene, Series, Truth
+from startrack import rendering
+from startrack.camera import load_camera
+from startrack.cli.console import progress
+from startrack.core.files import check_output, write_atomically
+from startrack.core.types import TIME_SIGMA_S
+from startrack.exposure import with_facts, write_exposure, write_sidecar
+from startrack.frames import format_utc, heading_pitch_roll_from_R_body_enu, parse_utc, tum_line
+from startrack.rendering import Drive, Pose, Scene, Series, Truth
+from startrack.terrain import load_terrain
 
 SUFFIXES = {"png": ".png", "tiff": ".tif", "fits": ".fits"}
-KNOWN_SUFFIXES = {".png", ".tif", ".tiff", ".fits", ".fit", ".fts"}
+KNOWN_SUFFIXES = {*SUFFIXES.values(), ".tiff", ".fit", ".fts"}
 CATALOG_V_MAG = 10.0  # catalogue stars drawn when there are no faint ones to go with them
 ANGLES = ("heading", "pitch", "roll")
 SETTINGS = (  # flags that determine the pixels, without those of the pose and of the files' names
     "max_tilt", "sky_mag", "sky_gradient", "sky_gradient_azimuth", "wall_reflectance", "faint_stars", "no_faint_stars",
     "flux_scatter", "hot_pixels", "cosmic_rays", "truth_mag",
 )  # fmt: skip
+TRUTH, ODOMETRY = "truth.tum", "odometry.tum"
+ODOMETRY_HEAD = (
+    "# time tx ty tz qx qy qz qw (Unix seconds UTC, m); frame: begins at the first pose, level, heading arbitrary\n"
+    "# error of each increment on each horizontal axis: sqrt(({sigma:g} length)^2 + ({floor:g} m)^2)\n"
+)
+TRUTH_HEAD = "# time tx ty tz qx qy qz qw (Unix seconds UTC as stated in the images, m); body in enu, true\n"
 
 
 def run(args: argparse.Namespace) -> int:
     """Render and write the images; 0. Raises BadInput for files and values that cannot be used, BadOutput for paths."""
-    from startrack.rendering import truth_paths
-
-    drive = read_drive_flags(args)
-    images = _targets(args, count_images(args, drive))
+    drive = _read_drive(args)
+    images = _targets(args, _count_images(args, drive))
     series = _series(args, drive)
-    written = (p for image in images for p in (image, image.with_suffix(".json"), *truth_paths(image)))
-    for path in (*written, *trajectory_paths(args)):  # all first: nothing is written half-way to an error
+    written = [p for image in images for p in (image, image.with_suffix(".json"), *rendering.truth_paths(image))]
+    if args.every is not None:
+        written += [Path(args.dir) / name for name in ([TRUTH] if args.path is None else [TRUTH, ODOMETRY])]
+    for path in written:  # all first: nothing is written half-way to an error
         check_output(path, overwrite=args.overwrite)
     poses = [series.pose(number) for number in range(len(images))] if args.every is not None else []
     with progress("render", len(images), shown=len(images) > 2) as bar:
@@ -64,8 +55,36 @@ def run(args: argparse.Namespace) -> int:
                 print(json.dumps(summary) if args.json else _line(summary))
             bar.advance()
     if poses:
-        write_trajectories(args, series, poses)
+        _write_trajectories(args, series, poses)
     return 0
+
+
+def _read_drive(args: argparse.Namespace) -> Drive | None:
+    """The drive of --path; None without. A usage error for flags that do not go together; else raises BadInput."""
+    if args.every is not None and args.output is not None:
+        args.usage_error("--output names one image, but --every makes several: give --dir")
+    if args.path is None:
+        for name in _given_flags(args, "speed", "odometry_sigma", "odometry_floor"):
+            args.usage_error(f"{name} needs --path")
+        return None
+    if args.every is None or args.speed is None:
+        args.usage_error("--path needs --speed and --every")
+    for name in _given_flags(args, "east", "north", "heading"):
+        args.usage_error(f"{name}: positions and headings are those of --path")
+    return rendering.read_drive(args.path, args.speed)
+
+
+def _given_flags(args: argparse.Namespace, *names: str) -> list[str]:
+    """Flags among the `names` of arguments that are not None."""
+    return [f"--{name.replace('_', '-')}" for name in names if getattr(args, name) is not None]
+
+
+def _count_images(args: argparse.Namespace, drive: Drive | None) -> int:
+    """Number of images: --count, or all along the path. A usage error for more than the path has."""
+    along = 1 if drive is None else drive.count_frames(args.every)
+    if drive is not None and args.count is not None and args.count > along:
+        args.usage_error(f"--count {args.count}: the path has {along} exposures")
+    return int(args.count or along)
 
 
 def _targets(args: argparse.Namespace, count: int) -> list[Path]:
@@ -82,12 +101,7 @@ def _targets(args: argparse.Namespace, count: int) -> list[Path]:
 
 
 def _series(args: argparse.Namespace, drive: Drive | None) -> Series:
-    from startrack.camera import load_camera
-    from startrack.frames import parse_utc
-    from startrack.rendering import Series, load_sky_catalog
-    from startrack.terrain import load_terrain
-
-    catalog = load_sky_catalog(args.stars)
+    catalog = rendering.load_sky_catalog(args.stars)
     faint = None if args.no_faint_stars else args.faint_stars
     return Series(
         camera=load_camera(args.camera), terrain=load_terrain(args.terrain),
@@ -104,12 +118,8 @@ def _series(args: argparse.Namespace, drive: Drive | None) -> Series:
 
 def _render_one(args: argparse.Namespace, series: Series, number: int, image: Path) -> dict[str, Any]:
     """Render, write image, sidecar and truth, and return the text about it."""
-    from startrack.core.types import TIME_SIGMA_S
-    from startrack.exposure import with_facts, write_exposure, write_sidecar
-    from startrack.rendering import render, write_truth
-
     scene, rng = series.scene(number, image.stem)
-    exposure, truth = render(scene, rng=rng)
+    exposure, truth = rendering.render(scene, rng=rng)
     stated = None if scene.time_utc is None else scene.time_utc - timedelta(seconds=args.clock_offset)
     exposure = with_facts(exposure, time_utc=stated)
     if args.time_sigma is not None or args.clock_offset != 0.0:  # else a right clock, which is exact
@@ -120,13 +130,13 @@ def _render_one(args: argparse.Namespace, series: Series, number: int, image: Pa
     write_sidecar(image, exposure, overwrite=args.overwrite)
     settings = {name: getattr(args, name) for name in SETTINGS}
     facts = {**pose, "seed": args.seed, "number": number, "catalog": series.catalog.name, "settings": settings}
-    pose_path, table_path = write_truth(image, truth, facts, to_v_mag=args.truth_mag, overwrite=args.overwrite)
+    pose_path, table_path = rendering.write_truth(
+        image, truth, facts, to_v_mag=args.truth_mag, overwrite=args.overwrite
+    )
     return {"image": str(image), "truth": str(pose_path), "table": str(table_path), **facts}
 
 
 def _pose(scene: Scene, truth: Truth) -> dict[str, Any]:
-    from startrack.frames import format_utc, heading_pitch_roll_from_R_body_enu
-
     heading, pitch, roll = heading_pitch_roll_from_R_body_enu(scene.camera.R_body_cam @ scene.R_cam_enu)
     return {
         "time_utc": None if scene.time_utc is None else format_utc(scene.time_utc),
@@ -148,74 +158,20 @@ def _line(summary: dict[str, Any]) -> str:
     )
 
 
-COMMANDS = (
-    Command(
-        "render", run, "make synthetic exposures and files with their truth",
-        "Render the image of a camera on the crater's floor. Position, heading, tilt and time are drawn from the seed "
-        "unless they are given. With --every the exposures are at equal steps of time, at rest or, with --path, on a "
-        "drive with odometry. Beside NAME.png: NAME.json (time, exposure, camera, terrain), NAME.truth.json (pose, "
-        "settings) and NAME.truth.ecsv (stars).",
-        {
-            "input": (
-                flag("-c --camera FILE", "camera file, or a shipped name", default="fisheye-2048"),
-                flag("-t --terrain FILE", "terrain file, or a shipped name", default="shackleton-thesis"),
-                flag("--seed N", "same seed, same bytes", count, default=0),
-                flag("-n --count N", "images (default 1; of a drive all along its path)", positive_count),
-            ),
-            "pose and time (what is not given is drawn from the seed)": (
-                flag("--time UTC", "middle of the exposure; else between 2024 and 2034"),
-                flag(
-                    "--time-sigma SECONDS",
-                    "standard deviation of the clock's error (0; with --clock-offset not stated)", time_sigma_s,
-                ),
-                flag(
-                    "--clock-offset SECONDS",
-                    "true minus stated time, for image and sidecar with the time of a wrong clock", clock_offset_s,
-                    default=0.0,
-                ),
-                flag("--east M", "from the terrain's origin", number),
-                flag("--north M", "from the terrain's origin", number),
-                flag("--heading DEG", "azimuth of the rover's nose", number),
-                flag("--pitch DEG", "nose up positive", number),
-                flag("--roll DEG", "right side down positive", number),
-                flag("--max-tilt DEG", "of random tilts", amount, default=5.0),
-            ),
-            "series at rest (--every alone) or along a path": DRIVE_FLAGS,
-            "light and defects": (
-                flag(
-                    "--exposure S",
-                    "seconds; default: a V 6 star on the axis reaches 5 sigma, which takes fisheye-2048 0.40 s",
-                    seconds,
-                ),
-                flag("--sky-mag V", "diffuse sky per arcsec^2", magnitude, default=22.0),
-                flag("--sky-gradient F", "its slope to the horizon", number, default=0.0),
-                flag("--sky-gradient-azimuth DEG", "where it rises to", number, default=0.0),
-                flag("--wall-reflectance F", "of the sky's light", amount, default=0.04),
-                flag(
-                    "--stars", "whose stars the sky has (auto: Gaia's where the extra `deep` is installed)",
-                    choices=("auto", "hipparcos", "gaia"), default="auto",
-                ),
-                flag(
-                    "--faint-stars V",
-                    "no stars fainter than this; down to it, stars that Hipparcos lacks are drawn at random (FIELD n)",
-                    magnitude, default=10.0,
-                ),
-                flag("--no-faint-stars", "the catalogue's stars alone"),
-                flag(
-                    "--flux-scatter MAG",
-                    "of each star's flux, beyond the catalogue's own errors; 0 turns both off", amount, default=0.03,
-                ),
-                flag("--hot-pixels N", "of the sensor", limited_count, default=200),
-                flag("--cosmic-rays N", "tracks per exposure", limited_count, default=5),
-            ),
-            "output": (
-                Either((flag("-o --output FILE", "one image: .png, .tif or .fits"), flags.DIR)),
-                flag("--format", "of images in the folder", choices=SUFFIXES, default="png"),
-                flag("--truth-mag V", "faintest star in the table", magnitude, default=8.5),
-                flags.OVERWRITE, flags.JSON, flags.NO_PLOTS,
-            ),
-            "more": flags.MORE,
-        },
-        "startrack render --seed 1",
-    ),
-)  # fmt: skip
+def _write_trajectories(args: argparse.Namespace, series: Series, poses: Sequence[Pose]) -> None:
+    """Write the true `poses` of the series and, of a drive, its odometry, as TUM text with the stated times."""
+    from startrack.applications.tracking import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
+
+    offset = timedelta(seconds=args.clock_offset)  # odometry and images have one clock
+    times_s = [(pose.time_utc - offset).timestamp() for pose in poses]
+
+    def write(name: str, head: str, position_m: Any, R_frame_body: Any) -> None:
+        lines = (tum_line(*row) for row in zip(times_s, position_m, R_frame_body, strict=True))
+        write_atomically(Path(args.dir) / name, (head + "".join(lines)).encode(), overwrite=args.overwrite)
+
+    write(TRUTH, TRUTH_HEAD, [pose.position_enu_m for pose in poses], [pose.R_body_enu.T for pose in poses])
+    if series.drive is not None:
+        sigma_1 = ODOMETRY_SIGMA if args.odometry_sigma is None else args.odometry_sigma
+        floor_m = ODOMETRY_FLOOR_M if args.odometry_floor is None else args.odometry_floor
+        head = ODOMETRY_HEAD.format(sigma=sigma_1, floor=floor_m)
+        write(ODOMETRY, head, *series.odometry(poses, sigma_1=sigma_1, floor_m=floor_m))

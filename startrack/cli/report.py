@@ -8,16 +8,12 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from startrack.cli.flag_types import count
-from startrack.cli.flags import DIR, MORE, Command, flag
+from startrack.applications.batch import JOB, result_stems, tabled_results
 from startrack.core import REPORTED_IMAGES
 from startrack.core.errors import BadInput
 from startrack.core.files import check_output, existing_folder
-
-if TYPE_CHECKING:
-    from startrack.output import Found
+from startrack.output import Found, result_at, results_under, write_page
 
 PAGE = "report.html"  # of a folder; of one result NAME.report.html
 NAMED_FILES = 3
@@ -36,8 +32,6 @@ def write_page_of(
     out: str, *, truth: str | None = None, images: int = REPORTED_IMAGES, output: str | None = None
 ) -> Path:
     """Write the page of a folder of results or of one NAME.fix.json; its path. Raises BadInput, BadOutput."""
-    from startrack.output import result_at, results_under, write_page
-
     if output is not None:
         check_output(output, overwrite=True)
     if Path(out).is_file():
@@ -56,8 +50,6 @@ def write_page_of(
 
 def _select_tabled(out: str, found: list[Found]) -> list[Found]:
     """The results without results of a batch that its tables lack; a line on stderr names these."""
-    from startrack.applications.batch import JOB, tabled_results
-
     known = tabled_results(Path(out))
     if known is None:
         return found
@@ -77,8 +69,6 @@ def write_page_of_images(out: str, images: Sequence[str]) -> None:
 
     An image that could not be read has no result to show.
     """
-    from startrack.applications.batch import result_stems
-
     results = [path for stem in result_stems(images) if (path := Path(out) / f"{stem}.fix.json").is_file()]
     if len(images) == 1 and results:
         write_page_of(str(results[0]))
@@ -87,27 +77,25 @@ def write_page_of_images(out: str, images: Sequence[str]) -> None:
 
 
 def _true_positions(found: Sequence[Found], folder: str | None) -> dict[str, tuple[float, float]]:
-    """True (east, north) [m] by the results' stems, where the folder has them."""
+    """True (east, north) [m] by the results' stems, of NAME.truth.json at the path of the image or of its result."""
     if folder is None:
         return {}
-    root = existing_folder(folder, "truth")
-    return {one.stem: position for one in found if (position := _true_position(root, one)) is not None}
-
-
-def _true_position(folder: Path, one: Found) -> tuple[float, float] | None:
-    """(east, north) [m] from NAME.truth.json at the path of the image or of its result."""
-    image = one.record["image"]
-    names = dict.fromkeys((image.removesuffix(Path(image).suffix), one.stem, Path(one.stem).name))
-    path = next((file for name in names if (file := folder / f"{name}.truth.json").is_file()), None)
-    if path is None:
-        return None
-    try:
-        east, north = (float(value) for value in json.loads(path.read_text(encoding="utf-8"))["position_enu_m"][:2])
-    except (OSError, ValueError, KeyError, TypeError) as cause:
-        raise BadInput("bad_image", f"{path}: holds no position_enu_m ({type(cause).__name__})") from cause
-    if not (math.isfinite(east) and math.isfinite(north)):
-        raise BadInput("bad_image", f"{path}: position_enu_m is not finite")
-    return east, north
+    root, positions_m = existing_folder(folder, "truth"), {}
+    for one in found:
+        image = Path(one.record["image"])
+        names = dict.fromkeys((str(one.record["image"]).removesuffix(image.suffix), one.stem, Path(one.stem).name))
+        path = next((file for name in names if (file := root / f"{name}.truth.json").is_file()), None)
+        if path is None:
+            continue
+        try:
+            truth = json.loads(path.read_text(encoding="utf-8"))
+            east, north = (float(value) for value in truth["position_enu_m"][:2])
+        except (OSError, ValueError, KeyError, TypeError) as cause:
+            raise BadInput("bad_image", f"{path}: holds no position_enu_m ({type(cause).__name__})") from cause
+        if not (math.isfinite(east) and math.isfinite(north)):
+            raise BadInput("bad_image", f"{path}: position_enu_m is not finite")
+        positions_m[one.stem] = east, north
+    return positions_m
 
 
 def run_demo(args: argparse.Namespace) -> int:
@@ -128,35 +116,3 @@ def run_demo(args: argparse.Namespace) -> int:
 
         webbrowser.open(page.resolve().as_uri())
     return code
-
-
-COMMANDS = (
-    Command(
-        "report", run, "results as one page for a browser",
-        "Write OUT/report.html: every result of the folder OUT, in one file that needs no server and no network. Of a "
-        "single NAME.fix.json it writes NAME.report.html beside it.",
-        {
-            "input": (
-                flag("out OUT", "folder of results, or one NAME.fix.json"),
-                flag("--truth FOLDER", "folder with NAME.truth.json of the images, to show the errors"),
-            ),
-            "output": (
-                flag("-o --output FILE", "file of the page"),
-                flag("--images N", "number of images with picture and stars; the table contains all", count,
-                     default=REPORTED_IMAGES),
-            ),
-            "more": MORE,
-        },
-        "startrack report startrack-out",
-    ),
-    Command(
-        "demo", run_demo, "make a picture, locate it and open the report",
-        "Render a fisheye picture from a crater floor, locate it, and open the report in a browser. Writes demo.png "
-        "with the truth beside it, and the results of startrack locate.",
-        {
-            "output": (DIR, flag("--no-open", "do not open the report in a browser")),
-            "more": (flag("--seed N", "of attitude, time and noise", int, default=1), *MORE),
-        },
-        "startrack demo",
-    ),
-)  # fmt: skip

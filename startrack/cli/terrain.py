@@ -8,30 +8,25 @@ import sys
 import time
 from collections.abc import Iterator
 from math import degrees, radians
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from startrack.cli import flags, terrain_state
-from startrack.cli.flags import Command, flag
-from startrack.cli.progress import prepare
+import numpy as np
+
+from startrack import terrain as terrains
+from startrack.cli.flag_types import amount
+from startrack.cli.images import prepare
+from startrack.cli.input_commands import STATED_ERRORS, state_flag
+from startrack.core import files
 from startrack.core.compilation import announce_compilation
 from startrack.core.errors import BadInput
-from startrack.core.files import check_output, file_stem, make_folder
+from startrack.frames import Site, latlon_from_enu
+from startrack.terrain import StateableError, Terrain, load_terrain
 
-if TYPE_CHECKING:
-    from startrack.frames import Site
-    from startrack.terrain import Terrain
-
-START = """usage: startrack terrain ACTION ... (startrack terrain ACTION --help)
-
-look             startrack terrain show shackleton --at 0 0                  properties, relief, a horizon
-your own map     startrack terrain import MAP.tif -o NAME.toml --latitude DEG --longitude DEG
-state errors     startrack terrain state NAME.toml                           what its file leaves out widens circles
-prepare          startrack terrain build NAME.toml                           its horizons, before the first fix"""
+Values = dict[tuple[str, str], float | bool]  # by table and key
 
 
-def _show_terrain(args: argparse.Namespace) -> int:
-    from startrack.terrain import load_terrain
-
+def show(args: argparse.Namespace) -> int:
+    """Print a terrain's properties, and draw it; 0."""
     terrain = load_terrain(args.terrain)
     position = None if args.at is None else (args.at[0], args.at[1])
     facts = _facts_of(terrain) | ({} if position is None else _view_facts(terrain, position))
@@ -47,19 +42,18 @@ def _draw(args: argparse.Namespace, terrain: Terrain, position: tuple[float, flo
 
     from startrack.output import horizon_picture, relief_picture
 
-    out, stem = make_folder(args.dir, "bad_terrain"), file_stem(terrain.name)
+    out, stem = files.make_folder(args.dir, "bad_terrain"), files.file_stem(terrain.name)
     pictures = {out / f"{stem}.relief.png": relief_picture(terrain, position)}
     if position is not None:
         pictures[out / f"{stem}.horizon.png"] = horizon_picture(terrain, position)
     for path, picture in pictures.items():
-        check_output(path, overwrite=True, reason="bad_terrain")
+        files.check_output(path, overwrite=True, reason="bad_terrain")
         Image.fromarray(picture).save(path)
     return [str(path) for path in pictures]
 
 
-def _build_tables(args: argparse.Namespace) -> int:
-    from startrack.terrain import load_terrain
-
+def build(args: argparse.Namespace) -> int:
+    """Compute the horizons of terrains; 0."""
     for name in args.terrain:
         terrain = load_terrain(name)
         facts: dict[str, Any] = {"name": terrain.name, "horizons": None}
@@ -75,13 +69,12 @@ def _build_tables(args: argparse.Namespace) -> int:
     return 0
 
 
-def _import_map(args: argparse.Namespace) -> int:
-    from startrack.terrain import import_maps, load_terrain
-
+def import_map(args: argparse.Namespace) -> int:
+    """Make a terrain file from elevation data; 0."""
     announce_compilation()
     half = list(args.half or [])
     half += [30_000.0 if not half and k == 0 else 300_000.0 for k in range(len(half), len(args.maps))]
-    imported = import_maps(
+    imported = terrains.import_maps(
         args.maps, args.output, latitude_rad=radians(args.latitude), longitude_rad=radians(args.longitude), half_m=half,
         radius_m=args.radius, scale=args.scale or (), offset_m=args.offset or (), height_sigma_m=args.sigma,
         compare=args.compare, camera_height_m=args.camera_height, overwrite=args.overwrite,
@@ -123,10 +116,6 @@ def _site_of(terrain: Terrain) -> Site:
 
 def _view_facts(terrain: Terrain, position: tuple[float, float]) -> dict[str, Any]:
     """Ground and horizon at a position (east, north) [m]. Raises BadInput outside the terrain."""
-    import numpy as np
-
-    from startrack.frames import latlon_from_enu
-
     point = np.array([position])
     if not terrain.allowed(point)[0]:
         raise BadInput("bad_terrain", f"E {position[0]:g} m, N {position[1]:g} m is outside the terrain")
@@ -188,64 +177,73 @@ def _latlon_text(latitude_deg: float, longitude_deg: float) -> str:
     return f"{abs(latitude_deg):.5f} {north}, {abs(longitude_deg):.5f} {east}"
 
 
-COMMANDS = (
-    Command(
-        "terrain", None, "show a terrain, compute its horizons, make one from elevation data, state its errors",
-        "TERRAIN is a terrain file (a path if it ends in .toml or contains a separator) or a shipped name.",
-        start=START,
-        actions=(
-            Command(
-                "show", _show_terrain, "properties, relief and, with --at, the horizon from a position", None,
-                {
-                    "input": (
-                        flag("terrain TERRAIN", "terrain file, or the name of a shipped one"),
-                        flag("--at EAST NORTH", "a position [m]", float, nargs=2),
-                    ),
-                    "output": (flags.DIR, flags.JSON, flags.NO_PLOTS),
-                    "more": flags.MORE,
-                },
-                "startrack terrain show shackleton --at 0 0",
-            ),
-            Command(
-                "build", _build_tables, "compute the horizons now; otherwise the first fix does", None,
-                {
-                    "input": (
-                        flag("terrain TERRAIN", "terrain file, or the name of a shipped one", nargs="+"),
-                        flag("--force", "even if they are known"),
-                    ),
-                    "more": (flags.JSON, *flags.MORE),
-                },
-                "startrack terrain build shackleton",
-            ),
-            Command(
-                "import", _import_map, "a terrain file and GeoTIFF crops from elevation data", None,
-                {
-                    "input": (
-                        flag("maps MAP", "GeoTIFF, COG, PDS label ..., the finest first", nargs="+"),
-                        flag("--latitude DEG", "of the origin, north positive", float, required=True),
-                        flag("--longitude DEG", "east positive", float, required=True),
-                        flag("--radius M", "of the search area", float, default=10_000.0),
-                        flag("--half M", "half side of each map's crop (30000 for the first, then 300000)", float,
-                             nargs="+"),
-                        flag("--scale M", "metres per unit of each map; needed for integers if the files lack it",
-                             float, nargs="+"),
-                        flag("--offset M", "height of value 0 of each map, if the files lack it", float, nargs="+"),
-                        flag("--sigma M", "error of single posts (default: measured or estimated)", float),
-                        flag(
-                            "--compare MAP",
-                            "finer maps of a part of the ground, to measure the errors (the shipped maps are tried "
-                            "anyway)", nargs="+", default=(),
-                        ),
-                        flag("--camera-height M", "above the ground", float, default=1.5),
-                    ),
-                    "output": (
-                        flag("-o --output NAME.toml", "the terrain file", required=True), flags.OVERWRITE, flags.JSON,
-                    ),
-                    "more": flags.MORE,
-                },
-                "startrack terrain import MAP.tif -o own.toml --latitude -89.5 --longitude 130",
-            ),
-            terrain_state.COMMAND,
-        ),
-    ),
-)  # fmt: skip
+def state(args: argparse.Namespace) -> int:
+    """Write the errors; 0, or 2 where there is nothing to write and nobody to ask. Raises BadInput, BadOutput."""
+    path = files.resolve_named(args.file, "terrain", "bad_terrain")
+    text = files.read_text(path, "bad_terrain")
+    try:
+        known = terrains.stateable_errors(text)
+        missing = [error for error in known if error.is_missing]
+        values = _values_of_flags(args, known, text)
+        if not values and missing and sys.stdin.isatty():
+            values = _ask(missing)
+        if values:
+            text = terrains.state_errors(text, values)
+            # Refuses what would be no terrain.
+            terrains.terrain_from_dict(
+                files.parse_toml(text, "bad_terrain"), default_name=path.stem, folder=path.parent
+            )
+    except BadInput as cause:
+        raise BadInput(cause.reason, f"{files.printable(path)}: {cause}") from cause
+    if values:
+        files.write_atomically(path, text.encode("utf-8"), overwrite=True, reason="bad_terrain")
+    _show(args, str(path), missing, {key: value for (_, key), value in values.items()})
+    return 2 if missing and not values and not sys.stdin.isatty() else 0
+
+
+def _values_of_flags(args: argparse.Namespace, known: list[StateableError], text: str) -> Values:
+    """What the flags state. Wrong usage: keys of another kind of terrain, and keys that the file states."""
+    tables = {error.key: error.table for error in known}
+    given = {key: getattr(args, key) for key in STATED_ERRORS if getattr(args, key) is not None}
+    for key in given:
+        if key not in tables:
+            args.usage_error(f"{state_flag(key)}: {args.file} has no {key}: it describes another kind of ground")
+    is_cylinder = "depth_sigma_m" in tables
+    if args.exact and not is_cylinder:
+        given = {error.key: 0.0 for error in known if error.is_missing} | given
+    values: Values = {(tables[key], key): value for key, value in given.items()}
+    if args.exact and is_cylinder and "exact" not in files.parse_toml(text, "bad_terrain")["cylinder"]:
+        values["cylinder", "exact"] = True
+    return values
+
+
+def _ask(missing: list[StateableError]) -> Values:
+    """Answers on the terminal; an empty one leaves an error unstated."""
+    print("One standard deviation of each; 0 if it is exact; Enter leaves it out.")
+    values: Values = {}
+    for error in missing:
+        try:
+            while answer := input(f"{error.key}, {error.meaning} (left out: {error.default}): ").strip():
+                try:
+                    values[error.table, error.key] = amount(answer)
+                    break
+                except (argparse.ArgumentTypeError, ValueError) as cause:
+                    print(f"  {cause}")
+        except EOFError:
+            continue
+    return values
+
+
+def _show(args: argparse.Namespace, path: str, missing: list[StateableError], written: dict[str, float | bool]) -> None:
+    """Print what was written and what is left out."""
+    left = [error for error in missing if error.key not in written and "exact" not in written]
+    if args.json:
+        unstated = [{"fact": error.key, "default": error.default} for error in left]
+        print(json.dumps({"format": "startrack.terrain/1", "file": path, "stated": written, "unstated": unstated}))
+    elif not args.quiet:
+        lines = [f"  written   {key} = {str(value).lower()}" for key, value in written.items()]
+        lines += [f"  left out  {error.key}, {error.meaning}: {error.default}" for error in left]
+        print("\n".join([path, *(lines or ["  states every error"])]))
+    if left and not written and not sys.stdin.isatty():
+        flags = " ".join(f"{state_flag(error.key)} {STATED_ERRORS[error.key]}" for error in left)
+        print(f"startrack terrain state {path}: give {flags}, or --exact", file=sys.stderr)

@@ -3,30 +3,46 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
+import signal
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from startrack.cli import flags
-from startrack.cli.flag_types import seconds
-from startrack.cli.flags import Command, flag
-from startrack.cli.images import flag_facts, worst_code
-from startrack.cli.track_run import TrackRun
-from startrack.core.errors import BadInput, BadOutput
+from startrack.applications import tracking
+from startrack.applications.batch import images_under
+from startrack.applications.tracking import FrameStore, ObservedFrame, Odometry, Track, TrackSession
+from startrack.chain import Settings
+from startrack.cli.console import progress, worst_code
+from startrack.cli.images import flag_facts, prepare_reference
+from startrack.core.errors import EXIT_BAD_INPUT, EXIT_REFUSED, EXIT_STOPPED, BadInput, BadOutput, exit_code_of
 from startrack.core.files import make_folder, printable
+from startrack.core.types import Exposure
+from startrack.exposure import is_bag, read_exposure
+from startrack.output import png_bytes
 
 STORE = ".frames"  # in OUT
+QUICK_S = 0.2  # files that take longer are written when no image waits
 
 
 def run(args: argparse.Namespace) -> int:
     """Estimate and write the track; the exit code of its worst image."""
     _check_flags(args)
-    from startrack.applications.tracking import FrameStore, TrackSession
-    from startrack.chain import Settings
-
-    _check_folder(args)
-    store, settings = FrameStore(Path(args.dir) / STORE), Settings(evidence_sources=args.evidence)
-    errors = {"odometry_sigma": args.odometry_sigma, "odometry_floor_m": args.odometry_floor}
-    track = TrackRun(args, TrackSession(store=store, settings=settings, facts=flag_facts(args), **errors))
+    out = make_folder(args.dir)
+    if not args.overwrite and (out / "track.json").exists() and not (out / STORE).is_dir():
+        raise BadOutput(
+            "bad_image", f"{out} holds a track that this command did not write: choose another -D, or give -O"
+        )
+    session = TrackSession(
+        store=FrameStore(out / STORE), settings=Settings(evidence_sources=args.evidence), facts=flag_facts(args),
+        odometry_sigma=args.odometry_sigma, odometry_floor_m=args.odometry_floor,
+    )  # fmt: skip
+    track = TrackRun(args, session)
     if args.follow:
         track.follow()
     else:
@@ -46,45 +62,209 @@ def _check_flags(args: argparse.Namespace) -> None:
         args.usage_error("--until-idle is for --follow")
     if not any(os.path.exists(path) for path in args.frames):  # one missing image of several is refused later
         first = printable(args.frames[0])
-        message = f"{first}: no such file or folder: give images, one folder of images, or one ROS bag"
-        raise BadInput("bad_image", message)
-
-
-def _check_folder(args: argparse.Namespace) -> None:
-    """Make the folder of the results. Raises BadOutput where it holds the track of other images, and not -O."""
-    out = Path(args.dir)
-    make_folder(out)
-    if not args.overwrite and (out / "track.json").exists() and not (out / STORE).is_dir():
-        raise BadOutput(
-            "bad_image", f"{out} holds a track that this command did not write: choose another -D, or give -O"
+        raise BadInput(
+            "bad_image", f"{first}: no such file or folder: give images, one folder of images, or one ROS bag"
         )
 
 
-COMMANDS = (
-    Command(
-        "track", run, "images of a drive or of a rover at rest to a trajectory",
-        "Locate the images of one camera and estimate its trajectory from all of them, with the errors that they "
-        "share. Writes track.tum (by all images), track.filtered.tum (by the images up to each), track.ecsv, "
-        "track.geojson, track.json, track.crests.ecsv, track.png and track.html.",
-        {
-            "input": (
-                flag("frames FRAMES", "images, one folder, or one ROS bag", nargs="+"),
-                flags.TOPIC, *flags.FACTS, flags.TERRAIN,
-            ),
-            "method": (flags.EVIDENCE,),
-            "motion between the images (without: each is alone but for shared errors)": (
-                flag("--odometry FILE", "TUM text, or a ROS bag"),
-                flag("--odometry-topic TOPIC", "of a bag with several"),
-                *flags.ODOMETRY,
-                flag("--at-rest", "the camera did not move"),
-            ),
-            "live": (
-                flag("--follow", "take images as they are written into the folder FRAMES"),
-                flag("--until-idle S", "end after S seconds without an image", seconds),
-            ),
-            "output": flags.OUTPUT,
-            "more": (flags.NO_SEED, *flags.MORE),
-        },
-        "startrack track DRIVE/ --odometry odometry.tum -c camera.toml -t shackleton",
-    ),
-)  # fmt: skip
+class OdometryFile:
+    """A file of odometry that is read again where it has changed."""
+
+    def __init__(self, path: str, topic: str | None, is_followed: bool) -> None:
+        """Of a `path`, and of a bag the `topic`; `is_followed`: its last line may be incomplete."""
+        self.path, self.topic, self._is_growing = path, topic, is_followed
+        self._has_ended = False
+        self._read: tuple[object, Odometry] | None = None  # with the stamp of the file
+
+    @property
+    def has_changed(self) -> bool:
+        """Whether the file is another one than was read."""
+        return self._read is None or self._read[0] != self._stamp()
+
+    def read(self) -> Odometry:
+        """The odometry as it is now. Raises BadInput as `read_odometry`."""
+        stamp = self._stamp()
+        if self._read is None or self._read[0] != stamp:
+            read = partial(tracking.read_odometry, self.path, self.topic)
+            try:
+                self._read = stamp, read(growing=self._is_growing)
+            except BadInput:
+                if not self._has_ended:
+                    raise
+                self._read = stamp, read(growing=True)  # without the last line
+        return self._read[1]
+
+    def end(self) -> None:
+        """The file grows no more: its last line counts too, if it can be read."""
+        self._has_ended, self._is_growing, self._read = True, False, None
+
+    def _stamp(self) -> object:
+        with suppress(OSError):
+            found = Path(self.path).stat()
+            return found.st_size, found.st_mtime_ns
+        return None
+
+
+class TrackRun:
+    """One run of the command: what it prints and writes."""
+
+    def __init__(self, args: argparse.Namespace, session: TrackSession) -> None:
+        self.args, self.session = args, session
+        self.codes: set[int] = set()
+        self._is_old, self._write_s = False, 0.0  # the files; what writing them took
+        self._printed = 0  # lines at rest
+        self._shown: set[str] = set()  # facts whose gross error an image showed
+        self._moves: OdometryFile | None = None
+        if args.odometry is not None:
+            self._moves = OdometryFile(args.odometry, args.odometry_topic, bool(args.follow))
+
+    def take_all(self) -> None:
+        """Locate all images, then estimate and write the track."""
+        first = Path(self.args.frames[0])
+        paths: list[str] | None = list(self.args.frames)
+        if len(self.args.frames) == 1 and is_bag(first):
+            paths = None
+        elif first.is_dir():
+            paths = [one.path for one in images_under(first, self.args.dir)]
+            if not paths:
+                raise BadInput("bad_image", f"{first}: no images in this folder")
+        with progress("track", len(paths or ()), shown=paths is not None and not self.args.quiet) as bar:
+            if paths is None:
+                bag = tracking.read_bag_exposures(first, self.args.image_topic, **self.session.facts)
+                sources = ((exposure.name, partial(self._add_exposure, exposure)) for exposure in bag)
+            else:
+                sources = ((Path(path).name, partial(self._add, path)) for path in paths)
+            for name, add in sources:
+                try:
+                    add()
+                except BadInput as cause:
+                    self._refuse(name, cause)
+                bar.advance()
+        self._finish()
+
+    def follow(self) -> None:
+        """Take images as they come; Ctrl-C and SIGTERM end it, before the first image with the code of a stop."""
+        folder = self.args.frames[0]
+        former = signal.signal(signal.SIGTERM, signal.default_int_handler)
+        try:
+            for path in tracking.follow_images(
+                lambda: [image.path for image in images_under(folder, self.args.dir)],
+                self._add,
+                lambda path, cause: self._refuse(os.path.relpath(path, folder), cause),
+                until_idle_s=self.args.until_idle,
+            ):
+                self._update(path is not None)
+        except KeyboardInterrupt:
+            if not self.session.frames:
+                print("startrack: interrupted before the first image", file=sys.stderr, flush=True)
+                self.codes.add(EXIT_STOPPED)
+                return
+        finally:
+            signal.signal(signal.SIGTERM, former)
+        if self._moves is not None:
+            self._moves.end()
+        self._finish(growing=True)
+
+    def _finish(self, growing: bool = False) -> None:
+        """Write and print the track of all images, `growing` in front of the user; the reasons where there is none."""
+        try:
+            track = self._estimate(growing)
+        except BadInput as cause:
+            if exit_code_of(cause.reason) == EXIT_BAD_INPUT:
+                raise
+            for frame in self.session.frames:
+                if frame.reason:
+                    print(f"{frame.name}  refused  {frame.reason}: {frame.message}", file=sys.stderr, flush=True)
+            print(f"startrack: {cause.reason}: {cause}", file=sys.stderr, flush=True)
+            self.codes.add(exit_code_of(cause.reason))
+            return
+        self._write(track)
+        if any(frame.status != "used" for frame in track.frames):
+            self.codes.add(EXIT_REFUSED)
+        if not growing:
+            self._print(tracking.frame_records(track), "")
+        if not (self.args.quiet or self.args.json):
+            counts = tracking.track_record(track)["counts"]
+            print(
+                f"{counts['frames']} frames: {counts['used']} used, {counts['left_out']} left out, {counts['refused']} "
+                f"refused; {counts['slips']} slips of the odometry; files in {self.args.dir}/track.*"
+            )
+
+    def _update(self, has_come: bool) -> None:
+        """A line about each image that the odometry reaches; the files, unless the next image would wait for them."""
+        waits = self._moves is not None and self.session.waits and self._moves.has_changed
+        if not (has_come or self._is_old or waits):
+            return
+        try:
+            records = list(self._newest_records())
+            self._print(records, "filtered_")
+            self._is_old |= bool(records)
+            if self._is_old and (not has_come or self._write_s < QUICK_S):
+                start = time.monotonic()
+                self._write(self._estimate(growing=True), pictures=False)
+                self._write_s, self._is_old = time.monotonic() - start, False
+        except BadInput as cause:  # no position yet, or no odometry for the first images
+            if has_come:
+                print(f"waiting: {cause}", file=sys.stderr, flush=True)
+            self._is_old = False
+
+    def _newest_records(self) -> Iterator[dict[str, Any]]:
+        """The record of each image that was not printed yet."""
+        if self.args.at_rest:
+            before, self._printed = self._printed, len(self.session.frames)
+            yield from tracking.frame_records(self._estimate())[before:]
+        else:
+            for track in self.session.newest(self._odometry()):
+                yield from tracking.frame_records(track)
+
+    def _print(self, records: Sequence[dict[str, Any]], prefix: str) -> None:
+        """Print a line, or the JSON object, of each frame; its position is that of the keys with this `prefix`."""
+        for record in () if self.args.quiet and not self.args.json else records:
+            if self.args.json:
+                print(json.dumps(record), flush=True)
+                continue
+            east_m, north_m, radius_m = (record[f"{prefix}{key}"] for key in ("east_m", "north_m", "radius95_m"))
+            is_known = east_m is not None and radius_m is not None
+            place = f"E {east_m:.1f} m  N {north_m:.1f} m  ±{radius_m:.1f} m (95 %)" if is_known else "no position"
+            why = f"  {record['reason']}: {record['message']}" if record["reason"] else ""
+            slip = "  after a slip" if record["slipped"] else ""
+            print(f"{record['image']}  {record['status'].replace('_', ' ')}  {place}{slip}{why}", flush=True)
+
+    def _add(self, path: str) -> None:
+        self._add_exposure(read_exposure(path, **self.session.facts), path)
+
+    def _add_exposure(self, exposure: Exposure, path: str | None = None) -> None:
+        """Locate the image; print the facts that it shows to be grossly wrong, once each."""
+        if self.session.terrain is None:
+            prepare_reference(exposure.terrain, self.args)
+        frame: ObservedFrame = self.session.add_exposure(exposure, path)
+        for one in frame.shown:
+            if one.fact not in self._shown:
+                self._shown.add(one.fact)
+                what = f"the image shows {one.text}, which no file states: the track estimates it"
+                print(f"{frame.name}  {what}", file=sys.stderr, flush=True)
+        if not frame.modes:
+            self.codes.add(EXIT_REFUSED)
+
+    def _refuse(self, name: str, cause: BadInput) -> None:
+        self.codes.add(exit_code_of(cause.reason))
+        print(f"{name}  refused  {cause.reason}: {cause}", file=sys.stderr, flush=True)
+
+    def _estimate(self, growing: bool = False) -> Track:
+        return self.session.estimate(self._odometry(), at_rest=self.args.at_rest, covered_only=growing)
+
+    def _odometry(self) -> Odometry | None:
+        return None if self._moves is None else self._moves.read()
+
+    def _write(self, track: Track, pictures: bool = True) -> None:
+        args, odometry, made, moves_m = self.args, None, {}, None
+        if args.odometry is not None:
+            odometry = {"file": Path(args.odometry).name, "sigma": args.odometry_sigma, "floor_m": args.odometry_floor}
+        if pictures and not args.no_plots:
+            if odometry is not None and not args.at_rest:
+                moves_m = self.session.odometry_positions_m(track, self._odometry())
+            picture = png_bytes(tracking.draw_track(track, moves_m))
+            title = f"Track of {Path(args.frames[0]).resolve().name}"
+            page = tracking.track_page(track, picture, title=title, odometry_m=moves_m)
+            made = {"track.png": picture, "track.html": page.encode()}
+        tracking.write_track(track, Path(args.dir), odometry=odometry, pictures=made)

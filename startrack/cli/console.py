@@ -1,0 +1,102 @@
+"""What a command prints: outcomes of images, advice, and the progress bar of work that lasts."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Any
+
+from startrack.core import errors
+from startrack.core.errors import BadInput, NoSolution, Reason
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as RichProgress
+
+Outcome = tuple[dict[str, Any], str]  # of an image: the JSON object, and the line or lines
+
+
+def refusal(cause: BadInput | NoSolution, name: str, **first: Any) -> Outcome:
+    """The outcome of an image or file `name` that was refused; `first` stands at the beginning of the JSON object."""
+    return refusal_record(cause.reason, str(cause), **first), f"{name}  refused {cause.reason}: {cause}"
+
+
+def refusal_record(reason: str, message: str, **first: Any) -> dict[str, Any]:
+    """The JSON object of what was refused; `first` stands at its beginning."""
+    return {**first, "status": "refused", "reason": reason, "message": message, "advice": Reason(reason).advice}
+
+
+def print_outcome(args: argparse.Namespace, record: dict[str, Any], line: str) -> int:
+    """Print the record or the line; the exit code of its reason."""
+    if args.json:
+        print(json.dumps(record), flush=True)
+        return errors.exit_code_of(record["reason"])
+    if not args.quiet or record["status"] != "ok":
+        print(line, file=sys.stderr if args.quiet else sys.stdout, flush=True)
+    for need in () if args.quiet else record.get("explain", ()):
+        print(f"  needs {need}", file=sys.stderr, flush=True)
+    print_advice(record["reason"], record.get("message", ""), args)
+    return errors.exit_code_of(record["reason"])
+
+
+def print_advice(reason: str | None, message: str, args: argparse.Namespace) -> None:
+    """What to do after a refusal, on stderr, where its `message` does not contain it; once for each reason."""
+    advice = "" if reason is None or getattr(args, "quiet", False) else errors.next_step(reason, message)
+    printed: set[str] = vars(args).setdefault("printed_advice", set())
+    if advice and advice not in printed:
+        printed.add(advice)
+        print(f"  next: {advice}", file=sys.stderr, flush=True)
+
+
+def print_left_out(images: Any) -> None:
+    """A line on stderr for each of the `images` refused, which have a name, a reason and a message."""
+    for one in images:
+        print(f"{one.name}: left out, {one.reason}: {one.message}", file=sys.stderr, flush=True)
+
+
+def worst_code(codes: set[int]) -> int:
+    """The exit code of a command whose images have these `codes`."""
+    order = (errors.EXIT_INTERNAL_ERROR, errors.EXIT_BAD_INPUT, errors.EXIT_STOPPED, errors.EXIT_REFUSED)
+    return next((code for code in order if code in codes), errors.EXIT_OK)
+
+
+def discard_stdout() -> None:
+    """Discard the rest of the buffer: its reader has ended, or its disk is full."""
+    with suppress(OSError, ValueError):  # not a file, as under a test
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+class Progress:
+    """One row of a bar of rich; without a bar there is no output."""
+
+    def __init__(self, bar: RichProgress | None = None, row: Any = None) -> None:
+        self._bar, self._row = bar, row
+
+    def advance(self, steps: int = 1, text: str | None = None) -> None:
+        """Further steps are done; `text` names the current step."""
+        fields: dict[str, Any] = {} if text is None else {"text": text}
+        if self._bar is not None:
+            self._bar.update(self._row, advance=steps, **fields)
+
+    def update(self, completed: int, total: int) -> None:
+        """Numbers of steps done and of all steps."""
+        if self._bar is not None:
+            self._bar.update(self._row, completed=completed, total=total)
+
+
+@contextmanager
+def progress(what: str, total: int | None = None, *, shown: bool = True) -> Iterator[Progress]:
+    """A bar on stderr with a text behind it, if `shown` and stderr is a terminal; it disappears at the end."""
+    if not shown or total == 0 or not sys.stderr.isatty():
+        yield Progress()
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as RichProgress
+
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with RichProgress(*columns, TextColumn("{task.fields[text]}"), console=Console(stderr=True), transient=True) as bar:
+        yield Progress(bar, bar.add_task(what, total=total, text=""))

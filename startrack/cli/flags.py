@@ -94,7 +94,7 @@ class _Formatter(argparse.HelpFormatter):
         return text if "\n" in text else super()._fill_text(text, width, indent)
 
 
-def run(path: str) -> Callable[[argparse.Namespace], int]:
+def function_at(path: str) -> Callable[[argparse.Namespace], int]:
     """The function at `path` in startrack.cli, as "module.function"; its module is loaded when the function is called.
 
     So the help, which needs no result, is printed without numpy.

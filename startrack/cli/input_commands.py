@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from startrack.cli import flags
 from startrack.cli.flag_types import amount, field_of_view_rad, limited, number, positive_number
-from startrack.cli.flags import Command, Either, flag, run
+from startrack.cli.flags import Command, Either, flag, function_at
 
 CALIBRATE = """usage: startrack calibrate [ACTION] ... (startrack calibrate --help lists the flags of each action)
 
@@ -36,7 +36,7 @@ def state_flag(key: str) -> str:
 
 COMMANDS = (
     Command(
-        "calibrate", run("calibrate.run"), "a camera file from star exposures",
+        "calibrate", function_at("calibrate.run"), "a camera file from star exposures",
         "Fit the lens of a camera to the stars of one or more exposures of the open night sky, check the fit, and "
         "write the camera file with its covariance, a report and a JSON record. A fit that fails a check is refused, "
         "with the exposures that would help.",
@@ -59,14 +59,14 @@ COMMANDS = (
         start=CALIBRATE,
     ),
     Command(
-        "calibrate verify", run("calibrate.verify"), None,
+        "calibrate verify", function_at("calibrate.verify"), None,
         "Check whether a camera file still fits exposures of the stars. If the file was calibrated with --site, verify "
         "needs --site too.",
         {"input": flags.SKY, "more": (flags.JSON, *flags.MORE)},
         "startrack calibrate verify LATER.jpg -c camera.toml",
     ),
     Command(
-        "calibrate show", run("camera_files.show"), None, "Print the content of camera files.",
+        "calibrate show", function_at("camera_files.show"), None, "Print the content of camera files.",
         {
             "input": (flag("cameras CAMERA", "camera file, or the name of a shipped one", nargs="+"),),
             "more": (flags.JSON, *flags.MORE),
@@ -74,7 +74,7 @@ COMMANDS = (
         "startrack calibrate show fisheye-2048",
     ),
     Command(
-        "calibrate convert", run("camera_files.convert"), None,
+        "calibrate convert", function_at("camera_files.convert"), None,
         "Convert a camera file to another program's format, or from it.",
         {
             "input": (
@@ -99,7 +99,7 @@ COMMANDS = (
         "startrack calibrate convert camera.toml --to ros",
     ),
     Command(
-        "calibrate board", run("calibrate.run_board"), None,
+        "calibrate board", function_at("calibrate.run_board"), None,
         "Fit the lens of a camera to pictures of a chessboard or a ChArUco board.",
         {
             "input": (
@@ -115,7 +115,7 @@ COMMANDS = (
         "startrack calibrate board BOARD.png... --pattern 9x6 -o camera.toml",
     ),
     Command(
-        "horizon", run("horizon.run"), "the horizon of a fixed camera from photographs of the night sky",
+        "horizon", function_at("horizon.run"), "the horizon of a fixed camera from photographs of the night sky",
         "Measure the skyline (obstruction profile) of a fixed camera on the Earth from one or several photographs of "
         "the night sky: from stars seen, stars missing, and the place where the sky's light stops. The suffix of -o "
         "chooses the format: .csv, .ecsv, .hrz (N.I.N.A.), .png (panorama), none (folder of a Stellarium landscape).",
@@ -140,7 +140,8 @@ COMMANDS = (
         start=TERRAIN,
         actions=(
             Command(
-                "show", run("terrain.show"), "properties, relief and, with --at, the horizon from a position", None,
+                "show", function_at("terrain.show"),
+                "properties, relief and, with --at, the horizon from a position", None,
                 {
                     "input": (
                         flag("terrain TERRAIN", "terrain file, or the name of a shipped one"),
@@ -152,7 +153,7 @@ COMMANDS = (
                 "startrack terrain show shackleton --at 0 0",
             ),
             Command(
-                "build", run("terrain.build"), "compute the horizons now; otherwise the first fix does", None,
+                "build", function_at("terrain.build"), "compute the horizons now; otherwise the first fix does", None,
                 {
                     "input": (
                         flag("terrain TERRAIN", "terrain file, or the name of a shipped one", nargs="+"),
@@ -163,7 +164,8 @@ COMMANDS = (
                 "startrack terrain build shackleton",
             ),
             Command(
-                "import", run("terrain.import_map"), "a terrain file and GeoTIFF crops from elevation data", None,
+                "import", function_at("terrain.import_map"),
+                "a terrain file and GeoTIFF crops from elevation data", None,
                 {
                     "input": (
                         flag("maps MAP", "GeoTIFF, COG, PDS label ..., the finest first", nargs="+"),
@@ -191,7 +193,7 @@ COMMANDS = (
                 "startrack terrain import MAP.tif -o own.toml --latitude -89.5 --longitude 130",
             ),
             Command(
-                "state", run("terrain.state"), "write into a terrain file the errors that it leaves out",
+                "state", function_at("terrain.state"), "write into a terrain file the errors that it leaves out",
                 "An error that the file states is trusted; for one that it leaves out a default counts, and that it "
                 "may be grossly wrong. Without flags the missing ones are asked for, or listed where there is no "
                 "terminal.",

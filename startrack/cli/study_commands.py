@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from startrack.cli import flag_types as types
 from startrack.cli import flags
-from startrack.cli.flags import Command, Either, flag, run
+from startrack.cli.flags import Command, Either, flag, function_at
 
 # The keys of startrack.applications.reproduction.ARTEFACTS, whose import would load numpy.
 ARTEFACT_NAMES = (
@@ -27,7 +27,7 @@ DRIVE_FLAGS = (
 )
 COMMANDS = (
     Command(
-        "render", run("render.run"), "make synthetic exposures and files with their truth",
+        "render", function_at("render.run"), "make synthetic exposures and files with their truth",
         "Render the image of a camera on the crater's floor. Position, heading, tilt and time are drawn from the seed "
         "unless they are given. With --every the exposures are at equal steps of time, at rest or, with --path, on a "
         "drive with odometry. Beside NAME.png: NAME.json (time, exposure, camera, terrain), NAME.truth.json (pose, "
@@ -97,7 +97,7 @@ COMMANDS = (
         "startrack render --seed 1",
     ),
     Command(
-        "predict", run("studies.predict"), "expected accuracy over a terrain, before a drive",
+        "predict", function_at("studies.predict"), "expected accuracy over a terrain, before a drive",
         "Predict how well images would be located: evidence of the stars is drawn at every place and located as "
         "`locate` does. Writes predict.tif, predict.png, predict.ecsv and predict.json. Draws are kept in "
         "OUT/.predict: a stopped run is resumed.",
@@ -132,7 +132,7 @@ COMMANDS = (
         "startrack predict -t shackleton -c fisheye-2048 --time 2030-01-01T00:00:00",
     ),
     Command(
-        "reproduce", run("studies.reproduce"), "the thesis's tables and figures, ours beside them",
+        "reproduce", function_at("studies.reproduce"), "the thesis's tables and figures, ours beside them",
         "Reproduce the tables and figures of Kua 2008 in its crater simulator, with its method and ours on the same "
         "draws. Each NAME gives NAME.md, NAME.png and, with numbers, NAME.ecsv. Computed chunks are kept in "
         "OUT/.chunks: a stopped run is resumed.",
@@ -155,7 +155,7 @@ COMMANDS = (
         "startrack reproduce table3.1 --quick",
     ),
     Command(
-        "doctor", run("doctor.run"), "versions, data files, compiled kernels, self-test",
+        "doctor", function_at("doctor.run"), "versions, data files, compiled kernels, self-test",
         "Check the installation: versions, extras, data files, and one rendered exposure located from its pixels, for "
         "which the kernels are compiled (once for each installation). Exit code 0 if all is well, 1 otherwise.",
         {
@@ -167,7 +167,7 @@ COMMANDS = (
         "startrack doctor",
     ),
     Command(
-        "schema", run("doctor.run_schema"), "JSON schemas of the files",
+        "schema", function_at("doctor.run_schema"), "JSON schemas of the files",
         "Print the JSON schema of one kind of file, or without a name the list of kinds.",
         {"input": (flag("name KIND", "such as fix, identification, camera, terrain", nargs="?"),)},
         "startrack schema fix",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -82,18 +82,15 @@ def write_tables(out: Path, records: Sequence[Record], settings: dict[str, Any])
     one cannot be.
     """
     records = sorted(records, key=lambda record: str(record["image"]))
-    made: dict[str, Callable[[], bytes]] = {"results.ecsv": lambda: _results(records)}
-    if has_parquet():
-        made[PARQUET] = lambda: _parquet(records)
-    for name, lines in _trajectories(records).items():
-        made[name] = "".join(lines).encode
-    made |= {"timings.ecsv": lambda: _timings(records), MANIFEST: lambda: _manifest(records, settings)}
+    made = {"results.ecsv": _results(records)} | ({PARQUET: _parquet(records)} if has_parquet() else {})
+    made |= {name: "".join(lines).encode() for name, lines in _trajectories(records).items()}
+    made |= {"timings.ecsv": _timings(records), MANIFEST: _manifest(records, settings)}
     for former in (out / PARQUET, out / TRAJECTORY, *out.glob("trajectory-*.tum")):
         if former.name not in made:
             with suppress(OSError):
                 former.unlink()
-    for name, make in made.items():
-        write_atomically(out / name, make(), overwrite=True)
+    for name, data in made.items():
+        write_atomically(out / name, data, overwrite=True)
     return [out / name for name in made]
 
 

@@ -1,19 +1,33 @@
-"""A reproduced table or figure, as values and as files."""
+"""A reproduced table or figure: its values, its pictures in the thesis's colours, and its files."""
 
 from __future__ import annotations
 
+import io
+import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.applications.reproduction.drawing import png_bytes
+import numpy as np
+
+from startrack.applications.reproduction.simulator import directions
 from startrack.core.chunk_store import ChunkStore
 from startrack.core.files import write_atomically
+from startrack.core.types import Array
 from startrack.output import Column, ecsv_text
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+STYLE: dict[Any, Any] = {
+    "figure.constrained_layout.use": True, "figure.dpi": 100, "axes.titlesize": 10, "legend.frameon": False
+}  # fmt: skip
+EDGE_COLOUR = "#1a9641"  # the thesis draws the crater's edge in green
+STAR, OTHER_STAR = "#20304a", "#b9c0cc"
+CENTRE = PUBLISHED = "#d7191c"  # and centres of mass in red
+COLOURS = 128  # of a PNG's palette: enough for these drawings, at a third of the size
 
 
 @dataclass(frozen=True)
@@ -55,8 +69,27 @@ class Context:
 class Picture:
     """A figure and the caption below it."""
 
-    draw: Callable[[], Figure]
+    size_in: tuple[float, float]  # (width, height)
+    draw: Callable[[Figure], None]
     caption: str
+
+    def png(self) -> bytes:
+        """The figure with its caption below, as a PNG with a palette; the same figure gives the same bytes."""
+        from matplotlib import rc_context
+        from matplotlib.figure import Figure
+        from PIL import Image
+
+        drawn, packed = io.BytesIO(), io.BytesIO()
+        with rc_context(STYLE):
+            figure = Figure(figsize=self.size_in)
+            self.draw(figure)
+            lines = textwrap.wrap(self.caption, int(13.7 * self.size_in[0]))
+            figure.supxlabel("\n".join(lines), fontsize=9, x=0.02, ha="left")
+            figure.savefig(drawn, format="png", metadata={"Software": None})
+        picture = Image.open(drawn).convert("RGB")
+        picture = picture.quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        picture.save(packed, format="PNG", optimize=True)
+        return packed.getvalue()
 
 
 @dataclass(frozen=True)
@@ -74,15 +107,17 @@ class Artefact:
 
     @classmethod
     def of_figure(
-        cls, name: str, title: str, line: str, picture: Picture, values: Mapping[str, Any], text: str = "", **more: Any
-    ) -> Artefact:
-        """The figure `name` with one `picture`; the `title` is put after its number.
+        cls, name: str, title: str, detail: str, line: str, size_in: tuple[float, float],
+        draw: Callable[[Figure], None], values: Mapping[str, Any], **more: Any,
+    ) -> Artefact:  # fmt: skip
+        """The figure `name` with one picture of `size_in`, which `draw` draws on an empty figure.
 
-        The `text` is the caption of the picture unless it is given. `line`, `values` and `more` are
-        fields of the class.
+        The `title` is put after the figure's number; the caption is both and the `detail`. `line`, `values` and `more`
+        are fields of the class.
         """
         title = f"Figure {name.removeprefix('fig')}: {title}"
-        return cls(name, title, line, text or picture.caption, values, pictures={name: picture}, **more)
+        picture = Picture(size_in, draw, title + detail)
+        return cls(name, title, line, picture.caption, values, pictures={name: picture}, **more)
 
 
 def write_artefact(artefact: Artefact, out: Path, *, plots: bool) -> list[Path]:
@@ -91,7 +126,7 @@ def write_artefact(artefact: Artefact, out: Path, *, plots: bool) -> list[Path]:
     if artefact.columns:
         files[f"{artefact.name}.ecsv"] = ecsv_text(artefact.columns).encode()
     shown = artefact.pictures if plots else {}
-    files |= {f"{stem}.png": png_bytes(picture.draw(), picture.caption) for stem, picture in shown.items()}
+    files |= {f"{stem}.png": picture.png() for stem, picture in shown.items()}
     parts = [f"## {artefact.title}", *(f"![{stem}.png]({stem}.png)" for stem in shown), artefact.text.strip()]
     files[f"{artefact.name}.md"] = ("\n\n".join(parts) + "\n").encode()
     for name, data in files.items():
@@ -104,3 +139,15 @@ def markdown_table(head: Iterable[str], rows: Iterable[Iterable[object]]) -> str
     head = list(head)
     lines = [head, ["---"] * len(head), *([str(cell) for cell in row] for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def fisheye_points(azimuth_rad: Array, elevation_rad: Array) -> Array:
+    """Points (n, 2) of the picture: zenith distance in degrees times the horizontal direction, east to the right."""
+    return np.degrees(np.pi / 2 - elevation_rad)[:, None] * directions(azimuth_rad)
+
+
+def fisheye_axes(axes: Axes) -> None:
+    """Equal scales, the horizon as a circle, and no tick labels, as in the thesis."""
+    axes.plot(*fisheye_points(np.linspace(0.0, 2 * np.pi, 361), np.zeros(361)).T, color="0.6", linewidth=0.7)
+    axes.set(aspect="equal", xlim=(-93, 93), ylim=(-93, 93), xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from startrack.applications.reproduction import published
-from startrack.applications.reproduction.artefact import Artefact, Context, Picture
-from startrack.applications.reproduction.drawing import PUBLISHED, STAR, mark_published, new_figure
+from startrack.applications.reproduction.artefact import PUBLISHED, STAR, Artefact, Context
 from startrack.applications.reproduction.simulator import (
+    ASPECT_RATIO,
+    LUNAR_ASPECT_RATIOS,
     MAGNITUDE,
+    MAX_GAP_M,
+    MEAN_GAP_M,
     STEP_M,
     Sky,
     change_steps_m,
@@ -34,36 +35,46 @@ VIEWS = f"views compared at every {STEP_M:.0f} m"
 
 def fig3_7(context: Context) -> Artefact:
     """Distance between changes against the faintest magnitude."""
-    curves = np.array([_gaps(context, magnitude, 10.0) for magnitude in MAGNITUDES])
+    curves = np.array([_gaps(context, magnitude, ASPECT_RATIO) for magnitude in MAGNITUDES])
     six = curves[int(np.argmin(np.abs(MAGNITUDES - MAGNITUDE)))].mean(axis=0)
-    caption = (
-        f"Figure 3.7: Effects of changing the star detection limit, {context.size.traverses} starfields (line: mean, "
-        f"band: all). At magnitude 6: mean {six[0]:.1f} m, thesis 14.9 m; largest {six[1]:.0f} m, thesis 215 m "
-        f"({VIEWS}; every single change counted, the mean is {six[2]:.1f} m)."
+    detail = (
+        f", {context.size.traverses} starfields (line: mean, band: all). At magnitude 6: mean {six[0]:.1f} m, thesis "
+        f"14.9 m; largest {six[1]:.0f} m, thesis 215 m ({VIEWS}; every single change counted, the mean is "
+        f"{six[2]:.1f} m)."
     )
-    draw = partial(_draw_panels, MAGNITUDES, curves, "Minimum Detected Magnitude", (700.0, 7000.0), False)
     columns = (
         Column("magnitude", MAGNITUDES, form="%.6g"),
         Column("stars", [star_count(one) for one in MAGNITUDES], "int64", form="%d"),
     )
-    title = "Effects of changing the star detection limit"
-    return _artefact("fig3.7", title, Picture(draw, caption), columns, curves, six)
+
+    def draw(figure: Figure) -> None:
+        for axes in _draw_panels(figure, MAGNITUDES, curves, MAGNITUDE, (700.0, 7000.0)):
+            axes.set(xlabel="Minimum Detected Magnitude", xticks=np.arange(MAGNITUDES[0], MAGNITUDES[-1] + 0.01, 0.5))
+            axes.legend(loc="upper right")
+
+    return _artefact("fig3.7", "Effects of changing the star detection limit", detail, draw, columns, curves, six)
 
 
 def fig3_9(context: Context) -> Artefact:
     """Distance between changes against the crater's aspect ratio."""
     curves = np.array([_gaps(context, MAGNITUDE, ratio) for ratio in ASPECT_RATIOS])
-    ten = _gaps(context, MAGNITUDE, 10.0).mean(axis=0)
-    widest = _gaps(context, MAGNITUDE, 50.0).mean(axis=0)
-    caption = (
-        f"Figure 3.9: Effects of changing the crater aspect ratio, {context.size.traverses} starfields (line: mean, "
-        f"band: all; {VIEWS}; dashed: every change counted). At 10:1 mean {ten[0]:.1f} m and largest {ten[1]:.0f} m "
-        f"(thesis 14.9 and 215 m); at 50:1 largest {widest[1]:.0f} m (thesis: approximately 1 km)."
+    ten, widest = (_gaps(context, MAGNITUDE, ratio).mean(axis=0) for ratio in (ASPECT_RATIO, 50.0))
+    detail = (
+        f", {context.size.traverses} starfields (line: mean, band: all; {VIEWS}; dashed: every change counted). At "
+        f"10:1 mean {ten[0]:.1f} m and largest {ten[1]:.0f} m (thesis 14.9 and 215 m); at 50:1 largest "
+        f"{widest[1]:.0f} m (thesis: approximately 1 km)."
     )
-    draw = partial(_draw_panels, ASPECT_RATIOS, curves, "Crater Aspect Ratio (Diameter:Depth)", (250.0, 8000.0), True)
-    columns = (Column("aspect_ratio", ASPECT_RATIOS, form="%.6g"),)
-    title = "Effects of changing the crater aspect ratio"
-    return _artefact("fig3.9", title, Picture(draw, caption), columns, curves, ten)
+    columns, tops = (Column("aspect_ratio", ASPECT_RATIOS, form="%.6g"),), (250.0, 8000.0)
+
+    def draw(figure: Figure) -> None:
+        for axes, top in zip(_draw_panels(figure, ASPECT_RATIOS, curves, ASPECT_RATIO, tops), tops, strict=True):
+            axes.set(xscale="log", xlim=ASPECT_RATIOS[[0, -1]], xlabel="Crater Aspect Ratio (Diameter:Depth)")
+            for ratio, text in ((5.0, "5:1"), (10.0, "Shackleton 10:1"), (50.0, "50:1")):
+                axes.axvline(ratio, color="0.75", linewidth=0.8, zorder=0)
+                axes.text(ratio, 0.62 * top, f" {text}", fontsize=8, rotation=90, va="top", ha="right", color="0.35")
+            axes.legend(loc="upper center")
+
+    return _artefact("fig3.9", "Effects of changing the crater aspect ratio", detail, draw, columns, curves, ten)
 
 
 def fig3_8(context: Context) -> Artefact:
@@ -72,17 +83,23 @@ def fig3_8(context: Context) -> Artefact:
     changes = change_steps_m(changes_m(Sky.draw(context.seed, 0), cylinder), cylinder)
     gaps, middles = gaps_m(changes, cylinder), (changes[1:] + changes[:-1]) / 2
     inner, outer = (float(gaps[part].mean()) for part in (np.abs(middles) < 2000, np.abs(middles) > 8000))
-    caption = (
-        f"Figure 3.8: Plot of the distance between starfield changes along a crater traverse, one starfield, {VIEWS}. "
-        f"Largest {gaps.max():.0f} m (thesis 215 m); mean {inner:.1f} m within 2 km of the centre, {outer:.1f} m "
-        "beyond 8 km."
-    )
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        axes.plot(middles / 1e3, gaps, ".", color=STAR, markersize=3)
+        axes.axhline(MAX_GAP_M, color=PUBLISHED, linewidth=0.8, linestyle="--", label="thesis: largest 215 m")
+        axes.set(xlim=(-10, 10), ylim=(0, max(250.0, 1.1 * gaps.max())), xlabel="Distance from center (km)")
+        axes.set(ylabel="Distance (m)", title="Distances between appearing/disappearing stars during a crater traverse")
+        axes.legend()
+
     return Artefact.of_figure(
         "fig3.8", "Plot of the distance between starfield changes along a crater traverse",
+        f", one starfield, {VIEWS}. Largest {gaps.max():.0f} m (thesis 215 m); mean {inner:.1f} m within 2 km of the "
+        f"centre, {outer:.1f} m beyond 8 km.",
         f"largest {gaps.max():.0f} m (thesis 215), {inner:.0f} m near the centre, {outer:.0f} m near the wall",
-        Picture(partial(_draw_traverse, middles, gaps), caption),
+        (7.0, 4.8), draw,
         {
-            "thesis": {"max_m": published.MAX_GAP_M},
+            "thesis": {"max_m": MAX_GAP_M},
             "reproduced": {"max_m": float(gaps.max()), "mean_inner_m": inner, "mean_outer_m": outer},
         },
         columns=(
@@ -103,15 +120,15 @@ def _gaps(context: Context, magnitude: float, aspect_ratio: float) -> Array:
 
 
 def _artefact(
-    name: str, title: str, picture: Picture, columns: tuple[Column, ...], curves: Array, standard: Array
+    name: str, title: str, detail: str, draw: Any, columns: tuple[Column, ...], curves: Array, standard: Array
 ) -> Artefact:
     means = zip(("mean_distance", "max_distance", "mean_distance_every_change"), curves.mean(axis=1).T, strict=True)
     return Artefact.of_figure(
-        name, title,
+        name, title, detail,
         f"under standard conditions mean {standard[0]:.1f} m (thesis 14.9), largest {standard[1]:.0f} m (215)",
-        picture,
+        (7.0, 8.6), draw,
         {
-            "thesis": {"mean_m": published.MEAN_GAP_M, "max_m": published.MAX_GAP_M},
+            "thesis": {"mean_m": MEAN_GAP_M, "max_m": MAX_GAP_M},
             "reproduced": dict(zip(("mean_m", "max_m", "mean_every_change_m"), map(float, standard), strict=True)),
         },
         columns=(
@@ -121,73 +138,48 @@ def _artefact(
     )  # fmt: skip
 
 
-def _draw_panels(x: Array, curves: Array, axis: str, tops: tuple[float, float], log: bool) -> Figure:
-    figure = new_figure(7.0, 8.6)
-    for k, (axes, top, word) in enumerate(zip(figure.subplots(2, 1), tops, ("Mean", "Maximum"), strict=True)):
-        axes.fill_between(x, curves[..., k].min(axis=1), curves[..., k].max(axis=1), color=STAR, alpha=0.15, lw=0)
-        axes.plot(x, curves[..., k].mean(axis=1), color=STAR, marker=".", label="here")
+def _draw_panels(figure: Figure, x: Array, curves: Array, standard: float, tops: tuple[float, float]) -> Any:
+    """The mean and the largest distance over `x`, with the thesis's at the `standard` one; the axes (2,)."""
+    panels = figure.subplots(2, 1)
+    for k, (word, value) in enumerate((("Mean", MEAN_GAP_M), ("Maximum", MAX_GAP_M))):
+        axes, curve = panels[k], curves[..., k]
+        axes.fill_between(x, curve.min(axis=1), curve.max(axis=1), color=STAR, alpha=0.15, lw=0)
+        axes.plot(x, curve.mean(axis=1), color=STAR, marker=".", label="here")
         if k == 0:
             axes.plot(x, curves[..., 2].mean(axis=1), "--", color="0.5", linewidth=1, label="every change counted")
-        value = (published.MEAN_GAP_M, published.MAX_GAP_M)[k]
-        mark_published(axes, 10.0 if log else 6.0, value, f"thesis: {value:g} m")
-        if log:
-            axes.set_xscale("log")
-            for ratio, text in ((5.0, "5:1"), (10.0, "Shackleton 10:1"), (50.0, "50:1")):
-                axes.axvline(ratio, color="0.75", linewidth=0.8, zorder=0)
-                axes.text(ratio, 0.62 * top, f" {text}", fontsize=8, rotation=90, va="top", ha="right", color="0.35")
-        else:
-            axes.set_xticks(np.arange(x[0], x[-1] + 0.01, 0.5))
-        axes.set(xlim=(x[0], x[-1]), ylim=(0, top), xlabel=axis, ylabel="Distance (m)")
-        axes.set_title(f"({'ab'[k]}) {word} distance between changes in the viewed starfield", fontsize=10)
-        axes.legend(loc="upper center" if log else "upper right", frameon=False)
-    return figure
-
-
-def _draw_traverse(middles_m: Array, gaps: Array) -> Figure:
-    figure = new_figure(7.0, 4.8)
-    axes = figure.subplots()
-    axes.plot(middles_m / 1e3, gaps, ".", color=STAR, markersize=3)
-    axes.axhline(published.MAX_GAP_M, color=PUBLISHED, linewidth=0.8, linestyle="--", label="thesis: largest 215 m")
-    axes.set(xlim=(-10, 10), ylim=(0, max(250.0, 1.1 * gaps.max())), xlabel="Distance from center (km)")
-    axes.set_ylabel("Distance (m)")
-    axes.set_title("Distances between appearing/disappearing stars during a crater traverse", fontsize=10)
-    axes.legend(frameon=False)
-    return figure
+        axes.plot([standard], [value], "D", color=PUBLISHED, markersize=6, label=f"thesis: {value:g} m", zorder=5)
+        axes.set(xlim=(x[0], x[-1]), ylim=(0, tops[k]), ylabel="Distance (m)")
+        axes.set_title(f"({'ab'[k]}) {word} distance between changes in the viewed starfield")
+    return panels
 
 
 def fig_a2(context: Context) -> Artefact:
     """Aspect ratios of lunar craters by diameter."""
     simple, complex_ = np.linspace(0.5, 15, 59), np.linspace(12, 275, 264)
-    ratios = simple / published.simple_depth_km(simple), complex_ / published.complex_depth_km(complex_)
+    # Depths: eq. 3.11 and 3.12 of Kua 2008, from the Lunar Sourcebook.
+    ratios = simple / (0.196 * np.power(simple, 1.010)), complex_ / (1.044 * np.power(complex_, 0.301))
     shown = [f"{r.min():.2f} to {r.max():.2f}" for r in ratios]
-    caption = (
-        f"Figure A.2: Lunar crater aspect ratio ranges: simple craters {shown[0]} (thesis: approximately 5; axis 4.96 "
-        f"to 5.14), complex craters {shown[1]} (thesis: approximately 5 to 50)."
-    )
+    forms = ("simple", "complex")
+
+    def draw(figure: Figure) -> None:
+        limits = ((0, 15), (4.96, 5.14)), ((0, 300), (5, 50))
+        for k, (axes, x) in enumerate(zip(figure.subplots(2, 1), (simple, complex_), strict=True)):
+            axes.plot(x, ratios[k], color=STAR)
+            axes.set(xlim=limits[k][0], ylim=limits[k][1], xlabel="Diameter (km)", ylabel="Aspect Ratio (X:1)")
+            axes.set_title(f"({'ab'[k]}) Aspect ratios for {forms[k]} craterforms")
+
     return Artefact.of_figure(
         "figA.2", "Lunar crater aspect ratio ranges",
-        f"simple craters {shown[0]} (thesis 5), complex {shown[1]} (thesis 5 to 50)",
-        Picture(partial(_draw_ratios, (simple, complex_), ratios), caption),
+        f": simple craters {shown[0]} (thesis: approximately 5; axis 4.96 to 5.14), complex craters {shown[1]} "
+        "(thesis: approximately 5 to 50).",
+        f"simple craters {shown[0]} (thesis 5), complex {shown[1]} (thesis 5 to 50)", (7.0, 8.0), draw,
         {
-            "thesis": {"aspect_ratios": list(published.LUNAR_ASPECT_RATIOS)},
-            "reproduced": {
-                form: [float(r.min()), float(r.max())] for form, r in zip(("simple", "complex"), ratios, strict=True)
-            },
+            "thesis": {"aspect_ratios": list(LUNAR_ASPECT_RATIOS)},
+            "reproduced": {form: [float(r.min()), float(r.max())] for form, r in zip(forms, ratios, strict=True)},
         },
         columns=(
             Column("diameter", np.concatenate([simple, complex_]), unit="km", form="%.3f"),
             Column("aspect_ratio", np.concatenate(ratios), form="%.4f", description="diameter over depth"),
-            Column("craterform", ["simple"] * len(simple) + ["complex"] * len(complex_), "string"),
+            Column("craterform", np.repeat(forms, [len(simple), len(complex_)]).tolist(), "string"),
         ),
     )  # fmt: skip
-
-
-def _draw_ratios(diameters: tuple[Array, Array], ratios: tuple[Array, Array]) -> Figure:
-    figure = new_figure(7.0, 8.0)
-    titles = "(a) Aspect ratios for simple craterforms", "(b) Aspect ratios for complex craterforms"
-    limits = ((0, 15), (4.96, 5.14)), ((0, 300), (5, 50))
-    for axes, x, y, title, (xlim, ylim) in zip(figure.subplots(2, 1), diameters, ratios, titles, limits, strict=True):
-        axes.plot(x, y, color=STAR)
-        axes.set(xlim=xlim, ylim=ylim, xlabel="Diameter (km)", ylabel="Aspect Ratio (X:1)")
-        axes.set_title(title, fontsize=10)
-    return figure

@@ -3,8 +3,9 @@
 The limit for a perfect list is the centroid of the cell of positions from which exactly the listed stars are visible:
 by brute force on a grid, independently of the localizer's search, so that each checks the other.
 
-Source: Kua 2008, sections 3.2.1 and 3.2.2. No pixels: stars are identified and detected without error, except for
-`Mistakes`. All random draws depend on (seed, sky, number of the position) only.
+Source, also of the published results: Kua 2008, CMU-RI-TR-08-21, sections 3.2.1 and 3.2.2. No pixels: stars are
+identified and detected without error, except for `Mistakes`. All random draws depend on (seed, sky, number of the
+position) only.
 """
 
 from __future__ import annotations
@@ -18,23 +19,28 @@ from startrack.core.types import Array, Bools, Evidence
 from startrack.frames import Site
 from startrack.terrain import Cylinder
 
-DIAMETER_M, DEPTH_M = 20_000.0, 2_000.0  # Shackleton as the thesis has it (section 3.3)
+DIAMETER_M, ASPECT_RATIO = 20_000.0, 10.0  # Shackleton as the thesis has it (section 3.3)
 MAGNITUDE = 6.0
-ASPECT_RATIO = DIAMETER_M / DEPTH_M
 RIM_POINTS = 360  # of the drawn crater edge (section 3.2.1)
 STEP_M = 5.0  # of the traverse through the middle of the crater (section 3.2.2)
 GRID_POINTS = 161  # a side; odd, so that the position itself is a point of the first grid and the cell is not missed
 FIRST_HALF_M = 20.0
 CELL_MARGIN, REFINEMENTS = 1.05, 2  # of the grid
+NEVER_SETTLE = 0.006  # section 3.1.2
+MEAN_GAP_M, MAX_GAP_M = 14.9031, 215.0  # figure 3.7, magnitude 6
+STAR_COUNT = 2142  # section 3.2.2
+LUNAR_ASPECT_RATIOS = (5.0, 50.0)  # section 3.2.3
 SHACKLETON = Site(body="moon", latitude_rad=float(np.radians(-89.66)), longitude_rad=float(np.radians(129.78)))
-
-
-class Stream(IntEnum):
-    """Of random numbers."""
-
-    STARS = 1
-    POSITIONS = 2
-    MISTAKES = 3
+Stream = IntEnum("Stream", "STARS POSITIONS MISTAKES")  # of random numbers
+TRIALS = tuple(  # table 3.1: errors [m]
+    {"mean_m": mean, "sd_m": sd, "max_m": largest}
+    for mean, sd, largest in (
+        (33.3, 29.8, 317.9), (33.7, 29.9, 327.3), (34.6, 31.7, 344.3), (33.6, 30.2, 271.2), (34.3, 30.2, 242.9),
+        (34.1, 32.3, 300.7), (36.2, 32.9, 325.6), (33.9, 31.2, 300.2), (34.1, 31.2, 358.4), (34.4, 31.5, 356.6),
+    )
+)  # fmt: skip
+OVERALL = {"mean_m": 34.2, "sd_m": 31.1, "max_m": 358.4}  # table 3.1
+HULL = {"mean_m": 637.0, "sd_m": 275.0, "max_m": 1735.0}  # section 3.1.1
 
 
 def star_count(magnitude: float) -> int:
@@ -94,9 +100,8 @@ def visible_stars(points_m: Array, position_m: Array, radius_m: float) -> Bools:
 
     The thesis tests against a polygon of 360 points of the rim; it differs from the circle by 0.4 m at most.
     """
-    return np.asarray(
-        np.square(points_m[:, 0] + position_m[0]) + np.square(points_m[:, 1] + position_m[1]) < radius_m**2
-    )
+    east, north = (points_m + position_m).T
+    return np.asarray(np.square(east) + np.square(north) < radius_m**2)
 
 
 def crater_edge(cylinder: Cylinder, position_m: Array) -> tuple[Array, Array]:
@@ -208,5 +213,4 @@ def change_steps_m(changes: Array, cylinder: Cylinder, step_m: float = STEP_M) -
 
 def _draw_uniform(stream: list[int], shape: tuple[int, ...]) -> Array:
     """Uniform over [0, 1), the same for the same stream; a longer draw begins with the shorter one."""
-    rng = np.random.default_rng(stream)
-    return rng.random(shape)
+    return np.random.default_rng(stream).random(shape)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from startrack.applications.reproduction import published
 from startrack.applications.reproduction.artefact import Artefact, Context, markdown_table
 from startrack.applications.reproduction.methods import (
     BOUND,
@@ -15,7 +14,15 @@ from startrack.applications.reproduction.methods import (
     error_statistics,
     format_errors,
 )
-from startrack.applications.reproduction.simulator import MAGNITUDE, Mistakes, star_count
+from startrack.applications.reproduction.simulator import (
+    HULL,
+    MAGNITUDE,
+    NEVER_SETTLE,
+    OVERALL,
+    TRIALS,
+    Mistakes,
+    star_count,
+)
 from startrack.output import Column
 
 DEEP_MAGNITUDE, DEEP_MISTAKES = 8.0, Mistakes(missed=0.10, false=0.01)
@@ -40,10 +47,10 @@ def table31(context: Context) -> Artefact:
     )
     values = {
         "thesis": {
-            "descent": vars(published.OVERALL),
-            "hull": vars(published.HULL),
-            "never_settle": published.NEVER_SETTLE,
-            "trials": [vars(trial) for trial in published.TRIALS],
+            "descent": OVERALL,
+            "hull": HULL,
+            "never_settle": NEVER_SETTLE,
+            "trials": list(TRIALS),
         },
         "reproduced": {
             "descent": descent.statistics,
@@ -94,13 +101,13 @@ def _ratio_to_limit(ours: MethodErrors, limit: MethodErrors) -> float:
 
 def _trial_table(hull: MethodErrors, descent: MethodErrors, ours: MethodErrors, limit: MethodErrors) -> str:
     rows = [
-        [k + 1, _trial_text(published.TRIALS[k]), format_errors(errors),
+        [k + 1, _trial_text(TRIALS[k]), format_errors(errors),
          f"{100 * np.mean(~descent.answered[k]):.2f} %", format_errors(hull.errors_m[k], WHOLE),
          format_errors(ours.errors_m[k]), format_errors(limit.errors_m[k])]
         for k, errors in enumerate(descent.errors_m)
     ]  # fmt: skip
     rows.append(
-        ["Overall", _trial_text(published.OVERALL), format_errors(descent.errors),
+        ["Overall", _trial_text(OVERALL), format_errors(descent.errors),
          f"{100 * descent.refused_fraction:.2f} % (thesis 0.6 %)",
          f"{format_errors(hull.errors, WHOLE)} (thesis 637 / 275 / 1735)", format_errors(ours.errors),
          format_errors(limit.errors)]
@@ -109,15 +116,15 @@ def _trial_table(hull: MethodErrors, descent: MethodErrors, ours: MethodErrors, 
     return markdown_table(head, rows)
 
 
-def _trial_text(trial: published.Errors) -> str:
-    return f"{trial.mean_m:.1f} / {trial.sd_m:.1f} / {trial.max_m:.1f}"
+def _trial_text(trial: dict[str, float]) -> str:
+    return " / ".join(f"{value:.1f}" for value in trial.values())
 
 
 def _columns(hull: MethodErrors, descent: MethodErrors, ours: MethodErrors, limit: MethodErrors) -> tuple[Column, ...]:
     skies = len(descent.errors_m)
     columns = [Column("trial", list(range(1, skies + 1)), "int64", form="%d", description="starfield")]
     for name in ("mean", "sd", "max"):
-        values = [getattr(trial, f"{name}_m") for trial in published.TRIALS[:skies]]
+        values = [trial[f"{name}_m"] for trial in TRIALS[:skies]]
         columns.append(Column(f"thesis_{name}", values, unit="m", form="%.1f", description="Kua 2008, table 3.1"))
     methods = (
         (descent, "descent", "hull and pseudo-gradient"),

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from startrack.applications.calibration.board import Board, Corners, calibrate_board, find_corners
-from startrack.applications.calibration.board_pose import BoardState, initial_board_state
+from startrack.applications.calibration.initial_states import BoardState, initial_board_state
 from startrack.camera import Camera, KannalaBrandt, load_camera
 from startrack.cli.main import main
 from startrack.core.types import Exposure, NotIdentified

@@ -4,7 +4,7 @@
 """
 
 from startrack.applications.calibration.board import Board, BoardCalibration, calibrate_board
-from startrack.applications.calibration.initial_camera import initial_state
+from startrack.applications.calibration.initial_states import initial_state
 from startrack.applications.calibration.photometry import KnownSensor
 from startrack.applications.calibration.record import (
     REFRACTION_REMOVED,

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.applications.calibration.initial_camera import fit_attitudes
+from startrack.applications.calibration.initial_states import fit_attitudes
 from startrack.camera import Camera, cap_grid
 from startrack.catalog import MOST_BELOW_PART, StarCatalog, is_below_horizon, sky_at
 from startrack.core.types import Array, Bools, Ints
@@ -42,10 +42,22 @@ class Check:
     advice: str  # which pictures to take
 
 
-class Checked:
-    """A calibration with its acceptance checks."""
+@dataclass(frozen=True, kw_only=True)
+class RefusedImage:
+    """An image that the calibration does not use."""
 
+    name: str
+    reason: str
+    message: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checked:
+    """A calibrated camera with its acceptance checks."""
+
+    camera: Camera
     checks: tuple[Check, ...]
+    refused: tuple[RefusedImage, ...]
 
     @property
     def failed_checks(self) -> tuple[Check, ...]:
@@ -61,15 +73,6 @@ class Checked:
     def message(self) -> str:
         """Failed checks and advice; empty where the calibration is accepted."""
         return "; ".join(f"{c.name} is {c.value:.3g}, required {c.limit}: {c.advice}" for c in self.failed_checks)
-
-
-@dataclass(frozen=True, kw_only=True)
-class RefusedImage:
-    """An image that the calibration does not use."""
-
-    name: str
-    reason: str
-    message: str
 
 
 @dataclass(frozen=True)
@@ -150,37 +153,43 @@ def check_acceptance(joint: JointFit) -> tuple[Check, ...]:
     fit, matches = joint.fit, joint.matches
     stars = int(fit.used.sum())
     fraction = float(np.average([m.fraction for m in matches], weights=[max(len(m), 1) for m in matches]))
-    log_p = joint_log_p_value(joint)
-    cover = star_coverage(joint)
+    cover, log10_p = star_coverage(joint), joint_log_p_value(joint) / np.log(10)
     rings = int(np.sum(cover.stars.sum(axis=1) >= STARS_PER_RING))
     sectors = int(np.sum(cover.stars.sum(axis=0) >= STARS_PER_SECTOR))
-    held, mirrored, least_mirrored = fit.held_out_rms_px, _mirrored_residual_px(joint), 5 * LARGEST_HELD_OUT_RMS_PX
     return (
-        Check("matched stars", stars, f">= {MIN_STARS_MATCHED}", stars >= MIN_STARS_MATCHED, "not_identified",
-             "expose longer or open the lens, or add more pictures of the clear night sky"),
-        Check("matched fraction", fraction, f">= {SMALLEST_FRACTION}", fraction >= SMALLEST_FRACTION,
-             "inconsistent_evidence",
-             "bright stars lack a source, or bright sources a star: use a clear sky without cloud, "
-             "and check the time and the site"),
-        Check("log10 chance of as many matches", log_p / np.log(10), "<= -9", log_p <= np.log(MAX_FALSE_ALARM),
-             "not_identified", "more stars are needed: expose longer, focus better"),
-        held_out_check(held, "sharp stars are needed: focus, expose shorter, keep the camera still"),
+        at_least("matched stars", stars, MIN_STARS_MATCHED, "not_identified",
+                 "expose longer or open the lens, or add more pictures of the clear night sky"),
+        at_least("matched fraction", fraction, SMALLEST_FRACTION, "inconsistent_evidence",
+                 "bright stars lack a source, or bright sources a star: use a clear sky without cloud, "
+                 "and check the time and the site"),
+        at_most("log10 chance of as many matches", log10_p, round(np.log10(MAX_FALSE_ALARM)), "not_identified",
+                "more stars are needed: expose longer, focus better"),
+        held_out_check(fit.held_out_rms_px, "sharp stars are needed: focus, expose shorter, keep the camera still"),
         ring_check("rings with stars", rings, "take pictures where stars fill the image from its middle to its edge: "
                    "open sky, no walls"),
-        Check("sectors with stars", sectors, f">= {MIN_IMAGE_SECTORS} of {IMAGE_SECTORS}", sectors >= MIN_IMAGE_SECTORS,
-             "insufficient_geometry", "add pictures with the camera turned about its axis, so that stars fall on the "
-             "empty side of the image too"),
+        at_least("sectors with stars", sectors, MIN_IMAGE_SECTORS, "insufficient_geometry", "add pictures with the "
+                 "camera turned about its axis, so that stars fall on the empty side of the image too",
+                 f" of {IMAGE_SECTORS}"),
         map_check(fit.camera, "more stars near the edge of the image are needed: add pictures at other attitudes of "
                   "the camera"),
-        Check("opposite handedness [px]", mirrored, f">= {least_mirrored:g}", mirrored >= least_mirrored,
-             "inconsistent_evidence", "stars on one line do not determine the handedness: add pictures"),
+        at_least("opposite handedness [px]", _mirrored_residual_px(joint), round(5 * LARGEST_HELD_OUT_RMS_PX),
+                 "inconsistent_evidence", "stars on one line do not determine the handedness: add pictures"),
     )  # fmt: skip
+
+
+def at_least(name: str, value: float, least: float, reason: str, advice: str, of: str = "") -> Check:
+    """The check that a value is large enough; `of` follows the limit in words."""
+    return Check(name, value, f">= {least}{of}", value >= least, reason, advice)
+
+
+def at_most(name: str, value: float, most: float, reason: str, advice: str) -> Check:
+    """The check that a value is small enough."""
+    return Check(name, value, f"<= {most}", value <= most, reason, advice)
 
 
 def held_out_check(rms_px: float, advice: str) -> Check:
     """The check that fits predict observations that they do not contain."""
-    limit = LARGEST_HELD_OUT_RMS_PX
-    return Check("held-out RMS [px]", rms_px, f"<= {limit}", rms_px <= limit, "inconsistent_evidence", advice)
+    return at_most("held-out RMS [px]", rms_px, LARGEST_HELD_OUT_RMS_PX, "inconsistent_evidence", advice)
 
 
 def ring_check(name: str, rings: int, advice: str) -> Check:
@@ -193,8 +202,7 @@ def map_check(camera: Camera, advice: str) -> Check:
     grid = cap_grid(camera.calibrated_angle_rad)
     inside = camera.project(grid)[1]
     sigma = float(np.max(camera.projection_sigma_px(grid[inside] if inside.any() else grid)))
-    limit = LARGEST_MAP_SIGMA_PX
-    return Check("map sigma [px]", sigma, f"<= {limit}", sigma <= limit, "insufficient_geometry", advice)
+    return at_most("map sigma [px]", sigma, LARGEST_MAP_SIGMA_PX, "insufficient_geometry", advice)
 
 
 def horizon_checks(joint: JointFit, catalog: StarCatalog, site: Site | None) -> tuple[Check, ...]:

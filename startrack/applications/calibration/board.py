@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,14 +14,14 @@ from startrack.applications.calibration.acceptance import (
     Check,
     Checked,
     RefusedImage,
+    at_least,
     corner_angle_rad,
     held_out_check,
     map_check,
     ring_check,
     rings_and_sectors,
 )
-from startrack.applications.calibration.board_pose import initial_board_state
-from startrack.camera import Camera
+from startrack.applications.calibration.initial_states import initial_board_state
 from startrack.core.types import Array, BadInput, Exposure, NotIdentified
 from startrack.estimation.lens_fit import LensFit, fit_state
 from startrack.estimation.normal_equations import Observations, observations
@@ -42,8 +42,7 @@ class Board:
     marker_fraction: float = 0.75  # marker's side over the square's
 
 
-@dataclass(frozen=True)
-class Corners:
+class Corners(NamedTuple):
     """Corners found in one picture."""
 
     xy_px: Array  # (n, 2)
@@ -90,11 +89,8 @@ def _find_charuco(grey: Any, board: Board) -> Corners | None:
 class BoardCalibration(Checked):
     """A lens calibrated with boards, and its acceptance checks."""
 
-    camera: Camera
     fit: LensFit
-    checks: tuple[Check, ...]
     images: tuple[str, ...]
-    refused: tuple[RefusedImage, ...]
 
 
 def calibrate_board(
@@ -143,9 +139,8 @@ def _check_acceptance(fit: LensFit, points: Observations, pictures: int) -> tupl
     rings, used = int(np.sum(np.bincount(ring, minlength=IMAGE_RINGS) >= STARS_PER_RING)), int(fit.used.sum())
     tilt = "more pictures: the board tilted by 30 degrees and more, near and far, and in every corner of the image"
     return (
-        Check("pictures with a board", pictures, f">= {MIN_PICTURES}", pictures >= MIN_PICTURES,
-             "insufficient_geometry", tilt),
-        Check("corners", used, f">= {MIN_CORNERS}", used >= MIN_CORNERS, "insufficient_geometry", tilt),
+        at_least("pictures with a board", pictures, MIN_PICTURES, "insufficient_geometry", tilt),
+        at_least("corners", used, MIN_CORNERS, "insufficient_geometry", tilt),
         held_out_check(fit.held_out_rms_px, "a flat board and sharp pictures are needed"),
         ring_check("rings with corners", rings, tilt),
         map_check(fit.camera, tilt),

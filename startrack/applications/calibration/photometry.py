@@ -33,9 +33,7 @@ class Photometry:
 def measure_photometry(joint: JointFit, known: KnownSensor) -> Photometry:
     """Throughput and sensor from the exposures of a calibration."""
     properties = measure_sensor(joint)
-    fit = measure_throughput(joint, properties.flux_ratio)
-    throughput = fit.throughput
-    notes = list(fit.warnings)
+    throughput, notes = measure_throughput(joint, properties.flux_ratio)
     bias = known.bias_adu if known.bias_adu is not None else properties.bias_adu
     gain, noise, transfer = known.gain_e_per_adu, known.read_noise_e, properties.transfer
     if gain is None and transfer is not None:
@@ -81,9 +79,7 @@ def photometry_dict(found: Photometry) -> dict[str, Any]:
         "light": light,
         "gain_e_per_adu": None if properties.transfer is None else properties.transfer.gain_e_per_adu,
         "gain_sigma_e_per_adu": None if properties.transfer is None else properties.transfer.gain_sigma,
-        "bias_adu": properties.bias_adu,
-        "saturation_adu": properties.saturation_adu,
-        "psf_sigma_px": properties.psf_sigma_px,
+        **{key: getattr(properties, key) for key in ("bias_adu", "saturation_adu", "psf_sigma_px")},
         "psf_by_ring_px": list(properties.psf_by_ring_px),
         "hot_pixels": None if properties.hot_px is None else len(properties.hot_px),
         "notes": list(found.notes),

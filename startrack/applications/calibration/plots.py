@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from startrack.core.types import Array
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+STYLE: dict[Any, Any] = {
+    "figure.constrained_layout.use": True, "figure.dpi": 100, "axes.titlesize": 11, "legend.fontsize": 8
+}  # fmt: skip
 DARK, GOOD, BAD, LINE = "#1b2430", "#0072b2", "#d55e00", "#009e73"
 ARROW_FRACTION = 0.02  # of the frame's width: length of an arrow of the RMS residual
 MAP_SIDE = 160
@@ -25,16 +28,18 @@ MAX_ARROWS = 1000  # more overlap
 
 def report_png(calibration: Calibration) -> bytes:
     """The picture as PNG."""
+    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13.0, 11.0), dpi=100, layout="constrained")
-    axes = figure.subplots(2, 2)
-    _draw_vectors(axes[0, 0], calibration)
-    _draw_by_angle(axes[0, 1], calibration)
-    _draw_sigma(axes[1, 0], calibration.camera)
-    _draw_sectors(axes[1, 1], calibration)
     drawn = io.BytesIO()
-    figure.savefig(drawn, format="png", metadata={"Software": None})
+    with rc_context(STYLE):
+        figure = Figure(figsize=(13.0, 11.0))
+        axes = figure.subplots(2, 2)
+        _draw_vectors(axes[0, 0], calibration)
+        _draw_by_angle(axes[0, 1], calibration)
+        _draw_sigma(axes[1, 0], calibration.camera)
+        _draw_sectors(axes[1, 1], calibration)
+        figure.savefig(drawn, format="png", metadata={"Software": None})
     return drawn.getvalue()
 
 
@@ -48,7 +53,7 @@ def _draw_frame(axes: Axes, camera: Camera) -> None:
     ):
         px = camera.project_unlimited(cone_rays(np.array(angle), np.linspace(0.0, 2 * np.pi, 181)))
         axes.plot(px[:, 0], px[:, 1], style, color=LINE, linewidth=1.2, label=label)
-    axes.legend(loc="lower right", fontsize=8, framealpha=0.9)
+    axes.legend(loc="lower right", framealpha=0.9)
 
 
 def _draw_vectors(axes: Axes, calibration: Calibration) -> None:
@@ -63,7 +68,7 @@ def _draw_vectors(axes: Axes, calibration: Calibration) -> None:
     )  # fmt: skip
     rejected = ~fit.used
     axes.plot(px[rejected, 0], px[rejected, 1], "x", color=BAD, markersize=5, label=f"{rejected.sum()} rejected")
-    axes.set_title(f"Held-out residuals, {scale:.0f} times enlarged (RMS {fit.held_out_rms_px:.3f} px)", fontsize=11)
+    axes.set_title(f"Held-out residuals, {scale:.0f} times enlarged (RMS {fit.held_out_rms_px:.3f} px)")
     _draw_frame(axes, camera)
 
 
@@ -85,8 +90,8 @@ def _draw_by_angle(axes: Axes, calibration: Calibration) -> None:
     axes.axvline(float(np.degrees(camera.calibrated_angle_rad)), color=LINE, linewidth=1.2)
     top = 4.0 * max(fit.held_out_rms_px, 1e-3)
     axes.set(ylim=(-top, top), xlabel="angle off the axis, degrees", ylabel="held-out residual px")
-    axes.set_title("Residuals by angle: a curve shows a wrong lens model", fontsize=11)
-    axes.legend(loc="upper left", fontsize=8, ncols=3)
+    axes.set_title("Residuals by angle: a curve shows a wrong lens model")
+    axes.legend(loc="upper left", ncols=3)
 
 
 def _draw_sigma(axes: Axes, camera: Camera) -> None:
@@ -97,7 +102,7 @@ def _draw_sigma(axes: Axes, camera: Camera) -> None:
     sigma: Array = np.ma.masked_where(~inside, camera.projection_sigma_px(rays))
     drawn = axes.imshow(sigma, extent=(-0.5, width - 0.5, height - 0.5, -0.5), cmap="viridis", interpolation="bilinear")
     axes.figure.colorbar(drawn, ax=axes, shrink=0.85, label="px per axis")
-    axes.set_title("Projection sigma inside the calibrated radius, attitude free", fontsize=11)
+    axes.set_title("Projection sigma inside the calibrated radius, attitude free")
     _draw_frame(axes, camera)
 
 
@@ -116,4 +121,4 @@ def _draw_sectors(axes: Axes, calibration: Calibration) -> None:
     axes.set_xticks(range(sectors), [f"{360 * k // sectors}°" for k in range(sectors)])
     axes.set_yticks(range(rings), [f"{a:.0f}–{b:.0f}°" for a, b in pairwise(edges)])
     axes.set(xlabel="sector, from image right, clockwise", ylabel="ring")
-    axes.set_title("Held-out RMS and number of stars by ring and sector", fontsize=11)
+    axes.set_title("Held-out RMS and number of stars by ring and sector")

@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 
 from startrack import __version__
-from startrack.applications.calibration.acceptance import Checked, RefusedImage, star_coverage
+from startrack.applications.calibration.acceptance import Checked, star_coverage
 from startrack.applications.calibration.board import BoardCalibration
 from startrack.applications.calibration.photometry import photometry_dict
 from startrack.applications.calibration.run import Calibration
 from startrack.camera import Camera, camera_to_dict
 from startrack.core.errors import Reason
 from startrack.core.types import Array
+from startrack.estimation.lens_fit import LensFit
 from startrack.frames import format_utc, quat_xyzw_from_R
 
 CALIBRATION_FORMAT = "startrack.calibration/1"
@@ -25,12 +26,9 @@ def calibration_dict(calibration: Calibration) -> dict[str, Any]:
     """The calibration's JSON object, with the camera only if all checks passed."""
     fit, cover = calibration.joint.fit, star_coverage(calibration.joint)
     return {
-        **_outcome(calibration, calibration.camera),
+        **_outcome(calibration),
         "lens": {
-            "stars": int(fit.used.sum()),
-            "clipped": int((~fit.used).sum()),
-            "rms_px": fit.rms_px,
-            "held_out_rms_px": fit.held_out_rms_px,
+            **_fit_dict("stars", fit),
             "held_out_rms_arcmin": fit.held_out_rms_px * arcmin_per_px(calibration.camera),
             "extra_sigma_px": fit.extra_sigma_px,
             "chi2_per_dof": fit.chi2_per_dof,
@@ -47,7 +45,7 @@ def calibration_dict(calibration: Calibration) -> dict[str, Any]:
             "stars": cover.stars.astype(int).tolist(),
         },
         "photometry": photometry_dict(calibration.photometry),
-        "images": _images(calibration),
+        "images": image_rows(calibration),
         "obstructed_fraction": 0.0 if calibration.obstructed is None else float(calibration.obstructed.mean()),
         "refused": [vars(refused) for refused in calibration.refused],
         "provenance": {"version": __version__, "false_alarm_probability": calibration.false_alarm_probability},
@@ -58,14 +56,8 @@ def board_dict(found: BoardCalibration) -> dict[str, Any]:
     """The JSON object of `found`, a calibration with boards, with the camera only if all checks passed."""
     fit = found.fit
     return {
-        **_outcome(found, found.camera),
-        "lens": {
-            "corners": int(fit.used.sum()),
-            "clipped": int((~fit.used).sum()),
-            "rms_px": fit.rms_px,
-            "held_out_rms_px": fit.held_out_rms_px,
-            "models": [vars(candidate) for candidate in fit.candidates],
-        },
+        **_outcome(found),
+        "lens": {**_fit_dict("corners", fit), "models": [vars(candidate) for candidate in fit.candidates]},
         "gates": _gates(found),
         "images": [{"image": image} for image in found.images],
         "refused": [vars(refused) for refused in found.refused],
@@ -73,14 +65,24 @@ def board_dict(found: BoardCalibration) -> dict[str, Any]:
     }
 
 
-def _outcome(found: Checked, camera: Camera) -> dict[str, Any]:
+def _fit_dict(what: str, fit: LensFit) -> dict[str, Any]:
+    """The number of used observations, called `what`, and how well they fit."""
+    return {
+        what: int(fit.used.sum()),
+        "clipped": int((~fit.used).sum()),
+        "rms_px": fit.rms_px,
+        "held_out_rms_px": fit.held_out_rms_px,
+    }
+
+
+def _outcome(found: Checked) -> dict[str, Any]:
     failed = found.failed_checks
     return {
         "format": CALIBRATION_FORMAT,
         "status": "refused" if failed else "ok",
         "reason": failed[0].reason if failed else None,
         "message": found.message,
-        "camera": None if failed else camera_to_dict(camera),
+        "camera": None if failed else camera_to_dict(found.camera),
     }
 
 
@@ -91,10 +93,10 @@ def _gates(found: Checked) -> list[dict[str, Any]]:
     ]
 
 
-def refusal_dict(reason: str, text: str, refused: tuple[RefusedImage, ...] = ()) -> dict[str, Any]:
+def refusal_dict(reason: str, text: str) -> dict[str, Any]:
     """The JSON object of a calibration without a lens.
 
-    `reason` is a value of `Reason`; `text` explains it; `refused` lists the images that could not be used.
+    `reason` is a value of `Reason`; `text` explains it.
     """
     return {
         "format": CALIBRATION_FORMAT,
@@ -103,20 +105,29 @@ def refusal_dict(reason: str, text: str, refused: tuple[RefusedImage, ...] = ())
         "message": text,
         "advice": Reason(reason).advice,
         "camera": None,
-        "refused": [vars(one) for one in refused],
+        "refused": [],
     }
 
 
 def summary(calibration: Calibration, name: str) -> str:
     """Summary of the `calibration` of the camera called `name` in one line."""
-    camera, fit = calibration.camera, calibration.joint.fit
-    images = len(calibration.joint.frames)
-    head = f"{name}  {'ok' if calibration.accepted else 'refused ' + calibration.failed_checks[0].reason}"
+    fit, camera = calibration.joint.fit, calibration.camera
+    arcmin = f" ({fit.held_out_rms_px * arcmin_per_px(camera):.2f}')"
+    line = _line(calibration, name, fit, len(calibration.joint.frames), "images", "stars", arcmin)
+    return f"{line}{'  mirrored' if camera.mirrored else ''}"
+
+
+def board_line(found: BoardCalibration, name: str) -> str:
+    """Summary of `found`, a calibration of the camera called `name` with boards, in one line."""
+    return _line(found, name, found.fit, len(found.images), "pictures", "corners")
+
+
+def _line(found: Checked, name: str, fit: LensFit, images: int, of: str, what: str, arcmin: str = "") -> str:
+    verdict = "ok" if found.accepted else f"refused {found.failed_checks[0].reason}"
     return (
-        f"{head}  {images} of {images + len(calibration.refused)} images  {int(fit.used.sum())} stars  "
-        f"held-out {fit.held_out_rms_px:.2f} px ({fit.held_out_rms_px * arcmin_per_px(camera):.2f}')  "
-        f"f {camera.focal_px[0]:.2f} px/rad  calibrated to {np.degrees(camera.calibrated_angle_rad):.1f}°"
-        f"{'  mirrored' if camera.mirrored else ''}"
+        f"{name}  {verdict}  {images} of {images + len(found.refused)} {of}  {int(fit.used.sum())} {what}  "
+        f"held-out {fit.held_out_rms_px:.2f} px{arcmin}  f {found.camera.focal_px[0]:.2f} px/rad  "
+        f"calibrated to {np.degrees(found.camera.calibrated_angle_rad):.1f}°"
     )
 
 
@@ -125,19 +136,8 @@ def arcmin_per_px(camera: Camera) -> float:
     return float(np.degrees(camera.mean_scale_rad_per_px(np.array(0.5 * camera.calibrated_angle_rad))) * 60.0)
 
 
-def board_line(found: BoardCalibration, name: str) -> str:
-    """Summary of `found`, a calibration of the camera called `name` with boards, in one line."""
-    fit, camera = found.fit, found.camera
-    verdict = "ok" if found.accepted else f"refused {found.failed_checks[0].reason}"
-    return (
-        f"{name}  {verdict}  {len(found.images)} of {len(found.images) + len(found.refused)} pictures  "
-        f"{int(fit.used.sum())} corners  held-out {fit.held_out_rms_px:.2f} px  f {camera.focal_px[0]:.2f} px/rad  "
-        f"calibrated to {np.degrees(camera.calibrated_angle_rad):.1f}°"
-    )
-
-
-def _images(calibration: Calibration) -> list[dict[str, Any]]:
-    """One row per image."""
+def image_rows(calibration: Calibration) -> list[dict[str, Any]]:
+    """What the JSON object says about each image that was used."""
     fit, joint = calibration.joint.fit, calibration.joint
     rows = []
     for i, (frame, matched) in enumerate(zip(joint.frames, joint.matches, strict=True)):
@@ -162,17 +162,11 @@ def _images(calibration: Calibration) -> list[dict[str, Any]]:
 def camera_properties(camera: Camera) -> dict[str, Any]:
     """The camera file's keys, and the projection by angle: radius, scale, and sigma where there is a covariance."""
     angle = np.linspace(0.0, camera.calibrated_angle_rad, MAP_ANGLES)
-    radius, scale, sigma = projection_by_angle(camera, angle)
-    rows = [
-        {
-            "angle_deg": float(np.degrees(a)),
-            "radius_px": float(r),
-            "arcmin_per_px": float(s),
-            "map_sigma_px": None if camera.covariance is None else float(e),
-        }
-        for a, r, s, e in zip(angle, radius, scale, sigma, strict=True)
-    ]
-    return {"camera": camera_to_dict(camera), "map": rows}
+    radius, scale, sigma = (column.tolist() for column in projection_by_angle(camera, angle))
+    sigma = sigma if camera.covariance is not None else MAP_ANGLES * [None]
+    keys = ("angle_deg", "radius_px", "arcmin_per_px", "map_sigma_px")
+    rows = zip(np.degrees(angle).tolist(), radius, scale, sigma, strict=True)
+    return {"camera": camera_to_dict(camera), "map": [dict(zip(keys, row, strict=True)) for row in rows]}
 
 
 def projection_by_angle(camera: Camera, angle_rad: Array) -> tuple[Array, Array, Array]:

@@ -10,10 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from startrack.applications.calibration.acceptance import star_coverage
-from startrack.applications.calibration.record import arcmin_per_px, camera_summary, summary
+from startrack.applications.calibration.record import (
+    arcmin_per_px,
+    camera_summary,
+    image_rows,
+    summary,
+)
 from startrack.applications.calibration.run import Calibration
 from startrack.core.files import write_atomically
-from startrack.frames import format_utc
 
 NO_PICTURE = "no picture: it needs matplotlib, the extra plots (pip install '.[plots]' in a clone of startrack)"
 STYLE = """
@@ -33,48 +37,55 @@ def write_report(camera_path: Path, calibration: Calibration) -> str:
     The files show the `calibration`. It returns the line that explains how to get the picture; empty where it is
     written.
     """
-    picture: bytes | None = None
+    picture = b""
     if find_spec("matplotlib") is not None:
         from startrack.applications.calibration.plots import report_png
 
         picture = report_png(calibration)
         write_atomically(camera_path.with_suffix(".report.png"), picture, overwrite=True)
-    page = report_html(calibration, picture)
+    page = _report_html(calibration, picture)
     write_atomically(camera_path.with_suffix(".report.html"), page.encode("utf-8"), overwrite=True)
     return "" if picture else f"{camera_path.with_suffix('.report.html').name}: {NO_PICTURE}"
 
 
-def report_html(calibration: Calibration, picture: bytes | None) -> str:
+def _report_html(calibration: Calibration, picture: bytes) -> str:
     """The page, without scripts or other files."""
     camera = calibration.camera
-    verdict = "ok" if calibration.accepted else "no"
     text = "accepted" if calibration.accepted else f"refused: {html.escape(calibration.message)}"
     image = (
         f'<img alt="residuals and map sigma" src="data:image/png;base64,{base64.b64encode(picture).decode()}">'
         if picture
         else f"<p>{NO_PICTURE}.</p>"
     )
+    models = [
+        [html.escape(c.name), str(c.parameters), f"{c.held_out_chi2:.0f}", f"{c.held_out_rms_px:.3f}"]
+        for c in calibration.joint.fit.candidates
+    ]
     return (
         '<!doctype html><html lang="en"><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
         f"<title>Calibration of {html.escape(camera.name)}</title><style>{STYLE}</style>"
         f"<h1>Calibration of {html.escape(camera.name)}</h1>"
-        f'<p class="lead"><span class="{verdict}">{text}</span></p>'
+        f'<p class="lead">{_verdict(calibration.accepted, text)}</p>'
         f"<p>{html.escape(summary(calibration, camera.name))}</p>"
         f"<h2>Acceptance checks</h2>{_checks_table(calibration)}"
         f"<h2>Residuals</h2>{image}{_rings_table(calibration)}"
-        f"<h2>Lens models, tested with held-out stars</h2>{_models_table(calibration)}"
+        "<h2>Lens models, tested with held-out stars</h2>"
+        f"{_table(['model', 'parameters', 'held-out chi²', 'held-out RMS px'], models)}"
         f"<h2>Pictures</h2>{_pictures_table(calibration)}"
         f"<h2>Throughput and sensor</h2>{_photometry_table(calibration)}"
         f"<h2>The camera</h2><pre>{html.escape(camera_summary(camera))}</pre></html>\n"
     )
 
 
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    def line(cells: list[str], tag: str) -> str:
-        return "<tr>" + "".join(f"<{tag}>{cell}</{tag}>" for cell in cells) + "</tr>"
+def _verdict(good: bool, text: str) -> str:
+    return f'<span class="{"ok" if good else "no"}">{text}</span>'
 
-    return "<table>" + line(head, "th") + "".join(line(row, "td") for row in rows) + "</table>"
+
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    lines = [("th", head), *(("td", row) for row in rows)]
+    texts = ["<tr>" + "".join(f"<{tag}>{cell}</{tag}>" for cell in cells) + "</tr>" for tag, cells in lines]
+    return f"<table>{''.join(texts)}</table>"
 
 
 def _checks_table(calibration: Calibration) -> str:
@@ -82,8 +93,7 @@ def _checks_table(calibration: Calibration) -> str:
         ["condition", "value", "required", "", "advice"],
         [
             [html.escape(c.name), f"{c.value:,.0f}" if c.value >= 1000 else f"{c.value:.3g}", html.escape(c.limit),
-             f'<span class="{"ok" if c.passed else "no"}">{"passed" if c.passed else "failed"}</span>',
-             "" if c.passed else html.escape(c.advice)]
+             _verdict(c.passed, "passed" if c.passed else "failed"), "" if c.passed else html.escape(c.advice)]
             for c in calibration.checks
         ],
     )  # fmt: skip
@@ -110,30 +120,18 @@ def _rings_table(calibration: Calibration) -> str:
     return _table(head, rows) + note
 
 
-def _two_decimals(value: float) -> str:
-    return f"{value:.2f}" if np.isfinite(value) else "–"
-
-
-def _models_table(calibration: Calibration) -> str:
-    rows = [
-        [html.escape(c.name), str(c.parameters), f"{c.held_out_chi2:.0f}", f"{c.held_out_rms_px:.3f}"]
-        for c in calibration.joint.fit.candidates
-    ]
-    return _table(["model", "parameters", "held-out chi²", "held-out RMS px"], rows)
+def _two_decimals(value: float | None) -> str:
+    return f"{value:.2f}" if value is not None and np.isfinite(value) else "–"
 
 
 def _pictures_table(calibration: Calibration) -> str:
-    joint = calibration.joint
-    rows = []
-    for i, (frame, matched) in enumerate(zip(joint.frames, joint.matches, strict=True)):
-        own = (joint.points.image == i) & joint.fit.used
-        rms = float(np.sqrt(np.mean(np.sum(joint.fit.held_out_px[own] ** 2, axis=1)))) if own.any() else np.nan
-        rows.append(
-            [html.escape(frame.exposure.name), html.escape(format_utc(frame.time_utc)), str(int(own.sum())),
-             f"{matched.fraction:.2f}", _two_decimals(rms), "used"]
-        )  # fmt: skip
+    rows = [
+        [html.escape(row["image"]), html.escape(row["time_utc"]), str(row["stars"]), f"{row['matched_fraction']:.2f}",
+         _two_decimals(row["held_out_rms_px"]), "used"]
+        for row in image_rows(calibration)
+    ]  # fmt: skip
     rows += [
-        [html.escape(r.name), *4 * [""], f'<span class="no">{html.escape(r.reason)}: {html.escape(r.message)}</span>']
+        [html.escape(r.name), *4 * [""], _verdict(False, html.escape(f"{r.reason}: {r.message}"))]
         for r in calibration.refused
     ]
     note = "Refraction is taken out." if calibration.is_free_of_refraction else (

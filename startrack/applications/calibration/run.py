@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from startrack.applications.calibration.acceptance import (
-    Check,
     Checked,
     RefusedImage,
     check_acceptance,
@@ -36,10 +35,7 @@ Progress = Callable[[str], None]
 class Calibration(Checked):
     """The camera, its fit, and its acceptance checks."""
 
-    camera: Camera
     joint: JointFit
-    checks: tuple[Check, ...]
-    refused: tuple[RefusedImage, ...]
     site: Site | None
     false_alarm_probability: float  # the largest of the images' identifications
     photometry: Photometry
@@ -146,8 +142,8 @@ def load_frame(exposure: Exposure, catalog: StarCatalog, site: Site | None, came
 def _frames(run: _Run, exposures: Sequence[Exposure]) -> list[Frame]:
     frames: list[Frame] = []
     for exposure in exposures:
-        if exposure.size_px != exposures[0].size_px or (run.start and exposure.size_px != run.start.size_px):
-            wanted = (run.start or exposures[0]).size_px
+        wanted = (run.start or exposures[0]).size_px
+        if exposure.size_px != wanted:
             raise BadInput(
                 "size_mismatch",
                 f"{exposure.name} is {exposure.size_px[0]} x {exposure.size_px[1]} px, not {wanted[0]} x {wanted[1]}: "

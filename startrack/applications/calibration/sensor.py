@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from startrack.applications.calibration.acceptance import IMAGE_RINGS
-from startrack.applications.calibration.static_parts import find_hot_pixels
+from startrack.applications.calibration.static_parts import find_hot_pixels, turn_rad
 from startrack.camera import Camera
 from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Exposure
@@ -89,15 +89,10 @@ def _median_of_enough(values: Array) -> float | None:
 
 def _pairs(joint: JointFit) -> tuple[list[tuple[Exposure, Exposure]], bool]:
     """Successive exposures between which the sky stood still, and True; without such all successive ones, and False."""
-    R = joint.fit.R_cam_icrs
-    still: list[tuple[Exposure, Exposure]] = []
-    moving: list[tuple[Exposure, Exposure]] = []
-    for i, (a, b) in enumerate(pairwise(joint.frames)):
-        rotation = R[i + 1] @ R[i].T
-        angle = float(np.linalg.norm(rotation - rotation.T) / np.sqrt(8.0))
-        near = angle * max(joint.fit.camera.focal_px) < STILL_PX and np.trace(rotation) > 0
-        (still if near else moving).append((a.exposure, b.exposure))
-    return (still, True) if still else (moving, False)
+    pairs = [(a.exposure, b.exposure) for a, b in pairwise(joint.frames)]
+    moved_px = [turn_rad(a, b) * max(joint.fit.camera.focal_px) for a, b in pairwise(joint.fit.R_cam_icrs)]
+    still = [pair for pair, px in zip(pairs, moved_px, strict=True) if px < STILL_PX]
+    return (still, True) if still else (pairs, False)
 
 
 def _dark_level(exposures: list[Exposure], camera: Camera) -> float | None:

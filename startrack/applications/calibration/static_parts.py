@@ -28,9 +28,13 @@ FALSE_ALARM = 0.01  # expected cells of open sky without a star, all tests of a 
 
 def has_turned(one: Array, other: Array, size_px: tuple[int, int]) -> bool:
     """Whether the sky has clearly moved in the image between two attitudes (3, 3), except near the rotation's axis."""
+    return turn_rad(one, other) * max(size_px) / 4.0 > TURNED_PX
+
+
+def turn_rad(one: Array, other: Array) -> float:
+    """The angle [rad] of the rotation between two attitudes (3, 3)."""
     between = other @ one.T
-    angle = np.arctan2(np.linalg.norm(between - between.T) / np.sqrt(8.0), (np.trace(between) - 1.0) / 2.0)
-    return bool(angle * max(size_px) / 4.0 > TURNED_PX)
+    return float(np.arctan2(np.linalg.norm(between - between.T) / np.sqrt(8.0), (np.trace(between) - 1.0) / 2.0))
 
 
 def remove_static_sources(frames: tuple[Frame, ...], R_cam_icrs: Array) -> tuple[Frame, ...]:

@@ -14,7 +14,7 @@ import numpy as np
 from startrack.camera import MIN_THROUGHPUT_1, Sensor
 from startrack.catalog import airmass
 from startrack.core.statistics import robust_sigma
-from startrack.core.types import Array, Ints
+from startrack.core.types import Array, Ints, Rows, array
 from startrack.estimation.joint_fit import JointFit
 
 MIN_THROUGHPUT_STARS = 30
@@ -24,9 +24,12 @@ PHOTOMETRY_MAG = 0.05  # error of a star's magnitude beyond catalogue and noise
 LARGEST_TERM_SIGMA_MAG = 0.03  # per airmass, or per B-V: a term with a larger sigma is left out
 TYPICAL_B_V = 0.6
 LOWEST_ELEVATION_RAD = np.radians(8.0)
-THROUGHPUT_1 = (MIN_THROUGHPUT_1, 1.1)  # relative to the axis, up to the calibrated angle: a lens is darker at its edge
-EXTINCTION_MAG = (0.0, 1.5)  # per airmass; 0.1 to 0.5 in clear air
-COLOUR_MAG = (-1.0, 1.0)  # per B-V
+TERMS = {  # smallest value, start and largest value
+    "middle": (MIN_THROUGHPUT_1, 0.95, 1.1),  # throughput relative to the axis, half way to the calibrated angle, ...
+    "edge": (MIN_THROUGHPUT_1, 0.9, 1.1),  # ... and there: a lens is darker at its edge
+    "colour": (-1.0, 0.0, 1.0),  # magnitudes per B-V
+    "air": (0.0, 0.2, 1.5),  # magnitudes of extinction per airmass; 0.1 to 0.5 in clear air
+}
 AT_BOUND_1 = 1e-3  # of the range of a term
 HELD_OUT_PARTS = 5
 LARGEST_HELD_OUT_MAG = 0.4  # median scatter of held-out stars
@@ -48,62 +51,59 @@ class Throughput:
     stars: int
 
 
-@dataclass(frozen=True)
-class ThroughputFit:
-    """The throughput (None where it is not known), and warnings for the record."""
+@dataclass(frozen=True, kw_only=True)
+class StarFluxes(Rows):
+    """Bright matched stars of all frames."""
 
-    throughput: Throughput | None
-    warnings: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class StarFluxes:
-    """Bright matched stars of all frames, each (n,)."""
-
-    gain_mag: Array  # V minus the instrumental magnitude
-    sigma_mag: Array
-    angle_rad: Array
-    b_v: Array
-    airmass: Array | None
-    image: Ints
-
-    def take(self, which: Array) -> StarFluxes:
-        """The stars selected by a mask or index array."""
-        air = None if self.airmass is None else self.airmass[which]
-        return StarFluxes(
-            self.gain_mag[which], self.sigma_mag[which], self.angle_rad[which], self.b_v[which], air, self.image[which]
-        )
+    gain_mag: Array = array("n")  # V minus the instrumental magnitude
+    sigma_mag: Array = array("n")
+    angle_rad: Array = array("n")
+    b_v: Array = array("n")
+    airmass: Array = array("n")  # 0: not known
+    image: Ints = array("n", dtype=np.int64)
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Values of the terms, their sigmas, the scatter of the stars, and the terms at a bound."""
+    """Values of the terms, their sigmas, the terms at a bound, and the stars' residuals."""
 
     values: dict[str, float]
     sigma: dict[str, float]
-    scatter_mag: float
-    at_bound: tuple[str, ...]
+    at_bound: set[str]
+    residual_mag: Array  # (n,)
     edge_rad: float
 
+    @property
+    def scatter_mag(self) -> float:
+        """Of the stars."""
+        return float(robust_sigma(self.residual_mag, 0.0))
 
-def measure_throughput(joint: JointFit, flux_ratio: float = 1.0) -> ThroughputFit:
-    """The throughput from the matched stars of all frames.
+    @property
+    def vignetting(self) -> tuple[float, float]:
+        """v1 and v2 of the relative throughput."""
+        return _vignetting(self.values, self.edge_rad)
+
+
+def measure_throughput(joint: JointFit, flux_ratio: float = 1.0) -> tuple[Throughput | None, list[str]]:
+    """The throughput from the matched stars of all frames (None where it is not known), and warnings for the record.
 
     `flux_ratio`: by which the detector's fluxes are multiplied (its PSF is not quite each star's own).
     """
     stars = _star_fluxes(joint)
-    if stars is None or len(stars.gain_mag) < MIN_THROUGHPUT_STARS:
-        return ThroughputFit(None, (
+    if len(stars) < MIN_THROUGHPUT_STARS:
+        return None, [
             "zero point: not measured; the images must state their exposure time (EXPTIME, exposure_s), and 30 "
-            "unsaturated stars are needed",
-        ))  # fmt: skip
+            "unsaturated stars are needed"
+        ]
     return fit_throughput(stars, joint.fit.camera.calibrated_angle_rad, flux_ratio)
 
 
-def fit_throughput(stars: StarFluxes, edge_rad: float, flux_ratio: float = 1.0) -> ThroughputFit:
+def fit_throughput(
+    stars: StarFluxes, edge_rad: float, flux_ratio: float = 1.0
+) -> tuple[Throughput | None, list[str]]:  # fmt: skip
     """The throughput of stars up to the angle `edge_rad` off the axis, tested; None with a warning if it fails."""
     warnings: list[str] = []
-    terms = ["zero", "middle", "edge", "colour", *(["air"] if stars.airmass is not None else [])]
+    terms = ["zero", "middle", "edge", "colour", *(["air"] if stars.airmass.all() else [])]
     while True:
         fit = _fit(stars, terms, edge_rad)
         optional = [t for t in ("air", "colour") if t in terms]
@@ -116,38 +116,33 @@ def fit_throughput(stars: StarFluxes, edge_rad: float, flux_ratio: float = 1.0) 
         terms.remove(poor[0])
     failures = _failures(stars, terms, fit)
     if failures:
-        return ThroughputFit(None, (*warnings, *(f"throughput: left out; {failure}" for failure in failures)))
+        return None, [*warnings, *(f"throughput: left out; {failure}" for failure in failures)]
     if fit.values.get("air") is None and not warnings:
         warnings.append("extinction: not distinguished from vignetting; zero point and vignetting contain it")
-    return ThroughputFit(
-        Throughput(
-            zero_point_adu_per_s=float(flux_ratio * 10 ** (0.4 * fit.values["zero"])),
-            zero_point_sigma_mag=fit.sigma["zero"],
-            vignetting=_vignetting(fit.values["middle"], fit.values["edge"], edge_rad),
-            colour_mag=fit.values.get("colour"),
-            extinction_mag=fit.values.get("air"),
-            scatter_mag=fit.scatter_mag,
-            stars=len(stars.gain_mag),
-        ),
-        tuple(warnings),
+    throughput = Throughput(
+        zero_point_adu_per_s=float(flux_ratio * 10 ** (0.4 * fit.values["zero"])),
+        zero_point_sigma_mag=fit.sigma["zero"],
+        vignetting=fit.vignetting,
+        colour_mag=fit.values.get("colour"),
+        extinction_mag=fit.values.get("air"),
+        scatter_mag=fit.scatter_mag,
+        stars=len(stars),
     )
+    return throughput, warnings
 
 
 def _failures(stars: StarFluxes, terms: list[str], fit: _Fit) -> list[str]:
     """Reasons not to trust the fit: a bound, held-out stars, or images with different zero points."""
     failures = []
-    sensor = Sensor(
-        zero_point_e_per_s=1.0, vignetting=_vignetting(fit.values["middle"], fit.values["edge"], fit.edge_rad)
-    )
-    if {"middle", "edge"} & set(fit.at_bound) or sensor.lowest_throughput(fit.edge_rad) < MIN_THROUGHPUT_1:
+    sensor = Sensor(zero_point_e_per_s=1.0, vignetting=fit.vignetting)
+    if {"middle", "edge"} & fit.at_bound or sensor.lowest_throughput(fit.edge_rad) < MIN_THROUGHPUT_1:
         failures.append("the fitted vignetting is not physical")
     held_out = _held_out_mag(stars, terms, fit.edge_rad)
     scatter = robust_sigma(held_out, 0.0)
     if scatter > min(LARGEST_HELD_OUT_MAG, LARGEST_HELD_OUT_RATIO * max(fit.scatter_mag, PHOTOMETRY_MAG)):
         failures.append(f"held-out stars scatter by {scatter:.2f} mag, the fitted ones by {fit.scatter_mag:.2f}")
-    residual = stars.gain_mag - _model(stars, fit.values, fit.edge_rad)
     offsets = [
-        float(np.median(residual[stars.image == i]))
+        float(np.median(fit.residual_mag[stars.image == i]))
         for i, count in enumerate(np.bincount(stars.image))
         if count >= MIN_STARS_PER_IMAGE
     ]
@@ -158,24 +153,22 @@ def _failures(stars: StarFluxes, terms: list[str], fit: _Fit) -> list[str]:
 
 def _held_out_mag(stars: StarFluxes, terms: list[str], edge_rad: float) -> Array:
     """Residuals (n,) of fits that do not contain the star: with several images, none of its image's stars."""
-    images = len(np.unique(stars.image))
-    order = np.argsort(stars.angle_rad, kind="stable")
-    fold = np.empty(len(order), dtype=np.int64)
-    fold[order] = np.arange(len(order)) % HELD_OUT_PARTS
-    fold = stars.image if images > 1 else fold
+    fold = np.argsort(np.argsort(stars.angle_rad, kind="stable")) % HELD_OUT_PARTS
+    fold = stars.image if len(np.unique(stars.image)) > 1 else fold
     residual = np.empty(len(fold))
     for k in np.unique(fold):
         held = fold == k
         rest = stars.take(~held)
-        if len(rest.gain_mag) < MIN_THROUGHPUT_STARS:
+        if len(rest) < MIN_THROUGHPUT_STARS:
             rest = stars
         residual[held] = (stars.gain_mag - _model(stars, _fit(rest, terms, edge_rad).values, edge_rad))[held]
     return residual
 
 
-def _star_fluxes(joint: JointFit) -> StarFluxes | None:
-    """The bright, unsaturated matched stars; None where no image has an exposure time."""
-    columns: list[tuple[Array, ...]] = []
+def _star_fluxes(joint: JointFit) -> StarFluxes:
+    """The bright, unsaturated matched stars of the images that have an exposure time."""
+    none, no_image = np.zeros(0), np.zeros(0, dtype=np.int64)
+    parts = [StarFluxes(gain_mag=none, sigma_mag=none, angle_rad=none, b_v=none, airmass=none, image=no_image)]
     calibrated = joint.fit.camera.calibrated_angle_rad
     for i, (frame, matched) in enumerate(zip(joint.frames, joint.matches, strict=True)):
         exposure_s = frame.exposure.exposure_s
@@ -191,27 +184,27 @@ def _star_fluxes(joint: JointFit) -> StarFluxes | None:
         d, s, angle = d[good], s[good], angle[good]
         instrumental = -2.5 * np.log10(found.flux_e[d] / exposure_s)
         sigma = np.sqrt((1.086 / found.snr[d]) ** 2 + sky.stars.v_sigma_mag[s] ** 2 + PHOTOMETRY_MAG**2)
-        air = airmass(sky.elevation_rad[s]) if sky.elevation_rad is not None else np.full(len(s), np.nan)
-        columns.append((sky.stars.v_mag[s] - instrumental, sigma, angle, sky.b_v[s], air, np.full(len(s), i)))
-    if not columns:
-        return None
-    gain, sigma, angle, b_v, air, image = (np.concatenate(c) for c in zip(*columns, strict=True))
-    return StarFluxes(gain, sigma, angle, b_v, None if np.isnan(air).any() else air, image.astype(np.int64))
+        air = airmass(sky.elevation_rad[s]) if sky.elevation_rad is not None else np.zeros(len(s))
+        parts.append(StarFluxes(
+            gain_mag=sky.stars.v_mag[s] - instrumental, sigma_mag=sigma, angle_rad=angle, b_v=sky.b_v[s], airmass=air,
+            image=np.full(len(s), i),
+        ))  # fmt: skip
+    return StarFluxes.concatenate(*parts)
 
 
-def _vignetting(middle: float, edge: float, edge_rad: float) -> tuple[float, float]:
+def _vignetting(values: dict[str, float], edge_rad: float) -> tuple[float, float]:
     """v1, v2 of the relative throughput 1 + v1 a^2 + v2 a^4 from its values at a^2 = edge^2 / 2 and edge^2."""
-    u = edge_rad**2
+    middle, edge, u = values["middle"], values["edge"], edge_rad**2
     return (4.0 * middle - edge - 3.0) / u, (2.0 + 2.0 * edge - 4.0 * middle) / u**2
 
 
 def _model(stars: StarFluxes, values: dict[str, float], edge_rad: float) -> Array:
     """V minus the instrumental magnitude (n,) by the model."""
-    v1, v2 = _vignetting(values["middle"], values["edge"], edge_rad)
+    v1, v2 = _vignetting(values, edge_rad)
     a2 = np.square(stars.angle_rad)
-    throughput = np.maximum(1.0 + a2 * (v1 + a2 * v2), THROUGHPUT_1[0] / 2)
-    model = values["zero"] + 2.5 * np.log10(throughput) + values.get("colour", 0.0) * (stars.b_v - TYPICAL_B_V)
-    return np.asarray(model if stars.airmass is None else model - values.get("air", 0.0) * stars.airmass)
+    throughput = np.maximum(1.0 + a2 * (v1 + a2 * v2), MIN_THROUGHPUT_1 / 2)
+    by_colour, by_air = values.get("colour", 0.0) * (stars.b_v - TYPICAL_B_V), values.get("air", 0.0) * stars.airmass
+    return np.asarray(values["zero"] + 2.5 * np.log10(throughput) + by_colour - by_air)
 
 
 def _fit(stars: StarFluxes, terms: list[str], edge_rad: float) -> _Fit:
@@ -219,20 +212,16 @@ def _fit(stars: StarFluxes, terms: list[str], edge_rad: float) -> _Fit:
     from scipy.optimize import least_squares
 
     zero = float(np.median(stars.gain_mag))
-    bounds = {"zero": (zero - 10.0, zero + 10.0), "middle": THROUGHPUT_1, "edge": THROUGHPUT_1, "colour": COLOUR_MAG,
-              "air": EXTINCTION_MAG}  # fmt: skip
-    start = {"zero": zero, "middle": 0.95, "edge": 0.9, "colour": 0.0, "air": 0.2}
-    low, high = np.array([bounds[t] for t in terms]).T
+    limits = {"zero": (zero - 10.0, zero, zero + 10.0)} | TERMS  # with the start
+    low, start, high = np.array([limits[t] for t in terms]).T
 
     def misfit(p: Array) -> Array:
         values = dict(zip(terms, p.tolist(), strict=True))
         return np.asarray((stars.gain_mag - _model(stars, values, edge_rad)) / stars.sigma_mag)
 
     loss_scale = LOSS_MAG / float(np.median(stars.sigma_mag))
-    fit = least_squares(
-        misfit, [start[t] for t in terms], bounds=(low, high), loss="soft_l1", f_scale=loss_scale, xtol=1e-12,
-        ftol=1e-12, gtol=1e-12,
-    )  # fmt: skip
+    tolerances = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-12)
+    fit = least_squares(misfit, start, bounds=(low, high), loss="soft_l1", f_scale=loss_scale, **tolerances)
     residual = misfit(fit.x)
     spread = robust_sigma(residual, 0.0)
     covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * max(spread, 1.0) ** 2
@@ -241,7 +230,7 @@ def _fit(stars: StarFluxes, terms: list[str], edge_rad: float) -> _Fit:
     return _Fit(
         values=dict(zip(terms, fit.x.tolist(), strict=True)),
         sigma=dict(zip(terms, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
-        scatter_mag=robust_sigma(residual * stars.sigma_mag, 0.0),
-        at_bound=tuple(t for t, reached in zip(terms, at_bound, strict=True) if reached),
+        at_bound={t for t, reached in zip(terms, at_bound, strict=True) if reached},
+        residual_mag=residual * stars.sigma_mag,
         edge_rad=edge_rad,
     )

@@ -12,7 +12,12 @@ from datetime import timedelta
 
 import numpy as np
 
-from startrack.applications.calibration.acceptance import IMAGE_RINGS, IMAGE_SECTORS, rings_and_sectors
+from startrack.applications.calibration.acceptance import (
+    IMAGE_RINGS,
+    IMAGE_SECTORS,
+    STARS_PER_RING,
+    rings_and_sectors,
+)
 from startrack.camera import cap_grid, projection_covariance_px2
 from startrack.core.types import Ints
 from startrack.estimation.adjust import SMALLEST_EXTRA_PX2, inverse_covariance
@@ -23,7 +28,6 @@ from startrack.estimation.normal_equations import Observations
 # RMS of the projection, per calibration. All-sky camera of the Lowell Discovery Telescope, nights of 2018-06-29 and
 # 2018-08-06, each calibrated alone: within 80 degrees the projections differ by 0.063 px; the stars explain 0.021 px.
 FLOOR_PX = 0.04
-MIN_REGION_STARS = 3
 NIGHT_GAP = timedelta(hours=6)  # between exposures of different nights
 
 
@@ -53,7 +57,7 @@ def birge_ratio(fit: LensFit, points: Observations, groups: Ints) -> float:
     inverse = inverse_covariance(good.covariance_px2, max(fit.extra_sigma_px**2, SMALLEST_EXTRA_PX2))
     np.add.at(weight, region, inverse)
     np.add.at(weighted, region, np.einsum("nij,nj->ni", inverse, fit.residual_px[fit.used]))
-    enough = count >= MIN_REGION_STARS
+    enough = count >= STARS_PER_RING
     chi2 = float(np.einsum("ci,cij,cj->", weighted[enough], np.linalg.inv(weight[enough]), weighted[enough]))
     fitted = len(fit.camera.covariance_order) + 3 * len(np.unique(groups))
     freedom = 2 * int(enough.sum()) - fitted

@@ -213,4 +213,5 @@ def change_steps_m(changes: Array, cylinder: Cylinder, step_m: float = STEP_M) -
 
 def _draw_uniform(stream: list[int], shape: tuple[int, ...]) -> Array:
     """Uniform over [0, 1), the same for the same stream; a longer draw begins with the shorter one."""
-    return np.random.default_rng(stream).random(shape)
+    rng = np.random.default_rng(stream)
+    return rng.random(shape)

@@ -22,7 +22,7 @@ from startrack.chain.orientation import (
     solve_orientation,
 )  # fmt: skip
 from startrack.chain.sky_refinement import measured_skyline, refine_by_sky_light
-from startrack.chain.stages import Detected, Inputs, Located, Oriented, Refused, Settings
+from startrack.chain.stages import Detected, Identified, Inputs, Located, Oriented, Refused, Settings
 from startrack.core.errors import Reason
 from startrack.core.types import BadInput, Exposure, NoSolution
 from startrack.detection import find_damage
@@ -47,18 +47,14 @@ def locate(
     `settings` exchanges stages. Bad input of an image makes a refusal too: no image raises an exception.
     """
     settings = settings or Settings()
-    inputs = Inputs(
+    run = Run(Inputs(
         exposure=exposure, camera=camera, terrain=terrain, catalog_name=catalog.name,
         localizer_name=localizer_name(settings.localizer), damage=find_damage(exposure, camera),
-    )  # fmt: skip
-    run = Run(inputs)
-    try:
+    ))  # fmt: skip
+
+    def stages() -> Located:
         check_inputs(run.reached)
-        detected = run.run_stage("detect", detect_sources, run.reached, camera, settings.detector)
-        identified = run.run_stage(
-            "identify", identify_stars, detected, camera, catalog, settings.identifier, terrain.site
-        )
-        oriented = run.run_stage("attitude", solve_orientation, identified)
+        oriented = _orient(run, camera, settings, identify_stars, camera, catalog, settings.identifier, terrain.site)
         run.time_stage("attitude", check_one_attitude, oriented)
         measured = run.run_stage("evidence", measure_evidence, oriented, terrain, settings)
         first = replace(measured.evidence(), is_first_look=settings.evidence_sources != "stars")
@@ -72,9 +68,17 @@ def locate(
         located = run.time_stage("locate", _refine, located, is_bright, settings)
         sky_mag = None if step is None else step.brightness_mag_arcsec2(camera, exposure.exposure_s)
         skyline = run.time_stage("locate", measured_skyline, located)
-        return run.finish(replace(located, sky_brightness_mag_arcsec2=sky_mag, skyline=skyline))
-    except (BadInput, NoSolution) as refusal:
-        return run.refuse(refusal)
+        return replace(located, sky_brightness_mag_arcsec2=sky_mag, skyline=skyline)
+
+    return run.outcome(stages)
+
+
+def _orient(
+    run: Run, camera: Camera | None, settings: Settings, identify: Callable[..., Identified], *args: Any
+) -> Oriented:  # fmt: skip
+    """The stages up to the attitude; `identify` gets the sources and `args`."""
+    detected = run.run_stage("detect", detect_sources, run.reached, camera, settings.detector)
+    return run.run_stage("attitude", solve_orientation, run.run_stage("identify", identify, detected, *args))
 
 
 def _refine(located: Located, is_newer: bool, settings: Settings) -> Located:
@@ -112,13 +116,12 @@ def identify(
     """
     settings = settings or Settings()
     run = Run(Inputs(exposure=exposure, camera=camera, catalog_name=catalog.name))
-    try:
+
+    def stages() -> Oriented:
         check_inputs(run.reached)
-        detected = run.run_stage("detect", detect_sources, run.reached, camera, settings.detector)
-        identified = run.run_stage("identify", identify_stars, detected, camera, catalog, settings.identifier, site)
-        return run.finish(run.run_stage("attitude", solve_orientation, identified))
-    except (BadInput, NoSolution) as refusal:
-        return run.refuse(refusal)
+        return _orient(run, camera, settings, identify_stars, camera, catalog, settings.identifier, site)
+
+    return run.outcome(stages)
 
 
 def identify_blind(
@@ -131,23 +134,15 @@ def identify_blind(
     circle. `catalog` is the list of stars; `settings` has the detector. The lens found is the value's `camera`.
     """
     run = Run(Inputs(exposure=exposure, catalog_name=catalog.name))
-    try:
-        detected = run.run_stage("detect", detect_sources, run.reached, None, (settings or Settings()).detector)
-        identified = run.run_stage("identify", identify_unknown_lens, detected, np.atleast_1d(fov_rad), catalog)
-        return run.finish(run.run_stage("attitude", solve_orientation, identified))
-    except (BadInput, NoSolution) as refusal:
-        return run.refuse(refusal)
+    given = settings or Settings(), identify_unknown_lens, np.atleast_1d(fov_rad), catalog
+    return run.outcome(lambda: _orient(run, None, *given))
 
 
 def detect(exposure: Exposure, camera: Camera | None, settings: Settings | None = None) -> Detected | Refused:
     """Point sources of an `exposure`; `camera` (None: not known) gives fluxes in electrons, `settings` the detector."""
     run = Run(Inputs(exposure=exposure, camera=camera))
-    try:
-        return run.finish(
-            run.run_stage("detect", detect_sources, run.reached, camera, (settings or Settings()).detector)
-        )
-    except (BadInput, NoSolution) as refusal:
-        return run.refuse(refusal)
+    detector = (settings or Settings()).detector
+    return run.outcome(lambda: run.run_stage("detect", detect_sources, run.reached, camera, detector))
 
 
 def with_timing(outcome: Any, **more_ms: float) -> Any:
@@ -179,17 +174,18 @@ class Run:
         self.reached = value
         return value
 
-    def finish(self, value: T) -> T:
-        """The `value` with the times of the stages."""
-        return replace(value, timing_ms=MappingProxyType(self._timing_ms))
+    def outcome(self, stages: Callable[[], T]) -> T | Refused:
+        """The value that `stages` return, with their times, or the refusal with the last complete value.
 
-    def refuse(self, cause: BadInput | NoSolution) -> Refused:
-        """The refusal for a `cause`, with the last complete value; of a damaged image its damage may be the reason."""
-        damage = self.reached.damage
-        damaged = damage is not None and cause.reason in HIDDEN_BY_DAMAGE
-        return Refused(
-            reason=Reason.DAMAGED_IMAGE if damaged else cause.reason,
-            message=str(cause) if damage is None or not damaged else f"{damage.message} ({cause})",
-            reached=self.reached,
-            timing_ms=MappingProxyType(self._timing_ms),
-        )
+        Of a damaged image its damage may be the reason.
+        """
+        try:
+            return replace(stages(), timing_ms=MappingProxyType(self._timing_ms))
+        except (BadInput, NoSolution) as cause:
+            damage = self.reached.damage if cause.reason in HIDDEN_BY_DAMAGE else None
+            return Refused(
+                reason=cause.reason if damage is None else Reason.DAMAGED_IMAGE,
+                message=str(cause) if damage is None else f"{damage.message} ({cause})",
+                reached=self.reached,
+                timing_ms=MappingProxyType(self._timing_ms),
+            )

@@ -9,8 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from functools import lru_cache
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -37,7 +36,7 @@ Task = TypeVar("Task", bound=CountedTask)
 Progress = Callable[[str, int], AbstractContextManager[Bar]]  # text and number of steps of a computation
 
 
-class ChunkStore(Generic[Task]):
+class ChunkStore(Runner[Task, Chunk]):
     """Applies `work` to tasks and keeps their chunks in `folder`; a context manager that ends its processes.
 
     `key` is the name of a task's chunk: it must differ where the result may. Memory stays constant: a finished chunk
@@ -55,24 +54,14 @@ class ChunkStore(Generic[Task]):
         cluster: str | None = None,
         limit_s: float = TASK_LIMIT_S,
     ) -> None:
+        super().__init__(work, jobs=jobs, cluster=cluster, in_process=True, limit_s=limit_s)
         self.folder, self.key, self.progress = folder, key, progress
-        self._runner: Runner[Task, Chunk] = Runner(work, jobs=jobs, cluster=cluster, in_process=True, limit_s=limit_s)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, cause: BaseException | None, at: TracebackType | None) -> None:
-        self._runner.__exit__(kind, cause, at)
-
-    def connect(self) -> None:
-        """Connect to the cluster now. Raises BadInput (no_cluster) if no scheduler answers."""
-        self._runner.connect()
 
     def chunks(self, what: str, tasks: Sequence[Task]) -> Iterator[Chunk]:
         """The chunks of `what` in the order of the tasks; missing ones are computed. Raises RunStopped."""
         missing = self.missing(tasks)
         with self.progress(what, sum(map(len, missing))) as bar:
-            for task, chunk in self._runner.results(missing):
+            for task, chunk in self.results(missing):
                 if isinstance(chunk, Died):
                     raise RunStopped(f"{what}: {chunk.cause}")
                 buffer = io.BytesIO()

@@ -139,25 +139,14 @@ class BadInput(Exception):
 
 
 class BadOutput(BadInput):
-    """A path at which results cannot be written; of a flag it is wrong usage (exit code 2)."""
+    """A path at which results cannot be written; of a flag it is wrong usage (exit code 2).
 
-    @property
-    def command_message(self) -> str:
-        """The cause with flags of the command instead of arguments of the library."""
-        return str(self)
+    `command_message` is the cause with flags of the command instead of arguments of the library.
+    """
 
-
-class OutputExists(BadOutput):
-    """A file (`name`) that exists and may not be replaced."""
-
-    def __init__(self, reason: str, name: str) -> None:
-        super().__init__(reason, f"{name}: exists already: replace it with overwrite=True, or write elsewhere")
-        self.name = name
-
-    @property
-    def command_message(self) -> str:
-        """The cause with the flag of the command."""
-        return f"{self.name}: exists already: replace it with -O, or write elsewhere"
+    def __init__(self, reason: str, message: str, command_message: str = "") -> None:
+        super().__init__(reason, message)
+        self.command_message = command_message or message
 
 
 class NoSolution(Exception):

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from startrack.core.errors import BadInput, BadOutput, OutputExists
+from startrack.core.errors import BadInput, BadOutput
 
 PACKAGE = Path(__file__).resolve().parents[1]
 MAX_TEXT_BYTES = 2**20  # camera and terrain files have a few kilobytes
@@ -204,9 +204,10 @@ def _write_error(cause: Exception) -> type[BadInput]:
 
 
 def check_free(path: FilePath, *, overwrite: bool, reason: str = "bad_image") -> None:
-    """Raise OutputExists `reason` if the file exists and may not be replaced."""
+    """Raise BadOutput `reason` if the file exists and may not be replaced."""
     if not overwrite and os.path.lexists(path):
-        raise OutputExists(reason, printable(path))
+        text, ways = f"{printable(path)}: exists already: replace it with", ("overwrite=True", "-O")
+        raise BadOutput(reason, *(f"{text} {way}, or write elsewhere" for way in ways))
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from itertools import islice
 from multiprocessing import active_children, get_context, parent_process
 from multiprocessing.connection import wait as wait_for_sentinels
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
 
 from startrack.core.compilation import share_turn, turn_for_pool
 from startrack.core.errors import BadInput
@@ -74,7 +74,7 @@ class Runner(Generic[Task, Result]):
         self._pool: _Pool | None = None
         self._client: Client | None = None
 
-    def __enter__(self) -> Runner[Task, Result]:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, cause: BaseException | None, at: TracebackType | None) -> None:

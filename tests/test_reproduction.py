@@ -74,7 +74,7 @@ def small_run(tmp_path_factory):
 
 
 def test_star_counts_are_liebes():
-    assert star_count(6.0) == simulator.STAR_COUNT == 2142
+    assert star_count(6.0) == simulator.THESIS["stars"] == 2142
     assert star_count(2.0) == 28
 
 
@@ -179,10 +179,10 @@ def test_skyline_is_better_near_the_centre_and_stars_near_the_wall(small_run):
 
 
 def test_the_published_trials_average_to_the_published_overall():
-    assert np.mean([trial["mean_m"] for trial in simulator.TRIALS]) == pytest.approx(
-        simulator.OVERALL["mean_m"], abs=0.05
+    assert np.mean([trial["mean_m"] for trial in simulator.THESIS["trials"]]) == pytest.approx(
+        simulator.THESIS["overall"]["mean_m"], abs=0.05
     )
-    assert max(trial["max_m"] for trial in simulator.TRIALS) == simulator.OVERALL["max_m"]
+    assert max(trial["max_m"] for trial in simulator.THESIS["trials"]) == simulator.THESIS["overall"]["max_m"]
 
 
 # The traverse
@@ -202,8 +202,8 @@ def test_distances_between_changes_are_the_thesis_s():
         noticed = change_steps_m(changes_m(Sky.draw(0, number), crater()), crater())
         found.append((mean_gap_m(noticed, crater()), gaps_m(noticed, crater()).max()))
     mean, largest = np.array(found).T
-    assert abs(mean.mean() - simulator.MEAN_GAP_M) < 3 * mean.std() and mean.std() < 0.4
-    assert largest.min() < simulator.MAX_GAP_M < largest.max()
+    assert abs(mean.mean() - simulator.THESIS["gaps"]["mean_m"]) < 3 * mean.std() and mean.std() < 0.4
+    assert largest.min() < simulator.THESIS["gaps"]["max_m"] < largest.max()
 
 
 # Files

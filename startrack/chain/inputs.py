@@ -36,10 +36,10 @@ def exposure_input(image: Image, time: Time, time_sigma: Any = None) -> Exposure
         return read_exposure(image, **given)
     try:
         pixels = np.asanyarray(image)  # a plain array would have lost its mask
+        if pixels.dtype == object and pixels.ndim == 0:
+            raise TypeError("one object that is no sequence")
     except (TypeError, ValueError) as cause:
         raise BadInput("bad_image", f"{type(image).__name__} is neither a file nor an array of pixels") from cause
-    if pixels.dtype == object and pixels.ndim == 0:  # one object that is no sequence
-        raise BadInput("bad_image", f"{type(image).__name__} is neither a file nor an array of pixels")
     masked = getattr(pixels, "mask", None)  # of numpy's masked arrays and astropy's
     if masked is not None:
         masked = np.broadcast_to(masked, pixels.shape)

@@ -149,7 +149,9 @@ def measured_skyline(located: Located) -> MeasuredSkyline | None:
     sky, used, errors = located.sky_light, located.sky_used, located.image_errors
     if sky is not None and used is not None and errors is not None:
         used = used if located.blocked is None else used & ~located.blocked.whole
-        by_sky, sky_sigma = _skyline_by_sky_light(sky, errors)
+        by_image = np.einsum("ni,ij,nj->n", errors.raised_rad, errors.covariance, errors.raised_rad)
+        by_sky = sky.elevation_rad + sky.shift_px / sky.px_per_rad - errors.raised_rad @ errors.mean
+        sky_sigma = np.sqrt(sky.variance_px2 / np.square(sky.px_per_rad) + by_image)
         both = used & (sigma < SIMILAR_SIGMAS * sky_sigma)
         share = np.zeros(SECTORS)
         share[both] = 1.0 / (1.0 + np.square(sigma[both] / sky_sigma[both]))
@@ -175,10 +177,3 @@ def _skyline_by_stars(rows: Evidence, horizon: Skyline) -> tuple[Array, Array]:
     weight, mean, sigma = average_shifts(log, SHIFTS_RAD)
     bounded = weight[:, [0, -1]].max(axis=1) * len(SHIFTS_RAD) < END_DENSITY  # stars on both sides of the skyline
     return horizon(MIDDLES_RAD) + mean, np.where(bounded, sigma, np.inf)
-
-
-def _skyline_by_sky_light(sky: SkyLight, errors: ImageErrors) -> tuple[Array, Array]:
-    """Elevation and sigma (SECTORS,) of the skyline by the sky's light, offsets of the image taken out."""
-    by_image = np.einsum("ni,ij,nj->n", errors.raised_rad, errors.covariance, errors.raised_rad)
-    elevation = sky.elevation_rad + sky.shift_px / sky.px_per_rad - errors.raised_rad @ errors.mean
-    return elevation, np.sqrt(sky.variance_px2 / np.square(sky.px_per_rad) + by_image)

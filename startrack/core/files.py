@@ -25,11 +25,15 @@ FilePath = str | os.PathLike[str]
 
 
 class Locked(Exception):
-    """Another process holds the lock. `owner` is its process number as text, "unknown" if it cannot be read."""
+    """Another process holds a lock file. `owner` is its process number as text, "unknown" if it cannot be read."""
 
-    def __init__(self, owner: str) -> None:
-        super().__init__(f"process {owner} holds the lock")
-        self.owner = owner
+    owner = "unknown"
+
+    def __init__(self, lock_file: Path) -> None:
+        with suppress(OSError, ValueError):
+            text = lock_file.read_text(encoding="ascii").strip()
+            self.owner = text if text.isdecimal() else self.owner
+        super().__init__(f"process {self.owner} holds the lock")
 
 
 def data_dir(kind: str) -> Path:
@@ -127,9 +131,8 @@ def make_folder(folder: FilePath, reason: str = "bad_image") -> Path:
         with tempfile.TemporaryFile(dir=path):
             pass
     except (OSError, ValueError) as cause:  # ValueError: a name with a null character
-        text = getattr(cause, "strerror", None) or cause
-        raise _write_error(cause)(
-            reason, f"{printable(path)}: results cannot be written to this folder ({text}): choose another"
+        raise _write_error(
+            cause, reason, path, "results cannot be written to this folder", ": choose another"
         ) from cause
     return path
 
@@ -193,14 +196,14 @@ def write_atomically(path: FilePath, data: bytes, *, overwrite: bool, reason: st
     try:
         with atomic_file(path) as temporary, temporary.open("xb") as file:
             file.write(data)
-    except (OSError, ValueError) as error:
-        cause = getattr(error, "strerror", None) or error
-        raise _write_error(error)(reason, f"{printable(path)}: cannot be written ({cause})") from error
+    except (OSError, ValueError) as cause:
+        raise _write_error(cause, reason, path, "cannot be written") from cause
 
 
-def _write_error(cause: Exception) -> type[BadInput]:
+def _write_error(cause: Exception, reason: str, path: FilePath, text: str, advice: str = "") -> BadInput:
     """BadInput of a full disk, else BadOutput: the path is at fault."""
-    return BadInput if isinstance(cause, OSError) and cause.errno in FULL_DISK else BadOutput
+    kind = BadInput if isinstance(cause, OSError) and cause.errno in FULL_DISK else BadOutput
+    return kind(reason, f"{printable(path)}: {text} ({getattr(cause, 'strerror', None) or cause}){advice}")
 
 
 def check_free(path: FilePath, *, overwrite: bool, reason: str = "bad_image") -> None:
@@ -226,7 +229,7 @@ def hold_lock(path: FilePath, *, wait: bool = True, on_wait: Callable[[], None] 
         lock.acquire(blocking=False)
     except Timeout:
         if not wait:
-            raise Locked(_owner(file)) from None
+            raise Locked(file) from None
         if on_wait is not None:
             on_wait()
         lock.acquire()
@@ -238,12 +241,3 @@ def hold_lock(path: FilePath, *, wait: bool = True, on_wait: Callable[[], None] 
         with suppress(OSError):  # Windows keeps open files; a remaining file is not a lock
             file.unlink()
         lock.release()
-
-
-def _owner(lock_file: Path) -> str:
-    """The number of the process that holds a lock."""
-    try:
-        text = lock_file.read_text(encoding="ascii").strip()
-    except (OSError, ValueError):
-        return "unknown"
-    return text if text.isdecimal() else "unknown"

@@ -43,8 +43,7 @@ TRACK_STEP_PX = 0.25
 def render(scene: Scene, *, rng: np.random.Generator) -> tuple[Exposure, Truth]:
     """The exposure of a scene, and the truth about it. The same scene and state of `rng` give the same pixels.
 
-    Raises:
-        BadInput: bad_calibration when the camera has no sensor.
+    Raises BadInput: bad_calibration when the camera has no sensor.
     """
     electrons = light_e(scene)
     electrons += scene.sensor.dark_e_per_s * scene.exposure_s

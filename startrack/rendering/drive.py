@@ -75,9 +75,7 @@ class Drive(Value):
 def read_drive(path: FilePath, speed_m_s: float) -> Drive:
     """The drive at `speed_m_s` along the waypoints in a CSV file with a header line and columns east_m and north_m.
 
-    `path` is the file's.
-
-    Raises BadInput (bad_odometry) with the file and the cause.
+    `path` is the file's. Raises BadInput (bad_odometry) with the file and the cause.
     """
     lines = csv.reader(read_text(path, "bad_odometry").removeprefix("\ufeff").splitlines())
     rows = [(lines.line_num, [word.strip() for word in row]) for row in lines if any(word.strip() for word in row)]
@@ -85,20 +83,17 @@ def read_drive(path: FilePath, speed_m_s: float) -> Drive:
         if not rows or any(rows[0][1].count(name) != 1 for name in PATH_COLUMNS):
             raise ValueError(f"its first line does not name the columns {' and '.join(PATH_COLUMNS)}")
         columns = [rows[0][1].index(name) for name in PATH_COLUMNS]
-        waypoints_m = [_waypoint(number, row, columns) for number, row in rows[1:]]
+        waypoints_m: list[list[float]] = []
+        for number, row in rows[1:]:
+            try:
+                waypoints_m.append([float(row[column]) for column in columns])
+            except (ValueError, IndexError):
+                waypoints_m.append([np.nan])
+            if not np.isfinite(waypoints_m[-1]).all():
+                raise ValueError(f"line {number}: two finite numbers are expected for {' and '.join(PATH_COLUMNS)}")
         return Drive(waypoints_m=np.reshape(waypoints_m, (-1, 2)), speed_m_s=speed_m_s)
     except (ValueError, csv.Error) as cause:
         raise BadInput("bad_odometry", f"{printable(path)}: {cause}") from cause
-
-
-def _waypoint(number: int, row: list[str], columns: list[int]) -> list[float]:
-    try:
-        waypoint_m = [float(row[column]) for column in columns]
-    except (ValueError, IndexError):
-        waypoint_m = [np.nan]
-    if not np.isfinite(waypoint_m).all():
-        raise ValueError(f"line {number}: two finite numbers are expected for {' and '.join(PATH_COLUMNS)}")
-    return waypoint_m
 
 
 def draw_odometry(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
 
@@ -22,10 +22,8 @@ class HotPixels(Value):
     xy_px: Ints = array("n", 2, dtype=np.int64)  # column, row
     dark_e_per_s: Array = array("n")  # beyond the sensor's own
 
-    @staticmethod
-    def create_empty() -> HotPixels:
-        """A sensor without any."""
-        return HotPixels(xy_px=np.empty((0, 2), dtype=np.int64), dark_e_per_s=np.empty(0))
+
+NO_HOT_PIXELS = HotPixels(xy_px=np.empty((0, 2), dtype=np.int64), dark_e_per_s=np.empty(0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,15 +38,13 @@ class Scene(Value):
     position_enu_m: Array = array(3)  # the camera's centre
     R_cam_enu: Array = array(3, 3)
     R_enu_icrs: Array = array(3, 3)  # at mid-exposure
-    sky_rotvec_rad: Array = field(  # rotation vector in enu of the stars from start to end
-        default_factory=lambda: np.zeros(3), metadata={"shape": (3,), "dtype": np.float64}
-    )
+    sky_rotvec_rad: Array = array(3, default=0.0)  # rotation vector in enu of the stars from start to end
     exposure_s: float
     sky_v_mag_arcsec2: float | None  # diffuse light of the sky per square arcsecond; None: a black sky
     sky_gradient: float  # s: the sky is 1 + s cos(elevation) cos(azimuth - sky_gradient_azimuth_rad) of that
     sky_gradient_azimuth_rad: float
     wall_reflectance: float  # light of the terrain, as a fraction of the sky's
-    hot_pixels: HotPixels = field(default_factory=HotPixels.create_empty)
+    hot_pixels: HotPixels = NO_HOT_PIXELS
     cosmic_rays: int  # tracks in this exposure
     name: str = ""
     time_utc: datetime | None = None  # mid-exposure

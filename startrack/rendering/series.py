@@ -84,8 +84,17 @@ class Series:
             raise ValueError("Series.drive needs every_s")
         if self.every_s is not None and not self.every_s > 0:
             raise ValueError(f"Series.every_s must be positive, not {self.every_s!r}")
-        if self.drive is not None:
-            _require_in_search_area(self.drive, self.terrain)
+        if self.drive is not None:  # where all waypoints are in the search area, so are the lines between them
+            away_m = np.linalg.norm(self.drive.waypoints_m, axis=1)
+            outside = np.flatnonzero(away_m > self.terrain.search_radius_m)
+            if len(outside):
+                east_m, north_m = self.drive.waypoints_m[outside[0]]
+                raise BadInput(
+                    "bad_odometry",
+                    f"{len(outside)} of {len(away_m)} waypoints are outside the search area of {self.terrain.name}, "
+                    f"{self.terrain.search_radius_m:g} m about its origin; the first is {east_m:g} m east, "
+                    f"{north_m:g} m north",
+                )
 
     @cached_property
     def exposure_used_s(self) -> float:
@@ -103,8 +112,7 @@ class Series:
 
         `sky` is what `draw_sky` gives for the time of the exposure, if it has been drawn before.
 
-        Raises:
-            BadInput: bad_terrain when no position can be found, no_time outside the ephemeris.
+        Raises BadInput: bad_terrain when no position can be found, no_time outside the ephemeris.
         """
         pose, rng = self._pose_and_rng(number)
         time, site, exposure_s = pose.time_utc, self._site(), self.exposure_used_s
@@ -142,8 +150,7 @@ class Series:
     def pose(self, number: int) -> Pose:
         """Time and pose of exposure `number`.
 
-        Raises:
-            BadInput: bad_terrain where no camera can stand, no_time beyond the calendar.
+        Raises BadInput: bad_terrain where no camera can stand, no_time beyond the calendar.
         """
         return self._pose_and_rng(number)[0]
 
@@ -163,12 +170,15 @@ class Series:
         time, position_m, heading, pitch, roll = self._draw_pose(rng)
         if self.every_s is not None:
             first = self._draw_pose(np.random.default_rng([self.seed, Stream.EXPOSURE, 0]))
-            time = _time_after(first[0], number * self.every_s)
+            after_s = number * self.every_s
+            try:
+                time = first[0] + timedelta(seconds=after_s)
+            except OverflowError as cause:
+                raise BadInput("no_time", f"{after_s:g} s after {first[0]} is beyond the calendar") from cause
             if self.drive is None:  # at rest
                 _, position_m, heading, pitch, roll = first
             else:
-                position_m = self.drive.position_m(number * self.every_s)
-                heading = self.drive.heading_rad(number * self.every_s)
+                position_m, heading = self.drive.position_m(after_s), self.drive.heading_rad(after_s)
         if not bool(self.terrain.allowed(position_m[None])[0]):
             raise BadInput(
                 "bad_terrain",
@@ -222,19 +232,6 @@ def load_sky_catalog(stars: str) -> StarCatalog:
     return load_deep_catalog() if stars == "gaia" or (stars == "auto" and has_deep_catalog()) else load_catalog()
 
 
-def _require_in_search_area(drive: Drive, terrain: Terrain) -> None:
-    """Raises BadInput (bad_odometry) unless all waypoints, and so the lines between them, are in the search area."""
-    away_m = np.linalg.norm(drive.waypoints_m, axis=1)
-    outside = np.flatnonzero(away_m > terrain.search_radius_m)
-    if len(outside):
-        east_m, north_m = drive.waypoints_m[outside[0]]
-        raise BadInput(
-            "bad_odometry",
-            f"{len(outside)} of {len(away_m)} waypoints are outside the search area of {terrain.name}, "
-            f"{terrain.search_radius_m:g} m about its origin; the first is {east_m:g} m east, {north_m:g} m north",
-        )
-
-
 def _random_position(terrain: Terrain, rng: np.random.Generator) -> Array:
     """A position (2,) [m], uniform over the part of the search area where the camera can stand."""
     for _ in range(MAX_POSITION_TRIES):
@@ -243,10 +240,3 @@ def _random_position(terrain: Terrain, rng: np.random.Generator) -> Array:
         if bool(terrain.allowed(position[None])[0]):
             return position
     raise BadInput("bad_terrain", f"{terrain.name}: nowhere in its search area can the camera stand")
-
-
-def _time_after(start: datetime, seconds: float) -> datetime:
-    try:
-        return start + timedelta(seconds=seconds)
-    except OverflowError as cause:
-        raise BadInput("no_time", f"{seconds:g} s after {start} is beyond the calendar") from cause

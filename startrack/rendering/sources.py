@@ -53,7 +53,9 @@ def is_above_terrain(scene: Scene, rays_enu: Array) -> Bools:
 
 def add_sources(image_e: Array, scene: Scene) -> None:
     """Add to the image (H, W) [e] the stars and bodies of the scene, trailed where the sky's rotation is visible."""
-    rays_icrs, v_mag = _points(scene)
+    parts = [(scene.stars.rays_icrs, scene.stars.v_mag + scene.v_error_mag)]
+    parts += [_body_points(body, max(scene.camera.focal_px)) for body in scene.bodies]
+    rays_icrs, v_mag = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     rays_enu = rays_icrs @ scene.R_enu_icrs.T
     rotations = _step_rotations(scene)
     limit_rad = scene.camera.max_angle_rad + float(np.linalg.norm(scene.sky_rotvec_rad))
@@ -102,13 +104,6 @@ def _noise_on_axis(camera: Camera, sky_v_mag_arcsec2: float | None) -> tuple[Sen
         raise ValueError(f"camera {camera.name} has no sensor")
     sky = float(sky_e_per_s(camera, sky_v_mag_arcsec2, np.zeros(1))[0])
     return sensor, 4 * np.pi * (sensor.psf_sigma_px**2 + 1 / 12), sensor.dark_e_per_s + sky
-
-
-def _points(scene: Scene) -> tuple[Array, Array]:
-    """Directions (n, 3) and true magnitudes (n,) of all points of light; a disk of a body is many points."""
-    parts = [(scene.stars.rays_icrs, scene.stars.v_mag + scene.v_error_mag)]
-    parts += [_body_points(body, max(scene.camera.focal_px)) for body in scene.bodies]
-    return np.concatenate([rays for rays, _ in parts]), np.concatenate([v_mag for _, v_mag in parts])
 
 
 def _body_points(body: Body, focal_px: float) -> tuple[Array, Array]:

@@ -52,7 +52,7 @@ class RefusedImage:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Checked:
+class CheckedCamera:
     """A calibrated camera with its acceptance checks."""
 
     camera: Camera
@@ -157,39 +157,39 @@ def check_acceptance(joint: JointFit) -> tuple[Check, ...]:
     rings = int(np.sum(cover.stars.sum(axis=1) >= STARS_PER_RING))
     sectors = int(np.sum(cover.stars.sum(axis=0) >= STARS_PER_SECTOR))
     return (
-        at_least("matched stars", stars, MIN_STARS_MATCHED, "not_identified",
-                 "expose longer or open the lens, or add more pictures of the clear night sky"),
-        at_least("matched fraction", fraction, SMALLEST_FRACTION, "inconsistent_evidence",
-                 "bright stars lack a source, or bright sources a star: use a clear sky without cloud, "
-                 "and check the time and the site"),
-        at_most("log10 chance of as many matches", log10_p, round(np.log10(MAX_FALSE_ALARM)), "not_identified",
-                "more stars are needed: expose longer, focus better"),
+        minimum_check("matched stars", stars, MIN_STARS_MATCHED, "not_identified",
+                      "expose longer or open the lens, or add more pictures of the clear night sky"),
+        minimum_check("matched fraction", fraction, SMALLEST_FRACTION, "inconsistent_evidence",
+                      "bright stars lack a source, or bright sources a star: use a clear sky without cloud, "
+                      "and check the time and the site"),
+        maximum_check("log10 chance of as many matches", log10_p, round(np.log10(MAX_FALSE_ALARM)), "not_identified",
+                      "more stars are needed: expose longer, focus better"),
         held_out_check(fit.held_out_rms_px, "sharp stars are needed: focus, expose shorter, keep the camera still"),
         ring_check("rings with stars", rings, "take pictures where stars fill the image from its middle to its edge: "
                    "open sky, no walls"),
-        at_least("sectors with stars", sectors, MIN_IMAGE_SECTORS, "insufficient_geometry", "add pictures with the "
-                 "camera turned about its axis, so that stars fall on the empty side of the image too",
-                 f" of {IMAGE_SECTORS}"),
+        minimum_check("sectors with stars", sectors, MIN_IMAGE_SECTORS, "insufficient_geometry", "add pictures with "
+                      "the camera turned about its axis, so that stars fall on the empty side of the image too",
+                      f" of {IMAGE_SECTORS}"),
         map_check(fit.camera, "more stars near the edge of the image are needed: add pictures at other attitudes of "
                   "the camera"),
-        at_least("opposite handedness [px]", _mirrored_residual_px(joint), round(5 * LARGEST_HELD_OUT_RMS_PX),
-                 "inconsistent_evidence", "stars on one line do not determine the handedness: add pictures"),
+        minimum_check("opposite handedness [px]", _mirrored_residual_px(joint), round(5 * LARGEST_HELD_OUT_RMS_PX),
+                      "inconsistent_evidence", "stars on one line do not determine the handedness: add pictures"),
     )  # fmt: skip
 
 
-def at_least(name: str, value: float, least: float, reason: str, advice: str, of: str = "") -> Check:
+def minimum_check(name: str, value: float, least: float, reason: str, advice: str, of: str = "") -> Check:
     """The check that a value is large enough; `of` follows the limit in words."""
     return Check(name, value, f">= {least}{of}", value >= least, reason, advice)
 
 
-def at_most(name: str, value: float, most: float, reason: str, advice: str) -> Check:
+def maximum_check(name: str, value: float, most: float, reason: str, advice: str) -> Check:
     """The check that a value is small enough."""
     return Check(name, value, f"<= {most}", value <= most, reason, advice)
 
 
 def held_out_check(rms_px: float, advice: str) -> Check:
     """The check that fits predict observations that they do not contain."""
-    return at_most("held-out RMS [px]", rms_px, LARGEST_HELD_OUT_RMS_PX, "inconsistent_evidence", advice)
+    return maximum_check("held-out RMS [px]", rms_px, LARGEST_HELD_OUT_RMS_PX, "inconsistent_evidence", advice)
 
 
 def ring_check(name: str, rings: int, advice: str) -> Check:
@@ -202,7 +202,7 @@ def map_check(camera: Camera, advice: str) -> Check:
     grid = cap_grid(camera.calibrated_angle_rad)
     inside = camera.project(grid)[1]
     sigma = float(np.max(camera.projection_sigma_px(grid[inside] if inside.any() else grid)))
-    return at_most("map sigma [px]", sigma, LARGEST_MAP_SIGMA_PX, "insufficient_geometry", advice)
+    return maximum_check("map sigma [px]", sigma, LARGEST_MAP_SIGMA_PX, "insufficient_geometry", advice)
 
 
 def horizon_checks(joint: JointFit, catalog: StarCatalog, site: Site | None) -> tuple[Check, ...]:

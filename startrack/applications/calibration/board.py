@@ -12,12 +12,12 @@ from startrack.applications.calibration.acceptance import (
     IMAGE_RINGS,
     STARS_PER_RING,
     Check,
-    Checked,
+    CheckedCamera,
     RefusedImage,
-    at_least,
     corner_angle_rad,
     held_out_check,
     map_check,
+    minimum_check,
     ring_check,
     rings_and_sectors,
 )
@@ -86,7 +86,7 @@ def _find_charuco(grey: Any, board: Board) -> Corners | None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoardCalibration(Checked):
+class BoardCalibration(CheckedCamera):
     """A lens calibrated with boards, and its acceptance checks."""
 
     fit: LensFit
@@ -139,8 +139,8 @@ def _check_acceptance(fit: LensFit, points: Observations, pictures: int) -> tupl
     rings, used = int(np.sum(np.bincount(ring, minlength=IMAGE_RINGS) >= STARS_PER_RING)), int(fit.used.sum())
     tilt = "more pictures: the board tilted by 30 degrees and more, near and far, and in every corner of the image"
     return (
-        at_least("pictures with a board", pictures, MIN_PICTURES, "insufficient_geometry", tilt),
-        at_least("corners", used, MIN_CORNERS, "insufficient_geometry", tilt),
+        minimum_check("pictures with a board", pictures, MIN_PICTURES, "insufficient_geometry", tilt),
+        minimum_check("corners", used, MIN_CORNERS, "insufficient_geometry", tilt),
         held_out_check(fit.held_out_rms_px, "a flat board and sharp pictures are needed"),
         ring_check("rings with corners", rings, tilt),
         map_check(fit.camera, tilt),

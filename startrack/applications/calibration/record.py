@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from startrack import __version__
-from startrack.applications.calibration.acceptance import Checked, star_coverage
+from startrack.applications.calibration.acceptance import CheckedCamera, star_coverage
 from startrack.applications.calibration.board import BoardCalibration
 from startrack.applications.calibration.photometry import photometry_dict
 from startrack.applications.calibration.run import Calibration
@@ -26,20 +26,21 @@ def calibration_dict(calibration: Calibration) -> dict[str, Any]:
     """The calibration's JSON object, with the camera only if all checks passed."""
     fit, cover = calibration.joint.fit, star_coverage(calibration.joint)
     return {
-        **_outcome(calibration),
-        "lens": {
-            **_fit_dict("stars", fit),
-            "held_out_rms_arcmin": fit.held_out_rms_px * arcmin_per_px(calibration.camera),
-            "extra_sigma_px": fit.extra_sigma_px,
-            "chi2_per_dof": fit.chi2_per_dof,
-            "birge_ratio": calibration.joint.birge_ratio,
-            "map_sigma_px": next(check.value for check in calibration.checks if check.name.startswith("map sigma")),
-            "refraction": REFRACTION_REMOVED
-            if calibration.is_free_of_refraction
-            else "not taken out: no site on the Earth was given",
-            "models": [vars(candidate) for candidate in fit.candidates],
-        },
-        "gates": _gates(calibration),
+        **_outcome(
+            calibration,
+            {
+                **_fit_dict("stars", fit),
+                "held_out_rms_arcmin": fit.held_out_rms_px * arcmin_per_px(calibration.camera),
+                "extra_sigma_px": fit.extra_sigma_px,
+                "chi2_per_dof": fit.chi2_per_dof,
+                "birge_ratio": calibration.joint.birge_ratio,
+                "map_sigma_px": next(check.value for check in calibration.checks if check.name.startswith("map sigma")),
+                "refraction": REFRACTION_REMOVED
+                if calibration.is_free_of_refraction
+                else "not taken out: no site on the Earth was given",
+                "models": [vars(candidate) for candidate in fit.candidates],
+            },
+        ),
         "coverage": {
             "ring_edges_deg": np.degrees(cover.ring_edges_rad).round(3).tolist(),
             "stars": cover.stars.astype(int).tolist(),
@@ -56,9 +57,7 @@ def board_dict(found: BoardCalibration) -> dict[str, Any]:
     """The JSON object of `found`, a calibration with boards, with the camera only if all checks passed."""
     fit = found.fit
     return {
-        **_outcome(found),
-        "lens": {**_fit_dict("corners", fit), "models": [vars(candidate) for candidate in fit.candidates]},
-        "gates": _gates(found),
+        **_outcome(found, {**_fit_dict("corners", fit), "models": [vars(one) for one in fit.candidates]}),
         "images": [{"image": image} for image in found.images],
         "refused": [vars(refused) for refused in found.refused],
         "provenance": {"version": __version__},
@@ -75,7 +74,7 @@ def _fit_dict(what: str, fit: LensFit) -> dict[str, Any]:
     }
 
 
-def _outcome(found: Checked) -> dict[str, Any]:
+def _outcome(found: CheckedCamera, lens: dict[str, Any]) -> dict[str, Any]:
     failed = found.failed_checks
     return {
         "format": CALIBRATION_FORMAT,
@@ -83,14 +82,12 @@ def _outcome(found: Checked) -> dict[str, Any]:
         "reason": failed[0].reason if failed else None,
         "message": found.message,
         "camera": None if failed else camera_to_dict(found.camera),
+        "lens": lens,
+        "gates": [
+            {"name": c.name, "value": float(np.clip(c.value, -1e6, 1e6)), "limit": c.limit, "passed": bool(c.passed)}
+            for c in found.checks
+        ],
     }
-
-
-def _gates(found: Checked) -> list[dict[str, Any]]:
-    return [
-        {"name": c.name, "value": float(np.clip(c.value, -1e6, 1e6)), "limit": c.limit, "passed": bool(c.passed)}
-        for c in found.checks
-    ]
 
 
 def refusal_dict(reason: str, text: str) -> dict[str, Any]:
@@ -122,7 +119,7 @@ def board_line(found: BoardCalibration, name: str) -> str:
     return _line(found, name, found.fit, len(found.images), "pictures", "corners")
 
 
-def _line(found: Checked, name: str, fit: LensFit, images: int, of: str, what: str, arcmin: str = "") -> str:
+def _line(found: CheckedCamera, name: str, fit: LensFit, images: int, of: str, what: str, arcmin: str = "") -> str:
     verdict = "ok" if found.accepted else f"refused {found.failed_checks[0].reason}"
     return (
         f"{name}  {verdict}  {images} of {images + len(found.refused)} {of}  {int(fit.used.sum())} {what}  "

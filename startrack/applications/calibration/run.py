@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from startrack.applications.calibration.acceptance import (
-    Checked,
+    CheckedCamera,
     RefusedImage,
     check_acceptance,
     corner_angle_rad,
@@ -32,7 +33,7 @@ Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Calibration(Checked):
+class Calibration(CheckedCamera):
     """The camera, its fit, and its acceptance checks."""
 
     joint: JointFit
@@ -47,8 +48,7 @@ class Calibration(Checked):
         return all(frame.sky.includes_refraction for frame in self.joint.frames)
 
 
-@dataclass(frozen=True)
-class _IdentifiedFrame:
+class _IdentifiedFrame(NamedTuple):
     frame: Frame
     camera: Camera
     R_cam_icrs: Array
@@ -184,27 +184,23 @@ def _identify_all(run: _Run, frames: list[Frame]) -> None:
 
 
 def _identify(run: _Run, frame: Frame) -> None:
+    """With the lens of earlier frames, else the approximate one, else without a lens."""
     run.progress(f"identifying the stars of {frame.exposure.name}")
-    camera, found = _first_identification(run, frame)
+    camera, found = run.lead.camera if run.identified else run.start, None
+    if camera is not None:
+        try:
+            camera, found = identify_with_camera(camera, frame)
+        except NotIdentified:
+            if run.identified:
+                raise
+    if camera is None or found is None:  # an approximate camera with another kind of lens still gives the field of view
+        solution = identify_unknown_lens(frame.sources, frame.exposure.size_px, run.fov_rad, frame.sky.stars)
+        camera, found = solution.camera, solution.identification
     R = found.R_cam_icrs
     if not run.identified:
         run.progress(f"growing the lens outwards in {frame.exposure.name}")
         camera, R = grow_from_matches(frame, camera, R, found.star, found.detection)
     run.identified.append(_IdentifiedFrame(frame, camera, R, found))
-
-
-def _first_identification(run: _Run, frame: Frame) -> tuple[Camera, Identification]:
-    """Camera and identification: with the lens of earlier frames, else the approximate one, else without a lens."""
-    known = run.lead.camera if run.identified else run.start
-    if known is not None:
-        try:
-            return identify_with(known, frame)
-        except NotIdentified:
-            if run.identified:
-                raise
-    # An approximate camera with another kind of lens still gives the field of view.
-    solution = identify_unknown_lens(frame.sources, frame.exposure.size_px, run.fov_rad, frame.sky.stars)
-    return solution.camera, solution.identification
 
 
 def _field_rad(camera: Camera | None, fov_rad: float | None) -> float:
@@ -223,7 +219,7 @@ def _field_rad(camera: Camera | None, fov_rad: float | None) -> float:
     return float(min(np.sum(camera.angle_rad(sides)), 0.99 * WIDE_FIELD_RAD))
 
 
-def identify_with(camera: Camera, frame: Frame) -> tuple[Camera, Identification]:
+def identify_with_camera(camera: Camera, frame: Frame) -> tuple[Camera, Identification]:
     """Bright stars identified with an approximate camera or with its mirror image. Raises NotIdentified."""
     identifier = Identifier(whole_field=False)
     try:

@@ -71,11 +71,13 @@ def measure_sensor(joint: JointFit) -> SensorProperties:
     pairs, same_sky = _pairs(joint)
     sigma_px, angle, ratio = _measure_widths(joint)
     edges = np.linspace(0.0, camera.calibrated_angle_rad, IMAGE_RINGS + 1)
+    top = max(float(exposure.recorded_adu.max()) for exposure in exposures)
+    saturated = sum(int(np.count_nonzero(exposure.recorded_adu >= top)) for exposure in exposures)
     return SensorProperties(
         transfer=fit_photon_transfer(pairs),
         same_sky=same_sky,
         bias_adu=_dark_level(exposures, camera),
-        saturation_adu=_saturation_level(exposures),
+        saturation_adu=top if saturated >= MIN_SATURATED_PIXELS else None,  # the largest value, if pixels share it
         psf_sigma_px=_median_of_enough(sigma_px),
         flux_ratio=_median_of_enough(ratio) or 1.0,
         psf_by_ring_px=tuple(_median_of_enough(sigma_px[(angle >= a) & (angle < b)]) for a, b in pairwise(edges)),
@@ -118,13 +120,6 @@ def _dark_level(exposures: list[Exposure], camera: Camera) -> float | None:
         if max(in_corners) - min(in_corners) < LARGEST_DARK_SPREAD_1 * (sky - level):
             levels.append(level)
     return min(levels) if levels else None
-
-
-def _saturation_level(exposures: list[Exposure]) -> float | None:
-    """The largest value [ADU], where several pixels share it; None where nothing is saturated."""
-    top = max(float(exposure.recorded_adu.max()) for exposure in exposures)
-    count = sum(int(np.count_nonzero(exposure.recorded_adu >= top)) for exposure in exposures)
-    return top if count >= MIN_SATURATED_PIXELS else None
 
 
 def fit_photon_transfer(pairs: list[tuple[Exposure, Exposure]]) -> PhotonTransfer | None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from startrack.applications.calibration.acceptance import horizon_checks
-from startrack.applications.calibration.run import identify_with, load_frame
+from startrack.applications.calibration.run import identify_with_camera, load_frame
 from startrack.applications.calibration.shared_errors import widen_covariance
 from startrack.camera import Camera, cap_grid, projection_covariance_px2
 from startrack.catalog import StarCatalog
@@ -67,7 +67,7 @@ def verify(
     with the file, also with the reasons mirrored and, for a wrong site or time, inconsistent_evidence.
     """
     frame = load_frame(exposure, catalog, site, camera=camera)
-    found_camera, found = identify_with(camera, frame)
+    found_camera, found = identify_with_camera(camera, frame)
     if found_camera.mirrored != camera.mirrored:
         raise NotIdentified("the picture is a mirror image, compared with the camera file", reason="mirrored")
     start, R = grow_from_matches(frame, found_camera, found.R_cam_icrs, found.star, found.detection)

@@ -9,11 +9,9 @@ import numpy as np
 from startrack.applications.reproduction.artefact import PUBLISHED, STAR, Artefact, Context
 from startrack.applications.reproduction.simulator import (
     ASPECT_RATIO,
-    LUNAR_ASPECT_RATIOS,
     MAGNITUDE,
-    MAX_GAP_M,
-    MEAN_GAP_M,
     STEP_M,
+    THESIS,
     Sky,
     change_steps_m,
     changes_m,
@@ -87,7 +85,8 @@ def fig3_8(context: Context) -> Artefact:
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         axes.plot(middles / 1e3, gaps, ".", color=STAR, markersize=3)
-        axes.axhline(MAX_GAP_M, color=PUBLISHED, linewidth=0.8, linestyle="--", label="thesis: largest 215 m")
+        largest = THESIS["gaps"]["max_m"]
+        axes.axhline(largest, color=PUBLISHED, linewidth=0.8, linestyle="--", label=f"thesis: largest {largest:g} m")
         axes.set(xlim=(-10, 10), ylim=(0, max(250.0, 1.1 * gaps.max())), xlabel="Distance from center (km)")
         axes.set(ylabel="Distance (m)", title="Distances between appearing/disappearing stars during a crater traverse")
         axes.legend()
@@ -99,7 +98,7 @@ def fig3_8(context: Context) -> Artefact:
         f"largest {gaps.max():.0f} m (thesis 215), {inner:.0f} m near the centre, {outer:.0f} m near the wall",
         (7.0, 4.8), draw,
         {
-            "thesis": {"max_m": MAX_GAP_M},
+            "thesis": {"max_m": THESIS["gaps"]["max_m"]},
             "reproduced": {"max_m": float(gaps.max()), "mean_inner_m": inner, "mean_outer_m": outer},
         },
         columns=(
@@ -128,7 +127,7 @@ def _artefact(
         f"under standard conditions mean {standard[0]:.1f} m (thesis 14.9), largest {standard[1]:.0f} m (215)",
         (7.0, 8.6), draw,
         {
-            "thesis": {"mean_m": MEAN_GAP_M, "max_m": MAX_GAP_M},
+            "thesis": THESIS["gaps"],
             "reproduced": dict(zip(("mean_m", "max_m", "mean_every_change_m"), map(float, standard), strict=True)),
         },
         columns=(
@@ -141,7 +140,7 @@ def _artefact(
 def _draw_panels(figure: Figure, x: Array, curves: Array, standard: float, tops: tuple[float, float]) -> Any:
     """The mean and the largest distance over `x`, with the thesis's at the `standard` one; the axes (2,)."""
     panels = figure.subplots(2, 1)
-    for k, (word, value) in enumerate((("Mean", MEAN_GAP_M), ("Maximum", MAX_GAP_M))):
+    for k, (word, value) in enumerate(zip(("Mean", "Maximum"), THESIS["gaps"].values(), strict=True)):
         axes, curve = panels[k], curves[..., k]
         axes.fill_between(x, curve.min(axis=1), curve.max(axis=1), color=STAR, alpha=0.15, lw=0)
         axes.plot(x, curve.mean(axis=1), color=STAR, marker=".", label="here")
@@ -174,7 +173,7 @@ def fig_a2(context: Context) -> Artefact:
         "(thesis: approximately 5 to 50).",
         f"simple craters {shown[0]} (thesis 5), complex {shown[1]} (thesis 5 to 50)", (7.0, 8.0), draw,
         {
-            "thesis": {"aspect_ratios": list(LUNAR_ASPECT_RATIOS)},
+            "thesis": {"aspect_ratios": THESIS["aspect_ratios"]},
             "reproduced": {form: [float(r.min()), float(r.max())] for form, r in zip(forms, ratios, strict=True)},
         },
         columns=(

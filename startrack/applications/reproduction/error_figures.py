@@ -21,14 +21,10 @@ from startrack.applications.reproduction.methods import (
 from startrack.applications.reproduction.simulator import (
     ASPECT_RATIO,
     DIAMETER_M,
-    HULL,
     MAGNITUDE,
-    NEVER_SETTLE,
-    OVERALL,
-    TRIALS,
+    THESIS,
     star_count,
 )
-from startrack.core.types import Array
 from startrack.output import Column
 
 if TYPE_CHECKING:
@@ -54,7 +50,7 @@ def fig3_4(context: Context) -> Artefact:
         text=f"{caption}\n\n{_ring_table({'skyline estimate': hull})}",
         columns=_ring_columns({"hull": hull}),
         pictures={"fig3.4": _error_map(hull, 0, "Skyline estimate", caption)},
-        values={"thesis": HULL, "reproduced": hull.statistics},
+        values={"thesis": THESIS["hull"], "reproduced": hull.statistics},
         timing_ms={"hull_and_descent": hull.ms_per_fix},
     )
 
@@ -91,7 +87,7 @@ def fig3_10(context: Context) -> Artefact:
             "fig3.10.ours": _error_map(ours, 0, "Ours", of_ours),
         },
         values={
-            "thesis": {**OVERALL, "never_settle": NEVER_SETTLE},
+            "thesis": {**THESIS["overall"], "never_settle": THESIS["never_settle"]},
             "reproduced": {**descent.statistics, "never_settle": descent.refused_fraction},
             "ours": {**ours.statistics, "refused": ours.refused_count},
         },
@@ -104,7 +100,7 @@ def fig_b(context: Context) -> Artefact:
     size = context.size
     _, descent = collect_errors(context, "figures B.1 to B.10", KUA, size.skies, size.per_sky)
     pictures = {}
-    for k, trial in enumerate(TRIALS[: size.skies]):
+    for k, trial in enumerate(THESIS["trials"][: size.skies]):
         caption = (
             f"Figure B.{k + 1}: Position error at {size.per_sky:,} sampled points in a Shackleton-style crater, "
             f"starfield {k + 1}. {SCALED} Mean / s.d. / largest: {format_errors(descent.errors_m[k])} m; "
@@ -118,7 +114,7 @@ def fig_b(context: Context) -> Artefact:
         text="\n\n".join(picture.caption for picture in pictures.values()),
         pictures=pictures,
         values={
-            "thesis": {"trials": list(TRIALS)},
+            "thesis": {"trials": THESIS["trials"]},
             "reproduced": {"trials": [error_statistics(errors) for errors in descent.errors_m]},
         },
         timing_ms={"hull_and_descent": descent.ms_per_fix},
@@ -216,6 +212,18 @@ def _sweep(
         "ours refuses (the stars leave too much of the floor open) are not in its mean."
     )
     usual = means[list(x).index(standard)]
+
+    def draw(figure: Figure) -> None:
+        axes: Any = figure.subplots()
+        styles = (("s:", "0.6"), ("^--", "#2166ac"), ("o-", STAR), ("x", PUBLISHED))
+        for method, mean, (style, colour) in zip(SWEEP_METHODS, means.T, styles, strict=True):
+            axes.plot(x, mean, style, color=colour, label=method)
+        if key == "aspect_ratio":
+            axes.set_xscale("log")
+        axes.set(yscale="log", xlabel=words, ylabel="mean position error (m)")
+        axes.grid(alpha=0.3)
+        axes.legend()
+
     return Artefact(
         name=name,
         title=title,
@@ -230,21 +238,9 @@ def _sweep(
             Column("never_settles", unsettled, form="%.5f"),
             Column("refused_by_ours", refused, "int64", form="%d"),
         ),
-        pictures={name: Picture((7.0, 5.4), lambda figure: _draw_sweep(figure, x, means, words), caption)},
+        pictures={name: Picture((7.0, 5.4), draw, caption)},
         values={
             "reproduced": {"hull_m": means[:, 0].tolist(), "descent_m": means[:, 1].tolist()},
             "ours": {key: list(x), "mean_m": means[:, 2].tolist(), "limit_m": means[:, 3].tolist(), "refused": refused},
         },
     )
-
-
-def _draw_sweep(figure: Figure, x: Sequence[float], means: Array, label: str) -> None:
-    axes: Any = figure.subplots()
-    styles = (("s:", "0.6"), ("^--", "#2166ac"), ("o-", STAR), ("x", PUBLISHED))
-    for k, (style, colour) in enumerate(styles):
-        axes.plot(x, means[:, k], style, color=colour, label=SWEEP_METHODS[k])
-    if label != "magnitude":
-        axes.set_xscale("log")
-    axes.set(yscale="log", xlabel=label, ylabel="mean position error (m)")
-    axes.grid(alpha=0.3)
-    axes.legend()

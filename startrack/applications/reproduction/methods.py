@@ -178,7 +178,8 @@ def collect_errors(
     """
     by_sky = [tasks_of(method, context.seed, sky, per_sky, **settings) for sky in range(skies)]
     found = context.store.chunks(what, [task for tasks in by_sky for task in tasks])
-    chunks = [_join_chunks([next(found) for _ in tasks]) for tasks in by_sky]
+    parts = [[next(found) for _ in tasks] for tasks in by_sky]
+    chunks = [{key: np.concatenate([part[key] for part in of_sky]) for key in of_sky[0]} for of_sky in parts]
     ms_per_fix = 1e3 * sum(float(chunk["seconds"].sum()) for chunk in chunks) / (skies * per_sky)
     answered = tuple(chunk[ANSWERED[method]] for chunk in chunks) if method in ANSWERED else ()
     truth = tuple(chunk["truth_m"][chunk["located"]] if method == OURS else chunk["truth_m"] for chunk in chunks)
@@ -189,7 +190,3 @@ def collect_errors(
         )
         for key in ERROR_OF[method]
     ]  # fmt: skip
-
-
-def _join_chunks(chunks: list[Chunk]) -> Chunk:
-    return {key: np.concatenate([chunk[key] for chunk in chunks]) for key in chunks[0]}

@@ -17,7 +17,7 @@ from startrack.applications.reproduction.artefact import (
     fisheye_points,
 )
 from startrack.applications.reproduction.simulator import (
-    STAR_COUNT,
+    THESIS,
     Sky,
     crater,
     crater_edge,
@@ -127,9 +127,9 @@ def fig_a1(context: Context) -> Artefact:
     return Artefact.of_figure(
         "figA.1", "Simulation generated starfield for a magnitude 6 detection limit",
         ": (a) projected on the unit hemisphere, (b) fisheye projection. "
-        f"{star_count(6.0)} stars (thesis: {STAR_COUNT}).",
-        f"{len(sky)} stars (thesis {STAR_COUNT})", (6.4, 10.6), draw,
-        {"thesis": {"stars": STAR_COUNT}, "reproduced": {"stars": len(sky)}},
+        f"{star_count(6.0)} stars (thesis: 2142).",
+        f"{len(sky)} stars (thesis 2142)", (6.4, 10.6), draw,
+        {"thesis": {"stars": THESIS["stars"]}, "reproduced": {"stars": len(sky)}},
     )  # fmt: skip
 
 

@@ -15,11 +15,8 @@ from startrack.applications.reproduction.methods import (
     format_errors,
 )
 from startrack.applications.reproduction.simulator import (
-    HULL,
     MAGNITUDE,
-    NEVER_SETTLE,
-    OVERALL,
-    TRIALS,
+    THESIS,
     Mistakes,
     star_count,
 )
@@ -47,10 +44,10 @@ def table31(context: Context) -> Artefact:
     )
     values = {
         "thesis": {
-            "descent": OVERALL,
-            "hull": HULL,
-            "never_settle": NEVER_SETTLE,
-            "trials": list(TRIALS),
+            "descent": THESIS["overall"],
+            "hull": THESIS["hull"],
+            "never_settle": THESIS["never_settle"],
+            "trials": THESIS["trials"],
         },
         "reproduced": {
             "descent": descent.statistics,
@@ -101,19 +98,19 @@ def _ratio_to_limit(ours: MethodErrors, limit: MethodErrors) -> float:
 
 def _trial_table(hull: MethodErrors, descent: MethodErrors, ours: MethodErrors, limit: MethodErrors) -> str:
     rows = [
-        [k + 1, _trial_text(TRIALS[k]), format_errors(errors),
+        [k + 1, _trial_text(THESIS["trials"][k]), format_errors(errors),
          f"{100 * np.mean(~descent.answered[k]):.2f} %", format_errors(hull.errors_m[k], WHOLE),
          format_errors(ours.errors_m[k]), format_errors(limit.errors_m[k])]
         for k, errors in enumerate(descent.errors_m)
     ]  # fmt: skip
-    rows.append(
-        ["Overall", _trial_text(OVERALL), format_errors(descent.errors),
-         f"{100 * descent.refused_fraction:.2f} % (thesis 0.6 %)",
-         f"{format_errors(hull.errors, WHOLE)} (thesis 637 / 275 / 1735)", format_errors(ours.errors),
-         format_errors(limit.errors)]
-    )  # fmt: skip
+    overall = [
+        "Overall", _trial_text(THESIS["overall"]), format_errors(descent.errors),
+        f"{100 * descent.refused_fraction:.2f} % (thesis 0.6 %)",
+        f"{format_errors(hull.errors, WHOLE)} (thesis 637 / 275 / 1735)", format_errors(ours.errors),
+        format_errors(limit.errors),
+    ]  # fmt: skip
     head = ["Trial", "thesis", "its method, redone", "never settles", "its hull, redone", "ours", "limit"]
-    return markdown_table(head, rows)
+    return markdown_table(head, [*rows, overall])
 
 
 def _trial_text(trial: dict[str, float]) -> str:
@@ -124,7 +121,7 @@ def _columns(hull: MethodErrors, descent: MethodErrors, ours: MethodErrors, limi
     skies = len(descent.errors_m)
     columns = [Column("trial", list(range(1, skies + 1)), "int64", form="%d", description="starfield")]
     for name in ("mean", "sd", "max"):
-        values = [trial[f"{name}_m"] for trial in TRIALS[:skies]]
+        values = [trial[f"{name}_m"] for trial in THESIS["trials"][:skies]]
         columns.append(Column(f"thesis_{name}", values, unit="m", form="%.1f", description="Kua 2008, table 3.1"))
     methods = (
         (descent, "descent", "hull and pseudo-gradient"),

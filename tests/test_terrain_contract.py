@@ -20,7 +20,7 @@ from startrack.terrain.crater import DeformedCrater
 SITE = Site("moon", np.radians(-89.66), np.radians(129.78))
 AZIMUTHS = np.linspace(0.01, 2 * np.pi, 12, endpoint=False)
 TRACED_RAD = 3e-6  # to which traced horizons and their bounds meet; closed forms meet exactly
-INTERPOLATED_RAD = 1e-4  # MAX_BEND_TAN of horizon_interpolator
+INTERPOLATED_RAD = 1e-4
 
 
 class LevelHorizon(Terrain):

@@ -27,7 +27,6 @@ COLMAP_COUNTS = {
 }  # fmt: skip
 OPENCV_DISTORTION = "distortion_coefficients"
 OPENCV_COUNTS = 4, 5, 8, 12, 14  # of distortion coefficients of OpenCV's models
-NO_DISTORTION = (0.0,) * 5  # of a pinhole
 OPENCV_HEAD = re.compile(r"\A\s*%YAML[: ]1\.0|!!opencv-matrix")  # which YAML itself does not have
 Coefficients = tuple[float, ...] | None  # of a fisheye; None of a pinhole
 
@@ -65,7 +64,7 @@ def find_program(text: str) -> str | None:
 
 def _write_ros(camera: Camera, k: Coefficients) -> str:
     """A camera_info file (camera_calibration_parsers): equidistant for fisheyes, plumb_bob for pinholes."""
-    model, coefficients = ("plumb_bob", NO_DISTORTION) if k is None else ("equidistant", k)
+    model, coefficients = ("plumb_bob", (0.0,) * 5) if k is None else ("equidistant", k)
     (fx, fy), (cx, cy) = camera.focal_px, camera.centre_px
     name = json.dumps(camera.name, ensure_ascii=False)  # a JSON string is one of YAML
     return (
@@ -94,7 +93,7 @@ def _write_kalibr(camera: Camera, k: Coefficients) -> str:
 
     T_cam_imu takes points of the rover's body (Kalibr's imu) into the camera.
     """
-    model, coefficients = ("radtan", NO_DISTORTION[:4]) if k is None else ("equidistant", k)
+    model, coefficients = ("radtan", (0.0,) * 4) if k is None else ("equidistant", k)
     rows = "".join(f"  - {_yaml_list([*row, 0.0])}\n" for row in np.asarray(camera.R_body_cam).T.tolist())
     return (
         f"cam0:\n  cam_overlaps: []\n  camera_model: pinhole\n  distortion_coeffs: {_yaml_list(coefficients)}\n"
@@ -177,7 +176,7 @@ def _write_opencv(camera: Camera, k: Coefficients) -> str:
         text = ", ".join(repr(float(v)) for v in data)
         return f"!!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: [ {text} ]\n"
 
-    coefficients = NO_DISTORTION if k is None else k
+    coefficients = (0.0,) * 5 if k is None else k
     return (
         f"%YAML:1.0\n---\nimage_width: {camera.size_px[0]}\nimage_height: {camera.size_px[1]}\n"
         f"fisheye_model: {int(k is not None)}\ncamera_matrix: {matrix(3, 3, _matrix_of(camera))}"

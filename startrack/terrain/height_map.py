@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.types import Array, Bools, Ints
-from startrack.terrain.derived_maps import DEFAULT_NODES, DeformedMap, HorizonInterpolator
+from startrack.terrain.derived_maps import DeformedMap, HorizonInterpolator
 from startrack.terrain.ground import cell_posts, post_positions
 from startrack.terrain.horizon_table import AZIMUTH_BINS, HorizonSigma
 from startrack.terrain.protocol import HorizonPosts, Terrain
-from startrack.terrain.shape import BIAS, CAMERA_ERROR, STRETCH, VERTICAL, ShapeError, by_name, select_slopes
+from startrack.terrain.shape import BIAS, CAMERA_ERROR, EXACT, STRETCH, VERTICAL, ShapeError, by_name, select_slopes
 from startrack.terrain.traced_map import TracedMap
 
 COMMON_PER_POST = 3.0
@@ -26,11 +26,11 @@ Sectors = tuple[tuple[float, float], ...]  # azimuth ranges [rad], each from the
 class HeightMap(TracedMap):
     """Height maps and what is known of their errors: see `TracedMap` for the ground, `Terrain` for the methods."""
 
-    height_sigma_m: float = 0.0  # of single posts, independent of each other
+    height_sigma_m: float = Terrain.height_sigma_m  # of single posts, independent of each other
     horizon_sigma_common_rad: float | None = None  # of an error that all azimuths share; None: see common_sigma_rad
-    stretch_sigma_1: float | None = 0.0  # of the factor of tan H, less 1; None: not stated, see `terrain.shape`
-    vertical_sigma_rad: float | None = 0.0  # of a tilt of the whole map, of each of two axes
-    camera_height_sigma_m: float | None = 0.0
+    stretch_sigma_1: float | None = EXACT  # of the factor of tan H, less 1; None: not stated, see `terrain.shape`
+    vertical_sigma_rad: float | None = EXACT  # of a tilt of the whole map, of each of two axes
+    camera_height_sigma_m: float | None = EXACT
     most_slope_rad: float = np.pi / 2  # a rover does not stand on steeper ground
     glare_rad: Sectors = ()  # lit by the Sun: no evidence there
     unstated_errors: tuple[str, ...] = ()
@@ -149,7 +149,7 @@ class HeightMap(TracedMap):
             "horizons_ready": self.table_path.is_file(),
         }
 
-    def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = DEFAULT_NODES) -> Terrain:
+    def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = 3) -> Terrain:
         """The ground near a centre (2,), see `HorizonInterpolator`."""
         centre = np.asarray(centre_m, dtype=np.float64)
         return HorizonInterpolator(self, centre, half_m, np.unique(azimuths_rad), across)

@@ -19,8 +19,6 @@ from startrack.terrain.cylinder import CAMERA_HEIGHT, CAMERA_SIGMA, CYLINDER_KEY
 from startrack.terrain.protocol import Terrain
 from startrack.terrain.shape import CYLINDER_FACTS
 
-DEFAULT_MAP_RADIUS_M = 10_000.0  # of the search area on height maps
-
 FILE = Text(max_chars=4000)
 KEYS = Table(
     keys={
@@ -198,7 +196,7 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
         camera_height_m=rover["camera_height_m"],
         maps=tuple(read_map(file, near=near, **scaling) for file in files),
         files=tuple(files),
-        search_radius_m=search.get("radius_m", DEFAULT_MAP_RADIUS_M),
+        search_radius_m=search.get("radius_m", Terrain.search_radius_m),
         height_sigma_m=dem.get("height_sigma_m", 0.0),
         unstated_errors=() if "height_sigma_m" in dem else ("height_sigma_m",),
         horizon_sigma_common_rad=_radians(dem.get("horizon_sigma_deg")),

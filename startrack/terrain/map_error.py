@@ -12,7 +12,7 @@ from startrack.terrain.raster import Raster
 
 MIN_ERROR_M = 0.1
 MIN_RATIO_ROUGH = 0.5  # natural ground is no smoother: errors fall with the distance of the posts, not with its square
-MIN_RATIO_SMOOTH = 0.25  # a curve without any roughness: errors fall with the square
+MIN_RATIO_SMOOTH = MIN_RATIO_ROUGH**2  # a curve without any roughness: errors fall with the square
 MIN_POSTS = 9  # a side
 SPACING_TOLERANCE_OCTAVES = 0.25  # error of `carried_spacing`
 SPECTRUM_POSTS = 64  # posts of one spectrum

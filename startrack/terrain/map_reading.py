@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from startrack.core.files import MAX_CAUSE_CHARS
 from startrack.core.types import MAX_PIXELS, BadInput
 from startrack.frames import MOON_RADIUS_M
+from startrack.terrain.cylinder import MAX_LENGTH_M
 from startrack.terrain.map_writing import METRE, PROJECTION_CODES
 from startrack.terrain.raster import EQUIRECTANGULAR, ORTHOGRAPHIC, STEREOGRAPHIC, Projection, Raster, projection_of
 
 WINDOW_HALF_M = 300_000.0  # about the origin; farther away even 10 km mountains are below the horizontal
-MAX_HEIGHT_M = 1e7  # larger values are marks of missing heights
 METRES = {"m", "meter", "meters", "metre", "metres"}
 STEREOGRAPHIC_CODES = (PROJECTION_CODES[STEREOGRAPHIC], 15, 16)  # oblique, and two variants of the polar one
 DECODED = (1, 8, 32773, 32946)  # codes of compression: none, deflate, PackBits, deflate
@@ -91,7 +91,7 @@ def _raster_of(grid: Grid, path: Path, scale: float | None, offset_m: float | No
         )
     with np.errstate(over="ignore", invalid="ignore"):
         heights = values.astype(np.float64) * scale + offset
-    missing = ~(np.abs(heights) < MAX_HEIGHT_M)  # NaN too
+    missing = ~(np.abs(heights) < MAX_LENGTH_M)  # NaN too; larger values are marks
     if grid.no_data is not None:
         missing |= values == grid.no_data
     if missing.all():

@@ -9,22 +9,30 @@ import numpy as np
 
 from startrack.core.types import Array
 
+EXACT = 0.0  # sigma of a ground without the error
+
 
 @dataclass(frozen=True, kw_only=True)
-class ShapeError:
-    """One error that all azimuths share, normal about 0, in the unit that its name ends with.
+class Prior:
+    """Of an error: normal about 0 with `sigma`, or with `gross_probability` with the wider `gross_sigma`."""
 
-    Its prior is a mixture: `sigma`, or with `gross_probability` the wider `gross_sigma`. Errors of a pair (the terms of
+    sigma: float
+    gross_probability: float = 0.0
+    gross_sigma: float = 0.0
+    scales: bool = False  # an error of a round crater's size: positions are that much farther from its axis too
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShapeError(Prior):
+    """One error that all azimuths share, in the unit that its name ends with.
+
+    Errors of a pair (the terms of
     an ellipse, the axes of a tilt) have the same `fact`, and one gross part: both are gross, or neither. Of a stated
     error `gross_sigma` is what it would be if the statement were wrong.
     """
 
     name: str  # such as "depth_1" (relative), "bias_rad", "camera_height_m"
     fact: str  # the key of the terrain file that states it, such as "depth_sigma_m"
-    sigma: float
-    gross_probability: float = 0.0
-    gross_sigma: float = 0.0
-    scales: bool = False  # an error of a round crater's size: positions are that much farther from its axis too
 
     @property
     def is_stated(self) -> bool:
@@ -33,15 +41,11 @@ class ShapeError:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fact:
-    """A key of the terrain file that states the sigma of some errors, and what counts for them where it is absent."""
+class Fact(Prior):
+    """A key of the terrain file that states the sigma of some errors, and the prior of each where it is absent."""
 
     key: str
     errors: tuple[str, ...]  # names of the errors
-    sigma: float  # of each, in the unit of the errors
-    gross_probability: float = 0.0
-    gross_sigma: float = 0.0
-    scales: bool = False
 
     def shape_errors(self, stated: float | None) -> list[ShapeError]:
         """Those of the errors that count; `stated` is the sigma in the unit of the errors, None where it is not."""

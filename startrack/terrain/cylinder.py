@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from startrack.core.declaration import Flag, Number
+from startrack.core.declaration import Flag
 from startrack.core.kernels import njit
 from startrack.core.types import Array, BadInput
 from startrack.terrain.crater import (
@@ -19,42 +19,30 @@ from startrack.terrain.crater import (
     slopes_of_round_crater,
 )
 from startrack.terrain.shape import (
+    AMOUNT,
     CAMERA_ERROR,
+    CYLINDER_FACTS,
     DEPTH,
     DIAMETER,
     ELLIPSE,
     EXACT,
+    LENGTH,
     RIM_TILT,
     ShapeError,
     by_name,
     select_slopes,
 )
 
-MAX_LENGTH_M = 1e7  # five times the Moon's radius
 MAX_SHAPE_SIGMA = 0.2  # of depth and diameter; the posterior of the shape is expanded about the stated one
-MAX_TILT_DEG = 5.0
-LENGTH = Number(low=0.0, high=MAX_LENGTH_M, above=True)
-CAMERA_HEIGHT = Number(low=0.0, high=MAX_LENGTH_M)
-_SIGMA = Number(low=0.0, high=MAX_LENGTH_M)
-CAMERA_SIGMA = replace(_SIGMA, description="if absent 0.02 above a height map, and 0 in a cylinder")
 _SIZES = {"diameter_m": replace(LENGTH, required=True), "depth_m": replace(LENGTH, required=True)}
-_SIGMAS = {
-    "depth_sigma_m": replace(_SIGMA, description="if absent 0.1 % of it, and with probability 1 % 1 %"),
-    "diameter_sigma_m": replace(_SIGMA, description="if absent 0.1 % of it, and with probability 1 % 1 %"),
-    "ellipse_sigma_1": Number(low=0.0, high=0.1, description="relative, of each of the rim's two terms; if absent "
-                              "0.0005, and with probability 1 % 0.005"),
-}  # fmt: skip
 CYLINDER_KEYS = {  # of [cylinder] in a terrain file
     **_SIZES,
     "exact": Flag(description="true: a model, without errors of its shape"),
-    **_SIGMAS,
-    "rim_tilt_sigma_deg": Number(low=0.0, high=MAX_TILT_DEG, description="of each of two axes; if absent 0.002, and "
-                                 "with probability 0.5 % 0.1"),
-}  # fmt: skip
-_CLASS_SIGMAS = {
-    **_SIGMAS,
-    "rim_tilt_sigma_rad": Number(low=0.0, high=float(np.radians(MAX_TILT_DEG))),
-    "camera_height_sigma_m": CAMERA_SIGMA,
+    **{fact.key: fact.limits for fact in CYLINDER_FACTS},
+}
+_SIGMAS = {
+    **{fact.key: fact.limits for fact in (DEPTH, DIAMETER, ELLIPSE, CAMERA_ERROR)},
+    "rim_tilt_sigma_rad": replace(RIM_TILT.limits, high=float(np.radians(RIM_TILT.limits.high))),
 }
 
 
@@ -77,8 +65,8 @@ class Cylinder(Crater):
     horizon_cost = 0.02
 
     def __post_init__(self) -> None:
-        stated = {key: kind for key, kind in _CLASS_SIGMAS.items() if getattr(self, key) is not None}
-        declared = {**_SIZES, "camera_height_m": CAMERA_HEIGHT, **stated}
+        stated = {key: kind for key, kind in _SIGMAS.items() if getattr(self, key) is not None}
+        declared = {**_SIZES, "camera_height_m": AMOUNT, **stated}
         if self.search_radius_m != np.inf:
             declared["search_radius_m"] = LENGTH
         try:

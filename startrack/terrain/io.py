@@ -15,9 +15,9 @@ from startrack.core.declaration import Choice, Either, List, Number, Table, Text
 from startrack.core.files import parse_toml, printable, read_text, resolve_named
 from startrack.core.types import BadInput
 from startrack.frames import Site
-from startrack.terrain.cylinder import CAMERA_HEIGHT, CAMERA_SIGMA, CYLINDER_KEYS, LENGTH, MAX_LENGTH_M, Cylinder
+from startrack.terrain.cylinder import CYLINDER_KEYS, Cylinder
 from startrack.terrain.protocol import Terrain
-from startrack.terrain.shape import CYLINDER_FACTS
+from startrack.terrain.shape import AMOUNT, BIAS, CAMERA_ERROR, CYLINDER_FACTS, LENGTH, MAX_LENGTH_M, STRETCH, VERTICAL
 
 FILE = Text(max_chars=4000)
 KEYS = Table(
@@ -43,15 +43,9 @@ KEYS = Table(
             keys={
                 "file": Either(kinds=(FILE, List(each=FILE, least=1, most=100)), required=True,
                                description="finest first"),
-                "height_sigma_m": Number(low=0.0, high=MAX_LENGTH_M,
-                                         description="of single posts, independent of each other; if absent 0, with "
-                                         "a warning"),
-                "horizon_sigma_deg": Number(low=0.0, high=9.99, description="of an error that all azimuths share"),
-                "stretch_sigma_1": Number(low=0.0, high=0.2, description="of the factor of tan of the horizon, less 1; "
-                                          "if absent 0, and with probability 0.5 % 0.005"),
-                "vertical_sigma_deg": Number(low=0.0, high=5.0,
-                                             description="of a tilt of the whole map, of each of two axes; if absent "
-                                             "0.0005, and with probability 0.5 % 0.02"),
+                "height_sigma_m": replace(AMOUNT, description="of single posts, independent of each other; if absent "
+                                          "0, with a warning"),
+                **{fact.key: fact.limits for fact in (BIAS, STRETCH, VERTICAL)},
                 "scale": Number(low=-1e6, high=1e6, description="metres per unit, where the files do not state it"),
                 "offset_m": Number(low=-MAX_LENGTH_M, high=MAX_LENGTH_M,
                                    description="height of value 0, where the files do not state it"),
@@ -60,8 +54,8 @@ KEYS = Table(
         "rover": Table(
             default={},
             keys={
-                "camera_height_m": replace(CAMERA_HEIGHT, default=1.5),
-                "camera_height_sigma_m": CAMERA_SIGMA,
+                "camera_height_m": replace(AMOUNT, default=1.5),
+                CAMERA_ERROR.key: CAMERA_ERROR.limits,
             }
         ),
         "search": Table(

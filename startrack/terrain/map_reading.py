@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from startrack.core.files import MAX_CAUSE_CHARS
 from startrack.core.types import MAX_PIXELS, BadInput
 from startrack.frames import MOON_RADIUS_M
-from startrack.terrain.cylinder import MAX_LENGTH_M
 from startrack.terrain.map_writing import METRE, PROJECTION_CODES
 from startrack.terrain.raster import EQUIRECTANGULAR, ORTHOGRAPHIC, STEREOGRAPHIC, Projection, Raster, projection_of
+from startrack.terrain.shape import MAX_LENGTH_M
 
 WINDOW_HALF_M = 300_000.0  # about the origin; farther away even 10 km mountains are below the horizontal
 METRES = {"m", "meter", "meters", "metre", "metres"}

@@ -268,17 +268,13 @@ def require_bounds(terrain: Terrain, low_rad: Array, high_rad: Array) -> None:
     `low_rad` and `high_rad` (...): the least and greatest horizons. The search asks for those of the whole search area
     first, so that an error in a user's terrain is named before it misleads the search.
     """
-    wrong = ~(low_rad <= high_rad + BOUNDS_ROUNDING_RAD)
+    wrong, fault = ~(low_rad <= high_rad + BOUNDS_ROUNDING_RAD), "least horizons above the greatest"
     if not wrong.any():
         return
     nan = np.isnan(low_rad) | np.isnan(high_rad)
-    fault = "NaN" if nan.any() else "least horizons above the greatest"
-    count = np.count_nonzero(nan if nan.any() else wrong)
-    raise BadInput(
-        "bad_terrain",
-        f"terrain {terrain.name!r} ({type(terrain).__name__}): horizon_bounds_rad gives {fault} for {count} of "
-        f"{wrong.size} sectors of boxes",
-    )
+    if nan.any():
+        wrong, fault = nan, "NaN"
+    _refuse(terrain, "horizon_bounds_rad", fault, wrong, "sectors of boxes")
 
 
 def require_horizons(terrain: Terrain, points_m: Array, horizon_rad: Array) -> None:
@@ -286,12 +282,16 @@ def require_horizons(terrain: Terrain, points_m: Array, horizon_rad: Array) -> N
 
     `points_m` (..., 2) are the positions, `horizon_rad` (...) what `horizon_rad` gave there.
     """
-    if np.isfinite(horizon_rad).all():
-        return
-    wrong = ~np.isfinite(horizon_rad) & np.asarray(terrain.allowed(points_m))
+    if not np.isfinite(horizon_rad).all():
+        wrong = ~np.isfinite(horizon_rad) & np.asarray(terrain.allowed(points_m))
+        _refuse(terrain, "horizon_rad", "NaN or infinity", wrong, "rays from ground on which a camera can stand")
+
+
+def _refuse(terrain: Terrain, method: str, fault: str, wrong: Bools, what: str) -> None:
+    """Raise BadInput (bad_terrain) if any value of a method is wrong."""
     if wrong.any():
         raise BadInput(
             "bad_terrain",
-            f"terrain {terrain.name!r} ({type(terrain).__name__}): horizon_rad gives NaN or infinity for "
-            f"{np.count_nonzero(wrong)} of {wrong.size} rays from ground on which a camera can stand",
+            f"terrain {terrain.name!r} ({type(terrain).__name__}): {method} gives {fault} for "
+            f"{np.count_nonzero(wrong)} of {wrong.size} {what}",
         )

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from startrack.core.declaration import Number
 from startrack.core.types import Array
 
 EXACT = 0.0  # sigma of a ground without the error
+MAX_LENGTH_M = 1e7  # five times the Moon's radius
+LENGTH = Number(low=0.0, high=MAX_LENGTH_M, above=True)
+AMOUNT = replace(LENGTH, above=False)  # a length or a sigma [m] that may be zero
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +50,8 @@ class Fact(Prior):
 
     key: str
     errors: tuple[str, ...]  # names of the errors
+    meaning: str  # for those who are asked for it
+    limits: Number  # of the value in the file
 
     def shape_errors(self, stated: float | None) -> list[ShapeError]:
         """Those of the errors that count; `stated` is the sigma in the unit of the errors, None where it is not."""
@@ -60,27 +66,49 @@ class Fact(Prior):
         ]  # fmt: skip
 
 
-DEPTH = Fact(key="depth_sigma_m", errors=("depth_1",), sigma=1e-3, gross_probability=0.01, gross_sigma=0.01)
-DIAMETER = Fact(
-    key="diameter_sigma_m", errors=("diameter_1",), sigma=1e-3, gross_probability=0.01, gross_sigma=0.01, scales=True
+DEPTH = Fact(
+    key="depth_sigma_m", errors=("depth_1",), sigma=1e-3, gross_probability=0.01, gross_sigma=0.01,
+    meaning="error of the depth [m]",
+    limits=replace(AMOUNT, description="if absent 0.1 % of it, and with probability 1 % 1 %"),
+)  # fmt: skip
+DIAMETER = replace(
+    DEPTH, key="diameter_sigma_m", errors=("diameter_1",), scales=True, meaning="error of the width [m]"
 )  # fmt: skip
 ELLIPSE = Fact(
     key="ellipse_sigma_1", errors=("ellipse_cos_1", "ellipse_sin_1"), sigma=5e-4, gross_probability=0.01,
-    gross_sigma=5e-3,
+    gross_sigma=5e-3, meaning="each of the two terms of an elliptic rim, relative to its radius",
+    limits=Number(low=0.0, high=0.1, description="relative, of each of the rim's two terms; if absent 0.0005, and with "
+                  "probability 1 % 0.005"),
 )  # fmt: skip
 RIM_TILT = Fact(
     key="rim_tilt_sigma_deg", errors=("rim_tilt_east_rad", "rim_tilt_north_rad"), sigma=float(np.radians(0.002)),
     gross_probability=0.005, gross_sigma=float(np.radians(0.1)),
+    meaning="tilt of the rim about each of two axes [deg]",
+    limits=Number(low=0.0, high=5.0, description="of each of two axes; if absent 0.002, and with probability "
+                  "0.5 % 0.1"),
 )  # fmt: skip
-BIAS = Fact(key="horizon_sigma_deg", errors=("bias_rad",), sigma=0.0, gross_sigma=float(np.radians(1.0)))
+BIAS = Fact(
+    key="horizon_sigma_deg", errors=("bias_rad",), sigma=0.0, gross_sigma=float(np.radians(1.0)),
+    meaning="error of the horizon that all azimuths share [deg]",
+    limits=Number(low=0.0, high=9.99, description="of an error that all azimuths share"),
+)  # fmt: skip
 STRETCH = Fact(
-    key="stretch_sigma_1", errors=("stretch_1",), sigma=0.0, gross_probability=0.005, gross_sigma=5e-3
+    key="stretch_sigma_1", errors=("stretch_1",), sigma=0.0, gross_probability=0.005, gross_sigma=5e-3,
+    meaning="error of the scale of heights, relative",
+    limits=Number(low=0.0, high=0.2, description="of the factor of tan of the horizon, less 1; if absent 0, and with "
+                  "probability 0.5 % 0.005"),
 )  # fmt: skip
 VERTICAL = Fact(
     key="vertical_sigma_deg", errors=("vertical_east_rad", "vertical_north_rad"), sigma=float(np.radians(0.0005)),
     gross_probability=0.005, gross_sigma=float(np.radians(0.02)),
+    meaning="tilt of the whole map about each of two axes [deg]",
+    limits=Number(low=0.0, high=5.0, description="of a tilt of the whole map, of each of two axes; if absent 0.0005, "
+                  "and with probability 0.5 % 0.02"),
 )  # fmt: skip
-CAMERA_ERROR = Fact(key="camera_height_sigma_m", errors=("camera_height_m",), sigma=0.02)
+CAMERA_ERROR = Fact(
+    key="camera_height_sigma_m", errors=("camera_height_m",), sigma=0.02, meaning="error of the camera's height [m]",
+    limits=replace(AMOUNT, description="if absent 0.02 above a height map, and 0 in a cylinder"),
+)  # fmt: skip
 CYLINDER_FACTS = (DEPTH, DIAMETER, ELLIPSE, RIM_TILT)
 MAP_FACTS = (BIAS, STRETCH, VERTICAL, CAMERA_ERROR)
 

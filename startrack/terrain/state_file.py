@@ -14,20 +14,9 @@ from startrack.terrain.io import read_keys
 from startrack.terrain.shape import BIAS, CAMERA_ERROR, CYLINDER_FACTS, DEPTH, DIAMETER, STRETCH, VERTICAL, Fact
 
 HEIGHT_KEY = "height_sigma_m"
-MEANINGS = {
-    DEPTH.key: "error of the depth [m]",
-    DIAMETER.key: "error of the width [m]",
-    "ellipse_sigma_1": "each of the two terms of an elliptic rim, relative to its radius",
-    "rim_tilt_sigma_deg": "tilt of the rim about each of two axes [deg]",
-    HEIGHT_KEY: "error of single heights of the map [m]",
-    BIAS.key: "error of the horizon that all azimuths share [deg]",
-    STRETCH.key: "error of the scale of heights, relative",
-    VERTICAL.key: "tilt of the whole map about each of two axes [deg]",
-    CAMERA_ERROR.key: "error of the camera's height [m]",
-}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class StateableError:
     """A key of a terrain file that states an error."""
 
@@ -46,21 +35,24 @@ def stateable_errors(text: str) -> list[StateableError]:
         sizes_m = {DEPTH.key: cylinder["depth_m"], DIAMETER.key: cylinder["diameter_m"]}
         inexact = not cylinder.get("exact", False)
         rows = [
-            ("cylinder", fact.key, _default_text(fact, sizes_m.get(fact.key)), inexact and fact.key not in cylinder)
+            ("cylinder", fact, _default_text(fact, sizes_m.get(fact.key)), inexact and fact.key not in cylinder)
             for fact in CYLINDER_FACTS
         ]
-        rows.append(("rover", CAMERA_ERROR.key, "0", False))
+        rows.append(("rover", CAMERA_ERROR, "0", False))
     else:
         rows = [
-            ("dem", HEIGHT_KEY, "0, with a warning", HEIGHT_KEY not in dem),
-            ("dem", BIAS.key, f"three times what {HEIGHT_KEY} makes of the horizon", BIAS.key not in dem),
-            *(("dem", fact.key, _default_text(fact), fact.key not in dem) for fact in (STRETCH, VERTICAL)),
-            ("rover", CAMERA_ERROR.key, _default_text(CAMERA_ERROR), CAMERA_ERROR.key not in rover),
+            ("dem", BIAS, f"three times what {HEIGHT_KEY} makes of the horizon", BIAS.key not in dem),
+            *(("dem", fact, _default_text(fact), fact.key not in dem) for fact in (STRETCH, VERTICAL)),
+            ("rover", CAMERA_ERROR, _default_text(CAMERA_ERROR), CAMERA_ERROR.key not in rover),
         ]
-    return [
-        StateableError(table=table, key=key, meaning=MEANINGS[key], default=default, is_missing=missing)
-        for table, key, default, missing in rows
+    found = [
+        StateableError(table=table, key=fact.key, meaning=fact.meaning, default=default, is_missing=missing)
+        for table, fact, default, missing in rows
     ]
+    if cylinder is not None:
+        return found
+    meaning, default = "error of single heights of the map [m]", "0, with a warning"
+    return [StateableError("dem", HEIGHT_KEY, meaning, default, is_missing=HEIGHT_KEY not in dem), *found]
 
 
 def _default_text(fact: Fact, size_m: float | None = None) -> str:

@@ -50,45 +50,35 @@ STAGE_KEYS: Schema = {
     "timing_ms": object_schema(dict.fromkeys(STAGES, POSITIVE)),
     "provenance": SECTIONS["provenance"],
 }
-
-WARNINGS: Schema = {"type": "array", "items": TEXT, "description": "what was found in the image's file and not used"}
-
-EXPLAIN: Schema = {
-    "type": "array", "items": TEXT, "description": "with --explain: what a refused or wide answer would need"
-}  # fmt: skip
 ADVICE_TEXT: Schema = {"type": "string", "description": "what to do next, by the reason; absent where the status is ok"}
 
 
-def _result(kind: str, title: str, own: Schema, rules: list[Schema]) -> Schema:
-    keys = {"format": {"const": FORMATS[kind]}, **COMMON}
-    return file_schema(
-        title,
-        object_schema(keys, optional={"advice": ADVICE_TEXT, **own, **STAGE_KEYS, "warnings": WARNINGS})
-        | {"allOf": [*_STATUS_RULES, *rules]},
-    )
+def _list_of(items: Schema, description: str = "") -> Schema:
+    return {"type": "array", "items": items} | ({"description": description} if description else {})
 
 
 def _if_status(status: str, then: Schema) -> Schema:
     return {"if": {"properties": {"status": {"const": status}}}, "then": then}
 
 
-_STATUS_RULES = [
-    _if_status("ok", {"properties": {"reason": {"const": None}}, "required": [*STAGE_KEYS]}),
-    _if_status("ambiguous", {"properties": {"reason": {"const": "ambiguous"}}, "required": [*STAGE_KEYS]}),
-    _if_status("refused", {"properties": {"reason": {"enum": REFUSALS}}}),
-]
-_FIX_RULES = [
-    _if_status("ok", {"required": ["position", "attitude"]}),
-    _if_status("ambiguous", {"required": ["modes", "attitude"], "properties": {"position": False}}),
-    _if_status("refused", {"properties": {"position": False}}),
-]
+def _result(kind: str, title: str, own: Schema, rules: list[Schema]) -> Schema:
+    keys = {"format": {"const": FORMATS[kind]}, **COMMON}
+    warnings = _list_of(TEXT, "what was found in the image's file and not used")
+    found = object_schema(keys, optional={"advice": ADVICE_TEXT, **own, **STAGE_KEYS, "warnings": warnings})
+    by_status = [
+        _if_status("ok", {"properties": {"reason": {"const": None}}, "required": [*STAGE_KEYS]}),
+        _if_status("ambiguous", {"properties": {"reason": {"const": "ambiguous"}}, "required": [*STAGE_KEYS]}),
+        _if_status("refused", {"properties": {"reason": {"enum": REFUSALS}}}),
+    ]
+    return file_schema(title, found | {"allOf": [*by_status, *rules]})
+
+
 MATCH = object_schema({
     "hip": or_null({"type": "integer", "minimum": 1}, "Hipparcos number; null: the star has none"),
     "x_px": NUMBER,
     "y_px": NUMBER,
 })  # fmt: skip
 POINT_SOURCE = object_schema({"x_px": NUMBER, "y_px": NUMBER, "flux_e": NUMBER, "snr": NUMBER})
-LEFT_OUT_IMAGE = object_schema({"image": TEXT, "reason": {"enum": REFUSALS}, "message": TEXT})
 HORIZON = object_schema(
     {
         "format": {"const": "startrack.horizon/1"},
@@ -99,11 +89,8 @@ HORIZON = object_schema(
     optional={
         "advice": ADVICE_TEXT,
         "output": TEXT,
-        "images": {"type": "array", "items": TEXT},
-        "left_out": {
-            "type": "array",
-            "items": LEFT_OUT_IMAGE,
-        },
+        "images": _list_of(TEXT),
+        "left_out": _list_of(object_schema({"image": TEXT, "reason": {"enum": REFUSALS}, "message": TEXT})),
         "azimuths": object_schema(dict.fromkeys(("known", "stars", "sky_light", "both"), COUNT)),
         "median_sigma_deg": or_null(POSITIVE, "of the known azimuths"),
         "lowest_deg": or_null(NUMBER, "apparent elevation"),
@@ -123,9 +110,13 @@ SCHEMAS: dict[str, Schema] = {
             "position": SECTIONS["position"],
             "modes": {**BY_PATH["modes"].schema, "description": BY_PATH["modes"].description},
             **{name: SECTIONS[name] for name in ("search", "attitude", "evidence", "sky", "clock")},
-            "explain": EXPLAIN,
+            "explain": _list_of(TEXT, "with --explain: what a refused or wide answer would need"),
         },
-        _FIX_RULES,
+        [
+            _if_status("ok", {"required": ["position", "attitude"]}),
+            _if_status("ambiguous", {"required": ["modes", "attitude"], "properties": {"position": False}}),
+            _if_status("refused", {"properties": {"position": False}}),
+        ],
     ),
     "identification": _result(
         "identification",
@@ -133,14 +124,14 @@ SCHEMAS: dict[str, Schema] = {
         {
             "attitude": SECTIONS["attitude"],
             "camera": {"title": "Camera file", **camera_keys().schema()},
-            "matches": {"type": "array", "items": MATCH},
+            "matches": _list_of(MATCH),
         },
         [_if_status("ok", {"required": ["attitude", "camera", "matches"]})],
     ),
     "detection": _result(
         "detection",
         "Point sources of one image",
-        {"detections": {"type": "array", "items": POINT_SOURCE}},
+        {"detections": _list_of(POINT_SOURCE)},
         [_if_status("ok", {"required": ["detections"]})],
     ),
     "horizon": file_schema("Summary of a measured skyline", HORIZON | {"allOf": _HORIZON_RULES}),

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 STAR_STATUSES = ("seen", "hidden", "uncertain", "unusable")
 FAINTER_THAN_FAINTEST_MATCH_MAG = 0.5
+QUOTE = '"'
 LEAST_HALF_RAD, MOST_HALF_RAD = np.radians(0.02), np.radians(5.0)
 
 
@@ -41,11 +42,16 @@ class Column:
 
 def ecsv_text(columns: Sequence[Column]) -> str:
     """The table as ECSV. All columns have the same length; texts must be free of line breaks."""
-    head = ["# %ECSV 1.0", "# ---", "# delimiter: ','", "# datatype:"]
-    head += [_yaml_line(column) for column in columns]
+    head, fields = ["# %ECSV 1.0", "# ---", "# delimiter: ','", "# datatype:"], []
+    for one in columns:
+        unit, description = f"unit: {one.unit}, " if one.unit else "", one.description.replace("'", "''")
+        head.append(f"# - {{name: '{one.name}', {unit}datatype: {one.datatype}, description: '{description}'}}")
+        texts = format_values(one.form, one.values.tolist() if isinstance(one.values, np.ndarray) else one.values)
+        if one.datatype == "string":  # quoted where a text holds a comma or a quote
+            texts = [f'"{text.replace(QUOTE, 2 * QUOTE)}"' if "," in text or QUOTE in text else text for text in texts]
+        fields.append(texts)
     head += ["# schema: astropy-2.0", ",".join(column.name for column in columns)]
-    values = [_field_texts(column) for column in columns]
-    return "\n".join([*head, *map(",".join, zip(*values, strict=True))]) + "\n"
+    return "\n".join([*head, *map(",".join, zip(*fields, strict=True))]) + "\n"
 
 
 def quantity_columns(quantities: Iterable[Quantity], values: Mapping[str, Iterable[Any]]) -> list[Column]:
@@ -63,23 +69,6 @@ def format_values(form: str, values: Iterable[Any]) -> list[str]:
     return ["" if value is None or value != value else form % value for value in values]
 
 
-def quote_texts(texts: Iterable[str]) -> list[str]:
-    """Texts as CSV fields: quoted where they hold a comma or a quote."""
-    return ['"' + text.replace('"', '""') + '"' if "," in text or '"' in text else text for text in texts]
-
-
-def _field_texts(column: Column) -> list[str]:
-    values = column.values.tolist() if isinstance(column.values, np.ndarray) else column.values
-    texts = format_values(column.form, values)
-    return quote_texts(texts) if column.datatype == "string" else texts
-
-
-def _yaml_line(column: Column) -> str:
-    unit = f"unit: {column.unit}, " if column.unit else ""
-    description = column.description.replace("'", "''")
-    return f"# - {{name: '{column.name}', {unit}datatype: {column.datatype}, description: '{description}'}}"
-
-
 def star_table_text(value: Inputs) -> str:
     """The star table of `value`, the last of a result, as ECSV, brightest star first; stars must have been identified.
 
@@ -89,7 +78,13 @@ def star_table_text(value: Inputs) -> str:
     if not isinstance(value, Oriented):
         raise ValueError("no star table without identified stars")
     light = value.light if isinstance(value, Measured) else None
-    star, xy_px = stars_in_view(value) if light is None else (light.star, light.xy_px)
+    if light is None:  # stars in the frame down to the depth of the matches
+        faintest = float(value.stars.v_mag[value.identification.star].max(initial=-np.inf))
+        star = np.flatnonzero(value.stars.v_mag <= faintest + FAINTER_THAN_FAINTEST_MATCH_MAG)
+        xy_px, inside = value.camera.project(value.stars.rays_icrs[star] @ value.attitude.R_cam_icrs.T)
+        star, xy_px = star[inside], xy_px[inside]
+    else:
+        star, xy_px = light.star, light.xy_px
     stars, hips = value.stars, value.stars.hip[star]
     measured_px = np.full((len(star), 2), np.nan)
     _, row, match = np.intersect1d(star, value.identification.star, return_indices=True)
@@ -138,15 +133,6 @@ def names_of(hips: Ints) -> list[str]:
     """Names of Hipparcos stars, empty for those without one."""
     names = star_names()
     return [names.get(hip, "") for hip in hips.tolist()]
-
-
-def stars_in_view(value: Oriented) -> tuple[Ints, Array]:
-    """Stars in the frame down to the depth of the matches: indices (n,) and predicted pixels (n, 2)."""
-    stars, matched = value.stars, value.identification.star
-    faintest = float(stars.v_mag[matched].max(initial=-np.inf)) + FAINTER_THAN_FAINTEST_MATCH_MAG
-    candidates = np.flatnonzero(stars.v_mag <= faintest)
-    xy_px, inside = value.camera.project(stars.rays_icrs[candidates] @ value.attitude.R_cam_icrs.T)
-    return candidates[inside], xy_px[inside]
 
 
 def skyline_table_text(skyline: MeasuredSkyline) -> str:

@@ -80,9 +80,8 @@ def star_table_of(path: Path, most: int) -> tuple[dict[str, Any] | None, Measure
 def read_ecsv(path: Path) -> tuple[list[str], list[dict[str, str]]]:
     """The comment lines and the rows of an ECSV file; both empty where there is none."""
     lines = path.read_text(encoding="utf-8").split("\n") if path.is_file() else []
-    return [one for one in lines if one.startswith("#")], [
-        *csv.DictReader(one for one in lines if not one.startswith("#"))
-    ]
+    head = [line for line in lines if line.startswith("#")]
+    return head, list(csv.DictReader(lines[len(head) :]))
 
 
 def _text_or_number(text: str, decimals: int | None) -> Any:
@@ -175,23 +174,14 @@ def skyline_of(path: Path, horizon: Horizon | None, stars: dict[str, Any] | None
     if horizon is None:
         return found
     above = elevation - horizon(azimuth)
-    half = half_range_rad(above, sigma)
-    return {
-        **found,
-        "above": rounded(np.degrees(above), 4),
-        "half": round(float(np.degrees(half)), 3),
-        "near": _stars_near(stars, horizon, half),
-    }
-
-
-def _stars_near(stars: dict[str, Any] | None, horizon: Horizon, half_rad: float) -> list[list[float]]:
-    """Index and height above the `horizon` [deg] of each star within `half_rad` of it."""
+    half, near = half_range_rad(above, sigma), list[list[float]]()
     columns = stars["columns"] if stars is not None else {}
-    if "az" not in columns or "el" not in columns:
-        return []
-    above = np.radians(columns["el"]) - horizon(np.radians(columns["az"]))
-    near = np.flatnonzero(np.abs(above) < half_rad)
-    return [list(pair) for pair in zip(near.tolist(), rounded(np.degrees(above[near]), 3), strict=True)]
+    if "az" in columns and "el" in columns:
+        heights = np.radians(columns["el"]) - horizon(np.radians(columns["az"]))
+        which = np.flatnonzero(np.abs(heights) < half)
+        near = [[k, height] for k, height in zip(which.tolist(), rounded(np.degrees(heights[which]), 3), strict=True)]
+    shown = {"above": rounded(np.degrees(above), 4), "half": round(float(np.degrees(half)), 3), "near": near}
+    return found | shown
 
 
 def ground_map(
@@ -208,16 +198,12 @@ def ground_map(
     if terrain.rim_radius_m is not None:
         return {**shape, "rim_m": terrain.rim_radius_m}
     half_m = MAP_MARGIN * terrain.reach_m if half_m is None else half_m
-    return {**shape, "half_m": half_m, "centre_m": list(centre_m), "relief": _relief(terrain, centre_m, half_m)}
-
-
-def _relief(terrain: Terrain, centre_m: tuple[float, float], half_m: float) -> str:
-    """The ground's shape, lit from the north-west as maps are; see-through where a camera cannot stand."""
-    halves_m, shape = (half_m, half_m), (RELIEF_CELLS, RELIEF_CELLS)
-    ground_m, known = ground_cells(terrain, halves_m, shape, centre_m)
-    grey = np.rint(BRIGHTEST * hill_shading(ground_m, known, halves_m)).astype(np.uint8)
-    cover = np.rint(255 * edge_cover(known, shape)).astype(np.uint8)
-    return data_uri(np.stack([grey, grey, grey, cover], axis=-1))
+    cells = RELIEF_CELLS, RELIEF_CELLS
+    ground_m, known = ground_cells(terrain, (half_m, half_m), cells, centre_m)
+    grey = np.rint(BRIGHTEST * hill_shading(ground_m, known, (half_m, half_m)))
+    cover = np.rint(255 * edge_cover(known, cells))  # see-through where a camera cannot stand
+    relief = data_uri(np.stack([grey, grey, grey, cover], axis=-1).astype(np.uint8))
+    return {**shape, "half_m": half_m, "centre_m": list(centre_m), "relief": relief}
 
 
 def picture_of(picture: Path, longest_px: int) -> dict[str, Any] | None:
@@ -228,20 +214,21 @@ def picture_of(picture: Path, longest_px: int) -> dict[str, Any] | None:
     """
     data = picture.read_bytes() if picture.is_file() else b""
     layers = layers_of(data)
+    sky: Any = None
     if layers is not None:
-        shown = _shown(layers.bare[:, :, ::-1], longest_px)
-        return {**shown, "scale": round(shown["width"] / layers.overlay["size"][0], 6), "marks": layers.overlay}
-    whole = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
-    return None if whole is None else _shown(np.asarray(whole, dtype=np.uint8), longest_px)
-
-
-def _shown(sky: NDArray[np.uint8], longest_px: int) -> dict[str, Any]:
-    """The picture (H, W, 3), blue first, for the page."""
-    shrink = min(1.0, longest_px / max(sky.shape[:2]))
+        sky = layers.bare[:, :, ::-1]
+    elif data:
+        sky = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if sky is None:
+        return None
+    shrink = longest_px / max(sky.shape[:2])
     if shrink < 1:
         size = tuple(max(1, round(n * shrink)) for n in sky.shape[1::-1])
-        sky = np.asarray(cv2.resize(sky, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    return {"src": data_uri(sky), "width": sky.shape[1], "height": sky.shape[0]}
+        sky = cv2.resize(sky, size, interpolation=cv2.INTER_AREA)
+    shown = {"src": data_uri(np.asarray(sky, dtype=np.uint8)), "width": sky.shape[1], "height": sky.shape[0]}
+    if layers is None:
+        return shown
+    return {**shown, "scale": round(shown["width"] / layers.overlay["size"][0], 6), "marks": layers.overlay}
 
 
 def data_uri(pixels: NDArray[np.uint8]) -> str:

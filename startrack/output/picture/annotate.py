@@ -60,8 +60,11 @@ def annotate(outcome: Outcome, truth_enu_m: EastNorth = None) -> NDArray[np.uint
 def annotated_png(outcome: Outcome, truth_enu_m: EastNorth = None) -> bytes:
     """The picture of `annotate` as a PNG file with the layers of `layers_of`."""
     value = last_value(outcome)
-    layers = Layers(bare_picture(value), overlay_of(value))
-    return add_layers(png_bytes(_annotated(outcome, truth_enu_m, layers.bare, layers.overlay)), layers)
+    bare, overlay = bare_picture(value), overlay_of(value)
+    png = png_bytes(_annotated(outcome, truth_enu_m, bare, overlay))
+    jpeg = encoded_bytes(".jpg", bare[:, :, ::-1], cv2.IMWRITE_JPEG_QUALITY, QUALITY)
+    text = json.dumps(overlay, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    return insert_png_chunks(png, [(BARE_CHUNK, jpeg), (MARKS_CHUNK, zlib.compress(text.encode("utf-8")))])
 
 
 @dataclass(frozen=True)
@@ -70,13 +73,6 @@ class Layers:
 
     bare: NDArray[np.uint8]
     overlay: dict[str, Any]
-
-
-def add_layers(png: bytes, layers: Layers) -> bytes:
-    """The PNG file with the layers before its picture data."""
-    jpeg = encoded_bytes(".jpg", layers.bare[:, :, ::-1], cv2.IMWRITE_JPEG_QUALITY, QUALITY)
-    text = json.dumps(layers.overlay, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    return insert_png_chunks(png, [(BARE_CHUNK, jpeg), (MARKS_CHUNK, zlib.compress(text.encode("utf-8")))])
 
 
 def layers_of(png: bytes) -> Layers | None:

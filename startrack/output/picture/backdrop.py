@@ -108,7 +108,8 @@ def _background_and_light(value: Inputs, size: tuple[int, int], inside: Bools) -
     """
     scale = size[0] / value.exposure.size_px[0]
     width_px = scale * (value.detections.psf_sigma_px if isinstance(value, Detected) else 1.0)
-    pixels = _resize(remove_hot_pixels(value.exposure.pixels_adu, width_px / scale), size)
+    method = cv2.INTER_AREA if scale <= 1 else cv2.INTER_LINEAR
+    pixels = cv2.resize(remove_hot_pixels(value.exposure.pixels_adu, width_px / scale), size, interpolation=method)
     image = np.asarray(cv2.GaussianBlur(pixels, (0, 0), float(np.clip(width_px, *SMOOTHING_PX))), dtype=np.float32)
     sample, known = image[::SAMPLE, ::SAMPLE], inside[::SAMPLE, ::SAMPLE]
     low, high = (float(level) for level in np.percentile(sample[known] if known.any() else sample, [0.5, 99.0]))
@@ -148,8 +149,3 @@ def _distance_to_edge_px(camera: Camera, size: tuple[int, int]) -> Image:
     )
     radius = np.sqrt(x[None, :] ** 2 + y[:, None] ** 2)
     return np.asarray((np.float32(edge) - radius) * np.float32(min(camera.focal_px) * scale))
-
-
-def _resize(image: Image, size: tuple[int, int]) -> Image:
-    smaller = size[0] <= image.shape[1]
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR))

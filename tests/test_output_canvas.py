@@ -200,8 +200,8 @@ def test_contours_stand_at_their_heights_with_their_names():
     lines = np.flatnonzero((row > sum(Ink.PAPER) + 60) & (row >= np.roll(row, 1)) & (row > np.roll(row, -1)))
     np.testing.assert_allclose(lines[lines > 10], 300 + np.arange(-250, 300, 50), atol=1.0)  # a pixel is 1 m of height
     assert {text for _, text, *_ in canvas._texts} == {str(height) for height in range(-250, 300, 50)}
-    for (x, _), text, size, *_ in canvas._texts:  # each name stands on its own contour
-        assert x + text_width(text, size) / 2 == pytest.approx(300 + float(text), abs=1.5)
+    for (x, _), text, *_ in canvas._texts:  # each name stands on its own contour
+        assert x == pytest.approx(300 + float(text), abs=1.5)
     assert view.draw_heights(Ramp(0.0)) == ""
 
 

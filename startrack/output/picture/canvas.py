@@ -61,7 +61,7 @@ class Canvas:
     def __init__(self, width: int, height: int, colour: Colour = Ink.PAPER) -> None:
         self.pixels: NDArray[np.uint8] = np.full((height, width, 3), colour, dtype=np.uint8)
         self._origin = np.zeros(2)
-        self._texts: list[tuple[tuple[float, float], str, float, Colour, bool]] = []  # place, text, size, colour, halo
+        self._texts: list[tuple[tuple[float, float], str, str, float, Colour, bool]] = []  # arguments of `text`
         self._occupied: list[Box] = []
 
     def window(self, box: Box) -> Canvas:
@@ -153,13 +153,9 @@ class Canvas:
         `anchor` is the place of `xy` in the text: l, m or r, and t (top), m or s. `halo` adds a dark edge to
         letters of any `colour`.
         """
-        text = printable(text)
         x, y = (float(c) for c in np.asarray(xy, dtype=float))
-        width, (rise, fall) = text_width(text, size), letter_height(size)
-        x -= {"l": 0.0, "m": width / 2, "r": width}[anchor[0]]
-        y += {"t": rise, "m": (rise - fall) / 2 + 0.06 * size, "s": 0.0}[anchor[1]]
-        self._texts.append(((x, y), text, size, colour, halo))
-        self._occupied.append((x, y - rise, x + width, y + fall))
+        self._texts.append(((x, y), printable(text), anchor, size, colour, halo))
+        self._occupied.append(text_box((x, y), text, anchor, size))
         return self._occupied[-1]
 
     def paragraph(
@@ -187,18 +183,16 @@ class Canvas:
         It stands at the first of eight sides that is free; False where there is none.
         """
         x, y = (float(c) for c in np.asarray(at, dtype=float))
-        width, (rise, fall) = text_width(printable(text), size), letter_height(size)
-        near, middle = 0.75 * gap, y + (rise - fall) / 2
-        sides = [
-            (x + gap, middle), (x - gap - width, middle), (x + near, y - near), (x + near, y + near + rise),
-            (x - near - width, y - near), (x - near - width, y + near + rise), (x - width / 2, y - gap - fall),
-            (x - width / 2, y + gap + rise),
-        ]  # fmt: skip
-        for left, base in sides:
-            box = left - 2, base - rise, left + width + 2, base + fall
+        near = 0.75 * gap
+        for dx, dy, anchor in (
+            (gap, 0.0, "lm"), (-gap, 0.0, "rm"), (near, -near, "ls"), (near, near, "lt"), (-near, -near, "rs"),
+            (-near, near, "rt"), (0.0, -gap, "ms"), (0.0, gap, "mt"),
+        ):  # fmt: skip
+            left, top, right, bottom = text_box((x + dx, y + dy), text, anchor, size)
+            box = left - 2, top, right + 2, bottom
             inside = box[0] >= within[0] and box[1] >= within[1] and box[2] <= within[2] and box[3] <= within[3]
             if inside and self.is_free(box):
-                self.text((left, base), text, colour, size=size, halo=True)
+                self.text((x + dx, y + dy), text, colour, anchor, size, halo=True)
                 return True
         return False
 
@@ -221,9 +215,9 @@ class Canvas:
 
         picture = Image.fromarray(self.pixels)
         draw = ImageDraw.Draw(picture)
-        for xy, text, size, colour, halo in self._texts:
+        for xy, text, anchor, size, colour, halo in self._texts:
             stroke = max(1, round(size / 10)) if halo else 0
-            draw.text(xy, text, colour, _font(size), "ls", stroke_width=stroke, stroke_fill=Ink.SHADOW)
+            draw.text(xy, text, colour, _font(size), anchor, stroke_width=stroke, stroke_fill=Ink.SHADOW)
         return np.asarray(picture)
 
 
@@ -248,10 +242,10 @@ def text_width(text: str, size: float) -> float:
     return float(_font(size).getlength(text))
 
 
-def letter_height(size: float) -> tuple[float, float]:
-    """How far letters reach above and below the line of writing [px]."""
-    _, top, _, bottom = _font(size).getbbox("bp", anchor="ls")
-    return -top, bottom
+def text_box(xy: tuple[float, float], text: str, anchor: str, size: float) -> Box:
+    """The box of a text of `size` [px] whose `anchor` is at `xy`."""
+    left, top, right, bottom = _font(size).getbbox(printable(text), anchor=anchor)
+    return xy[0] + left, xy[1] + top, xy[0] + right, xy[1] + bottom
 
 
 def wrap_text(text: str, size: float, width: float) -> list[str]:

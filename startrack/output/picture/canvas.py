@@ -189,7 +189,7 @@ class Canvas:
             (-near, near, "rt"), (0.0, -gap, "ms"), (0.0, gap, "mt"),
         ):  # fmt: skip
             left, top, right, bottom = text_box((x + dx, y + dy), text, anchor, size)
-            box = left - 2, top, right + 2, bottom
+            box = left - 2, top - 2, right + 2, bottom + 2
             inside = box[0] >= within[0] and box[1] >= within[1] and box[2] <= within[2] and box[3] <= within[3]
             if inside and self.is_free(box):
                 self.text((x + dx, y + dy), text, colour, anchor, size, halo=True)

@@ -50,34 +50,26 @@ def choose_cache_folder() -> None:
     os.environ[VARIABLE] = str(folder)
 
 
-class _Turn:
-    """Whether this process may still announce; the first of the processes that share a semaphore does."""
+class Turn:
+    """Whether this process may still announce a compilation, and of the processes that share a semaphore the first."""
 
     def __init__(self) -> None:
         self.is_taken = False
-        self.shared: Semaphore | None = None
+        self.shared: Semaphore | None = None  # of a pool, in its processes
 
     def take(self) -> bool:
+        """True at the first call in all of the processes."""
         if self.is_taken:
             return False
         self.is_taken = True
         return self.shared is None or bool(self.shared.acquire(block=False))
 
-
-_TURN = _Turn()
-
-
-def turn_for_pool(context: BaseContext) -> Semaphore:
-    """A semaphore for `share_turn` in the processes that a multiprocessing `context` starts.
-
-    None of them announces where this process has done so.
-    """
-    return context.Semaphore(int(not _TURN.is_taken))
+    def semaphore(self, context: BaseContext) -> Semaphore:
+        """For `shared` of the processes that a multiprocessing `context` starts; none announces where this one has."""
+        return context.Semaphore(int(not self.is_taken))
 
 
-def share_turn(semaphore: Semaphore) -> None:
-    """From now on, announce in this process only if no other process that shares the `semaphore` has done so."""
-    _TURN.shared = semaphore
+TURN = Turn()
 
 
 @cache
@@ -90,7 +82,7 @@ def announce_compilation() -> None:
 
     class Announcement(event.Listener):  # type: ignore[misc]
         def on_start(self, event: Any) -> None:
-            if event.data["dispatcher"].py_func.__module__.startswith("startrack.") and _TURN.take():
+            if event.data["dispatcher"].py_func.__module__.startswith("startrack.") and TURN.take():
                 LOG.warning(
                     "compiling what this command uses first: about 20 s, for height maps a minute; kept on disk"
                 )

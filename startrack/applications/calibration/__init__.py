@@ -3,7 +3,7 @@
 `run.py` tells the story; `lens_fit.py` and `joint_fit.py` of the estimation fit the lens. Boards: `board.py`.
 """
 
-from startrack.applications.calibration.board import Board, BoardCalibration, calibrate_board
+from startrack.applications.calibration.board import Board, calibrate_board
 from startrack.applications.calibration.initial_states import initial_state
 from startrack.applications.calibration.photometry import KnownSensor
 from startrack.applications.calibration.record import (
@@ -19,12 +19,11 @@ from startrack.applications.calibration.record import (
 from startrack.applications.calibration.report import write_report
 from startrack.applications.calibration.run import Calibration, calibrate
 from startrack.applications.calibration.verify import Verification, verify, verify_dict, verify_line
-from startrack.estimation.lens_fit import LensFit, fit_lens
-from startrack.estimation.normal_equations import Observations, observations
+from startrack.estimation.lens_fit import fit_lens
+from startrack.estimation.normal_equations import observations
 
 __all__ = [
-    "REFRACTION_REMOVED", "Board", "BoardCalibration", "Calibration", "KnownSensor", "LensFit", "Observations",
-    "Verification", "board_dict", "board_line", "calibrate", "calibrate_board", "calibration_dict",
-    "camera_properties", "camera_summary", "fit_lens", "initial_state", "observations", "refusal_dict", "summary",
-    "verify", "verify_dict", "verify_line", "write_report",
+    "REFRACTION_REMOVED", "Board", "Calibration", "KnownSensor", "Verification", "board_dict", "board_line",
+    "calibrate", "calibrate_board", "calibration_dict", "camera_properties", "camera_summary", "fit_lens",
+    "initial_state", "observations", "refusal_dict", "summary", "verify", "verify_dict", "verify_line", "write_report",
 ]  # fmt: skip

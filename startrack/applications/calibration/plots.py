@@ -74,14 +74,13 @@ def _draw_vectors(axes: Axes, calibration: Calibration) -> None:
 
 def _draw_by_angle(axes: Axes, calibration: Calibration) -> None:
     fit, camera, points = calibration.joint.fit, calibration.camera, calibration.joint.points
-    angle = camera.angle_rad(points.xy_px)
-    offset = points.xy_px - np.asarray(camera.centre_px)
+    px, residual = points.xy_px[fit.used], fit.held_out_px[fit.used]
+    offset = px - np.asarray(camera.centre_px)
     outwards = offset / np.maximum(np.linalg.norm(offset, axis=1), 1e-9)[:, None]
-    radial = np.sum(fit.held_out_px * outwards, axis=1)
-    across = fit.held_out_px[:, 1] * outwards[:, 0] - fit.held_out_px[:, 0] * outwards[:, 1]
-    used = fit.used
-    axes.plot(np.degrees(angle[used]), radial[used], ".", color=GOOD, markersize=3, label="radial", alpha=0.6)
-    axes.plot(np.degrees(angle[used]), across[used], ".", color=BAD, markersize=3, label="across", alpha=0.6)
+    radial = np.sum(residual * outwards, axis=1)
+    across = residual[:, 1] * outwards[:, 0] - residual[:, 0] * outwards[:, 1]
+    for shown, colour, name in ((radial, GOOD, "radial"), (across, BAD, "across")):
+        axes.plot(np.degrees(camera.angle_rad(px)), shown, ".", color=colour, markersize=3, label=name, alpha=0.6)
     grid = np.linspace(0.0, camera.calibrated_angle_rad, 60)
     sigma = projection_by_angle(camera, grid)[2]
     for sign in (-1, 1):

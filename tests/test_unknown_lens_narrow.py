@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 from test_unknown_lens import SIZE, detections, lens_camera, picture, sky
@@ -9,16 +11,18 @@ from test_unknown_lens import SIZE, detections, lens_camera, picture, sky
 from startrack.camera import KannalaBrandt, Pinhole
 from startrack.core.types import Detections
 from startrack.identification.hypotheses import HypothesisSearch
-from startrack.identification.narrow_field import NarrowField
+from startrack.identification.narrow_field import narrow_lenses
 from startrack.identification.similar_triangles import shape_index
 from startrack.identification.triangles import triangles
 from startrack.identification.unknown_lens import LOG_FALSE_ALARM, identify_unknown_lens
+from startrack.identification.verify_unknown_lens import VerifiedLens
 
 FIELD_SR = 0.05
 
 
-def search(seen: Detections, fov: float, size: tuple[int, int] = SIZE) -> NarrowField:
-    return NarrowField(seen, HypothesisSearch(seen.xy_px, size), np.radians(fov), FIELD_SR, sky())
+def search(seen: Detections, fov: float) -> tuple[HypothesisSearch, Iterator[VerifiedLens]]:
+    hypotheses = HypothesisSearch(seen.xy_px, SIZE)
+    return hypotheses, narrow_lenses(seen, hypotheses, np.radians(fov), FIELD_SR, sky())
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -27,9 +31,9 @@ def search(seen: Detections, fov: float, size: tuple[int, int] = SIZE) -> Narrow
 def test_the_first_view_voted_for_is_right(seed: int, wrong_by: float, mirrored: bool) -> None:
     camera = lens_camera(Pinhole(), 16, 700, mirrored=mirrored)
     seen, truth, R = picture(camera, seed=seed, limit=7.0, hidden=0.2)
-    narrow = search(seen, 16 * wrong_by)
-    found = next(narrow.lenses())
-    assert narrow.search.tried < 30_000
+    hypotheses, lenses = search(seen, 16 * wrong_by)
+    found = next(lenses)
+    assert hypotheses.tried < 30_000
     assert found.log_p < LOG_FALSE_ALARM
     assert found.camera.mirrored == mirrored
     assert found.camera.focal_px[0] == pytest.approx(camera.focal_px[0], rel=1e-3)
@@ -67,9 +71,9 @@ def test_noise_with_or_without_clumps_is_far_from_acceptance(seed: int) -> None:
         else rng.uniform(0, 1, (n, 2)) * SIZE
     )
     noise = detections(np.clip(xy, 0, np.array(SIZE) - 1), 100 * np.sort(rng.pareto(1.5, n) + 1)[::-1])
-    narrow = search(noise, 14)
-    assert all(found.log_p > -12 for found in narrow.lenses())
-    assert narrow.search.tried > 1000
+    hypotheses, lenses = search(noise, 14)
+    assert all(found.log_p > -12 for found in lenses)
+    assert hypotheses.tried > 1000
 
 
 def test_similar_triangles_equal_those_of_an_exhaustive_comparison() -> None:

@@ -19,7 +19,7 @@ STEEP_FRACTION = 0.03  # of the blocks
 MIN_NOISE_STEPS = 1.0  # noise in units of the smallest step below which the pixels hold too few values for quantiles
 LOW_QUANTILE, HIGH_QUANTILE = 0.05, 0.65  # quantiles of the pixels between which the noise is measured
 COARSE_PX = BLOCK_PX // 4  # the local level is a mean over squares of this side
-CLIPPED_SIGMA = 2.5
+CLIPPED_SIGMA = 2.5  # beyond, a value is no noise
 Image = NDArray[np.float32]
 # From -1/2 to 1/2 evenly, in an order without a pattern: 101 is a prime, so that each number comes once.
 ORDER = np.arange(BLOCK_PX**2) * 101 % BLOCK_PX**2

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.types import Array, Bools, Ints
+from startrack.detection.background import CLIPPED_SIGMA
 from startrack.detection.deblend import Fitted, source_signal
 from startrack.detection.fit import FIT_ROUNDS_AGAIN, PointFits, Stamps, fit_points
 from startrack.detection.frame import Frame, Pixels, SourceNoise
@@ -24,7 +25,6 @@ USUAL_SKEWNESS, LARGEST_SKEWNESS = 0.088, 0.3  # the first: 100 photons and 3 el
 FILTERED_SKEWNESS = 0.376  # 2 / (3 sqrt(pi)): fraction that remains after a matched filter of 1 px
 NOISE_TOO_SMALL = 0.17  # relative underestimate of the noise per unit of skewness
 OWN_LEVEL_FRACTION = 0.8  # of the threshold: required of every source with the level of its stamp alone
-UNEVEN_SIGMA = 2.5  # difference between the levels of stamp and surroundings above which the latter is not used
 EDGE_MARGIN = 8.0  # chi^2 by which an edge must fit better than a star: noise alone gives faint stars less
 BAD_FIT_CHI2_PER_DOF = 4.0
 ROUGH_PSF_MISFIT = 0.06  # typical misfit above which stars are compared with the frame's bright stars
@@ -120,7 +120,7 @@ def peak_heights(fits: PointFits) -> Array:
     height from the stamp alone. If the two levels disagree (a slope, the skyline), the stamp alone is used.
     """
     by_itself = fits.flux / np.sqrt(fits.covariance[:, 2, 2])
-    even = np.abs(fits.level - fits.surround) < UNEVEN_SIGMA * np.sqrt(fits.covariance[:, 3, 3])
+    even = np.abs(fits.level - fits.surround) < CLIPPED_SIGMA * np.sqrt(fits.covariance[:, 3, 3])
     return np.where(even, np.minimum(fits.significance, by_itself / OWN_LEVEL_FRACTION), by_itself)
 
 

@@ -11,7 +11,8 @@ from startrack.core.values import Rows, array
 from startrack.detection.frame import MODEL_ERROR, Pixels, SourceNoise
 from startrack.psf import pixel_profile
 
-FIT_ROUNDS, FIT_ROUNDS_AGAIN = 3, 2  # iterations of a first fit, and of a repeated one
+FIT_ROUNDS = 3  # iterations of a first fit
+FIT_ROUNDS_AGAIN = FIT_ROUNDS - 1
 BRIGHT_STAR_SNR = 15.0  # of stars that show what the frame's stars are like
 MIN_NOISE_STARS, MAX_NOISE_STARS = 20, 120
 FAINT_FRACTION = 0.3  # of the pixel's variance: pixels with less signal are left out

@@ -9,11 +9,11 @@ import numpy as np
 
 from startrack.core.types import Array, Bools, Ints
 from startrack.core.values import Rows, array
+from startrack.detection.background import CLIPPED_SIGMA
 from startrack.detection.fit import BRIGHT_STAR_SNR
 from startrack.detection.frame import Frame
 from startrack.detection.psf_width import MAX_BRIGHT_SOURCES
 
-PIXEL_SIGMAS = 2.5  # of the lightly smoothed image: pixels of a streak
 SMOOTH_PX = 1.0
 MIN_AREA_PX, MAX_AREA_PX = 12, 20_000
 MIN_STREAKS = 6  # streaks of similar direction and length
@@ -73,7 +73,7 @@ def find_streaks(frame: Frame) -> Streaks | None:
         whole = np.where(frame.dead, np.float32(50.0), whole)
     smooth = cv2.GaussianBlur(whole, (0, 0), SMOOTH_PX)
     quiet = 1.0 / np.sqrt(4.0 * np.pi * SMOOTH_PX**2)
-    mask = (smooth > PIXEL_SIGMAS * 2.0 * quiet).astype(np.uint8)
+    mask = (smooth > CLIPPED_SIGMA * 2.0 * quiet).astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
     area = stats[:, cv2.CC_STAT_AREA]
     left, top = stats[:, cv2.CC_STAT_LEFT], stats[:, cv2.CC_STAT_TOP]

@@ -41,7 +41,7 @@ NEEDED_SECTORS = SECTORS // 4  # with a step; fewer determine no shift of the sk
 MIN_STEP_SIGMAS = 8.0  # of the mean step
 SECTOR_STEP_SIGMAS = 3.0  # of the step of one sector
 MISFIT_SIGMAS = 6.0  # of a sector's misfit against the others'
-RAMP_PX = 4.0  # standard deviation of an edge that is no skyline: light that fades
+RAMP_PX = SHIFTS_PX[-1]  # standard deviation of an edge that is no skyline: light that fades
 SHARP_NATS = 10.0  # by which the sharp edge must explain the pixels better than such a ramp
 
 

@@ -15,7 +15,6 @@ from startrack.identification.lost_in_space import Identifier
 from startrack.identification.unknown_lens import identify_unknown_lens
 
 DEFAULT_SIGMA_PX = 0.3  # centroid error per axis where none is given
-DEFAULT_PSF_SIGMA_PX = 1.0
 STAR_COUNT_SLOPE = 1.08  # natural logarithm of the increase of the number of stars per magnitude
 
 
@@ -68,7 +67,7 @@ def identify_centroids(
     flux: ArrayLike | None = None,
     sigma_px: ArrayLike | None = None,
     saturated: ArrayLike | None = None,
-    psf_sigma_px: float = DEFAULT_PSF_SIGMA_PX,
+    psf_sigma_px: float = 1.0,
     stars: Stars | None = None,
     identifier: Identifier | None = None,
 ) -> IdentifiedCentroids:

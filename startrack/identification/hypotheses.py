@@ -20,7 +20,7 @@ MAX_HYPOTHESES = 6  # of one lens and window; the true one is nearly always the 
 # Detections tested, and the log p-value below which the test goes on; random skies reach -15 in a whole search.
 VERIFICATION_STAGES = ((24, -1.5), (48, -4.0), (80, -11.0))
 MAX_VOTED = 150  # triangles with the most votes whose attitudes are compared
-SAME_VIEW_RAD, SAME_FOCAL_1 = 0.02, 0.01  # differences of views that agree
+SAME_VIEW_RAD = 0.02  # difference of views that agree; half of it in the logarithm of the focal length
 MIN_AGREEING = 3
 VIEWS_OF_ROUND = 4
 
@@ -83,7 +83,7 @@ class HypothesisSearch:
         focal, mirrored, cam, R = _solve_triangles(patterns, guess, xy, image, catalogue)
         flat, log_focal = R.reshape(len(R), 9), np.log(focal)
         same = flat @ flat.T > 3.0 - SAME_VIEW_RAD**2  # the trace is 1 + 2 cos of the angle between
-        same &= (np.abs(log_focal[:, None] - log_focal) < SAME_FOCAL_1) & (mirrored[:, None] == mirrored)
+        same &= (np.abs(log_focal[:, None] - log_focal) < SAME_VIEW_RAD / 2) & (mirrored[:, None] == mirrored)
         found = []
         free = np.ones(len(R), dtype=bool)
         for _ in range(VIEWS_OF_ROUND):

@@ -34,11 +34,11 @@ from startrack.identification.attitude_search import (
 from startrack.identification.index import patterns_of, pixel_scale_of
 
 MAX_FALSE_ALARM = 1e-9  # probability that chance gives an accepted identification
-SMALLEST_RADIUS_PX = 0.5
 BRIGHT_DETECTIONS = 300  # brightest detections that decide whether the camera file is right
 INLIER_FRACTION = 0.7  # of the stars within GATE_PX that lie within INLIER_PX if the camera file is right
 MAX_REFINED = 40
 TOLERANCE_SIGMAS = 3.0
+SMALLEST_RADIUS_PX = INLIER_PX / TOLERANCE_SIGMAS
 LOCAL_FRACTION = 0.1  # of the field's diameter: radius of the caps in which the density of detections is measured
 
 

@@ -16,7 +16,7 @@ from startrack.identification.index import keep_last_few
 from startrack.identification.triangles import Triangles, number_runs, separate_bright_stars, triangles
 
 CELL_LENGTH = 16.0  # range of the logarithm of the size within a cell of the key
-SMALLEST_LOG = -12.0
+SMALLEST_LOG = -0.75 * CELL_LENGTH  # most of it for sizes below a radian
 HEMISPHERE_SR = 2 * np.pi
 STARS_OF_HEMISPHERE = 200  # pattern stars of the whole sky for a lens with half of it in view
 MAX_PATTERN_STARS = 25_000

@@ -25,7 +25,7 @@ from startrack.identification.lens_guesses import (
     image_circle,
 )
 from startrack.identification.lost_in_space import MAX_FALSE_ALARM
-from startrack.identification.narrow_field import NarrowField
+from startrack.identification.narrow_field import narrow_lenses
 from startrack.identification.region_growing import WIDE_STAGES, GrowthStage, grow, prior_of
 from startrack.identification.similar_triangles import (
     MAX_DETECTIONS,
@@ -160,7 +160,7 @@ class _Search:
     def lenses(self) -> Iterator[VerifiedLens]:
         """Verified lenses, whatever their p-value."""
         if self.narrow:
-            yield from NarrowField(self.centroids, self.hypotheses, self.fov_rad, self.rounded_sr, self.stars).lenses()
+            yield from narrow_lenses(self.centroids, self.hypotheses, self.fov_rad, self.rounded_sr, self.stars)
         if not self.wide:
             shapes = (PINHOLE,) if self.narrow else MIDDLE_SHAPES
             yield from self._grow_all(guess_lenses(self.size_px, self.fov_rad, shapes), MAX_TRIED)

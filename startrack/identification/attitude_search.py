@@ -94,7 +94,6 @@ class AttitudeSearch:
             sources, sources.rays_cam, sources.patterns, sources.scale,
         )  # fmt: skip
         self.tried = 0  # matching triangles so far
-        self.mirrored: list[tuple[Array, Array, int, float]] = []  # matches of the other handedness
 
     def hypotheses(self, tolerance_px: float, rough_px: float) -> Iterator[AttitudeHypothesis]:
         """Attitudes that are unlikely by chance.
@@ -118,12 +117,6 @@ class AttitudeSearch:
                     yield from self._attitudes_from_triangles(index, first, fresh, end, tolerance)
         yield from self._attitudes_from_pairs(tolerance)
         yield from self._attitudes_from_short_triangles(rough_px * self.scale.axis_rad_per_px)
-
-    def mirrored_hypotheses(self) -> Iterator[AttitudeHypothesis]:
-        """The same for the mirror image, from the stored triangles of the other handedness."""
-        flip = np.array([-1.0, 1.0, 1.0])
-        for cam, icrs, first, tolerance in self.mirrored:
-            yield from self._plausible_attitudes(cam * flip, icrs, self.rays_cam * flip, first, tolerance)
 
     def _attitudes_from_triangles(
         self, index: PatternIndex, first: int, fresh: int, end: int, tolerance: float
@@ -162,18 +155,10 @@ class AttitudeSearch:
     def _test_triangles(
         self, cam: Array, icrs: Array, handedness: Array, first: int, tolerance: float
     ) -> Iterator[AttitudeHypothesis]:
-        """Test the triangles cam (m, 3, 3) of the catalogue's handedness (m,); store the others in `mirrored`."""
+        """Attitudes that rotate rays icrs (m, 3, 3), of this handedness (m,), to cam (m, 3, 3), with more bright stars."""
         self.tried += len(cam)
         same = np.linalg.det(cam) * handedness > 0
-        if np.count_nonzero(same) < len(same):
-            self.mirrored.append((cam[~same], icrs[~same], first, tolerance))
-            cam, icrs = cam[same], icrs[same]
-        yield from self._plausible_attitudes(cam, icrs, self.rays_cam, first, tolerance)
-
-    def _plausible_attitudes(
-        self, cam: Array, icrs: Array, rays_cam: Array, first: int, tolerance: float
-    ) -> Iterator[AttitudeHypothesis]:
-        """Attitudes that rotate the rays icrs (m, 3, 3) to cam (m, 3, 3) and that bright stars support."""
+        cam, icrs, rays_cam = cam[same], icrs[same], self.rays_cam
         some, radius = rays_cam[: first + VERIFIED_DETECTIONS], 2.0 * tolerance
         depth = int(DEPTH_FACTOR * 4 * np.pi / self.patterns.field_sr * len(some))
         for R in self._supported_attitudes(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +23,6 @@ from startrack.identification.attitude_search import (
     INLIER_PX,
     MIN_MATCHES,
     ONE_SOURCE_SIGMAS,
-    AttitudeHypothesis,
     AttitudeMatch,
     AttitudeSearch,
     Sources,
@@ -70,14 +68,14 @@ class Identifier:
         search = AttitudeSearch(sources)
         tolerance_px, rough_px = self.tolerances_px
         tolerance_px = min(max(tolerance_px, TOLERANCE_SIGMAS * upper_median(sources.variance_px2) ** 0.5), rough_px)
-        found, refusal = self._find_accepted(search.hypotheses(tolerance_px, rough_px), sources, search)
+        found, refusal = self._find_accepted(search, tolerance_px, rough_px)
         if found is not None:
             if is_whole:
                 return found
             outside = int(np.count_nonzero(np.delete(centroids.snr, inside) > SIGNIFICANT_SNR))
             return replace(found, detection=inside[found.detection], unexplained=found.unexplained + outside)
-        lenient = replace(self, whole_field=False)
-        if lenient._find_accepted(search.mirrored_hypotheses(), sources.mirror_image(), search)[0] is not None:
+        mirror, lenient = AttitudeSearch(sources.mirror_image()), replace(self, whole_field=False)
+        if lenient._find_accepted(mirror, tolerance_px, rough_px)[0] is not None:
             raise NotIdentified(
                 "the image is a mirror image, compared with the camera file: flip the image, or set mirrored = "
                 f"{str(not camera.mirrored).lower()} in the camera file",
@@ -91,18 +89,18 @@ class Identifier:
         )
 
     def _find_accepted(
-        self, hypotheses: Iterable[AttitudeHypothesis], sources: Sources, search: AttitudeSearch
+        self, search: AttitudeSearch, tolerance_px: float, rough_px: float
     ) -> tuple[Identification | None, str]:
         """The first hypothesis that is accepted, or why the last one was not."""
         refusal = "no triangle of detections matches one of the catalogue"
-        for refined, hypothesis in enumerate(hypotheses):
+        for refined, hypothesis in enumerate(search.hypotheses(tolerance_px, rough_px)):
             if refined == MAX_REFINED:
                 break
-            match = refine_attitude(sources, hypothesis)
+            match = refine_attitude(search.sources, hypothesis)
             if match is None:
                 continue
             try:
-                return self._accept_match(match, sources, search.tried), ""
+                return self._accept_match(match, search.sources, search.tried), ""
             except _WrongCamera:
                 raise
             except NotIdentified as cause:

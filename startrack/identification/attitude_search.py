@@ -155,7 +155,7 @@ class AttitudeSearch:
     def _test_triangles(
         self, cam: Array, icrs: Array, handedness: Array, first: int, tolerance: float
     ) -> Iterator[AttitudeHypothesis]:
-        """Attitudes that rotate rays icrs (m, 3, 3), of this handedness (m,), to cam (m, 3, 3), with more bright stars."""
+        """Attitudes that rotate rays icrs (m, 3, 3), of this handedness (m,), to cam (m, 3, 3), by bright stars."""
         self.tried += len(cam)
         same = np.linalg.det(cam) * handedness > 0
         cam, icrs, rays_cam = cam[same], icrs[same], self.rays_cam

@@ -130,19 +130,16 @@ def find_double_exposure(light: StarPhotometry, terrain: Terrain, position_m: Ar
         return _Rows(azimuth[chosen], elevation[chosen], logs[:, 0], logs[:, -1], logs[:, 1:-1])
 
     near = np.abs(above_rad) < SCREENED_RAD[-1]
-    if _screened_gain(rows(near), np.abs(above_rad[near])) < SCREENED_NATS:
+    screened, distance_rad = rows(near), np.abs(above_rad[near])
+    # The best gain of a share of dimmed stars over none, of all bands about the skyline.
+    ratio = np.exp(screened.dimmed - screened.free[:, None]) - 1.0
+    each = np.log1p(SCREENED_SHARES[:, None, None] * ratio)
+    if max(float(each[:, distance_rad < reach].sum(axis=1).max()) for reach in SCREENED_RAD) < SCREENED_NATS:
         return None
     near = np.abs(above_rad) < PAIRED_RAD
     reach_m = TRACED_REACH * terrain.search_radius_m
     ground = terrain.near(position_m, reach_m, azimuth[near], TRACED_NODES).interpolated()
     return _best_pair(rows(near), ground, position_m)
-
-
-def _screened_gain(rows: _Rows, distance_rad: Array) -> float:
-    """The best gain [nats] of a share of dimmed stars over none, of all bands about the skyline; distances (n,)."""
-    ratio = np.exp(rows.dimmed - rows.free[:, None]) - 1.0
-    each = np.log1p(SCREENED_SHARES[:, None, None] * ratio)
-    return max(float(each[:, distance_rad < reach].sum(axis=1).max()) for reach in SCREENED_RAD)
 
 
 def _best_pair(rows: _Rows, terrain: Terrain, position_m: Array) -> DoubleExposure:

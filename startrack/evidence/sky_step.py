@@ -139,11 +139,12 @@ def subtract_sky_step(detections: Detections, camera: Camera, R_cam_enu: Array, 
     rest = (detections.image_e.ravel()[pixel] - background.ravel()[pixel]).astype(np.float64)
     spread = noise.ravel()[pixel].astype(np.float64)
     steps = int(2 * BAND_PX / PROFILE_STEP_PX)
-    cell = (azimuth / (2 * np.pi) * STEP_SECTORS).astype(np.int64) % STEP_SECTORS * steps + _step_of(above, steps)
+    across = np.clip(((above + BAND_PX) / PROFILE_STEP_PX).astype(np.int64), 0, steps - 1)
+    cell = (azimuth / (2 * np.pi) * STEP_SECTORS).astype(np.int64) % STEP_SECTORS * steps + across
     middle = _medians(rest, cell, STEP_SECTORS * steps).reshape(STEP_SECTORS, steps)
     profile = _interpolate_table(middle, azimuth, above)
     background.reshape(-1)[pixel] += profile.astype(np.float32)
-    across = _step_of(above, steps)  # all sectors together: the noise is known better than it varies
+    # All sectors together: the noise is known better than it varies.
     ratio = _medians(np.abs(rest - profile) / spread, across, steps) / MEDIAN_ABS_NORMAL
     ratio = np.where(ratio > 0, ratio, 1.0)
     noise.reshape(-1)[pixel] *= ratio[across].astype(np.float32)
@@ -241,10 +242,6 @@ def _grouped_median(light_e: NDArray[np.float32]) -> tuple[float, float]:
     at = int(np.searchsorted(below, 0.5 * len(light_e), side="right")) - 1
     median = float(values[at]) + quantum * ((0.5 * len(light_e) - below[at]) / counts[at] - 0.5)
     return median, float(robust_sigma(light_e, median) * MEDIAN_LOSS / np.sqrt(len(light_e)))
-
-
-def _step_of(above_px: Array, steps: int) -> Ints:
-    return np.clip(((above_px + BAND_PX) / PROFILE_STEP_PX).astype(np.int64), 0, steps - 1)
 
 
 def _medians(values: Array, cell: Ints, cells: int) -> Array:

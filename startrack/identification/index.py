@@ -137,7 +137,8 @@ class CatalogPatterns:
             plain = np.isin(near[0], crowded, invert=True)
             found = crowded[more.ray], more.star, more.chord
             order = np.argsort(np.concatenate([near[0][plain], found[0]]), kind="stable")
-            near = tuple(np.concatenate([a[plain], b])[order] for a, b in zip(near, found, strict=True))  # type: ignore[assignment]
+            ray, star, apart = (np.concatenate([a[plain], b])[order] for a, b in zip(near, found, strict=True))
+            return Neighbours(ray, star, apart, tree.n)
         return Neighbours(*near, tree.n)
 
 

@@ -41,7 +41,6 @@ class SecondField:
     shift_px: float  # by which its stars are displaced, the median
     ratio: float  # of light at equal magnitude, that of the fainter field to that of the other
     interleaved: float  # part of its stars beside which a star of the first field is seen
-    false_alarm_probability: float
 
     @property
     def is_exposure(self) -> bool:
@@ -101,7 +100,6 @@ def find_second_field(centroids: Centroids, camera: Camera, stars: Stars, first:
         shift_px=float(np.median(shift_px)),
         ratio=min(light, 1.0 / light),
         interleaved=float(np.mean(np.isin(bright[nearest], first.star))),
-        false_alarm_probability=second.false_alarm_probability,
     )
 
 

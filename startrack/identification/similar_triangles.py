@@ -173,7 +173,6 @@ def patterns_for(stars: Stars, sizes: PatternSizes) -> ShapePatterns:
 
     The last few are kept; the key rounds the stars' directions, so that catalogues of nearby years share them.
     """
-    import hashlib
 
     def compute() -> ShapePatterns:
         star = separate_bright_stars(stars, sizes.stars)
@@ -182,7 +181,7 @@ def patterns_for(stars: Stars, sizes: PatternSizes) -> ShapePatterns:
         index = shape_index(found, sizes.shape_tolerance, sizes.size_tolerance)
         return ShapePatterns(star, rays, sizes.longest_side_rad, index, proximity_mask(rays, sizes.near_rad))
 
-    key = (sizes, len(stars), hashlib.sha1(np.round(stars.rays_icrs[:500], 3).tobytes()).hexdigest())
+    key = (sizes, len(stars), np.round(stars.rays_icrs[:500], 3).tobytes())
     return keep_last_few(_KEPT, key, compute)
 
 

@@ -106,7 +106,7 @@ def test_a_refusal_for_lack_of_stars_replaces_a_solution(folder):
 
 @pytest.mark.parametrize("end", ["stars.ecsv", "skyline.ecsv", "skyline.png", "annotated.png", "wcs", "corr"])
 def test_a_solution_without_one_of_its_files_is_incomplete(folder, end):
-    from startrack.applications.batch.store import has_companions
+    from startrack.applications.batch.task import has_companions
 
     record, result = stored_record(folder / "out" / "00.fix.json"), folder / "out" / "00.fix.json"
     assert has_companions(record, result, plots=True)

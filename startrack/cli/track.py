@@ -43,10 +43,7 @@ def run(args: argparse.Namespace) -> int:
         odometry_sigma=args.odometry_sigma, odometry_floor_m=args.odometry_floor,
     )  # fmt: skip
     track = TrackRun(args, session)
-    if args.follow:
-        track.follow()
-    else:
-        track.take_all()
+    (track.follow if args.follow else track.take_all)()
     return worst_code(track.codes)
 
 

@@ -1,19 +1,22 @@
-"""The images of a folder tree, and the names of their results."""
+"""The images of a folder tree; the names of their results, and the lock of these."""
 
 from __future__ import annotations
 
 import os
 import stat
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path, PurePosixPath
 
-from startrack.core.files import existing_folder
-from startrack.core.types import BadInput
+from startrack.core.errors import BadInput
+from startrack.core.files import Locked, existing_folder, hold_lock
 from startrack.exposure import PACKING_SUFFIXES, PICTURE_SUFFIXES, BagImage, list_bag_images, stem
 from startrack.output import PICTURES
+
+LOCK = ".startrack-batch.lock"
 
 
 @dataclass(frozen=True, order=True)
@@ -70,7 +73,8 @@ def listed_images(
         names = [os.path.relpath(path, root).replace(os.sep, "/") for path in paths_read]
         name = next((name for name in names if name in known), None)
         if name is None:
-            name = next((name for name in names if _is_missing(root, name)), None)
+            inside = (name for name in names if not name.startswith("../") and _is_image(PurePosixPath(name).name))
+            name = next((name for name in inside if not os.path.lexists(os.path.join(root, name))), None)
             if name is None:
                 raise BadInput("bad_image", f"{text} is not an image under {folder}")
             of_results = (PurePosixPath(name).parent / stem(Path(name))).as_posix()
@@ -100,10 +104,28 @@ def unique_names(names: Sequence[str]) -> list[str]:
     return unique
 
 
-def _is_missing(root: str, name: str) -> bool:
-    """Whether `name` is that of an image within the folder that does not exist."""
-    path = PurePosixPath(name)
-    return path.parts[:1] != ("..",) and _is_image(path.name) and not os.path.lexists(os.path.join(root, name))
+def record_path(out: Path, image: Image) -> Path:
+    """Path of the record of an `image` in the folder `out`."""
+    return out / f"{image.stem}.fix.json"
+
+
+@contextmanager
+def lock_results(out: Path) -> Iterator[None]:
+    """Lock the folder `out` of results against other batches.
+
+    Raises BadInput (bad_image) if another batch writes to it, or if the lock file cannot be used.
+    """
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(hold_lock(out / LOCK, wait=False))
+        except Locked as cause:
+            raise BadInput(
+                "bad_image",
+                f"another batch is writing to {out} (process {cause.owner}): wait for it, or choose another -D",
+            ) from cause
+        except OSError as cause:
+            raise BadInput("bad_image", f"{out / LOCK}: cannot be used as lock file ({cause.strerror})") from cause
+        yield
 
 
 def _image_names(root: Path, excluded: str | None) -> list[str]:

@@ -19,15 +19,17 @@ from typing import Any
 import numpy as np
 
 from startrack import __version__
-from startrack.applications.batch.find import unique_names
-from startrack.applications.batch.store import INPUTS, JOB, MANIFEST, RESULT, is_solved, stored_record, text_of_name
-from startrack.applications.batch.task import Record, Task, valid_stored_record
-from startrack.chain import STAGES
+from startrack.applications.batch import task as results
+from startrack.applications.batch.find import Image, record_path, unique_names
+from startrack.applications.batch.task import INPUTS, JOB, Record, Task, is_solved, stored_record, text_of_name
+from startrack.chain import STAGES, content_sha256
 from startrack.core.files import write_atomically
 from startrack.frames import R_from_quat_xyzw, tum_line
 from startrack.output import Column, TableColumn, ecsv_text, format_values, table_columns
 
 FORMAT = "startrack.manifest/1"
+MANIFEST = "manifest.json"
+RESULT = "result"  # in the manifest: path of NAME.fix.json within the folder; null where that is an earlier solution
 TRAJECTORY = "trajectory.tum"
 PARQUET = "results.parquet"
 NOT_IN_TABLES = ("modes", "message", "warnings", "format")
@@ -59,7 +61,7 @@ def table_rows(tasks: Iterable[Task], now: Mapping[str, Record], out: str | os.P
     found = Rows()
     for task in tasks:
         name = text_of_name(task.name)
-        record = now.get(name) or valid_stored_record(task)
+        record = now.get(name) or results.valid_stored_record(task)
         if record is None:
             found.omitted += os.path.exists(task.result)
             continue
@@ -183,3 +185,32 @@ def _manifest(records: Sequence[Record], settings: dict[str, Any]) -> bytes:
     ]
     whole = {"format": FORMAT, "version": __version__, "settings": settings, "images": images}
     return (json.dumps(whole, indent=1, ensure_ascii=False) + "\n").encode()
+
+
+def belongs_to_other_images(out: Path, images: Iterable[Image]) -> bool:
+    """Whether `out` has results, none of which matches the current content of its image.
+
+    Compared by content: the folder may have moved or grown, or some images may have changed.
+    """
+    listed = {one["image"]: one.get("image_sha256") for one in _manifest_images(out) or ()}
+    some = bool(listed)
+    for image in images:
+        record = stored_record(record_path(out, image))
+        known = listed.get(text_of_name(image.name)) or (record and results.image_sha256(record))
+        if known is not None and known == content_sha256(image.path, image.bag_image):
+            return False
+        some = some or known is not None
+    return some
+
+
+def tabled_results(out: Path) -> set[str] | None:
+    """Paths within `out` of the results in its tables; None if there is no manifest."""
+    images = _manifest_images(out)
+    return None if images is None else {str(one.get(RESULT)) for one in images}
+
+
+def _manifest_images(out: Path) -> list[dict[str, Any]] | None:
+    images = (results.read_object(out / MANIFEST) or {}).get("images")
+    if not isinstance(images, list):
+        return None
+    return [one for one in images if isinstance(one, dict) and isinstance(one.get("image"), str)]

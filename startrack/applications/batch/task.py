@@ -3,33 +3,32 @@
 from __future__ import annotations
 
 import errno
+import json
+import os
+import stat
 from collections.abc import Generator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from startrack import __version__
-from startrack.applications.batch.store import (
-    INPUTS,
-    JOB,
-    has_companions,
-    image_sha256,
-    is_older_than,
-    is_solved,
-    stored_record,
-    text_of_name,
-)
-from startrack.chain import MISSING, are_unchanged, content_sha256, input_hashes, job_sha256
+from startrack import __version__, chain, output
+from startrack.chain import Outcome, content_sha256
 from startrack.core.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput
 from startrack.core.files import FULL_DISK
 from startrack.core.runner import Died, Runner, RunStopped
+from startrack.core.types import Exposure, PositionPrior
+from startrack.exposure import BagImage, read_bag_image, read_exposure
+from startrack.localization import require_localizer
 
-if TYPE_CHECKING:
-    from startrack.chain import Outcome
-    from startrack.core.types import Exposure
-    from startrack.exposure import BagImage
-
+JOB = "job_sha256"  # hash of a result's inputs (content of its files, flags, version); null: the next run repeats it
+INPUTS = "inputs"  # camera and terrain files that the result was made with: path from the image to SHA-256
+SOLVED = ("ok", "ambiguous")
+NEEDED = {  # by the tables, of a record that is ok
+    "position": ("east_m", "north_m", "up_m", "covariance_m2"),
+    "attitude": ("quat_xyzw_body_enu", "quat_xyzw_cam_icrs", "sigma_arcsec"),
+    "provenance": ("time_utc", "image_sha256"),
+}
 Record = dict[str, Any]
 ImageDone = tuple[Record, bool]  # the record, and whether it was there already
 DISK_ERRORS = FULL_DISK | {errno.EROFS}
@@ -90,27 +89,27 @@ def valid_stored_record(task: Task) -> dict[str, Any] | None:
 
 def write_failure(task: Task, message: str, reason: str = INTERNAL_ERROR) -> dict[str, Any]:
     """Write and return the record of an image that failed: without a job hash, so that the next run repeats it."""
-    from startrack.output import write_json
-
     record = _unread_record(task, reason, message, content_sha256(task.path, task.bag_image))
     record |= {"image": text_of_name(task.name), JOB: None}
     with suppress(BadInput):  # the record is returned all the same
         if not is_solved(stored_record(task.result)):
             _remove_former(Path(task.result))
-            write_json(task.result, record)
+            output.write_json(task.result, record)
     return record
 
 
 def _valid_record(task: Task, key: str) -> dict[str, Any] | None:
     """The stored record, if it is complete and everything it was made from is unchanged; else None."""
     record = stored_record(task.result)
-    if record is None or record.get(JOB) != key or not are_unchanged(task.path, record.get(INPUTS, {})):
+    if record is None or record.get(JOB) != key or not chain.are_unchanged(task.path, record.get(INPUTS, {})):
         return None
     return record if has_companions(record, Path(task.result), plots=task.plots) else None
 
 
 def _key(task: Task, sha256: str) -> str:
-    return job_sha256(task.path, sha256, task.facts, task.plots, task.localizer, task.evidence, *(task.near or ()))
+    return chain.job_sha256(
+        task.path, sha256, task.facts, task.plots, task.localizer, task.evidence, *(task.near or ())
+    )
 
 
 def _locate_and_write(task: Task, sha256: str, key: str) -> dict[str, Any]:
@@ -118,8 +117,6 @@ def _locate_and_write(task: Task, sha256: str, key: str) -> dict[str, Any]:
 
     Former files are removed before new ones are written, so that no result consists of both.
     """
-    from startrack.output import result_dict, write_json, write_results
-
     result = Path(task.result)
     found, inputs = _locate(task, sha256)
     reason = found["reason"] if isinstance(found, dict) else found.reason
@@ -129,31 +126,27 @@ def _locate_and_write(task: Task, sha256: str, key: str) -> dict[str, Any]:
     if isinstance(found, dict):
         record = found
     elif keeps_former:
-        record = result_dict(found)
+        record = output.result_dict(found)
     else:
-        record = write_results(found, result, plots=task.plots, write_record=False)
+        record = output.write_results(found, result, plots=task.plots, write_record=False)
     record = {**record, "image": text_of_name(task.name), JOB: key, INPUTS: inputs}
     if not keeps_former:
-        write_json(result, record)
+        output.write_json(result, record)
     return record
 
 
 def _remove_former(result: Path) -> None:
     """Make the folder and remove the files of an earlier run. Raises BadInput if that is impossible."""
-    from startrack.output import remove_companions
-
     try:
         result.parent.mkdir(parents=True, exist_ok=True)
         result.unlink(missing_ok=True)
-        remove_companions(result)
+        output.remove_companions(result)
     except OSError as cause:
         raise BadInput("bad_image", f"{result}: cannot be written ({cause.strerror})") from cause
 
 
 def read_task(task: Task) -> Exposure:
     """The exposure of a task's image. Raises BadInput."""
-    from startrack.exposure import read_bag_image, read_exposure
-
     if task.bag_image is not None:
         return read_bag_image(task.bag_image, **task.facts)
     return read_exposure(task.path, **task.facts)
@@ -161,32 +154,90 @@ def read_task(task: Task) -> Exposure:
 
 def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str, str]]:
     """A value with companions, or the record of a refusal without; and the hashes of camera and terrain files."""
-    from startrack.chain import Inputs, Refused, Settings, locate_exposure
-    from startrack.core.types import PositionPrior
-    from startrack.localization import require_localizer
-    from startrack.output import result_dict
-
     try:
         exposure = read_task(task)
     except BadInput as cause:
         return _unread_record(task, cause.reason, str(cause), sha256), {}
     # Before the files are read, so that a change in between is noticed.
     mask = exposure.mask if isinstance(exposure.mask, str) else None
-    inputs = input_hashes(task.path, [exposure.camera], exposure.terrain, mask)
+    inputs = chain.input_hashes(task.path, [exposure.camera], exposure.terrain, mask)
     try:
         near = None if task.near is None else PositionPrior(*task.near)
-        settings = Settings(
-            localizer=require_localizer(task.localizer), evidence_sources=task.evidence, near=near
-        )  # fmt: skip
-        return locate_exposure(exposure, settings), inputs
+        localizer = require_localizer(task.localizer)
+        settings = chain.Settings(localizer=localizer, evidence_sources=task.evidence, near=near)
+        return chain.locate_exposure(exposure, settings), inputs
     except BadInput as cause:
-        return result_dict(Refused(reason=cause.reason, message=str(cause), reached=Inputs(exposure=exposure))), inputs
+        refused = chain.Refused(reason=cause.reason, message=str(cause), reached=chain.Inputs(exposure=exposure))
+        return output.result_dict(refused), inputs
 
 
 def _unread_record(task: Task, reason: str, message: str, sha256: str) -> dict[str, Any]:
     """The record of an image that could not be decoded, or its sidecar not be read: with the hash of its file."""
-    from startrack.output import refused_dict
+    record = output.refused_dict(task.name, reason, message)
+    if sha256 != chain.MISSING:
+        unknown = dict.fromkeys(("camera", "terrain", "catalog", "time_utc", "exposure_s"))
+        record["provenance"] = {"version": __version__, "image_sha256": sha256, **unknown}
+    return record
 
-    unknown = dict.fromkeys(("camera", "terrain", "catalog", "time_utc", "exposure_s"))
-    provenance = {"version": __version__, "image_sha256": sha256, **unknown}
-    return refused_dict(task.name, reason, message) | ({} if sha256 == MISSING else {"provenance": provenance})
+
+def stored_record(result: str | Path) -> dict[str, Any] | None:
+    """A result's record; None if there is none, or it cannot be read or is incomplete."""
+    record = read_object(Path(result))
+    return record if record is not None and _is_record(record) else None
+
+
+def is_solved(record: dict[str, Any] | None) -> bool:
+    """Whether a record has a position, or several that fit."""
+    return record is not None and record["status"] in SOLVED
+
+
+def has_companions(record: dict[str, Any], result: Path, *, plots: bool) -> bool:
+    """Whether tables, WCS and pictures are beside a solved record; other records need none."""
+    stem = result.name.removesuffix(".fix.json")
+    needed = {*output.COMPANIONS} if is_solved(record) else set()
+    if not plots:
+        needed -= {*output.PICTURES}
+    if record["status"] != "ok" or record["position"].get("search") == "approximate":
+        needed -= {*output.SKYLINE_FILES}
+    return all(result.with_name(f"{stem}{suffix}").is_file() for suffix in needed)
+
+
+def image_sha256(record: dict[str, Any]) -> str | None:
+    """SHA-256 of the image that a batch made the record from; None for records of `locate`."""
+    sha256 = record.get("provenance", {}).get("image_sha256") if JOB in record else None
+    return sha256 if isinstance(sha256, str) else None
+
+
+def is_older_than(image: str | os.PathLike[str], result: str | os.PathLike[str]) -> bool:
+    """Whether the image was neither written nor moved after its result was written; neither file is read."""
+    try:
+        of_image, of_result = os.stat(image), os.stat(result)
+    except (OSError, ValueError):  # a NUL in the name
+        return False
+    return max(of_image.st_mtime_ns, of_image.st_ctime_ns) < of_result.st_mtime_ns
+
+
+def text_of_name(name: str) -> str:
+    """A file's name as text: undecodable bytes become question marks."""
+    return name.encode("utf-8", "replace").decode("utf-8")
+
+
+def read_object(file: Path) -> dict[str, Any] | None:
+    """The JSON object in a file; None if it cannot be read, or is nested too deep."""
+    try:
+        if not stat.S_ISREG(file.stat().st_mode):  # reading a pipe would block
+            return None
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def _is_record(found: dict[str, Any]) -> bool:
+    """Whether a JSON object has the keys that resuming and the tables need."""
+    status, provenance = found.get("status"), found.get("provenance", {})
+    named = isinstance(found.get("image"), str) and "reason" in found and isinstance(provenance, dict)
+    if not named or status not in (*SOLVED, "refused") or not isinstance(found.get(INPUTS, {}), dict):
+        return False
+    parts = NEEDED if status == "ok" else {}
+    return all(isinstance(found.get(part), dict) and found[part].keys() >= set(keys) for part, keys in parts.items())

@@ -61,22 +61,15 @@ def camera_keys(lens: type[Lens] | None = None) -> Table:
             "name": Text(max_chars=200),
             "model": Choice(values=tuple(lens_kinds()), default=default_lens().model),
             "size_px": List(each=Number(low=1, high=65_535, integer=True), count=2, required=True),
-            "focal_px": List(
-                each=Number(low=1e-3, high=1e6), count=2, required=True, description="pixels per radian on the axis"
-            ),
-            "centre_px": List(
-                each=Number(low=-1e6, high=1e6),
-                count=2,
-                required=True,
-                description="(0, 0) is the centre of the top-left pixel",
-            ),
+            "focal_px": List(each=Number(low=1e-3, high=1e6), count=2, required=True,
+                             description="pixels per radian on the axis"),
+            "centre_px": List(each=Number(low=-1e6, high=1e6), count=2, required=True,
+                              description="(0, 0) is the centre of the top-left pixel"),
             **lens_keys,
-            "max_angle_deg": Number(
-                low=0, high=180, above=True, required=True, description="edge of the image circle, off the axis"
-            ),
-            "calibrated_angle_deg": Number(
-                low=0, high=360, above=True, description="beyond this the lens is not known; default: max_angle_deg"
-            ),
+            "max_angle_deg": Number(low=0, high=180, above=True, required=True,
+                                    description="edge of the image circle, off the axis"),
+            "calibrated_angle_deg": Number(low=0, high=360, above=True,
+                                           description="beyond this the lens is not known; default: max_angle_deg"),
             "mirrored": Flag(default=False),
             "mask": Text(description="8-bit image of this size, relative to this file: pixels below 128 do not count"),
             "decentring": List(each=Number(low=-1, high=1), count=2, description="p1, p2 of a decentred lens"),
@@ -84,7 +77,7 @@ def camera_keys(lens: type[Lens] | None = None) -> Table:
             "sensor": SENSOR,
             "covariance": COVARIANCE,
         },
-    )
+    )  # fmt: skip
 
 
 def save_camera(camera: Camera, path: str | Path) -> None:
@@ -160,21 +153,24 @@ def _camera(values: dict[str, Any], default_name: str, folder: Path) -> Camera:
         raise ValueError(f"max_angle_deg: the radius of this lens only rises to {limit:.2f} degrees")
     calibrated = float(np.radians(min(values.get("calibrated_angle_deg", np.inf), values["max_angle_deg"])))
     order, covariance = _covariance(values.get("covariance"), lens)
-    sensor = None if "sensor" not in values else _sensor(values["sensor"], calibrated)
+    sensor = None if "sensor" not in values else Sensor(**values["sensor"])
+    lowest = 1.0 if sensor is None else sensor.lowest_throughput(calibrated)
+    if lowest < MIN_THROUGHPUT_1:
+        raise ValueError(
+            f"sensor.vignetting: within the calibrated angle of {np.degrees(calibrated):.1f} degrees the "
+            f"throughput falls to {lowest:.2g} of that on the axis, below {MIN_THROUGHPUT_1:g}: no lens is that dark"
+        )
     R_body_cam, quat_xyzw = ZENITH_MOUNT_R_BODY_CAM, values.get("mount", {}).get("quat_xyzw_body_cam")
     if quat_xyzw is not None:
         if abs(np.linalg.norm(quat_xyzw) - 1) > UNIT_QUATERNION_1:
             raise ValueError("mount.quat_xyzw_body_cam is not a unit quaternion")
         R_body_cam = R_from_quat_xyzw(quat_xyzw)
     return Camera(
+        **{key: values[key] for key in ("size_px", "focal_px", "centre_px", "mirrored")},
         name=values.get("name", default_name),
-        size_px=values["size_px"],
-        focal_px=values["focal_px"],
-        centre_px=values["centre_px"],
         max_angle_rad=max_angle,
         calibrated_angle_rad=calibrated,
         lens=lens,
-        mirrored=values["mirrored"],
         decentring=Decentring(*values.get("decentring", ())),
         R_body_cam=R_body_cam,
         sensor=sensor,
@@ -182,18 +178,6 @@ def _camera(values: dict[str, Any], default_name: str, folder: Path) -> Camera:
         covariance=covariance,
         mask=str(folder / values["mask"]) if "mask" in values else None,
     )
-
-
-def _sensor(values: dict[str, Any], calibrated_rad: float) -> Sensor:
-    """The sensor. Raises ValueError for a lens that lets hardly any light through within the calibrated angle."""
-    sensor = Sensor(**values)
-    lowest = sensor.lowest_throughput(calibrated_rad)
-    if lowest < MIN_THROUGHPUT_1:
-        raise ValueError(
-            f"sensor.vignetting: within the calibrated angle of {np.degrees(calibrated_rad):.1f} degrees the "
-            f"throughput falls to {lowest:.2g} of that on the axis, below {MIN_THROUGHPUT_1:g}: no lens is that dark"
-        )
-    return sensor
 
 
 def _covariance(values: dict[str, Any] | None, lens: Lens) -> tuple[tuple[str, ...], Array | None]:

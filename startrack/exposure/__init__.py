@@ -21,17 +21,16 @@ from startrack.exposure.bag import (
 )
 from startrack.exposure.correction import (
     combine_masks,
-    correct_exposure,
     mask_of,
     read_dark,
     read_flat,
     read_mask,
     touch_masked,
 )
-from startrack.exposure.decoding import are_fractions, decode_bytes
+from startrack.exposure.decoding import are_fractions
 from startrack.exposure.facts import NO_TIME, Facts, check_time_sigma_s, with_facts
 from startrack.exposure.png import insert_png_chunks, png_chunks
-from startrack.exposure.read import exposure_of, exposure_of_decoded, read_exposure
+from startrack.exposure.read import exposure_of, read_exposure
 from startrack.exposure.sidecar import (
     IMAGE_KEYS,
     PACKING_SUFFIXES,
@@ -47,7 +46,7 @@ from startrack.exposure.write import write_exposure, write_sidecar
 __all__ = [
     "BAG_SUFFIXES", "IMAGE_KEYS", "NO_TIME", "ODOMETRY_TYPES", "PACKING_SUFFIXES", "PICTURE_SUFFIXES", "RAW_SUFFIXES",
     "SIDECAR", "BagImage", "Facts", "Sidecar", "are_fractions", "check_time_sigma_s", "choose_bag_image",
-    "combine_masks", "correct_exposure", "decode_bytes", "exposure_of", "exposure_of_decoded", "insert_png_chunks",
+    "combine_masks", "exposure_of", "insert_png_chunks",
     "is_bag", "list_bag_images", "mask_of", "png_chunks", "read_bag_exposures", "read_bag_image", "read_dark",
     "read_exposure", "read_flat", "read_mask", "read_messages", "sidecar_of", "split_bag_path", "stem", "touch_masked",
     "with_facts", "write_exposure", "write_sidecar",

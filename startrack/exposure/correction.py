@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from startrack.core.files import FilePath, printable
-from startrack.core.types import Array, BadInput, Bools, Correction, Exposure, Mask
+from startrack.core.types import Array, BadInput, Bools, Correction, Mask
 from startrack.exposure.decoding import Stamp, bad_image, decode_file, read_stamped
 from startrack.exposure.facts import header_number
 from startrack.exposure.mosaic import PHASES
@@ -110,20 +110,6 @@ class CalibrationFrame:
     median_adu: float
     sha256: str
     exposure_s: float | None  # by its header
-
-
-def correct_exposure(exposure: Exposure, *, dark: FilePath | None = None, flat: FilePath | None = None) -> Exposure:
-    """The exposure corrected by the images `dark` and `flat`. Not for mosaics, which `read_exposure` corrects.
-
-    Raises BadInput as `correct_counts`, ValueError where the exposure is corrected already.
-    """
-    if exposure.correction is not None:
-        raise ValueError(f"{exposure.name}: is corrected already")
-    if dark is None and flat is None:
-        return exposure
-    pixels, correction = correct_counts(exposure.pixels_adu, exposure.saturation_adu, dark, flat)
-    notes = exposure.warnings + correction_warnings(dark, flat, exposure.exposure_s)
-    return replace(exposure, pixels_adu=pixels, correction=correction, warnings=notes)
 
 
 def correct_counts(

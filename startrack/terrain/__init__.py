@@ -11,7 +11,6 @@ from startrack.terrain.io import MAKERS, body_of_terrain, files_of_terrain, load
 from startrack.terrain.protocol import (
     NO_POST,
     ForwardingTerrain,
-    HorizonPosts,
     Terrain,
     require_bounds,
     require_horizons,
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "EQUIRECTANGULAR", "MAKERS", "NO_POST", "STEREOGRAPHIC", "TERRAIN_KEYS", "Cylinder", "ForwardingTerrain",
-    "HeightMap", "HorizonPosts", "Projection", "Raster", "ShapeError", "StateableError", "Terrain",
+    "HeightMap", "Projection", "Raster", "ShapeError", "StateableError", "Terrain",
     "body_of_terrain", "files_of_terrain", "import_maps", "load_terrain", "read_map", "require_bounds",
     "require_horizons", "require_terrain", "state_errors", "stateable_errors", "terrain_from_dict", "write_bands",
     "write_map",

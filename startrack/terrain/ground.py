@@ -51,7 +51,8 @@ def pack_maps(site: Site, maps: Sequence[Raster]) -> Ground:
         heights.append(h.ravel())
         posts.append((first_post, *h.shape))
         first_post += h.size
-        unit = max(_steepest_rise(h) / SLOPE_STEPS, 1e-6)
+        steepest = max(np.abs(h[:, 1:] - h[:, :-1]).max(), np.abs(h[1:] - h[:-1]).max())
+        unit = max(float(steepest) * 2.05 / SLOPE_STEPS, 1e-6)  # across the corner too
         units.append(unit)
         block_table = []
         top, slope = _raise_to_finer_maps(_cell_tops(h), height_map, maps[:number]), _cell_slopes(h, unit)
@@ -85,11 +86,6 @@ def pack_maps(site: Site, maps: Sequence[Raster]) -> Ground:
 
 def _cell_tops(h: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.maximum(np.maximum(h[:-1, :-1], h[:-1, 1:]), np.maximum(h[1:, :-1], h[1:, 1:]))
-
-
-def _steepest_rise(h: NDArray[np.float32]) -> float:
-    """Largest rise between two posts, neighbours across the corner too [m]."""
-    return float(max(np.abs(h[:, 1:] - h[:, :-1]).max(), np.abs(h[1:] - h[:-1]).max())) * 2.05
 
 
 def _cell_slopes(h: NDArray[np.float32], unit: float) -> NDArray[np.int8]:

@@ -149,8 +149,8 @@ def measure_errors(rim: Raster, others: Sequence[Raster]) -> StatedErrors:
     comparison = compare_with_finest(rim, [*others, *shipped])
     if comparison is not None and comparison.same_ground:
         return StatedErrors(
-            height_sigma_m=_rounded(comparison.height_sigma_m), common_crest_sigma_m=comparison.common_crest_sigma_m,
-            origin="comparison", comment=f"{rim.source} {comparison.line()}",
+            height_sigma_m=float(f"{comparison.height_sigma_m:.2g}"), origin="comparison",
+            common_crest_sigma_m=comparison.common_crest_sigma_m, comment=f"{rim.source} {comparison.line()}",
         )  # fmt: skip
     warnings: tuple[str, ...] = ()
     if comparison is not None:
@@ -160,17 +160,13 @@ def measure_errors(rim: Raster, others: Sequence[Raster]) -> StatedErrors:
             "its scale wrong?",
         )
     return StatedErrors(
-        height_sigma_m=_rounded(MEASURED_PER_ESTIMATE * error_between_posts_m(rim)), origin="map",
+        height_sigma_m=float(f"{MEASURED_PER_ESTIMATE * error_between_posts_m(rim):.2g}"), origin="map",
         warnings=warnings,
         comment=f"{rim.source or 'the map'} could not be compared with a finer map: height_sigma_m is "
         f"{MEASURED_PER_ESTIMATE:g} times the error that its own roughness shows, the ratio that was measured on the "
         "240 m map of the south pole. A finer map of a part of the ground (--compare) or a known error (--sigma) is "
         "better",
     )  # fmt: skip
-
-
-def _rounded(sigma_m: float) -> float:
-    return float(f"{sigma_m:.2g}")
 
 
 def smoothness_warnings(rim: Raster, height_sigma_m: float) -> list[str]:

@@ -7,20 +7,19 @@ import os
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
 from startrack.core.files import MAX_CAUSE_CHARS
 from startrack.core.types import MAX_PIXELS, BadInput
 from startrack.frames import MOON_RADIUS_M
 from startrack.terrain.map_writing import METRE, PROJECTION_CODES
-from startrack.terrain.raster import EQUIRECTANGULAR, ORTHOGRAPHIC, STEREOGRAPHIC, Projection, Raster, projection_of
+from startrack.terrain.raster import EQUIRECTANGULAR, ORTHOGRAPHIC, STEREOGRAPHIC, Raster, projection_of
 from startrack.terrain.shape import MAX_LENGTH_M
 
 WINDOW_HALF_M = 300_000.0  # about the origin; farther away even 10 km mountains are below the horizontal
@@ -29,14 +28,10 @@ STEREOGRAPHIC_CODES = (PROJECTION_CODES[STEREOGRAPHIC], 15, 16)  # oblique, and 
 DECODED = (1, 8, 32773, 32946)  # codes of compression: none, deflate, PackBits, deflate
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Grid:
+class Stored(NamedTuple):
     """The content of a map file: height = offset + scale x value."""
 
-    values: NDArray[Any]  # (rows, columns)
-    projection: Projection
-    first_m: tuple[float, float]  # x, y of the first post
-    step_m: tuple[float, float]  # from a post to the next, in x and y
+    values: Raster  # as the file has them
     scale: float | None  # [m]; None where the file does not state it
     offset_m: float
     no_data: float | None
@@ -55,8 +50,8 @@ def read_map(
     path = Path(path)
     if not os.path.isfile(path):  # False also for names that the system cannot take
         raise BadInput("bad_terrain", f"{path}: no such file")
-    grid = _read_geotiff(path) if path.suffix.lower() in (".tif", ".tiff") else None
-    raster = _raster_of(grid or _read_with_rasterio(path, near), path, scale, offset_m)
+    stored = _read_geotiff(path) if path.suffix.lower() in (".tif", ".tiff") else None
+    raster = _heights_of(stored or _read_with_rasterio(path, near), path, scale, offset_m)
     cut = raster if near is None else raster.crop_around(*near, WINDOW_HALF_M)
     if min(cut.heights_m.shape) < 2:
         raise BadInput(
@@ -65,9 +60,9 @@ def read_map(
     return cut
 
 
-def _raster_of(grid: Grid, path: Path, scale: float | None, offset_m: float | None) -> Raster:
+def _heights_of(stored: Stored, path: Path, scale: float | None, offset_m: float | None) -> Raster:
     """The heights [m above the sphere], NaN where the file has none. Raises BadInput bad_terrain."""
-    values = grid.values
+    raster, values = stored.values, stored.values.heights_m
     if values.ndim != 2 or min(values.shape) < 2:
         raise BadInput(
             "bad_terrain",
@@ -75,8 +70,8 @@ def _raster_of(grid: Grid, path: Path, scale: float | None, offset_m: float | No
         )
     if values.dtype.kind not in "iuf":
         raise BadInput("bad_terrain", f"{path}: values of type {values.dtype} are no heights")
-    scale = grid.scale if scale is None else scale
-    offset = grid.offset_m if offset_m is None else offset_m
+    scale = stored.scale if scale is None else scale
+    offset = stored.offset_m if offset_m is None else offset_m
     if scale is None and np.issubdtype(values.dtype, np.integer):
         raise BadInput(
             "bad_terrain",
@@ -84,25 +79,22 @@ def _raster_of(grid: Grid, path: Path, scale: float | None, offset_m: float | No
             "metres), with --scale of terrain import or as scale in [dem]",
         )
     scale = 1.0 if scale is None else scale
-    numbers = (*grid.first_m, *grid.step_m, scale, offset)
-    if not np.isfinite(numbers).all() or 0.0 in grid.step_m or max(map(abs, numbers)) > 1e12:
+    numbers = (raster.x0_m, raster.y0_m, raster.dx_m, raster.dy_m, scale, offset)
+    if not np.isfinite(numbers).all() or 0.0 in numbers[2:4] or max(map(abs, numbers)) > 1e12:
         raise BadInput(
             "bad_terrain", f"{path}: its position, its scale or its offset is not a usable number: {numbers}"
         )
     with np.errstate(over="ignore", invalid="ignore"):
         heights = values.astype(np.float64) * scale + offset
     missing = ~(np.abs(heights) < MAX_LENGTH_M)  # NaN too; larger values are marks
-    if grid.no_data is not None:
-        missing |= values == grid.no_data
+    if stored.no_data is not None:
+        missing |= values == stored.no_data
     if missing.all():
         raise BadInput("bad_terrain", f"{path}: no post has a height")
     if np.median(heights[~missing]) > MOON_RADIUS_M / 2:  # counted from the Moon's centre
         heights -= MOON_RADIUS_M
     heights[missing] = np.nan
-    return Raster(
-        heights_m=heights.astype(np.float32), projection=grid.projection, x0_m=grid.first_m[0], y0_m=grid.first_m[1],
-        dx_m=grid.step_m[0], dy_m=grid.step_m[1], source=path.name,
-    )  # fmt: skip
+    return replace(raster, heights_m=heights.astype(np.float32), source=path.name)
 
 
 @contextmanager
@@ -121,8 +113,8 @@ def _one_line_refusal(what: str) -> Iterator[None]:
         log.disabled = False
 
 
-def _read_geotiff(path: Path) -> Grid | None:
-    """The grid of a GeoTIFF, or None where its place, size, projection or compression is one for rasterio.
+def _read_geotiff(path: Path) -> Stored | None:
+    """The content of a GeoTIFF, or None where its place, size, projection or compression is one for rasterio.
 
     Raises BadInput bad_terrain for a file that cannot be decoded.
     """
@@ -145,15 +137,11 @@ def _read_geotiff(path: Path) -> Grid | None:
         dx, dy = float(keys["ModelPixelScale"][0]), -float(keys["ModelPixelScale"][1])
         i, j, _, x, y, _ = (float(v) for v in keys["ModelTiepoint"][:6])
         middle = 0.0 if int(keys.get("GTRasterTypeGeoKey", 1)) == 2 else 0.5  # 2: the tie point is a post
-        return Grid(
-            values=np.asarray(page.asarray()),
-            projection=projection_of(parameters),
-            first_m=(x + (middle - i) * dx, y + (middle - j) * dy),
-            step_m=(dx, dy),
-            scale=scale,
-            offset_m=offset,
-            no_data=None if no_data is None else float(str(no_data).strip("\x00 ")),
-        )
+        raster = Raster(
+            heights_m=np.asarray(page.asarray()), projection=projection_of(parameters),
+            x0_m=x + (middle - i) * dx, y0_m=y + (middle - j) * dy, dx_m=dx, dy_m=dy,
+        )  # fmt: skip
+        return Stored(raster, scale, offset, None if no_data is None else float(str(no_data).strip("\x00 ")))
 
 
 def _gdal_scale(items: Any) -> tuple[float | None, float]:
@@ -196,8 +184,8 @@ def _proj_parameters(keys: Mapping[str, Any]) -> dict[str, Any] | None:
     return None
 
 
-def _read_with_rasterio(path: Path, near: tuple[float, float] | None) -> Grid:
-    """The grid, cut to a window about `near`. Raises BadInput bad_terrain."""
+def _read_with_rasterio(path: Path, near: tuple[float, float] | None) -> Stored:
+    """The content, cut to a window about `near`. Raises BadInput bad_terrain."""
     hint = f" (of a PDS map give the label, {path.stem}.LBL)" if path.suffix.lower() == ".img" else ""
     if find_spec("rasterio") is None or find_spec("pyproj") is None:
         raise BadInput(
@@ -211,11 +199,11 @@ def _read_with_rasterio(path: Path, near: tuple[float, float] | None) -> Grid:
         # About files without a position, which have their own message, and about terms that PROJ lacks beside WKT.
         warnings.simplefilter("ignore")
         with rasterio.open(path) as file:
-            return _grid_of(file, path, near, hint)
+            return _content_of(file, path, near, hint)
 
 
-def _grid_of(file: Any, path: Path, near: tuple[float, float] | None, hint: str) -> Grid:
-    """The grid of an open rasterio file."""
+def _content_of(file: Any, path: Path, near: tuple[float, float] | None, hint: str) -> Stored:
+    """The content of an open rasterio file."""
     import pyproj
     from rasterio.windows import Window
 
@@ -225,24 +213,19 @@ def _grid_of(file: Any, path: Path, near: tuple[float, float] | None, hint: str)
     if t.b or t.d:
         raise BadInput("bad_terrain", f"{path}: a rotated grid; bring it to north up (gdalwarp)")
     projection = projection_of(pyproj.CRS.from_wkt(file.crs.to_wkt()).to_dict())
-    first = t.c + 0.5 * t.a, t.f + 0.5 * t.e
+    raster = Raster(
+        heights_m=np.broadcast_to(np.float32(0), (file.height, file.width)), projection=projection,
+        x0_m=t.c + 0.5 * t.a, y0_m=t.f + 0.5 * t.e, dx_m=float(t.a), dy_m=float(t.e),
+    )  # fmt: skip
     rows, columns = slice(0, file.height), slice(0, file.width)
     if near is not None:
-        unread = np.broadcast_to(np.float32(0), (file.height, file.width))
-        probe = Raster(heights_m=unread, projection=projection, x0_m=first[0], y0_m=first[1], dx_m=t.a, dy_m=t.e)
-        rows, columns = probe.window(*near, WINDOW_HALF_M)
+        rows, columns = raster.window(*near, WINDOW_HALF_M)
     shape = rows.stop - rows.start, columns.stop - columns.start
     if shape[0] * shape[1] > MAX_PIXELS:
         raise BadInput("bad_terrain", f"{path}: too large; cut it to the area (startrack terrain import --half)")
     values = file.read(1, window=Window(columns.start, rows.start, shape[1], shape[0]))
     scale, offset = file.scales[0], file.offsets[0]
     stated = (scale, offset) != (1.0, 0.0) or str(file.units[0]).lower() in METRES
-    return Grid(
-        values=values,
-        projection=projection,
-        first_m=(first[0] + columns.start * t.a, first[1] + rows.start * t.e),
-        step_m=(float(t.a), float(t.e)),
-        scale=float(scale) if stated else None,
-        offset_m=float(offset),
-        no_data=file.nodata,
-    )
+    x0_m, y0_m = raster.x0_m + columns.start * t.a, raster.y0_m + rows.start * t.e
+    raster = replace(raster, heights_m=values, x0_m=x0_m, y0_m=y0_m)
+    return Stored(raster, float(scale) if stated else None, float(offset), file.nodata)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -70,23 +71,25 @@ def state_errors(text: str, values: Mapping[tuple[str, str], float | bool]) -> s
     Raises BadInput bad_terrain where a key is there already, or the file's notation leaves no place for it.
     """
     for (table, key), value in values.items():
-        text = _with_key(text, table, key, value)
+        before = parse_toml(text, "bad_terrain")
+        if key in before.get(table, {}):
+            raise BadInput("bad_terrain", f"it states {table}.{key} already")
+        wanted = {**before, table: {**before.get(table, {}), key: value}}
+        line = f"{key} = {str(value).lower() if isinstance(value, bool) else repr(float(value))}"
+        fits = (changed for changed in _places(text, table, line) if _keys_of(changed) == wanted)
+        found = next(fits, None)
+        if found is None:
+            raise BadInput("bad_terrain", f"startrack finds no place for it: write `{line}` into [{table}] by hand")
+        text = found
     return text
 
 
-def _with_key(text: str, table: str, key: str, value: float | bool) -> str:
-    before = parse_toml(text, "bad_terrain")
-    if key in before.get(table, {}):
-        raise BadInput("bad_terrain", f"it states {table}.{key} already")
-    wanted = {**before, table: {**before.get(table, {}), key: value}}
-    line = f"{key} = {str(value).lower() if isinstance(value, bool) else repr(float(value))}"
-    for changed in _places(text, table, line):
-        try:
-            if parse_toml(changed, "bad_terrain") == wanted:
-                return changed
-        except BadInput:
-            continue
-    raise BadInput("bad_terrain", f"startrack finds no place for it: write `{line}` into [{table}] by hand")
+def _keys_of(text: str) -> dict[str, Any] | None:
+    """The keys of a TOML text; None if it is none."""
+    try:
+        return parse_toml(text, "bad_terrain")
+    except BadInput:
+        return None
 
 
 def _places(text: str, table: str, line: str) -> Iterator[str]:

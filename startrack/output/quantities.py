@@ -80,13 +80,11 @@ RUN_QUANTITIES: tuple[Quantity, ...] = (
     Q("clock.offset_s", "s", Located, lambda v: None if v.fix.clock is None else v.fix.clock.offset_s,
       "true minus stated time: mean of the posterior; 0 in a round crater, where the image does not show it; null: a "
       "method without a posterior", NUMBER, nullable=True, form="%.6g", columns={"clock_offset_s": ()},
-      shown=(Show("text", "clock", "offset {:+.3f} s"), Show("notebook", "clock", "{:+.3f} s"),
-             Show("page", "Clock", "{:+.3f} s"))),
+      shown=(Show("text", "clock", "offset {:+.3f} s"), Show("notebook page", "clock", "{:+.3f} s"))),
     Q("clock.sigma_s", "s", Located, lambda v: None if v.fix.clock is None else v.fix.clock.sigma_s,
       "standard deviation of the offset; as stated (`provenance.time_sigma_s`) where the image does not show it; null: "
       "as above", POSITIVE, nullable=True, form="%.6g", columns={"clock_sigma_s": ()},
-      shown=(Show("text", "clock", "; sigma {:.3f} s"), Show("notebook", "clock", " ± {:.3f} s"),
-             Show("page", "Clock", " ± {:.3f} s"))),
+      shown=(Show("text", "clock", "; sigma {:.3f} s"), Show("notebook page", "clock", " ± {:.3f} s"))),
     Q("provenance.version", "", Inputs, lambda v: __version__, "of startrack", TEXT),
     Q("provenance.image_sha256", "", Inputs, lambda v: v.exposure.sha256,
       "of the file; of an array: of its type, shape and values", TEXT, form="%s"),

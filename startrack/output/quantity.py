@@ -57,8 +57,9 @@ ASTROPY_UNITS = {
 class Show:
     """One place where a quantity is shown; the quantities of one row are joined.
 
-    `place` is summary, text, panel, notebook or page; `row` names the line of text or the row of a table; `form` makes
-    the text, by str.format or as a function. Nothing is shown where the quantity at the path `unless` is known.
+    `place` is summary, text, panel, notebook or page, or several; `row` names the line of text or the row of a table,
+    with a capital on the page; `form` makes the text, by str.format or as a function. Nothing is shown where the
+    quantity at the path `unless` is known.
     """
 
     place: str
@@ -145,8 +146,11 @@ class TableColumn:
 
 def show_everywhere(label: str, form: str, line: str) -> tuple[Show, ...]:
     """A quantity shown as `label` with its `form` in text (on the `line`), panel, notebook and page."""
-    where = (("text", line), ("panel", label), ("notebook", label.lower()), ("page", label))
-    return tuple(Show(place, row, f"; {label.lower()} {form}" if place == "text" else form) for place, row in where)
+    return (
+        Show("text", line, f"; {label.lower()} {form}"),
+        Show("panel", label, form),
+        Show("notebook page", label.lower(), form),
+    )
 
 
 def record_from(quantities: Iterable[Quantity], value: Any) -> dict[str, Any]:

@@ -44,14 +44,15 @@ def rows(place: str, at: At, sections: Collection[str] | None = None) -> Rows:
         if sections is not None and one.section not in sections:
             continue
         for show in one.shown:
-            if show.place != place or (show.unless and at(show.unless) is not None):
+            if place not in show.place.split() or (show.unless and at(show.unless) is not None):
                 continue
             value = at(one.path)
             if value is None:
                 continue
             value = Angle(value) if one.schema is TURN else value
             text = show.form(value) if callable(show.form) else show.form.format(value)
-            found[show.row] = found[show.row] + text if show.row in found else text.lstrip(" ,;")
+            row = show.row[0].upper() + show.row[1:] if place == "page" else show.row
+            found[row] = found[row] + text if row in found else text.lstrip(" ,;")
     return [(row, text) for row, text in found.items() if text]
 
 

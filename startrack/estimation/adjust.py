@@ -23,7 +23,8 @@ STAR_OUTLIER_CHI2 = 16.0  # 4 sigma in each axis: rejects one good star in 3000
 HUBER_SIGMAS = 2.5  # residual beyond which the influence of an observation is constant
 MIN_ATTITUDE_STARS = 3
 SMALLEST_EXTRA_PX2, LARGEST_EXTRA_PX2 = 1e-6, 1e8
-SMALLEST_DAMPING, FIRST_DAMPING, MAX_DAMPING = 1e-12, 1e-6, 1e6
+FIRST_DAMPING = 1e-6
+SMALLEST_DAMPING, MAX_DAMPING = FIRST_DAMPING**2, 1.0 / FIRST_DAMPING
 SMALLEST_RISE_RAD = 0.2  # angle up to which the radius of a valid lens must increase
 
 
@@ -94,13 +95,11 @@ def cauchy_loss(scale_chi2: float) -> Loss:
     return Loss(lambda chi2: scale_chi2 * np.log1p(chi2 / scale_chi2), lambda chi2: 1.0 / (1.0 + chi2 / scale_chi2))
 
 
-def _huber_factor(chi2: Array) -> Array:
-    factor = np.minimum(1.0, HUBER_SIGMAS / np.sqrt(np.maximum(chi2, 1e-12)))
-    return np.where(chi2 < STAR_OUTLIER_CHI2, factor, 0.0)
-
-
 SQUARES = Loss(lambda chi2: chi2, np.ones_like)
-HUBER_WITH_CUT = Loss(lambda chi2: np.minimum(chi2, STAR_OUTLIER_CHI2), _huber_factor)
+HUBER_WITH_CUT = Loss(
+    lambda chi2: np.minimum(chi2, STAR_OUTLIER_CHI2),
+    lambda chi2: np.where(chi2 < STAR_OUTLIER_CHI2, HUBER_SIGMAS / np.sqrt(np.maximum(chi2, HUBER_SIGMAS**2)), 0.0),
+)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from startrack.camera import Camera
 from startrack.catalog import Sky, StarCatalog, sky_at
 from startrack.core.types import Array, BadInput, Bools, Centroids, Exposure, Ints
 from startrack.estimation.false_alarm import CELLS_ACROSS
-from startrack.estimation.match import instrumental_mag, is_isolated, match_by_brightness
+from startrack.estimation.match import DEPTH_BELOW_THRESHOLD_MAG, instrumental_mag, is_isolated, match_by_brightness
 from startrack.exposure import NO_TIME
 from startrack.frames import Site, off_axis_rad
 from startrack.terrain import body_of_terrain
@@ -27,7 +27,6 @@ ZERO_POINT_STARS = 4000  # brightest stars used for the zero point
 MIN_STARS_FOR_SHAPE = 30
 NEAR_CURVE_MAG = 1.2  # stars with a zero point this close to the curve are used in its fit
 CURVE_ROUNDS = 4
-SECURE_MAG = 0.7  # a star this much brighter than the frame's limit is detected where the sky is open
 LIMIT_QUANTILE = 0.85
 
 
@@ -44,12 +43,8 @@ class Frame:
 def frame_of(exposure: Exposure, found: Centroids, catalog: StarCatalog, site: Site | None) -> Frame:
     """The frame of an exposure whose point sources are `found`. Raises BadInput no_time."""
     time_utc = require_time(exposure)
-    return Frame(
-        exposure=exposure,
-        time_utc=time_utc,
-        sources=Centroids(**{f.name: getattr(found, f.name) for f in fields(Centroids)}),
-        sky=sky_at(catalog, time_utc, site),
-    )
+    sources = Centroids(**{f.name: getattr(found, f.name) for f in fields(Centroids)})
+    return Frame(exposure=exposure, time_utc=time_utc, sources=sources, sky=sky_at(catalog, time_utc, site))
 
 
 def require_time(exposure: Exposure) -> datetime:
@@ -81,9 +76,6 @@ class BrightStars:
     found: Bools  # whether there is a source of equal brightness
 
 
-NO_BRIGHT_STARS = BrightStars(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.bool_))
-
-
 @dataclass(frozen=True)
 class FrameMatches:
     """Matches of one frame, and how many there should be."""
@@ -105,10 +97,7 @@ class FrameMatches:
 
         Clouds and trees reduce the first, hot pixels and lamps the second, a wrong lens both.
         """
-        return max(
-            self.expected_found / self.expected if self.expected else 0.0,
-            self.significant_matched / self.significant if self.significant else 0.0,
-        )
+        return max(self.expected_found / max(self.expected, 1), self.significant_matched / max(self.significant, 1))
 
 
 def match_frame(frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: float, gate_px: float) -> FrameMatches:
@@ -131,9 +120,9 @@ def match_frame(frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: flo
     )  # fmt: skip
     alone = is_isolated(px[star], star, px, seen, stars.v_mag, BLENDED_SIGMAS * found.psf_sigma_px, BLENDED_MAG)
     faintest = float(np.quantile(source_mag[detection], LIMIT_QUANTILE)) if len(detection) else -np.inf
-    bright = seen[star_mag[seen] < faintest - SECURE_MAG]
+    bright = seen[star_mag[seen] < faintest - DEPTH_BELOW_THRESHOLD_MAG]
     expected = bright[_is_open_sky(px[bright], found.xy_px[detection], frame.exposure.size_px)]
-    significant = (camera.angle_rad(found.xy_px) < within_rad) & (source_mag < faintest - SECURE_MAG)
+    significant = (camera.angle_rad(found.xy_px) < within_rad) & (source_mag < faintest - DEPTH_BELOW_THRESHOLD_MAG)
     return FrameMatches(
         detection=detection[alone],
         star=star[alone],

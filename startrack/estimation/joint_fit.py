@@ -8,12 +8,12 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.core.types import Array, Ints, NotIdentified
-from startrack.estimation.frame_matching import NO_BRIGHT_STARS, Frame, FrameMatches, match_frame
-from startrack.estimation.lens_fit import MIN_LENS_STARS, LensFit, fit_lens
+from startrack.estimation.frame_matching import Frame, FrameMatches, match_frame
+from startrack.estimation.lens_fit import MIN_LENS_STARS, WIDEST_GAP_RAD, LensFit, fit_lens
 from startrack.estimation.normal_equations import Observations, observations
 from startrack.frames import off_axis_rad
 
-RING_RAD = np.radians(8.0)  # width of the ring added in each round
+RING_RAD = WIDEST_GAP_RAD  # width of the ring added in each round
 SMALLEST_GROWTH_RAD = np.radians(0.5)
 BRIGHTEST_SOURCES = 1000  # sources used; hot pixels may outnumber the bright stars
 JOINT_GATES_PX = (6.0, 4.0, 3.0, 2.0)  # the first while the region grows, the others for all stars
@@ -50,16 +50,17 @@ def grow_from_matches(
     frame = replace(frame, sources=frame.sources.take(slice(BRIGHTEST_SOURCES)))
     bright = np.flatnonzero(detection < BRIGHTEST_SOURCES)
     bright = bright[np.argsort(detection[bright])]
-    matched = FrameMatches(detection[bright], star[bright], 0, 0, 0, 0, NO_BRIGHT_STARS)
-    off_axis = off_axis_rad(frame.sky.stars.rays_icrs[matched.star] @ R_cam_icrs.T)
+    points = _points((frame,), [(detection[bright], star[bright])])
+    off_axis = off_axis_rad(points.rays_icrs @ R_cam_icrs.T)
     known = float(np.quantile(off_axis, KNOWN_QUANTILE)) if len(off_axis) else 0.0
-    fit = _fit_matches((frame,), (matched,), camera, R_cam_icrs[None], _coefficients(known, len(matched)))
+    fit = _fit_points(points, camera, R_cam_icrs[None], _coefficients(known, len(points)))
     for _ in range(GROWTH_ROUNDS):
         within = known + RING_RAD
         matched = match_frame(frame, fit.camera, fit.R_cam_icrs[0], within, JOINT_GATES_PX[0])
         if len(matched) < MIN_LENS_STARS:
             break
-        fit = _fit_matches((frame,), (matched,), fit.camera, fit.R_cam_icrs, _coefficients(within, len(matched)))
+        points = _points((frame,), [(matched.detection, matched.star)])
+        fit = _fit_points(points, fit.camera, fit.R_cam_icrs, _coefficients(within, len(matched)))
         reached = fit.camera.calibrated_angle_rad
         if reached < known + SMALLEST_GROWTH_RAD:
             break
@@ -80,33 +81,30 @@ def fit_frames(frames: tuple[Frame, ...], camera: Camera, R_cam_icrs: Array) -> 
         matches = tuple(
             match_frame(frame, camera, R, within, gate_px) for frame, R in zip(frames, R_cam_icrs, strict=True)
         )
-        fit = _fit_matches(frames, matches, camera, R_cam_icrs, _coefficients(within) if first else None)
+        points = _points(frames, [(matched.detection, matched.star) for matched in matches])
+        fit = _fit_points(points, camera, R_cam_icrs, _coefficients(within) if first else None)
         camera, R_cam_icrs = fit.camera, fit.R_cam_icrs
         total = sum(map(len, matches))
         if k > len(gates_px) and abs(total - before) <= SETTLED_FRACTION * total:
             break
         before = total
         gate_px = float(np.clip(LAST_GATE_SIGMAS * fit.rms_px / np.sqrt(2.0), NARROWEST_GATE_PX, gates_px[-1]))
-    return JointFit(frames=frames, matches=matches, points=_points(frames, matches), fit=fit, gate_px=gate_px)
+    return JointFit(frames=frames, matches=matches, points=points, fit=fit, gate_px=gate_px)
 
 
-def _fit_matches(
-    frames: tuple[Frame, ...], matches: tuple[FrameMatches, ...], camera: Camera, R_cam_icrs: Array,
-    coefficients: int | None,
-) -> LensFit:  # fmt: skip
-    points = _points(frames, matches)
+def _fit_points(points: Observations, camera: Camera, R_cam_icrs: Array, coefficients: int | None) -> LensFit:
     if not len(points):
         raise NotIdentified("no star lies where the camera predicts it")
     start = replace(camera, covariance=None, covariance_order=())
     return fit_lens(start, R_cam_icrs, points, coefficients=coefficients)
 
 
-def _points(frames: tuple[Frame, ...], matches: tuple[FrameMatches, ...]) -> Observations:
-    pairs = list(zip(frames, matches, strict=True))
+def _points(frames: tuple[Frame, ...], matches: list[tuple[Ints, Ints]]) -> Observations:
+    """The sources and stars of the `frames` that are matched: indices of both, frame by frame."""
+    pairs = [(f.sources.take(detection), f.sky.stars.rays_icrs[star])
+             for f, (detection, star) in zip(frames, matches, strict=True)]  # fmt: skip
     return observations(
-        [f.sources.xy_px[m.detection] for f, m in pairs],
-        [f.sky.stars.rays_icrs[m.star] for f, m in pairs],
-        [f.sources.covariance_px2[m.detection] for f, m in pairs],
+        [found.xy_px for found, _ in pairs], [rays for _, rays in pairs], [found.covariance_px2 for found, _ in pairs]
     )
 
 

@@ -119,7 +119,15 @@ def best_model(
     outermost, fold = float(off_axis.max()), assign_folds(points, off_axis)
 
     def fit(model: LensModel, start: CameraState) -> _Fitted:
-        return _fit(model, model.start_from(start), points, extra_px2, fold)
+        solution = adjust(model.start_from(start), points, model.free, LEAST_SQUARES, extra_px2=extra_px2)
+        held = held_out_residual_px(solution, fold)
+        score = ModelScore(
+            name=model.text,
+            parameters=len(model.free),
+            held_out_chi2=float(np.einsum("ni,nij,nj->", held, solution.weight, held)),
+            held_out_rms_px=float(np.sqrt(np.mean(np.sum(held**2, axis=1)))),
+        )
+        return _Fitted(model, solution, score)
 
     if coefficients is None:
         lenses = sorted(lens_kinds().values(), key=lambda lens: len(lens.fit_sizes()))  # those of fixed shape first
@@ -131,32 +139,14 @@ def best_model(
     fitted = [fit(model, state) for model in models]
     chosen = _choose_longest(fitted, outermost)
     for _ in range(0 if square else 2):
-        more = [fit(model, chosen.solution.state) for model in _extensions(chosen.model)]
+        wider = replace(chosen.model, aspect=True), replace(chosen.model, decentred=True)
+        more = [fit(model, chosen.solution.state) for model in wider if model != chosen.model]
         fitted += more
         better = min(more, key=lambda f: f.score.held_out_chi2, default=chosen)
         if better.score.held_out_chi2 > chosen.score.held_out_chi2 - EXTENSION_CHI2:
             break
         chosen = better
     return chosen.model, chosen.solution, tuple(f.score for f in fitted)
-
-
-def _extensions(model: LensModel) -> list[LensModel]:
-    """The models with one more kind of free parameters."""
-    aspect = [] if model.aspect else [replace(model, aspect=True)]
-    return aspect + ([] if model.decentred else [replace(model, decentred=True)])
-
-
-def _fit(model: LensModel, start: CameraState, points: Observations, extra_px2: float, fold: Ints) -> _Fitted:
-    solution = adjust(start, points, model.free, LEAST_SQUARES, extra_px2=extra_px2)
-    held = held_out_residual_px(solution, fold)
-    chi2 = np.einsum("ni,nij,nj->", held, solution.weight, held)
-    score = ModelScore(
-        name=model.text,
-        parameters=len(model.free),
-        held_out_chi2=float(chi2),
-        held_out_rms_px=float(np.sqrt(np.mean(np.sum(held**2, axis=1)))),
-    )
-    return _Fitted(model, solution, score)
 
 
 def _choose_longest(fitted: list[_Fitted], outermost_rad: float) -> _Fitted:

@@ -15,7 +15,9 @@ import numpy as np
 
 from startrack.core.types import Array, Bools, Ints
 
-DEPTH_BELOW_THRESHOLD_MAG = 0.7  # stars this much fainter than the faintest detection may still be detected
+DEPTH_BELOW_THRESHOLD_MAG = (
+    0.7  # about the faintest detections: fainter stars are not detected, brighter ones are in open sky
+)
 BRIGHTER_MAG = 0.8  # a detection is at most this much brighter than its star
 DIMMED_MAG = 1.6  # and at most this much fainter: haze, branches, the edge of the lens
 PX_PER_MAG = 0.6  # distance with the same cost as a difference of one magnitude
@@ -111,13 +113,10 @@ def is_isolated(
         return np.zeros(0, dtype=bool)
     near = cKDTree(px[seen]).query_ball_point(at_px, radius_px)
     limit = mag[star] + blend_mag
-    return np.array(
-        [
-            not any(seen[j] != own and mag[seen[j]] < faintest for j in others)
-            for others, own, faintest in zip(near, star, limit, strict=True)
-        ],
-        dtype=bool,
-    )
+    return np.array([
+        not any(seen[j] != own and mag[seen[j]] < faintest for j in others)
+        for others, own, faintest in zip(near, star, limit, strict=True)
+    ])  # fmt: skip
 
 
 @dataclass(frozen=True)

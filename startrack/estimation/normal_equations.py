@@ -15,7 +15,7 @@ import numpy as np
 from startrack.core.types import Array, Ints, Rows, array
 
 RIDGE_1 = 1e-14  # relative to the diagonal; the system stays solvable with unconstrained parameters
-TINY = 1e-300
+TINY = np.finfo(np.float64).tiny
 
 
 @dataclass(frozen=True, kw_only=True)

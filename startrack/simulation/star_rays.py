@@ -6,7 +6,6 @@ photometry masks them), light of the bodies beyond their glare, trails, and erro
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from datetime import datetime
 
 import numpy as np
@@ -14,7 +13,7 @@ import numpy as np
 from startrack.catalog import StarCatalog
 from startrack.chain import CERTAIN_PROBABILITY, StarRays
 from startrack.core.types import TIME_SIGMA_S, Array, BadInput, Bools, Ints
-from startrack.evidence import FluxScale, Skyline, StarEvidence, expect_stars, expected_flux_scale
+from startrack.evidence import Skyline, StarEvidence, expect_stars, expected_flux_scale
 from startrack.exposure import combine_masks
 from startrack.frames import R_enu_icrs, azel_from_rays, observer_velocity_m_s, off_axis_rad
 from startrack.localization import clock_at
@@ -25,16 +24,6 @@ from startrack.terrain import Terrain
 
 EXACT_RAD = np.radians(2.0)  # from the skyline; farther, its elevations at one azimuth in 3 arcmin decide
 UNDECIDED_RAD = np.radians(0.2)  # from the skyline: here the visibility of a neighbour is not known
-
-
-@dataclass(frozen=True, eq=False)
-class _Frame:
-    """A scene's stars in view (m), which of them shine, and the skyline."""
-
-    star: Ints  # (m,) index into the scene's stars
-    angle_rad: Array  # off the axis
-    visible: Bools
-    skyline: Skyline
 
 
 def simulate_rays(
@@ -72,23 +61,28 @@ def simulate_rays(
         raise BadInput("no_time", "the time of the scene is not known")
     camera, when = scene.camera, time_utc or scene.time_utc
     sensor, site = scene.sensor, terrain.site
-    frame = _visible_stars(scene, ground)
-    typical_e = _typical_noise_e(scene)
-    scale = _expected_scale(scene, frame, typical_e)
+    skyline = Skyline.trace(scene.position_enu_m[:2], ground)
+    shining, angle_rad = _shining_stars(scene, ground, skyline)
+    v_mag, error_mag = scene.stars.v_mag[shining], scene.v_error_mag[shining]
+    # Noise of a star's flux halfway between the axis and the edge of the view.
+    half = 0.5 * scene.camera.max_angle_rad
+    ray = np.array([[np.sin(half), 0.0, np.cos(half)]]) @ scene.R_cam_enu
+    pixel_e2 = float(_pixel_variance_e2(scene, ray, np.ones(1, dtype=np.bool_))[0])
+    typical_e = float(np.sqrt(pixel_e2 * noise_area_px(sensor.psf_sigma_px)))
+    zero_mag = 2.5 * float(np.log10(sensor.zero_point_e_per_s * scene.exposure_s))
+    scale = expected_flux_scale(zero_mag, typical_e, v_mag, error_mag)
     stars, R_enu = catalog.at(when, observer_velocity_m_s(site, when)), R_enu_icrs(site, when)
     found = expect_stars(
         camera, stars, list(scene.bodies), scene.R_cam_icrs, R_enu, scale, psf_sigma_px=sensor.psf_sigma_px,
         noise_e=typical_e, mask=combine_masks(None, camera.mask, camera.size_px),
     )  # fmt: skip
     true = np.asarray(stars.rays_icrs[found.star] @ scene.R_enu_icrs.T)  # directions at the true time
-    above = _height_above(true, frame.skyline)
+    above = _height_above(true, skyline)
     sure = np.where(above > 0, CERTAIN_PROBABILITY, 1.0 - CERTAIN_PROBABILITY)
     visible = np.where(np.abs(above) < UNDECIDED_RAD, 0.5, sure)[found.measurable]
     variance = _pixel_variance_e2(scene, true, above > 0)[found.measurable]
-    shining = frame.star[frame.visible]
     xy_px, _ = camera.project(scene.stars.rays_icrs[shining] @ scene.R_cam_icrs.T)
-    v_mag = scene.stars.v_mag[shining] + scene.v_error_mag[shining]
-    light_e = flux_e(sensor, v_mag, frame.angle_rad[frame.visible], scene.exposure_s)
+    light_e = flux_e(sensor, v_mag + error_mag, angle_rad, scene.exposure_s)
     light = Starlight(xy_px, light_e, sensor.psf_sigma_px).measure(
         found.sources(visible), variance, sensor.gain_e_per_adu * (sensor.saturation_adu - sensor.bias_adu), rng=rng
     )
@@ -101,38 +95,21 @@ def simulate_rays(
     return StarRays(terrain=terrain, R_enu_icrs=R_enu, clock=clock, light=measured)
 
 
-def _visible_stars(scene: Scene, ground: Terrain) -> _Frame:
-    """The scene's stars in the image circle, and which of them the terrain leaves visible at mid-exposure."""
+def _shining_stars(scene: Scene, ground: Terrain, skyline: Skyline) -> tuple[Ints, Array]:
+    """The scene's stars (m,) in the image circle that the ground leaves visible at mid-exposure, and their angles."""
     angle = off_axis_rad(scene.stars.rays_icrs @ scene.R_cam_icrs.T)
     star = np.flatnonzero(angle <= scene.camera.max_angle_rad)
     rays_enu = scene.stars.rays_icrs[star] @ scene.R_enu_icrs.T
-    position_m = scene.position_enu_m[:2]
-    skyline = Skyline.trace(position_m, ground)
     above = _height_above(rays_enu, skyline)
     near = np.flatnonzero(np.abs(above) < EXACT_RAD)
     azimuth, elevation = azel_from_rays(rays_enu[near])
-    above[near] = elevation - np.asarray(ground.horizon_rad(position_m[None], azimuth)).ravel()
-    return _Frame(star, angle[star], above > 0, skyline)
-
-
-def _expected_scale(scene: Scene, frame: _Frame, noise_e: float) -> FluxScale:
-    """The scale of fluxes that the bright visible stars of the scene show, with `noise_e` of a star's flux."""
-    zero_mag = 2.5 * float(np.log10(scene.sensor.zero_point_e_per_s * scene.exposure_s))
-    star = frame.star[frame.visible]
-    return expected_flux_scale(zero_mag, noise_e, scene.stars.v_mag[star], scene.v_error_mag[star])
+    above[near] = elevation - np.asarray(ground.horizon_rad(scene.position_enu_m[None, :2], azimuth)).ravel()
+    return star[above > 0], angle[star[above > 0]]
 
 
 def _height_above(rays_enu: Array, skyline: Skyline) -> Array:
     azimuth, elevation = azel_from_rays(rays_enu)
     return np.asarray(elevation - skyline(azimuth))
-
-
-def _typical_noise_e(scene: Scene) -> float:
-    """Noise of a star's flux halfway between the axis and the edge of the view."""
-    half = 0.5 * scene.camera.max_angle_rad
-    ray = np.array([[np.sin(half), 0.0, np.cos(half)]]) @ scene.R_cam_enu
-    variance = float(_pixel_variance_e2(scene, ray, np.ones(1, dtype=np.bool_))[0])
-    return float(np.sqrt(variance * noise_area_px(scene.sensor.psf_sigma_px)))
 
 
 def _pixel_variance_e2(scene: Scene, rays_enu: Array, above: Bools) -> Array:

@@ -13,7 +13,6 @@ from startrack.evidence import Photometry, Sources, half_width, neighbour_profil
 from startrack.psf import pixel_profile
 
 NEIGHBOUR_SIGMAS = 3.0  # of the PSF beyond half a stamp, to the last star whose light is subtracted, as in `measure`
-CORNER = float(np.sqrt(2.0))  # half diagonal of a stamp in its half widths: light reaches its corners, too
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +36,7 @@ class Starlight:
         from scipy.spatial import cKDTree
 
         sigma, radius = self.psf_sigma_px, half_width(self.psf_sigma_px)
-        reach_px = CORNER * radius + NEIGHBOUR_SIGMAS * sigma
+        reach_px = np.hypot(radius, radius) + NEIGHBOUR_SIGMAS * sigma  # from the corners of a stamp
         lowest_px = np.floor(sources.xy_px.min(axis=0, initial=0.0) - reach_px)
         near = (self.xy_px > lowest_px).all(axis=1)
         own_px = sources.xy_px - lowest_px

@@ -20,11 +20,12 @@ SKYLINE_AZIMUTHS = 360  # of the result, one degree each
 COLUMNS_PER_AZIMUTH = 4
 AZIMUTH_COLUMNS = SKYLINE_AZIMUTHS * COLUMNS_PER_AZIMUTH
 LOWEST_RAD, GRID_STEP_RAD = np.radians(-5.0), np.radians(0.02)  # of the grid of elevations
-TOP_RAD = np.radians(67.0)  # of the columns
-SAMPLES_PER_PX = 3
-FINEST_PX_RAD = np.radians(0.06)  # pixels of narrow fields are taken as larger ones
-SIDE_SAMPLES = 3  # across a column
-FILL_COLUMNS, FILL_SHARE = 21, 0.1  # around a star, and how many of them without a star are enough
+HIGHEST_GROUND_RAD = np.radians(45.0)  # higher columns are narrower than pixels and see the same features
+LEVEL_RAD, ABOVE_RAD = np.radians(2.0), np.radians(20.0)  # for the brightness of the sky above a step
+TOP_RAD = HIGHEST_GROUND_RAD + ABOVE_RAD + LEVEL_RAD  # of the columns
+COLUMN_SAMPLES = 3  # per pixel along a column, and across it
+WIDTHS = ((1, 0.6), (7, 0.3), (21, 0.2))  # columns averaged, and weight: they share their pixels with their neighbours
+FILL_SHARE = 0.1  # of the widest average around a star: so many columns without a star are enough
 LARGE_AREA_PX, MOON_GLARE_PX = 500, 40  # of the Moon and what surrounds it
 SATURATED_PX = 5  # around saturated pixels nothing is measured
 HOT_SIGMAS = 6.0  # above the median of the neighbours: stars and hot pixels
@@ -76,24 +77,27 @@ def sample_columns(
     smooth = cv2.medianBlur(detections.image_e, 3)
     stands_out = np.abs(detections.image_e - smooth) > HOT_SIGMAS * noise_e
     image_e = np.where(stands_out, smooth, detections.image_e).astype(np.float32)
-    px_rad = _px_rad(camera, R_cam_enu)
-    elevation = np.arange(LOWEST_RAD, TOP_RAD, px_rad / SAMPLES_PER_PX)
+    # Size of a pixel in elevation at the horizon, or where the view comes nearest to it; at least that of the grid.
+    away = off_axis_rad(rays_from_azel(np.linspace(0, 2 * np.pi, 36, endpoint=False), 0.0) @ R_cam_enu.T)
+    slope = camera.lens.slope(np.array(np.minimum(np.min(away), camera.max_angle_rad)))
+    px_rad = max(float(1.0 / (np.sqrt(np.prod(camera.focal_px)) * slope)), COLUMN_SAMPLES * GRID_STEP_RAD)
+    elevation = np.arange(LOWEST_RAD, TOP_RAD, px_rad / COLUMN_SAMPLES)
     disks = np.zeros_like(lost)
     for (i, j), radius in zip(np.rint(stars[0]).astype(int).tolist(), stars[1], strict=True):
         cv2.circle(disks, (i, j), round(radius), 1, -1)
     shape = len(elevation), AZIMUTH_COLUMNS
     total, spread, points = np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=bool)
-    for k in range(SIDE_SAMPLES):
-        azimuth = column_azimuths_rad() + ((k + 0.5) / SIDE_SAMPLES - 0.5) * 2 * np.pi / AZIMUTH_COLUMNS
+    for k in range(COLUMN_SAMPLES):
+        azimuth = column_azimuths_rad() + ((k + 0.5) / COLUMN_SAMPLES - 0.5) * 2 * np.pi / AZIMUTH_COLUMNS
         xy, inside = camera.project(rays_from_azel(azimuth[None, :], elevation[:, None]) @ R_cam_enu.T)
         x, y = (np.ascontiguousarray(xy[..., axis], dtype=np.float32) for axis in (0, 1))
         hidden = ~inside | (cv2.remap(lost, x, y, cv2.INTER_NEAREST) > 0)
         total += np.where(hidden, np.nan, cv2.remap(image_e, x, y, cv2.INTER_LINEAR))
         spread += cv2.remap(noise_e, x, y, cv2.INTER_NEAREST)
         points |= cv2.remap(disks, x, y, cv2.INTER_NEAREST) > 0
-    columns = Columns(elevation, total / SIDE_SAMPLES, spread / SIDE_SAMPLES, px_rad / SAMPLES_PER_PX, px_rad)
+    columns = Columns(elevation, total / COLUMN_SAMPLES, spread / COLUMN_SAMPLES, px_rad / COLUMN_SAMPLES, px_rad)
     without = replace(columns, light_e=np.where(points, np.nan, columns.light_e))
-    around = average_columns(without, FILL_COLUMNS, FILL_SHARE).light_e
+    around = average_columns(without, WIDTHS[-1][0], FILL_SHARE).light_e
     return replace(columns, light_e=np.where(points, around, columns.light_e))
 
 
@@ -106,15 +110,6 @@ def _lost_pixels(detections: Detections) -> NDArray[np.uint8]:
     around = [cv2.dilate(part.astype(np.uint8), np.ones((2 * px + 1,) * 2, np.uint8))
               for part, px in ((saturated, SATURATED_PX), (large, MOON_GLARE_PX))]  # fmt: skip
     return np.asarray(np.maximum(*around) | masked.view(np.uint8), dtype=np.uint8)
-
-
-def _px_rad(camera: Camera, R_cam_enu: Array) -> float:
-    """Size [rad] of a pixel in elevation at the horizon, or where the view comes nearest to it."""
-    azimuth = np.linspace(0, 2 * np.pi, 36, endpoint=False)
-    angle = off_axis_rad(rays_from_azel(azimuth, 0.0) @ R_cam_enu.T)
-    nearest = np.minimum(np.min(angle), camera.max_angle_rad)
-    px_rad = 1.0 / (np.sqrt(np.prod(camera.focal_px)) * camera.lens.slope(np.array(nearest)))
-    return max(float(px_rad), FINEST_PX_RAD)
 
 
 def average_columns(columns: Columns, width: int, least: float = 0.49) -> Columns:
@@ -130,10 +125,8 @@ def average_columns(columns: Columns, width: int, least: float = 0.49) -> Column
 
 def mean_above(columns: Columns, low_px: float, high_px: float) -> Array:
     """Mean (k, columns) of the samples from `low_px` to `high_px` above each elevation; nan where one is missing."""
-    low, high = round(low_px * SAMPLES_PER_PX), round(high_px * SAMPLES_PER_PX)
-    sums, count = columns.sums
-    samples = len(columns.elevation_rad)
-    first = np.clip(np.arange(samples) + low, 0, samples)
-    last = np.clip(np.arange(samples) + high, 0, samples)
+    low, high = round(low_px * COLUMN_SAMPLES), round(high_px * COLUMN_SAMPLES)
+    (sums, count), samples = columns.sums, len(columns.elevation_rad)
+    first, last = (np.clip(np.arange(samples) + to, 0, samples) for to in (low, high))
     full = (count[last] - count[first]) == high - low
     return np.where(full, (sums[last] - sums[first]) / (high - low), np.nan)

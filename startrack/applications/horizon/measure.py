@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, COLUMNS_PER_AZIMUTH, SKYLINE_AZIMUTHS
+from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, COLUMNS_PER_AZIMUTH, SKYLINE_AZIMUTHS, WIDTHS
 from startrack.applications.horizon.frames import LeftOut, SkyFrame, orient_frames
 from startrack.applications.horizon.posterior import (
-    Marginals,
+    WEAKEST_CONTRAST,
     column_log_prior,
     combine_columns,
     star_log_likelihood,
@@ -24,15 +24,13 @@ from startrack.core.errors import NoSolution
 from startrack.core.types import Array, Bools, Exposure, MeasuredSkyline
 from startrack.frames import Site, off_axis_rad, rays_from_azel
 
-WIDTHS = ((1, 0.6), (7, 0.3), (21, 0.2))  # columns averaged, and weight: they share their pixels with their neighbours
-UNKNOWN_SIGMA_RAD = np.radians(2.0)  # a wider posterior is no measurement
+UNKNOWN_SIGMA_RAD = np.radians(2.0)  # a wider posterior is no measurement, nor is a star farther away
 PLACE_SIGMA_RAD = np.radians(0.04)  # a quarter of a usual pixel: the edge's place depends on how the ground is lit
 WALL_RAD = np.radians(1.0)  # variation from which one elevation does not describe a bin
 WEATHER_1 = 0.1  # of the refraction: what the weather changes
 NEAR_LIGHT_RAD = np.radians(0.3)  # a step this near to the skyline is evidence for it
-GAP_CONTRAST, GAP_SIGNIFICANCE = 0.25, 5.0  # of brighter light below the skyline
+GAP_SIGNIFICANCE = 5.0  # of light below the skyline that is brighter than usual ground
 DEEPEST_GAP_RAD = np.radians(15.0)
-NEAR_STAR_RAD = np.radians(2.0)
 DECISIVE_LLR = 2.0
 
 
@@ -75,43 +73,33 @@ def measure_frames(frames: tuple[SkyFrame, ...], left_out: tuple[LeftOut, ...], 
         first = left_out[0]
         raise NoSolution(f"{first.name}: {first.message}", reason=first.reason)
     stars = [measure_stars(frame) for frame in frames]
-    widths = tuple(width for width, _ in WIDTHS)
-    steps = [find_steps(frame, light, widths) for frame, light in zip(frames, stars, strict=True)]
+    steps = [find_steps(frame, light) for frame, light in zip(frames, stars, strict=True)]
     total = column_log_prior()
     for light, by_width in zip(stars, steps, strict=True):
-        total = total + star_log_likelihood(light.rays, light.missing, light.spurious)
+        total = total + star_log_likelihood(light.rays, light.missing)
         for found, (_, weight) in zip(by_width, WIDTHS, strict=True):
             total += step_log_likelihood(found, weight)
-    marginals = combine_columns(total)
-    return SkylineResult(_skyline(marginals, frames, stars, steps, site), frames, left_out)
-
-
-def _skyline(
-    marginals: Marginals, frames: Sequence[SkyFrame], stars: Sequence[StarLight], steps: Sequence[list[Steps]],
-    site: Site,
-) -> MeasuredSkyline:  # fmt: skip
-    """The columns' posterior as bins of one degree; the errors that the frames share are added once."""
-    columns = marginals.mean_rad.reshape(SKYLINE_AZIMUTHS, COLUMNS_PER_AZIMUTH)
+    # The columns' posterior as bins of one degree; the errors that the frames share are added once.
+    mean, sigma = combine_columns(total)
     azimuth = np.radians(np.arange(SKYLINE_AZIMUTHS, dtype=np.float64) * (360.0 / SKYLINE_AZIMUTHS))
-    elevation = columns.mean(axis=1)
-    scatter = np.mean(np.square(marginals.sigma_rad.reshape(SKYLINE_AZIMUTHS, COLUMNS_PER_AZIMUTH)), axis=1)
-    half = COLUMNS_PER_AZIMUTH // 2
-    variation = _columns_of_bins(marginals.mean_rad, half).var(axis=1)  # within one degree to either side
+    elevation, scatter = (_columns_of_bins(one, 0).mean(axis=1) for one in (mean, np.square(sigma)))
+    variation = _columns_of_bins(mean, COLUMNS_PER_AZIMUTH // 2).var(axis=1)  # within one degree to either side
     shared = np.square(_common_sigma_rad(frames, azimuth, elevation, site)) + PLACE_SIGMA_RAD**2
-    shared += np.square(_gap_depth(steps, marginals.mean_rad))
-    by_stars, by_light = _has_star(stars, azimuth, elevation), _has_step(steps, marginals.mean_rad)
+    shared += np.square(_gap_depth(steps, mean))
+    by_stars, by_light = _has_star(stars, azimuth, elevation), _has_step(steps, mean)
     known = (scatter + variation + shared < UNKNOWN_SIGMA_RAD**2) & (by_stars | by_light)
     # A shorter run than three is a halo or a reflection more often than ground, and beside an unknown bin the ground
     # often rises.
     known &= np.roll(known, 1) & np.roll(known, -1)
     variance = scatter / COLUMNS_PER_AZIMUTH + np.square(variation) / (variation + WALL_RAD**2) + shared
     source = np.select([by_stars & by_light, by_light, by_stars], ["both", "sky light", "stars"], "")
-    return MeasuredSkyline(
+    skyline = MeasuredSkyline(
         azimuth_rad=azimuth,
         elevation_rad=np.where(known, elevation, np.nan),
         sigma_rad=np.where(known, np.sqrt(variance), np.inf),
         source=np.where(known, source, ""),
     )
+    return SkylineResult(skyline, frames, left_out)
 
 
 def _gap_depth(steps: Sequence[list[Steps]], elevation_rad: Array) -> Array:
@@ -119,7 +107,7 @@ def _gap_depth(steps: Sequence[list[Steps]], elevation_rad: Array) -> Array:
     depth = np.zeros(AZIMUTH_COLUMNS)
     for one in (one for by_width in steps for one in by_width[:2]):
         below = elevation_rad[one.column] - one.elevation_rad
-        light = (one.contrast > GAP_CONTRAST) & (one.significance > GAP_SIGNIFICANCE)
+        light = (one.contrast > WEAKEST_CONTRAST) & (one.significance > GAP_SIGNIFICANCE)
         light &= (below > NEAR_LIGHT_RAD) & (below < DEEPEST_GAP_RAD)
         np.maximum.at(depth, one.column[light], below[light])
     return np.asarray(_columns_of_bins(depth, 2 * COLUMNS_PER_AZIMUTH).mean(axis=1))
@@ -127,10 +115,8 @@ def _gap_depth(steps: Sequence[list[Steps]], elevation_rad: Array) -> Array:
 
 def _columns_of_bins(values: Array, beside: int) -> Array:
     """The values (AZIMUTH_COLUMNS,) of the columns of each bin and of so many `beside` it, (SKYLINE_AZIMUTHS, n)."""
-    columns = np.arange(SKYLINE_AZIMUTHS)[:, None] * COLUMNS_PER_AZIMUTH + np.arange(
-        -beside, COLUMNS_PER_AZIMUTH + beside
-    )
-    return values[columns % AZIMUTH_COLUMNS]
+    own = np.arange(-beside, COLUMNS_PER_AZIMUTH + beside)
+    return values[(np.arange(0, AZIMUTH_COLUMNS, COLUMNS_PER_AZIMUTH)[:, None] + own) % AZIMUTH_COLUMNS]
 
 
 def _common_sigma_rad(frames: Sequence[SkyFrame], azimuth: Array, elevation: Array, site: Site) -> Array:
@@ -152,8 +138,8 @@ def _has_star(stars: Sequence[StarLight], azimuth: Array, elevation: Array) -> B
     for light in stars:
         rays = light.rays.take(np.abs(light.rays.llr) > DECISIVE_LLR)
         apart = np.abs((rays.azimuth_rad - azimuth[:, None] + np.pi) % (2 * np.pi) - np.pi)
-        near = apart * np.cos(elevation)[:, None] < NEAR_STAR_RAD
-        found |= (near & (np.abs(rays.elevation_rad - elevation[:, None]) < NEAR_STAR_RAD)).any(axis=1)
+        near = apart * np.cos(elevation)[:, None] < UNKNOWN_SIGMA_RAD
+        found |= (near & (np.abs(rays.elevation_rad - elevation[:, None]) < UNKNOWN_SIGMA_RAD)).any(axis=1)
     return found
 
 
@@ -163,7 +149,7 @@ def _has_step(steps: Sequence[list[Steps]], elevation_rad: Array) -> Bools:
     for one in (one for by_width in steps for one in by_width):
         near = np.abs(one.elevation_rad - elevation_rad[one.column]) < NEAR_LIGHT_RAD
         found[one.column[near]] = True
-    return np.asarray(found.reshape(SKYLINE_AZIMUTHS, COLUMNS_PER_AZIMUTH).mean(axis=1) >= 0.5)
+    return np.asarray(_columns_of_bins(found, 0).mean(axis=1) >= 0.5)
 
 
 def predicted_visible(skyline: MeasuredSkyline, azimuth_rad: Array, elevation_rad: Array) -> tuple[Bools, Bools]:

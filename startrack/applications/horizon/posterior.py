@@ -7,7 +7,6 @@ distribution, sometimes a wide one (a tree), and sometimes it jumps anywhere (a 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from startrack.core.types import Array, Evidence
 
 CHANGES_RAD = np.radians(np.array([0.02, 0.12, 0.8]))  # Laplace scales of the change between columns: hill, wood, tree
 CHANGE_WEIGHTS = (0.55, 0.25, 0.18)
-JUMP_WEIGHT = 0.02  # a dome, a mast: any elevation
+JUMP_WEIGHT = 1.0 - sum(CHANGE_WEIGHTS)  # a dome, a mast: any elevation
 SHOWN_PROBABILITY = 0.75  # that the skyline itself is among a column's steps
 BRIGHTER_PROBABILITY = 0.25  # that the ground at the skyline is brighter than the sky, in moonlight or lamplight
 SURE_SIGNIFICANCE, RARELY_BRIGHTER_PROBABILITY = 8.0, 0.05  # weak bright steps are more often stars
@@ -26,21 +25,13 @@ NOISE_PER_RAD = np.degrees(0.5)  # density of steps of 3 sigma that are noise
 SKY_PER_RAD, SKY_CONTRAST = np.degrees(0.08), 0.12  # density of steps in the sky (clouds, reflections), and their scale
 RARE_PER_RAD = np.degrees(3e-4)  # of sharp ones in the sky: wires, halos of bright stars
 GROUND_PER_RAD, GROUND_CONTRAST = np.degrees(0.3), 0.15  # density of steps below the skyline, and their scale
+SPURIOUS_PROBABILITY = 0.01  # of light at a hidden star: leaves with gaps, hot pixels
 MOST_MISSING = 0.999  # probability that a visible star is not seen
 LOW_MISSING, LOW_SCALE_RAD = 0.4, np.radians(3.0)  # near the horizon: haze dims stars more than the fit
 HIGH_1_PER_RAD = 4.0  # per column; neighbours add up
 LEAST_LLR = 0.25  # rows below it are left out
-LARGEST_LLR = 500.0  # of a star, before the limits: its exponential would overflow at 710
 STAR_EDGE_SIGMAS = 5.0
 OUTLIER_PROBABILITY = 1e-4  # of a column whose evidence means nothing
-
-
-@dataclass(frozen=True)
-class Marginals:
-    """Posterior of each column (AZIMUTH_COLUMNS) on the grid of elevations."""
-
-    mean_rad: Array
-    sigma_rad: Array
 
 
 def column_log_prior() -> Array:
@@ -48,11 +39,10 @@ def column_log_prior() -> Array:
     return np.tile(-HIGH_1_PER_RAD * np.maximum(elevations_rad(), 0.0), (AZIMUTH_COLUMNS, 1))
 
 
-def star_log_likelihood(rays: Evidence, missing: float, spurious: float) -> Array:
+def star_log_likelihood(rays: Evidence, missing: float) -> Array:
     """Log-likelihood (AZIMUTH_COLUMNS, n) of the stars' rows at each elevation of the skyline.
 
-    `missing`: probability that a visible star is not seen (cloud), `spurious`: that a hidden one seems seen (a gap in
-    the leaves, a hot pixel).
+    `missing`: probability that a visible star is not seen (cloud).
     """
     from scipy.special import log_ndtr
 
@@ -60,7 +50,7 @@ def star_log_likelihood(rays: Evidence, missing: float, spurious: float) -> Arra
     n = len(elevation)
     low = missing + LOW_MISSING * np.exp(-np.maximum(rays.elevation_rad, 0.0) / LOW_SCALE_RAD)
     low = np.minimum(low, MOST_MISSING)
-    limited = limit_llr(rays.llr, low, spurious)
+    limited = limit_llr(rays.llr, low, SPURIOUS_PROBABILITY)
     use = (np.abs(limited) > LEAST_LLR) & (rays.elevation_rad > LOWEST_RAD) & (rays.elevation_rad < elevation[-1])
     rays, limited = rays.take(use), limited[use]
     column = column_of(rays.azimuth_rad)
@@ -82,8 +72,10 @@ def star_log_likelihood(rays: Evidence, missing: float, spurious: float) -> Arra
 
 def limit_llr(llr: Array, missing: Array, spurious: float) -> Array:
     """Log-likelihood ratios (n,) with the probabilities of a visible star not seen, and of a hidden one seen."""
-    ratio = np.exp(np.minimum(llr, LARGEST_LLR))
-    return np.asarray(np.log(((1 - missing) * ratio + missing) / (spurious * ratio + 1 - spurious)))
+    from scipy.special import expit
+
+    seen, unseen = expit(llr), expit(-llr)
+    return np.asarray(np.log(((1 - missing) * seen + missing * unseen) / (spurious * seen + (1 - spurious) * unseen)))
 
 
 def step_log_likelihood(steps: Steps, temper: float) -> Array:
@@ -108,8 +100,8 @@ def step_log_likelihood(steps: Steps, temper: float) -> Array:
     return temper * total
 
 
-def combine_columns(log_likelihood: Array) -> Marginals:
-    """Marginals of the chain with the log-likelihoods (AZIMUTH_COLUMNS, n)."""
+def combine_columns(log_likelihood: Array) -> tuple[Array, Array]:
+    """Means and standard deviations [rad] of each column by the chain with log-likelihoods (AZIMUTH_COLUMNS, n)."""
     from scipy.fft import irfft, next_fast_len, rfft
 
     columns, n = log_likelihood.shape
@@ -140,4 +132,4 @@ def combine_columns(log_likelihood: Array) -> Marginals:
     elevation = elevations_rad()
     mean = posterior @ elevation
     variance = np.maximum(posterior @ np.square(elevation) - np.square(mean), 0.0)
-    return Marginals(mean, np.sqrt(variance))
+    return mean, np.sqrt(variance)

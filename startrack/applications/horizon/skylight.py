@@ -12,8 +12,12 @@ from functools import lru_cache
 import numpy as np
 
 from startrack.applications.horizon.columns import (
+    ABOVE_RAD,
     AZIMUTH_COLUMNS,
-    SAMPLES_PER_PX,
+    COLUMN_SAMPLES,
+    HIGHEST_GROUND_RAD,
+    LEVEL_RAD,
+    WIDTHS,
     Columns,
     average_columns,
     mean_above,
@@ -31,13 +35,10 @@ MIN_SIGNIFICANCE = 3.0
 PEAK_PX = 2.0  # a step is the most significant within this distance
 RELATIVE_ERROR = 0.02  # of the extrapolated sky, of its brightness above the darkest pixels
 DARKEST_PERCENT = 0.5
-HIGHEST_STEP_RAD = np.radians(45.0)  # above, columns are narrower than pixels and see the same features
-LEVEL_RAD, ABOVE_RAD = np.radians(2.0), np.radians(20.0)  # for the brightness of the sky above a step
 WINDOW_PX = 10.0  # half width of the window in which an edge's place is measured
 REACH_PX, PLACE_STEP_PX = 2.5, 0.25
 PLACES_PX = np.arange(-REACH_PX, REACH_PX + PLACE_STEP_PX / 2, PLACE_STEP_PX)  # tried
 EDGE_SIGMAS_PX = (0.8, 1.5, 2.5, 3.5)  # widths tried: the PSF, fuzzy trees, haze
-EDGE_PARAMETERS = 5  # place, width, two levels, slope
 SHAPE_ERROR = 0.3  # of the difference between the fitted edge and the half level
 BLURRED_PX = 1.5  # error of the place of an edge of the largest width: where ground begins in haze
 MIN_SIGMA_PX, MAX_SIGMA_PX = 0.1, 2.0  # of a place; beyond, it is not measured
@@ -58,16 +59,18 @@ class Steps:
     significance: Array
 
 
-def find_steps(frame: SkyFrame, stars: StarLight, widths: tuple[int, ...]) -> list[Steps]:
-    """All significant steps of the image of a `frame`, for each width of columns averaged; `stars` are left out."""
+def find_steps(frame: SkyFrame, stars: StarLight) -> list[Steps]:
+    """All significant steps of the image of a `frame`, for each of the WIDTHS; `stars` are left out."""
     edge = min(frame.camera.max_angle_rad + BEYOND_CIRCLE_RAD, frame.camera.lens.max_invertible_rad)
     camera = replace(frame.camera, max_angle_rad=edge)
     columns = sample_columns(frame.detections, (stars.bright_px, stars.glare_px), camera, frame.R_cam_enu)
-    return [_steps_of(average_columns(columns, width), width) for width in widths]
+    return [_steps_of(average_columns(columns, width), width) for width, _ in WIDTHS]
 
 
 def _steps_of(columns: Columns, width: int) -> Steps:
     """The steps of columns that are means over `width`."""
+    from scipy.ndimage import maximum_filter1d
+
     width_px = width * 2 * np.pi / AZIMUTH_COLUMNS / columns.px_rad
     dark = float(np.nanpercentile(columns.light_e, DARKEST_PERCENT))
     at_ground = _level_above(columns, CLEAR_GAP_PX, 2 * CLEAR_GAP_PX + GROUND_PX / 2, dark)
@@ -78,13 +81,17 @@ def _steps_of(columns: Columns, width: int) -> Steps:
         np.square(noise) * (6.0 / SKY_PX + 1.0 / GROUND_PX) + np.square(RELATIVE_ERROR * (at_ground - dark))
     )
     significance = np.abs(difference) / sigma
-    peak = _is_peak(significance, round(PEAK_PX * SAMPLES_PER_PX)) & (significance > MIN_SIGNIFICANCE)
-    peak &= columns.elevation_rad[:, None] < HIGHEST_STEP_RAD
+    clean = np.nan_to_num(significance)
+    peak = clean == maximum_filter1d(clean, 2 * round(PEAK_PX * COLUMN_SAMPLES) + 1, axis=0)
+    peak &= (clean > MIN_SIGNIFICANCE) & (columns.elevation_rad[:, None] < HIGHEST_GROUND_RAD)
     row, column = np.nonzero(peak)
     elevation, sigma_px, good = _measure_edges(columns, row, column, noise)
-    contrast = difference[row, column] / np.maximum(_sky_level(columns)[row, column] - dark, 1e-9)
-    sigma_rad = sigma_px * columns.px_rad
-    return Steps(column[good], elevation[good], sigma_rad[good], contrast[good], significance[row, column][good])
+    # The sky's level is the largest mean of LEVEL_RAD within ABOVE_RAD.
+    level, size = mean_above(columns, 0.0, LEVEL_RAD / columns.px_rad), round(ABOVE_RAD / columns.step_rad)
+    sky = maximum_filter1d(np.nan_to_num(level), size, axis=0, origin=-(size // 2), mode="constant")
+    contrast = difference[row, column] / np.maximum(sky[row, column] - dark, 1e-9)
+    sigma_rad, row, column = sigma_px * columns.px_rad, row[good], column[good]
+    return Steps(column, elevation[good], sigma_rad[good], contrast[good], significance[row, column])
 
 
 def _level_above(columns: Columns, gap_px: float, distance_px: float, dark_e: float) -> Array:
@@ -98,30 +105,13 @@ def _level_above(columns: Columns, gap_px: float, distance_px: float, dark_e: fl
     return near + np.clip(near - far, -limit, limit) * (distance_px + SKY_PX / 2) / SKY_PX
 
 
-def _sky_level(columns: Columns) -> Array:
-    """Largest mean (k, columns) of LEVEL_RAD within ABOVE_RAD above each elevation."""
-    from scipy.ndimage import maximum_filter1d
-
-    mean = mean_above(columns, 0.0, LEVEL_RAD / columns.px_rad)
-    size = round(ABOVE_RAD / columns.step_rad)
-    return np.asarray(maximum_filter1d(np.nan_to_num(mean), size, axis=0, origin=-(size // 2), mode="constant"))
-
-
-def _is_peak(values: Array, half: int) -> Bools:
-    """Whether each value (k, columns) is the largest within `half` samples along its column."""
-    from scipy.ndimage import maximum_filter1d
-
-    clean = np.nan_to_num(values)
-    return (clean > 0) & (clean == maximum_filter1d(clean, 2 * half + 1, axis=0))
-
-
 def _measure_edges(columns: Columns, row: Ints, column: Ints, noise: Array) -> tuple[Array, Array, Bools]:
     """Elevation [rad] and sigma [px] (n,) of steps at samples (row, column) (n,), and which of them are measured.
 
     Least squares of a level of ground and a sloping level of sky, joined by an edge of one of several widths; the mean
     and the scatter of the edge's place over all widths and places, by their likelihoods.
     """
-    half = round(WINDOW_PX * SAMPLES_PER_PX)
+    half = round(WINDOW_PX * COLUMN_SAMPLES)
     good = (row >= half) & (row < len(columns.elevation_rad) - half)
     middle = np.where(good, row, half)
     light, depth_px = _fill_below(columns.light_e[middle[:, None] + np.arange(-half, half + 1), column[:, None]], half)
@@ -149,10 +139,10 @@ def _fill_below(light: Array, half: int) -> tuple[Array, Array]:
     Also the depth (n,) of the view below the middle [px].
     """
     first = np.minimum(np.argmax(np.isfinite(light), axis=1), half)
-    lowest = first[:, None] + np.arange(LEVEL_PX * SAMPLES_PER_PX)
+    lowest = first[:, None] + np.arange(LEVEL_PX * COLUMN_SAMPLES)
     level = np.take_along_axis(light, lowest, axis=1).mean(axis=1, keepdims=True)
     filled = np.where(np.arange(light.shape[1]) < first[:, None], level, light)
-    return filled, (half - first) / SAMPLES_PER_PX
+    return filled, (half - first) / COLUMN_SAMPLES
 
 
 def _weigh_edges(light: Array, half: int, noise_e: Array) -> tuple[Array, Ints]:
@@ -164,9 +154,10 @@ def _weigh_edges(light: Array, half: int, noise_e: Array) -> tuple[Array, Ints]:
     ])  # fmt: skip
     flat = rest.reshape(-1, len(light))
     least = flat.min(axis=0)
+    fitted = 2 + _edge_basis(half, 0.0, EDGE_SIGMAS_PX[0]).shape[1]  # place and width
     # Samples of one pixel are not independent.
-    variance = np.maximum(np.square(noise_e), least / SAMPLES_PER_PX / (2 * WINDOW_PX + 1 - EDGE_PARAMETERS))
-    chi2 = np.maximum(rest - least, 0.0) / SAMPLES_PER_PX / np.where(variance > 0, variance, 1.0)
+    variance = np.maximum(np.square(noise_e), least / COLUMN_SAMPLES / (2 * WINDOW_PX + 1 - fitted))
+    chi2 = np.maximum(rest - least, 0.0) / COLUMN_SAMPLES / np.where(variance > 0, variance, 1.0)
     weight = np.exp(-0.5 * chi2)
     return weight / weight.sum(axis=(0, 1)), flat.argmin(axis=0)
 
@@ -178,7 +169,7 @@ def _half_level(light: Array, half: int, best: Ints) -> Array:
     """
     from scipy.ndimage import uniform_filter1d
 
-    x = np.arange(-half, half + 1) / SAMPLES_PER_PX
+    x = np.arange(-half, half + 1) / COLUMN_SAMPLES
     smooth = uniform_filter1d(light, SMOOTH_SAMPLES, axis=1)
     found = np.full(len(light), np.nan)
     for k in np.unique(best):
@@ -193,7 +184,7 @@ def _half_level(light: Array, half: int, best: Ints) -> Array:
         low, high = above[np.arange(len(rows)), at], above[np.arange(len(rows)), at + 1]
         found[rows] = np.where(
             np.isfinite(distance.min(axis=1)),
-            x[at] - low / np.where(high > low, high - low, 1.0) / SAMPLES_PER_PX,
+            x[at] - low / np.where(high > low, high - low, 1.0) / COLUMN_SAMPLES,
             np.nan,
         )
     return found
@@ -209,6 +200,6 @@ def _edge_profile(half: int, place_px: float, sigma_px: float) -> Array:
     """Columns (2 half + 1, 3): ground, sky and the sky's slope, for an edge at a place in the window."""
     from scipy.special import ndtr
 
-    x = np.arange(-half, half + 1) / SAMPLES_PER_PX - place_px
+    x = np.arange(-half, half + 1) / COLUMN_SAMPLES - place_px
     sky = ndtr(x / sigma_px)
     return np.stack([1.0 - sky, sky, sky * x], axis=1)

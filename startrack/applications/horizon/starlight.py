@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from startrack.applications.horizon.columns import HIGHEST_GROUND_RAD
 from startrack.applications.horizon.frames import SkyFrame
 from startrack.catalog import airmass
 from startrack.core.statistics import robust_sigma
@@ -13,19 +14,14 @@ from startrack.core.types import Array, Evidence, Stars
 from startrack.evidence import SEEN_LLR, FluxScale, StarEvidence, StarPhotometry
 from startrack.frames import azel_from_rays, off_axis_rad
 
-FITTED_SNR = 12.0
-USUAL_EXTINCTION_MAG, EXTINCTION_SIGMA_MAG = 0.2, 0.1  # per airmass, in clear air
+BRIGHT_SNR = 12.0  # stars that show the dimming, and beside which the light of the sky is not measured
+USUAL_EXTINCTION_MAG, EXTINCTION_SIGMA_MAG = 0.2, 0.1  # per airmass, in clear air; in haze beyond most stars'
 FREE_TERM_MAG = 3.0  # prior sigma of the other terms of the throughput
-BELOW_STARS_MAG = 0.1  # per airmass beyond that of most stars: haze
 TYPICAL_SCATTER_MAG = 0.3
 MIN_SCATTER_MAG = 0.1
 TESTED_QUANTILE = 0.95
 DIMMING_ROUNDS = 12
-HIGHEST_NEEDED_RAD = np.radians(45.0)
-SPURIOUS_PROBABILITY = 0.01
 STAR_GLARE_PX, GLARE_PER_DECADE_PX = 3.0, 2.5  # of the faintest of them, and more for each factor of ten
-BRIGHT_SIGMAS = 12.0  # stars beside which the sky's light is not measured
-STAR_EDGE_PX = 1.0  # width of the skyline as a star of the usual PSF shows it
 
 
 @dataclass(frozen=True)
@@ -42,14 +38,14 @@ class Dimming:
 
     def sigma_mag(self, air: Array) -> Array:
         """Error (n,) of the zero point in directions that no bright star tested."""
-        return np.asarray(BELOW_STARS_MAG * np.maximum(air - self.tested_airmass, 0.0))
+        return np.asarray(EXTINCTION_SIGMA_MAG * np.maximum(air - self.tested_airmass, 0.0))
 
 
 def fit_dimming(frame: SkyFrame) -> Dimming:
     """The dimming that fits the bright identified stars, by robust least squares with a prior on the extinction."""
     d, s = frame.matched_detection, frame.matched_star
     found, stars = frame.detections, frame.sky.stars
-    use = (found.snr[d] > FITTED_SNR) & ~found.saturated[d] & (stars.v_sigma_mag[s] < 0.15)
+    use = (found.snr[d] > BRIGHT_SNR) & ~found.saturated[d] & (stars.v_sigma_mag[s] < 0.15)
     d, s = (d[use], s[use]) if use.sum() >= 5 else (d, s)
     rays = stars.rays_icrs[s]
     angle, air = off_axis_rad(rays @ frame.R_cam_icrs.T), _airmass(rays @ frame.R_enu_icrs.T)
@@ -74,7 +70,6 @@ class StarLight:
     bright_px: Array  # (m, 2) of stars and planets
     glare_px: Array  # (m,) radius of their light
     missing: float  # share of the stars high in the sky that are not seen: clouds
-    spurious: float = SPURIOUS_PROBABILITY  # probability of light at a hidden star: leaves with gaps, hot pixels
 
 
 def measure_stars(frame: SkyFrame) -> StarLight:
@@ -88,7 +83,7 @@ def measure_stars(frame: SkyFrame) -> StarLight:
     )  # fmt: skip
     rows = light.evidence()
     scale_rad = camera.mean_scale_rad_per_px(np.array(min(camera.max_angle_rad, np.pi / 2)))
-    rays = replace(rows, edge_sigma_rad=np.full(len(rows), STAR_EDGE_PX * float(scale_rad)))
+    rays = replace(rows, edge_sigma_rad=np.full(len(rows), float(scale_rad)))  # a pixel of the usual PSF
     bright_px, glare_px = _glare(frame, dimming, light)
     return StarLight(rays, bright_px, glare_px, _missing_share(rays))
 
@@ -104,14 +99,14 @@ def _glare(frame: SkyFrame, dimming: Dimming, light: StarPhotometry) -> tuple[Ar
     flux_e = 10 ** (-0.4 * (np.array([body.v_mag for body in planets]) - zero_mag))
     snr = np.concatenate([light.expected_e, flux_e[seen]]) / noise_e
     missing = np.concatenate([light.llr < -SEEN_LLR, np.zeros(int(seen.sum()), dtype=bool)])  # behind the ground
-    bright = (snr > BRIGHT_SIGMAS) & ~missing
-    radius_px = STAR_GLARE_PX + GLARE_PER_DECADE_PX * np.log10(snr[bright] / BRIGHT_SIGMAS)
+    bright = (snr > BRIGHT_SNR) & ~missing
+    radius_px = STAR_GLARE_PX + GLARE_PER_DECADE_PX * np.log10(snr[bright] / BRIGHT_SNR)
     return np.concatenate([light.xy_px, px[seen]])[bright], radius_px
 
 
 def _missing_share(rays: Evidence) -> float:
     """Share of decided stars that are not seen where no ground is expected."""
-    highest = rays.elevation_rad > min(HIGHEST_NEEDED_RAD, float(np.quantile(rays.elevation_rad, 0.5, method="lower")))
+    highest = rays.elevation_rad > min(HIGHEST_GROUND_RAD, float(np.quantile(rays.elevation_rad, 0.5, method="lower")))
     decided = rays.llr[highest & (np.abs(rays.llr) > SEEN_LLR)]
     return float((np.count_nonzero(decided < 0) + 1) / (len(decided) + 2))
 

@@ -101,8 +101,13 @@ FRAME_QUANTITIES = (
     ),
     *_trajectory("smoothed", "", "by all frames"),
     *_trajectory("filtered", "filtered_", "by the frames up to this one"),
-    _frame("latitude_deg", "deg", "%.8f", "of the smoothed position", _number(attrgetter("latlon_rad"), 0, convert=np.degrees)),
-    _frame("longitude_deg", "deg", "%.8f", "of the smoothed position", _number(attrgetter("latlon_rad"), 1, convert=np.degrees)),
+    *(
+        _frame(
+            key, "deg", "%.8f", "of the smoothed position",
+            _number(attrgetter("latlon_rad"), axis, convert=np.degrees),
+        )
+        for axis, key in enumerate(("latitude_deg", "longitude_deg"))
+    ),
     *(
         _frame(f"q{axis}_body_enu", "", "%.9f", "quaternion, enu to body (SciPy's order)", _quaternion(k))
         for k, axis in enumerate("xyzw")

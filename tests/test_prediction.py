@@ -152,7 +152,7 @@ def test_a_draw_depends_on_seed_and_place_only():
     terrain, camera = load_terrain("shackleton-thesis"), load_camera("fisheye-2048")
 
     def draw(number, seed=0, first=()):
-        conditions = Conditions("c", "t", (WHEN,), exposure_s=0.2, seed=seed)
+        conditions = Conditions("c", "t", (WHEN,), 22.0, seed, "posterior", exposure_s=0.2)
         predictor = Predictor(camera, terrain, conditions)
         for other in first:
             predictor.draw(Place(other, -3000.0, 0.0))
@@ -284,7 +284,7 @@ def test_depth_finds_the_exposure_of_a_known_radius():
             return ({key: values[0] for key, values in chunk.items()} for chunk in super().chunks(what, tasks))
 
     predictions = Predictions([Place(0, 0.0, 0.0)], Store())
-    conditions = Conditions("fisheye-2048", "shackleton-thesis", (WHEN,))
+    conditions = Conditions("fisheye-2048", "shackleton-thesis", (WHEN,), 22.0, 0, "posterior")
     best, record = predictions.depth(conditions, 6.0)  # reached in 4 s
     assert 4.0 <= best.exposure_s <= 4.0 * 1.25
     assert record["exposure_s"] == best.exposure_s

@@ -42,8 +42,7 @@ def solve_attitude(
     if len(xy_px) < MIN_ATTITUDE_STARS:
         raise NotIdentified("fewer than 3 stars agree on an attitude", matched=len(xy_px))
     points = observations_of_image(xy_px, covariance_px2, rays_icrs)
-    start = State(camera=camera, R_cam_icrs=np.array(R_cam_icrs)[None])
-    found = adjust(start, points, (), SCHEME)
+    found = adjust(State(camera=camera, R_cam_icrs=np.array(R_cam_icrs)[None]), points, (), SCHEME)
     used = found.chi2 < STAR_OUTLIER_CHI2
     pose, weight, residual = found.terms.pose[used], found.weight[used], found.residual_px[used]
     by_stars = _covariance_by_stars(pose, found.inverse[used], weight, residual)

@@ -82,13 +82,13 @@ class Observations:
         """(m, 2 n + k) response to all positions and the shared errors."""
         from scipy.sparse import csr_array
 
-        p, n = self.size, self.count
+        p, width = self.size, 2 * self.count + self.size - 2
         matrix = np.concatenate([e.response for e in self.estimates])
         frame = np.repeat(self.frames, p)[:, None]
-        shared = np.broadcast_to(2 * n + np.arange(p - 2), (len(frame), p - 2))
+        shared = np.broadcast_to(np.arange(2 * self.count, width), (len(frame), p - 2))
         column = np.concatenate([2 * frame, 2 * frame + 1, shared], axis=1)
-        row = np.broadcast_to(np.arange(len(frame))[:, None], column.shape)
-        return csr_array((matrix.ravel(), (row.ravel(), column.ravel())), shape=(len(frame), 2 * n + p - 2))
+        row = np.repeat(np.arange(len(frame)), p)
+        return csr_array((matrix.ravel(), (row, column.ravel())), shape=(len(frame), width))
 
     @cached_property
     def posts(self) -> Ints:
@@ -100,13 +100,11 @@ class Observations:
         """(m, c) response to the errors of the posts, in their standard deviations."""
         from scipy.sparse import csr_array
 
-        p, rows, columns, values = self.size, [], [], []
-        for number, e in enumerate(self.estimates):
-            rows.append(np.repeat(p * number + np.arange(p), len(e.post)))
-            columns.append(np.tile(np.searchsorted(self.posts, e.post), p))
-            values.append(self.height_sigma_m * e.by_post.ravel())
-        at = np.concatenate(rows), np.concatenate(columns)
-        return csr_array((np.concatenate(values), at), shape=(len(self.value), len(self.posts)))
+        each = [len(e.post) for e in self.estimates]
+        row = np.repeat(np.arange(len(self.value)), np.repeat(each, self.size))
+        column = np.concatenate([np.tile(np.searchsorted(self.posts, e.post), self.size) for e in self.estimates])
+        values = self.height_sigma_m * np.concatenate([e.by_post.ravel() for e in self.estimates])
+        return csr_array((values, (row, column)), shape=(len(self.value), len(self.posts)))
 
     @cached_property
     def inverse_covariance(self) -> Array:

@@ -23,6 +23,7 @@ from startrack.simulation import draw_ground, simulate_rays
 from startrack.terrain import Terrain, load_terrain
 
 DRAW_FOLDER = ".predict"
+LOCATED = "radius95_m", "covariance_m2", "offset_m"  # of draws with one position
 DRAW_SOURCES = (  # their content is part of a chunk's key
     "localization/*.py", "simulation/*.py", "evidence/*.py", "rendering/*.py", "terrain/*.py", "chain/measurement.py",
     "applications/prediction/draws.py",
@@ -48,10 +49,10 @@ class Conditions:
     camera: str  # file, or the name of a shipped one
     terrain: str
     times_utc: tuple[datetime, ...]  # mid-exposure, one a draw
+    sky_v_mag_arcsec2: float
+    seed: int
+    localizer: str
     exposure_s: float | None = None  # None: a V 6 star on the axis reaches 5 sigma
-    sky_v_mag_arcsec2: float = 22.0
-    seed: int = 0
-    localizer: str = "posterior"
 
 
 @dataclass(frozen=True)
@@ -128,36 +129,28 @@ class Predictor:
         `status` (a `Status`), and of draws with one position `radius95_m`, `covariance_m2` (n, 2, 2) and
         `offset_m` (n, 2), found minus true position; NaN of the others.
         """
-        n = len(self.conditions.times_utc)
-        found = {
-            "status": np.full(n, Status.REFUSED, dtype=np.int8), "radius95_m": np.full(n, np.nan),
-            "covariance_m2": np.full((n, 2, 2), np.nan), "offset_m": np.full((n, 2), np.nan),
-        }  # fmt: skip
-        for draw in range(n):
-            self._draw_one(place, draw, found)
-        return found
+        rows = [self._draw_one(place, draw) for draw in range(len(self.conditions.times_utc))]
+        status, *values = map(np.array, zip(*rows, strict=True))
+        return {"status": status.astype(np.int8)} | dict(zip(LOCATED, values, strict=True))
 
-    def _draw_one(self, place: Place, draw: int, found: Chunk) -> None:
-        """Fill in row `draw`."""
+    def _draw_one(self, place: Place, draw: int) -> tuple[Status, float, Array, Array]:
+        """Row `draw`."""
         series = replace(self._series[draw], east_m=place.east_m, north_m=place.north_m)
         if draw not in self._skies:
             self._skies[draw] = series.draw_sky(self.conditions.times_utc[draw])
         scene, rng = series.scene(place.number, sky=self._skies[draw])
         scene = replace(scene, terrain=draw_ground(self.terrain, rng=rng.spawn(1)[0]))
         rays = simulate_rays(scene, self.catalog, self.terrain, rng=rng)
+        nothing = (np.nan, np.full((2, 2), np.nan), np.full(2, np.nan))
         try:
-            located = locate_rays(rays, self.localizer)
+            fix = locate_rays(rays, self.localizer).fix
         except BadInput:
             raise
         except NoSolution:
-            return
-        if located.fix.ambiguous:
-            found["status"][draw] = Status.AMBIGUOUS
-            return
-        found["status"][draw] = Status.OK
-        found["radius95_m"][draw] = located.fix.radius95_m
-        found["covariance_m2"][draw] = located.fix.covariance_m2
-        found["offset_m"][draw] = (located.fix.position_enu_m - scene.position_enu_m)[:2]
+            return Status.REFUSED, *nothing
+        if fix.ambiguous:
+            return Status.AMBIGUOUS, *nothing
+        return Status.OK, fix.radius95_m, fix.covariance_m2, (fix.position_enu_m - scene.position_enu_m)[:2]
 
     def _series_of(self, draw: int, catalog: StarCatalog, faint_v_mag: float | None) -> Series:
         conditions = self.conditions
@@ -186,14 +179,9 @@ def draw_store(out: Path, *, draws: int, jobs: int, progress: Progress, cluster:
     """
     limit_s = draws * TASK_LIMIT_S  # a draw takes as long as an image
     return ChunkStore(
-        out / DRAW_FOLDER,
-        draw_task,
-        lambda task: task.key,
-        jobs=jobs,
-        progress=progress,
-        cluster=cluster,
+        out / DRAW_FOLDER, draw_task, lambda task: task.key, jobs=jobs, progress=progress, cluster=cluster,
         limit_s=limit_s,
-    )
+    )  # fmt: skip
 
 
 def times_between(first: datetime, last: datetime, count: int) -> tuple[datetime, ...]:

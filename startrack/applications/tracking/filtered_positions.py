@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from startrack.applications.tracking.contradictions import (
+    DOUBTFUL_NEIGHBOURS,
     SLIP_PROBABILITY,
     SLIP_SIGMA_M,
     WRONG_PROBABILITY,
@@ -37,7 +38,7 @@ from startrack.estimation.trajectory import Smoothed, TrackFilter, smooth
 from startrack.terrain import Terrain
 
 CLEAR_NATS = 3.0  # by which a mode must be likelier than the other modes
-SUSPECT_FRAMES = 2  # left out in a row, after which the frames before them are tried anew
+SUSPECT_FRAMES = DOUBTFUL_NEIGHBOURS  # left out in a row, after which the frames before them are tried anew
 RECENT_FRAMES = 30  # of these
 STILL_M = 1e-3  # of a camera at rest from exposure to exposure, in the comparison of single fixes
 

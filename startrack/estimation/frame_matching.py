@@ -166,11 +166,8 @@ def zero_point(
     distance, nearest = tree.query(px[seen], distance_upper_bound=gate_px)
     hit = np.isfinite(distance)
     hit[hit] &= ~found.saturated[nearest[hit]]
-    return _fit_parabola(angle[seen[hit]], v_mag[seen[hit]] - instrumental_mag(found.flux_e[nearest[hit]]))
-
-
-def _fit_parabola(angle_rad: Array, zero_mag: Array) -> Callable[[Array], Array]:
-    """Robust parabola through zero points, constant beyond the angles of the stars."""
+    angle_rad, zero_mag = angle[seen[hit]], v_mag[seen[hit]] - instrumental_mag(found.flux_e[nearest[hit]])
+    # A robust parabola, constant beyond the angles of the stars.
     if not len(zero_mag):
         return np.poly1d([0.0])
     fit = np.poly1d([float(np.median(zero_mag))])

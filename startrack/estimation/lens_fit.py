@@ -96,7 +96,12 @@ def fit_state(
             f"{len(points)} matched stars cannot determine a lens: at least {MIN_LENS_STARS} are needed"
         )
     for _ in range(2):
-        robust, extra_px2 = _fit_robustly(state, points, coefficients)
+        robust_state, extra_px2 = state, FIRST_SIGMA_PX**2
+        for k in range(ROBUST_ROUNDS):  # the polynomial grows
+            free = model_of(robust_state.camera, 1 + k if coefficients is None else min(coefficients, 1 + k)).free
+            robust = adjust(robust_state, points, free, ROBUST, extra_px2=extra_px2)
+            robust_state = robust.state
+            extra_px2 = extra_variance_px2(robust.residual_px, points.covariance_px2, robust.parameters)
         inverse = inverse_covariance(points.covariance_px2, extra_px2)
         used = chi_square(robust.residual_px, inverse) < WRONG_MATCH_CHI2
         good = points.take(used)
@@ -107,17 +112,6 @@ def fit_state(
             break
         state = best.state  # the outliers were rejected with a simpler model: repeat with the chosen one
     return _finish(model, best, points, used, candidates)
-
-
-def _fit_robustly(state: CameraState, points: Observations, coefficients: int | None) -> tuple[Solution, float]:
-    """Solution with Cauchy's loss, and the variance per axis beyond the stated one; the polynomial grows by rounds."""
-    extra_px2 = FIRST_SIGMA_PX**2
-    for k in range(ROBUST_ROUNDS):
-        free = model_of(state.camera, 1 + k if coefficients is None else min(coefficients, 1 + k)).free
-        solution = adjust(state, points, free, ROBUST, extra_px2=extra_px2)
-        state = solution.state
-        extra_px2 = extra_variance_px2(solution.residual_px, points.covariance_px2, solution.parameters)
-    return solution, extra_px2
 
 
 def _finish(

@@ -68,23 +68,23 @@ class TrackFilter:
             self.posts = {number: first + k for k, number in enumerate(kept)}
 
     def innovation(self, estimate: FrameEstimate) -> tuple[Array, Array, Array]:
-        """Observation less prediction (p,), its covariance (p, p), and that of the state with it (s, p)."""
-        p, by_post, place = estimate.parameters, self.height_sigma_m * estimate.by_post, self._places(estimate.post)
-        cross = self.covariance[:, :p] @ estimate.response.T + self.covariance[:, place] @ by_post.T
-        predicted = estimate.response @ self.mean[:p] + by_post @ self.mean[place]
-        covariance = estimate.response @ cross[:p] + by_post @ cross[place] + estimate.noise
-        return estimate.mean - predicted, 0.5 * (covariance + covariance.T), cross
+        """Observation less prediction (p,), its covariance (p, p), and that of the state with it (s, p).
 
-    def _places(self, post: Ints) -> Ints:
-        """Places (c,) of posts in the state, which grows by the new ones."""
-        size, new = len(self.mean), [number for number in post.tolist() if number not in self.posts]
+        The state grows by the posts that it does not have.
+        """
+        size, new = len(self.mean), [number for number in estimate.post.tolist() if number not in self.posts]
         if new:
             self.posts.update((number, size + k) for k, number in enumerate(new))
             self.mean = np.append(self.mean, np.zeros(len(new)))
             grown = np.eye(len(self.mean))
             grown[:size, :size] = self.covariance
             self.covariance = grown
-        return np.array([self.posts[number] for number in post.tolist()], dtype=np.int64)
+        place = np.array([self.posts[number] for number in estimate.post.tolist()], dtype=np.int64)
+        p, by_post = estimate.parameters, self.height_sigma_m * estimate.by_post
+        cross = self.covariance[:, :p] @ estimate.response.T + self.covariance[:, place] @ by_post.T
+        predicted = estimate.response @ self.mean[:p] + by_post @ self.mean[place]
+        covariance = estimate.response @ cross[:p] + by_post @ cross[place] + estimate.noise
+        return estimate.mean - predicted, 0.5 * (covariance + covariance.T), cross
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ import numpy as np
 from startrack.core.types import Array, Ints
 from startrack.terrain import NO_POST, ForwardingTerrain, Terrain
 
-MOST_SIGMAS = 4.0  # of an error of the shape, beyond which none is drawn
+MOST_SIGMAS = 4.0  # of an error of the shape, beyond which none is drawn: a crater may have no depth there
 
 
 def draw_ground(terrain: Terrain, *, rng: np.random.Generator) -> Terrain:
@@ -15,10 +15,17 @@ def draw_ground(terrain: Terrain, *, rng: np.random.Generator) -> Terrain:
 
     Errors of the shape are drawn from their stated or default sigmas, without the gross parts.
     """
-    errors, shared_sigma_rad = terrain.shape_errors, terrain.common_sigma_rad
+    errors, shared_sigma_rad, ground = terrain.shape_errors, terrain.common_sigma_rad, terrain
     if any(error.name == "bias_rad" and error.sigma > 0.0 for error in errors):
         shared_sigma_rad = 0.0  # it is drawn with the shape
-    ground = terrain.with_shape(_draw_shape(terrain, rng)) if any(error.sigma > 0.0 for error in errors) else terrain
+    shape = np.array([error.sigma for error in errors])
+    errs = np.flatnonzero(shape)
+    if len(errs):
+        drawn = rng.standard_normal(len(errs))
+        while (far := np.abs(drawn) > MOST_SIGMAS).any():
+            drawn[far] = rng.standard_normal(np.count_nonzero(far))
+        shape[errs] *= drawn
+        ground = terrain.with_shape(shape)
     if shared_sigma_rad > 0.0 or terrain.height_sigma_m > 0.0:
         return ErringGround(ground, rng, shared_sigma_rad)
     return ground
@@ -56,14 +63,3 @@ class ErringGround(ForwardingTerrain):
         order = np.argsort(post)
         self._post, self._error_m = post[order], np.concatenate([self._error_m, drawn])[order]
         return self._error_m[np.searchsorted(self._post, posts)]
-
-
-def _draw_shape(terrain: Terrain, rng: np.random.Generator) -> Array:
-    """Values (k,) for `with_shape`, normal within some sigmas: beyond them a crater may have no depth."""
-    sigma = np.array([error.sigma for error in terrain.shape_errors])
-    errs = np.flatnonzero(sigma)
-    drawn = rng.standard_normal(len(errs))
-    while (far := np.abs(drawn) > MOST_SIGMAS).any():
-        drawn[far] = rng.standard_normal(np.count_nonzero(far))
-    sigma[errs] *= drawn
-    return sigma

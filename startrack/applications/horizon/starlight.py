@@ -84,8 +84,11 @@ def measure_stars(frame: SkyFrame) -> StarLight:
     rows = light.evidence()
     scale_rad = camera.mean_scale_rad_per_px(np.array(min(camera.max_angle_rad, np.pi / 2)))
     rays = replace(rows, edge_sigma_rad=np.full(len(rows), float(scale_rad)))  # a pixel of the usual PSF
-    bright_px, glare_px = _glare(frame, dimming, light)
-    return StarLight(rays, bright_px, glare_px, _missing_share(rays))
+    # Stars are missed where no ground is expected.
+    highest = rays.elevation_rad > min(HIGHEST_GROUND_RAD, float(np.quantile(rays.elevation_rad, 0.5, method="lower")))
+    decided = rays.llr[highest & (np.abs(rays.llr) > SEEN_LLR)]
+    missing = float((np.count_nonzero(decided < 0) + 1) / (len(decided) + 2))
+    return StarLight(rays, *_glare(frame, dimming, light), missing)
 
 
 def _glare(frame: SkyFrame, dimming: Dimming, light: StarPhotometry) -> tuple[Array, Array]:
@@ -102,13 +105,6 @@ def _glare(frame: SkyFrame, dimming: Dimming, light: StarPhotometry) -> tuple[Ar
     bright = (snr > BRIGHT_SNR) & ~missing
     radius_px = STAR_GLARE_PX + GLARE_PER_DECADE_PX * np.log10(snr[bright] / BRIGHT_SNR)
     return np.concatenate([light.xy_px, px[seen]])[bright], radius_px
-
-
-def _missing_share(rays: Evidence) -> float:
-    """Share of decided stars that are not seen where no ground is expected."""
-    highest = rays.elevation_rad > min(HIGHEST_GROUND_RAD, float(np.quantile(rays.elevation_rad, 0.5, method="lower")))
-    decided = rays.llr[highest & (np.abs(rays.llr) > SEEN_LLR)]
-    return float((np.count_nonzero(decided < 0) + 1) / (len(decided) + 2))
 
 
 def _dimmed(frame: SkyFrame, dimming: Dimming) -> Stars:

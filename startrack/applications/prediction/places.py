@@ -13,7 +13,7 @@ from startrack.core.types import Array, BadInput, Ints
 from startrack.frames import Site, enu_from_latlon, latlon_from_enu
 from startrack.output import nice_step
 from startrack.rendering import Drive
-from startrack.terrain import EQUIRECTANGULAR, Projection, Raster, Terrain
+from startrack.terrain import EQUIRECTANGULAR, Raster, Terrain
 
 MAX_CELLS = 1_000_000
 DEFAULT_CELLS_ACROSS = 10  # of the default spacing
@@ -85,7 +85,10 @@ def area_cells(terrain: Terrain, spacing_m: float) -> AreaCells:
     ring_m = terrain.search_radius_m * np.stack([np.sin(PLACES_RING_RAD), np.cos(PLACES_RING_RAD)], axis=-1)
     x, y = projection.xy_from_latlon(*latlon_from_enu(site, ring_m[:, 0], ring_m[:, 1], 0.0))
     middle_x, middle_y = projection.xy_from_latlon(site.latitude_rad, site.longitude_rad)
-    dx, dy = spacing_m * _units_per_m(projection, site)
+    x_per_m = y_per_m = projection.scale  # map units of a metre on the ground at the origin
+    if projection.kind == EQUIRECTANGULAR:
+        x_per_m, y_per_m = projection.scale / np.cos(site.latitude_rad), projection.scale_y
+    dx, dy = spacing_m * x_per_m, spacing_m * y_per_m
     half_x = int(np.ceil(np.max(np.abs(x - middle_x)) / dx))
     half_y = int(np.ceil(np.max(np.abs(y - middle_y)) / dy))
     shape = 2 * half_y + 1, 2 * half_x + 1
@@ -129,13 +132,6 @@ def path_points(drive: Drive, terrain: Terrain, spacing_m: float) -> PathPoints:
             f"the path leaves the search area of {terrain.name} at {east:.0f} m east, {north:.0f} north",
         )
     return PathPoints(distance_m, points_m)
-
-
-def _units_per_m(projection: Projection, site: Site) -> Array:
-    """Map units (2,), along x and y, of a metre on the ground at the origin."""
-    if projection.kind == EQUIRECTANGULAR:
-        return np.array([projection.scale / np.cos(site.latitude_rad), projection.scale_y])
-    return np.full(2, projection.scale)
 
 
 def _ground_points_m(terrain: Terrain, site: Site, latitude_rad: Array, longitude_rad: Array) -> Array:

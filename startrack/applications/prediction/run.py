@@ -51,14 +51,10 @@ def cells_of_draws(draws: Chunk) -> Cells:
     radius[~np.isfinite(radius)] = np.nan
     found = (radius, *shares, *_ellipses(draws["covariance_m2"], located))
     cells = {one.key: values for one, values in zip(CELL_QUANTITIES, found, strict=True)}
-    return cells | {ERROR_RATIO: _error_ratio(draws, located)}
-
-
-def _error_ratio(draws: Chunk, located: Bools) -> Array:
-    """Root mean square (k,) of the errors of the draws (k, n, ...) that are `located` (k, n), over the stated one."""
+    # Root mean square of the errors over the stated one.
     error_m2 = np.where(located, np.square(draws["offset_m"]).sum(axis=-1), 0.0).sum(axis=1)
     stated_m2 = np.where(located, np.trace(draws["covariance_m2"], axis1=2, axis2=3), 0.0).sum(axis=1)
-    return np.sqrt(error_m2 / np.where(stated_m2 > 0.0, stated_m2, np.nan))
+    return cells | {ERROR_RATIO: np.sqrt(error_m2 / np.where(stated_m2 > 0.0, stated_m2, np.nan))}
 
 
 def _ellipses(covariance_m2: Array, located: Bools) -> tuple[Array, Array, Array]:
@@ -88,7 +84,14 @@ def add_odometry(position_m: Array, cells: Cells, *, sigma_1: float, floor_m: fl
     on each axis by `sigma_1` of their length and, in quadrature, by `floor_m`. Radii are NaN where nothing is known.
     """
     known = np.isfinite(cells["radius95_m"])
-    estimates = [_estimate(m2) if is_known else None for m2, is_known in zip(ellipse_m2(cells), known, strict=True)]
+    alone = FrameEstimate(
+        mean=np.zeros(2), covariance=np.eye(2), response=np.eye(2), noise=np.eye(2), post=np.zeros(0, dtype=np.int64),
+        by_post=np.zeros((2, 0)),
+    )  # fmt: skip
+    estimates = [
+        replace(alone, covariance=covariance, noise=covariance) if is_known else None
+        for covariance, is_known in zip(ellipse_m2(cells), known, strict=True)
+    ]
     move_m = np.diff(position_m, axis=0)
     steps = Steps(move_m, np.hypot(sigma_1 * np.linalg.norm(move_m, axis=1), floor_m))
     filtered = smoothed = np.full((len(known), 2, 2), np.inf)
@@ -113,14 +116,6 @@ def ellipse_m2(cells: Cells) -> Array:
     along, across = (np.stack([np.sin(a), np.cos(a)], axis=-1) for a in (azimuth, azimuth + 0.5 * np.pi))
     long, short = (np.square(cells[name])[:, None, None] for name in ("sigma_major_m", "sigma_minor_m"))
     return np.asarray(long * along[:, :, None] * along[:, None] + short * across[:, :, None] * across[:, None])
-
-
-def _estimate(covariance_m2: Array) -> FrameEstimate:
-    """An image whose error is its own."""
-    return FrameEstimate(
-        mean=np.zeros(2), covariance=covariance_m2, response=np.eye(2), noise=covariance_m2,
-        post=np.zeros(0, dtype=np.int64), by_post=np.zeros((2, 0)),
-    )  # fmt: skip
 
 
 @dataclass(frozen=True)

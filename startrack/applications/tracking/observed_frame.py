@@ -88,7 +88,7 @@ def observe_frame(outcome: Outcome, errors: TrackErrors | None = None, terrain: 
     if missing:
         raise ValueError(f"{name}: it shows a gross error of {', '.join(missing)}: it must be shared")
     fixes = _image_fixes(value.fix, terrain)
-    rows = _informative_rows(_located_evidence(value), terrain, fixes[0].at_time_m)
+    rows = _informative_rows(value, terrain, fixes[0].at_time_m)
     return observe_again(ObservedFrame(name, when, R, (), rows, fixes, value.fix.shown), errors, terrain)
 
 
@@ -123,18 +123,16 @@ def _image_fixes(fix: Fix, terrain: Terrain) -> tuple[ImageFix, ...]:
     return tuple(found)
 
 
-def _located_evidence(located: Located) -> Evidence:
-    """Rows of the stars and of the sky's light that a position is from, with the errors of the image."""
-    stars = replace(located.evidence(), near=None)
-    if located.sky_light is None or located.sky_used is None:
-        return stars
-    light = located.sky_light.evidence(located.sky_used)
-    rows = Evidence.concatenate(stars, light) if located.by_stars else light
-    return replace(rows, clock=stars.clock, image_errors=located.image_errors)
+def _informative_rows(located: Located, terrain: Terrain, position_m: Array) -> Evidence:
+    """The rows that say something about the skyline seen from a position (2,), with the errors of the image.
 
-
-def _informative_rows(rows: Evidence, terrain: Terrain, position_m: Array) -> Evidence:
-    """The rows about the skyline seen from a position (2,) that say something about it."""
+    They are those of the stars and of the sky's light that the position is from.
+    """
+    stars = rows = replace(located.evidence(), near=None)
+    if located.sky_light is not None and located.sky_used is not None:
+        light = located.sky_light.evidence(located.sky_used)
+        rows = Evidence.concatenate(stars, light) if located.by_stars else light
+        rows = replace(rows, clock=stars.clock, image_errors=located.image_errors)
     azimuth = np.linspace(0.0, 2 * np.pi, 721)
     above = rows.elevation_rad - np.interp(rows.azimuth_rad, azimuth, terrain.horizon_rad(position_m[None], azimuth))
     kept = (np.abs(rows.llr) > MIN_ROW_NATS) | (rows.extended_nats > MIN_ROW_NATS)

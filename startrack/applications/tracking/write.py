@@ -144,7 +144,10 @@ def track_page(track: Track, picture_png: bytes, *, title: str, odometry_m: Arra
         "title": title,
         "at_rest": track.at_rest,
         "frames": {
-            q.key: [_rounded(record[q.key], 8 if q.key in ACCURATE else PAGE_DECIMALS) for record in records]
+            q.key: [
+                round(value, 8 if q.key in ACCURATE else PAGE_DECIMALS) if isinstance(value, float) else value
+                for value in (record[q.key] for record in records)
+            ]
             for q in FRAME_QUANTITIES
             if not q.key.endswith(OFF_PAGE)
         },
@@ -156,7 +159,3 @@ def track_page(track: Track, picture_png: bytes, *, title: str, odometry_m: Arra
     }
     style, script = ((HERE / name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
     return filled_frame(f"{title} · startrack", {"results": head}, PAGE_SCRIPTS, style=style, script=script)
-
-
-def _rounded(value: Any, decimals: int) -> Any:
-    return round(value, decimals) if isinstance(value, float) else value

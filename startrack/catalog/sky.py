@@ -12,7 +12,7 @@ from datetime import datetime
 import numpy as np
 from numpy.polynomial.polynomial import polyval
 
-from startrack.catalog.stars import StarCatalog
+from startrack.catalog.stars import JULIAN_YEAR_S, StarCatalog
 from startrack.core.types import Array, Body, Bools, Stars
 from startrack.frames import (
     SPEED_OF_LIGHT_M_S,
@@ -152,7 +152,7 @@ def _apparent_body(source: _Source, observer_m: Array, velocity_m_s: Array, et: 
     view = _View(
         from_sun_au=(body_m - sun_m) / ASTRONOMICAL_UNIT_M,
         from_observer_au=to_body_m / ASTRONOMICAL_UNIT_M,
-        year=2000 + et / 31_557_600.0,
+        year=2000 + et / JULIAN_YEAR_S,
     )
     ray = aberrate(to_body_m / np.linalg.norm(to_body_m), velocity_m_s)
     return Body(name=source.name, ray_icrs=ray, v_mag=source.v_mag(view))

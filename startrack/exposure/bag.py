@@ -26,7 +26,6 @@ BAG_SUFFIXES = (".bag", ".db3", ".mcap")
 ODOMETRY_TYPES = ("nav_msgs/msg/Odometry",)
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 READING = {"reason": "bad_image", "flag": "--image-topic"}
-UNIX_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 NUMBERED = re.compile(r"(?P<bag>.+)#(?P<number>\d{1,9})")
 # Encodings of sensor_msgs/Image (image_encodings.h) of one channel.
 RAW_ENCODING = re.compile(r"(?:mono|bayer_(?P<pattern>rggb|bggr|gbrg|grbg))(?P<bits>8|16)")
@@ -168,7 +167,7 @@ def _exposure_of(message: Message, where: str, name: str, path: str, given: dict
     """The exposure of a message with the facts `given`; a refusal names `where` it is."""
     try:
         decoded, pattern = _decode(message)
-        time_utc = UNIX_EPOCH + timedelta(microseconds=message.stamp_ns // 1000)
+        time_utc = datetime.fromtimestamp(0, UTC) + timedelta(microseconds=message.stamp_ns // 1000)
         facts = Facts(**{"time_utc": time_utc, "bayer_pattern": pattern, **given})
         return exposure_of_decoded(decoded, facts, raw=message.raw, name=name, path=path)
     except BadInput as cause:

@@ -36,7 +36,7 @@ from startrack.frames.site import (
     position_fixed_m,
     sky_rotvec_rad,
 )
-from startrack.frames.time import as_utc, format_utc, parse_utc
+from startrack.frames.time import as_utc, format_utc, parse_utc, seconds_since_2000
 
 __all__ = [
     "MOON_RADIUS_M", "ORTHONORMAL_1", "SPEED_OF_LIGHT_M_S", "R_body_enu_from_heading_pitch_roll", "R_enu_fixed",
@@ -44,5 +44,5 @@ __all__ = [
     "azel_from_rays", "barycentric_state", "enu_from_latlon", "et_s", "format_utc",
     "heading_pitch_roll_from_R_body_enu", "latlon_from_enu", "length_xy", "nearest_rotation", "observer_state",
     "observer_velocity_m_s", "off_axis_rad", "parse_utc", "position_fixed_m", "quat_xyzw_from_R", "rays_from_azel",
-    "refract_rad", "sky_rotvec_rad", "tum_line", "turn_azel", "wahba",
+    "refract_rad", "seconds_since_2000", "sky_rotvec_rad", "tum_line", "turn_azel", "wahba",
 ]  # fmt: skip

@@ -29,7 +29,7 @@ STEP_PARTS = 4  # of a step, whose slopes are taken one by one
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _most(above, s, reach, cos_turn):
+def _most_tan(above, s, reach, cos_turn):
     """Largest tan of a height above the lowest camera, at s from the middle of the box."""
     if above > 0.0:
         tan = above / (s - reach) if s > reach else FAR_M
@@ -39,7 +39,7 @@ def _most(above, s, reach, cos_turn):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _least(above, s, reach, cos_turn):
+def _least_tan(above, s, reach, cos_turn):
     under = above / (s - reach) if s > reach else LOWEST_TAN
     return above * cos_turn / (s + reach) if above > 0.0 else under
 
@@ -56,9 +56,9 @@ def _step_bounds(s0, s1, s2, z0, z1, z2, slack, low_up, high_up, reach, cos_turn
         top, _ = best_in_step(-FAR_M, 0.0, s0 - reach, s2 - reach, z0 + rest, z1 + rest, z2 + rest)
     else:
         top = max(
-            _most(z0 + over - low_up, s0, reach, cos_turn),
-            _most(z1 + over - low_up, s1, reach, cos_turn),
-            _most(z2 + over - low_up, s2, reach, cos_turn),
+            _most_tan(z0 + over - low_up, s0, reach, cos_turn),
+            _most_tan(z1 + over - low_up, s1, reach, cos_turn),
+            _most_tan(z2 + over - low_up, s2, reach, cos_turn),
         )
     bottom, bottom_s, bottom_z = LOWEST_TAN, 0.0, 0.0
     rest = slack + high_up
@@ -69,8 +69,8 @@ def _step_bounds(s0, s1, s2, z0, z1, z2, slack, low_up, high_up, reach, cos_turn
         for k in range(3):
             s_k = s0 if k == 0 else s1 if k == 1 else s2
             z_k = (z0 if k == 0 else z1 if k == 1 else z2) - slack
-            if s_k > 0.0 and _least(z_k - high_up, s_k, reach, cos_turn) > bottom:
-                bottom, bottom_s, bottom_z = _least(z_k - high_up, s_k, reach, cos_turn), s_k, z_k
+            if s_k > 0.0 and _least_tan(z_k - high_up, s_k, reach, cos_turn) > bottom:
+                bottom, bottom_s, bottom_z = _least_tan(z_k - high_up, s_k, reach, cos_turn), s_k, z_k
     return top, bottom, bottom_s, bottom_z
 
 

@@ -137,7 +137,7 @@ class DeformedCrater(Crater):
         """Horizon elevation [rad]; pi/2 from inside the wall. See `Terrain`."""
         points = np.asarray(points_m, dtype=np.float64)
         distance = self._distance_m(points, azimuths_rad)
-        height = self.rim_m(_ahead(points, distance, azimuths_rad))[1]
+        height = self.rim_m(_points_ahead(points, distance, azimuths_rad))[1]
         return np.arctan2(height - self.camera_height_m, distance)
 
     def _distance_m(self, points: Array, azimuths_rad: Array) -> Array:
@@ -146,7 +146,7 @@ class DeformedCrater(Crater):
         far = distance_to_circle(points, azimuths_rad, self.radii_m[1])
         for _ in range(HALVINGS if np.any(far > near) else 0):
             middle = 0.5 * (near + far)
-            within = self._is_within(_ahead(points, middle, azimuths_rad))
+            within = self._is_within(_points_ahead(points, middle, azimuths_rad))
             near, far = np.where(within, middle, near), np.where(within, far, middle)
         return np.where(self._is_within(points), 0.5 * (near + far), 0.0)
 
@@ -178,7 +178,7 @@ def slopes_of_round_crater(crater: Crater, points_m: Array, azimuths_rad: Array)
     points = np.asarray(points_m, dtype=np.float64)
     radius_m, wall = crater.radius_m, crater.wall_m
     distance = distance_to_circle(points, azimuths_rad, radius_m)
-    rim = _ahead(points, distance, azimuths_rad)
+    rim = _points_ahead(points, distance, azimuths_rad)
     east, north = rim[..., 0] / radius_m, rim[..., 1] / radius_m
     facing = np.maximum(east * np.sin(azimuths_rad) + north * np.cos(azimuths_rad), 1e-12)
     per_tan_m = np.where(distance > 0, 1.0 / (np.square(distance) + wall**2), 0.0)  # cos^2 H / d^2
@@ -194,7 +194,7 @@ def slopes_of_round_crater(crater: Crater, points_m: Array, azimuths_rad: Array)
     }
 
 
-def _ahead(points: Array, distance: Array, azimuths_rad: Array) -> Array:
+def _points_ahead(points: Array, distance: Array, azimuths_rad: Array) -> Array:
     """The points (..., 2) that lie at the distances (...) along the azimuths."""
     return np.stack(
         [points[..., 0] + distance * np.sin(azimuths_rad), points[..., 1] + distance * np.cos(azimuths_rad)], axis=-1

@@ -29,7 +29,7 @@ from startrack.terrain.shape import (
     LENGTH,
     RIM_TILT,
     ShapeError,
-    by_name,
+    errors_by_name,
     select_slopes,
 )
 
@@ -116,7 +116,7 @@ class Cylinder(Crater):
 
     def with_shape(self, values: Array) -> DeformedCrater:
         """The crater with these errors; see `Terrain`."""
-        errors = by_name(self.shape_errors, values)
+        errors = errors_by_name(self.shape_errors, values)
         return DeformedCrater(
             name=self.name, site=self.site, search_radius_m=self.search_radius_m,
             diameter_m=self.diameter_m * (1.0 + errors.pop("diameter_1", 0.0)),

@@ -68,11 +68,11 @@ class DeformedMap(ForwardingTerrain):
         azimuths = np.broadcast_to(azimuths_rad, found.shape)
         own = np.array(azimuths)
         for _ in range(TILT_ROUNDS):
-            own += (azimuths - self._turned(own, found)[0] + np.pi) % (2 * np.pi) - np.pi
+            own += (azimuths - self._turn(own, found)[0] + np.pi) % (2 * np.pi) - np.pi
             found = self._level_rad(self._raised.horizon_rad(points_m, own))
-        return self._turned(own, found)[1]
+        return self._turn(own, found)[1]
 
-    def _turned(self, azimuths_rad: Array, elevations_rad: Array) -> tuple[Array, Array]:
+    def _turn(self, azimuths_rad: Array, elevations_rad: Array) -> tuple[Array, Array]:
         """Azimuths and elevations (...), (...) [rad] of directions of the map after the turn."""
         level = np.cos(elevations_rad)
         rays = np.stack([level * np.sin(azimuths_rad), level * np.cos(azimuths_rad), np.sin(elevations_rad)], axis=-1)

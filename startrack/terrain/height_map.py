@@ -14,7 +14,16 @@ from startrack.terrain.derived_maps import DeformedMap, HorizonInterpolator
 from startrack.terrain.ground import cell_posts, post_positions
 from startrack.terrain.horizon_table import AZIMUTH_BINS, HorizonSigma
 from startrack.terrain.protocol import HorizonPosts, Terrain
-from startrack.terrain.shape import BIAS, CAMERA_ERROR, EXACT, STRETCH, VERTICAL, ShapeError, by_name, select_slopes
+from startrack.terrain.shape import (
+    BIAS,
+    CAMERA_ERROR,
+    EXACT,
+    STRETCH,
+    VERTICAL,
+    ShapeError,
+    errors_by_name,
+    select_slopes,
+)
 from startrack.terrain.traced_map import TracedMap
 
 COMMON_PER_POST = 3.0
@@ -80,7 +89,7 @@ class HeightMap(TracedMap):
 
     def with_shape(self, values: Array) -> DeformedMap:
         """The ground with these errors; see `Terrain`."""
-        return DeformedMap(self, **by_name(self.shape_errors, values))
+        return DeformedMap(self, **errors_by_name(self.shape_errors, values))
 
     def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """From the height of the single post that makes the horizon: sigma cos^2 H / its distance."""

@@ -121,6 +121,6 @@ def select_slopes(errors: Sequence[ShapeError], slopes_rad: dict[str, Array], sh
     return np.stack([np.broadcast_to(slopes_rad[error.name], shape) for error in errors])
 
 
-def by_name(errors: Sequence[ShapeError], values: Array) -> dict[str, float]:
+def errors_by_name(errors: Sequence[ShapeError], values: Array) -> dict[str, float]:
     """The `values` (k,) of the errors by name. Raises ValueError where there are not as many."""
     return {error.name: float(value) for error, value in zip(errors, values, strict=True)}

@@ -56,13 +56,13 @@ def sector_bounds(values, lows, highs, across, reach, east, north, half, low_up,
                     wide = half * (abs(sin_a) + abs(cos_a))
                     aside = (east - (2 * i + 1) * side / 2 + reach) * cos_a
                     aside -= (north - (2 * j + 1) * side / 2 + reach) * sin_a
-                    below, above = _of_line(v, along, abs(aside), wide, low_up, high_up, 0.5 * side)
+                    below, above = _bounds_by_line(v, along, abs(aside), wide, low_up, high_up, 0.5 * side)
                 low, high = min(low, below), max(high, above)
     return low, high
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _of_line(v, along, aside, wide, low_up, high_up, cell_half):
+def _bounds_by_line(v, along, aside, wide, low_up, high_up, cell_half):
     """Bounds of the elevation, seen from `along` -+ `wide` along the ray from the cell's middle, and so far aside."""
     below, above = v[0] * ANGLE_STEP_RAD - np.pi / 2, v[1] * ANGLE_STEP_RAD - np.pi / 2
     cos_turn = np.cos(BIN_RAD / 2)

@@ -8,8 +8,9 @@ from typing import TypeVar
 import numpy as np
 
 from startrack.catalog import has_deep_catalog, hipparcos_rows_in_deep, load_catalog, load_deep_catalog
+from startrack.chain.orientation import require_time_and_site
 from startrack.chain.stages import Located, Measured, Oriented, Settings, StarFix, StarRays, extend
-from startrack.core.types import Array, BadInput, Detections, Evidence, Ints, Stars
+from startrack.core.types import Array, Detections, Evidence, Ints, Stars
 from startrack.evidence import (
     BAND_PX,
     SURE_SIGMAS,
@@ -46,17 +47,11 @@ def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -
     `oriented` is the exposure with its attitude; its time must be known. `settings` has the photometry, and whether
     Gaia's stars are used. Raises BadInput (bad_terrain, no_time) where the frame `enu` cannot be related to the stars.
     """
-    when = oriented.exposure.time_utc
-    if terrain.site is None:
-        raise BadInput(
-            "bad_terrain", f"terrain {terrain.name} has no site: locating an image needs its position on a body"
-        )
-    if when is None:
-        raise BadInput("no_time", "the mid-exposure time is not known")
+    when, site = require_time_and_site(oriented.exposure, terrain)
     shown = oriented
     if settings.deep_stars:
-        oriented = add_gaia_stars(oriented, terrain.site)
-    R, response = R_enu_icrs(terrain.site, when), None
+        oriented = add_gaia_stars(oriented, site)
+    R, response = R_enu_icrs(site, when), None
     if oriented.damage is not None:
         oriented = replace(oriented, detections=measure_noise(oriented.detections))
     light = _photometry(oriented, terrain, R, settings.evidence, oriented.detections)
@@ -68,11 +63,10 @@ def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -
     if oriented.damage is not None:
         response = measure_response(light)
         light = response.correct(light)
-    stated = oriented.exposure.time_sigma_s, oriented.exposure.time_sigma_is_stated
-    clock = clock_at(terrain.site, when, *stated)
+    clock = clock_at(site, when, oriented.exposure.time_sigma_s, oriented.exposure.time_sigma_is_stated)
     return extend(
-        oriented, Measured, terrain=terrain, site=terrain.site, R_enu_icrs=R, clock=clock, light=light,
-        response=response, near=settings.near,
+        oriented, Measured, terrain=terrain, site=site, R_enu_icrs=R, clock=clock, light=light, response=response,
+        near=settings.near,
     )  # fmt: skip
 
 

@@ -11,33 +11,44 @@ from startrack.camera import Camera
 from startrack.catalog import StarCatalog, bodies
 from startrack.chain.stages import Detected, Identified, Inputs, Oriented, extend
 from startrack.core.compilation import announce_compilation
-from startrack.core.types import Array, BadInput, NotIdentified, Stars, TooFewStars
+from startrack.core.types import Array, BadInput, Exposure, NotIdentified, Stars, TooFewStars
 from startrack.detection import Detector
 from startrack.estimation.attitude import AttitudeFit, solve_attitude
 from startrack.exposure import NO_TIME, are_fractions
 from startrack.frames import Site, observer_velocity_m_s
 from startrack.identification import Identifier, check_single_field
+from startrack.terrain import Terrain
 
 LEAST_SHIFT_PX, MOST_SHIFT_PX = 0.1, 8.0  # of the image's centre; a larger one is another camera
 SHIFT_CHI2 = 30.0  # of a shift in two coordinates: one in three million by chance
 SHIFT_ROUNDS = 3  # stars that the shift made outliers come back
-NO_SITE = "terrain {} has no site: an image can be located only on ground whose position on a body is known"
 ANYWHERE = Site("moon", 0.0, 0.0)  # used for an unknown site: 0.7 arcsec of aberration at most
 
 
 def check_inputs(inputs: Inputs) -> None:
     """Raises BadInput no_time, bad_terrain or size_mismatch for `inputs` that cannot be solved together."""
-    exposure, camera, terrain = inputs.exposure, inputs.camera, inputs.terrain
-    if terrain is not None and exposure.time_utc is None:
-        raise BadInput("no_time", "; ".join([NO_TIME, *exposure.warnings]))
-    if terrain is not None and terrain.site is None:
-        raise BadInput("bad_terrain", NO_SITE.format(terrain.name))
+    exposure, camera = inputs.exposure, inputs.camera
+    if inputs.terrain is not None:
+        require_time_and_site(exposure, inputs.terrain)
     if camera is not None and exposure.size_px != camera.size_px:
         raise BadInput(
             "size_mismatch",
             f"the image is {exposure.size_px[0]} x {exposure.size_px[1]} px, the camera file gives "
             f"{camera.size_px[0]} x {camera.size_px[1]}",
         )
+
+
+def require_time_and_site(exposure: Exposure, terrain: Terrain) -> tuple[datetime, Site]:
+    """The time of an `exposure` and the site of a `terrain`. Raises BadInput no_time or bad_terrain without one."""
+    if exposure.time_utc is None:
+        raise BadInput("no_time", "; ".join([NO_TIME, *exposure.warnings]))
+    if terrain.site is None:
+        raise BadInput(
+            "bad_terrain",
+            f"terrain {terrain.name} has no site: an image can be located only on ground whose position on a body is "
+            "known",
+        )
+    return exposure.time_utc, terrain.site
 
 
 def detect_sources(inputs: Inputs, camera: Camera | None, detector: Detector) -> Detected:

@@ -127,14 +127,9 @@ class Mistakes:
 
     def evidence(self, sky: Sky, listed: Bools) -> Evidence:
         """ln((1 - missed) / false) for the stars on the list, ln(missed / (1 - false)) for the others."""
-        for_it = float(np.log((1 - self.missed) / self.false))
-        against = float(np.log(self.missed / (1 - self.false)))
-        return Evidence(
-            azimuth_rad=sky.azimuth_rad,
-            elevation_rad=sky.elevation_rad,
-            llr=np.where(listed, for_it, against).astype(np.float64),
-            edge_sigma_rad=np.zeros(len(sky)),
-        )
+        for_it, against = np.log([(1 - self.missed) / self.false, self.missed / (1 - self.false)])
+        llr = np.where(listed, for_it, against)
+        return Evidence(azimuth_rad=sky.azimuth_rad, elevation_rad=sky.elevation_rad, llr=llr)
 
 
 PERFECT = Mistakes(missed=1e-6, false=1e-6)  # none, as in the thesis

@@ -72,7 +72,7 @@ def compile_beside_another(folder: str) -> int:
 @pytest.mark.parametrize(("announced", "level", "lines"), [(False, 0, 1), (True, 0, 0), (False, logging.ERROR, 0)])
 def test_two_processes_announce_once(tmp_path, capfd, monkeypatch, announced, level, lines):
     """And not at all where their parent has, or where it is quiet."""
-    monkeypatch.setattr(compilation.TURN, "is_taken", announced)
+    monkeypatch.setattr(compilation.ANNOUNCEMENT_TURN, "is_taken", announced)
     monkeypatch.setattr(logging.getLogger("startrack"), "level", level)
     with Runner(compile_beside_another, jobs=2) as runner:
         processes = {process for _, process in runner.results([str(tmp_path)] * 4)}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from contextlib import AbstractContextManager
 from functools import lru_cache
 from pathlib import Path
@@ -20,19 +20,13 @@ from startrack.core.runner import TASK_LIMIT_S, Died, Runner, RunStopped
 Chunk = dict[str, np.ndarray]  # the result of one task, by name
 
 
-class CountedTask(Protocol):
-    """A task whose length is the number of its steps on the progress bar."""
-
-    def __len__(self) -> int: ...
-
-
 class Bar(Protocol):
     """A progress bar."""
 
     def advance(self, steps: int = 1) -> None: ...
 
 
-Task = TypeVar("Task", bound=CountedTask)
+Task = TypeVar("Task", bound=Sized)  # its length: the number of its steps on the progress bar
 Progress = Callable[[str, int], AbstractContextManager[Bar]]  # text and number of steps of a computation
 
 

@@ -69,7 +69,7 @@ class Turn:
         return context.Semaphore(int(not self.is_taken))
 
 
-TURN = Turn()
+ANNOUNCEMENT_TURN = Turn()
 
 
 @cache
@@ -82,7 +82,7 @@ def announce_compilation() -> None:
 
     class Announcement(event.Listener):  # type: ignore[misc]
         def on_start(self, event: Any) -> None:
-            if event.data["dispatcher"].py_func.__module__.startswith("startrack.") and TURN.take():
+            if event.data["dispatcher"].py_func.__module__.startswith("startrack.") and ANNOUNCEMENT_TURN.take():
                 LOG.warning(
                     "compiling what this command uses first: about 20 s, for height maps a minute; kept on disk"
                 )

@@ -18,7 +18,7 @@ from multiprocessing.connection import wait as wait_for_sentinels
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
 
-from startrack.core.compilation import TURN
+from startrack.core.compilation import ANNOUNCEMENT_TURN
 from startrack.core.errors import BadInput
 
 if TYPE_CHECKING:
@@ -195,7 +195,7 @@ class _Pool:
         self._others = set(active_children())
         # New processes: a fork would copy the thread of the progress bar.
         context = get_context("spawn")
-        given = (TURN.semaphore(context), logging.getLogger("startrack").level)
+        given = (ANNOUNCEMENT_TURN.semaphore(context), logging.getLogger("startrack").level)
         self._executor = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_process, initargs=given)
 
     def submit(self, work: Callable[[Task], Result], task: Task) -> Future[Result]:
@@ -236,7 +236,7 @@ def _block_signals() -> Iterator[None]:
 
 def _begin_process(turn: Semaphore, log_level: int) -> None:
     """The first call in a new process: one of the pool announces compilation, and logs are as quiet as the parent's."""
-    TURN.shared = turn
+    ANNOUNCEMENT_TURN.shared = turn
     logging.getLogger("startrack").setLevel(log_level)
     for number in SIGNALS:  # sent to the whole process group: the tasks in progress are finished
         signal.signal(number, signal.SIG_IGN)

@@ -148,10 +148,7 @@ class Series:
         return self.terrain.site
 
     def pose(self, number: int) -> Pose:
-        """Time and pose of exposure `number`.
-
-        Raises BadInput: bad_terrain where no camera can stand, no_time beyond the calendar.
-        """
+        """Time and pose of exposure `number`. Raises BadInput (bad_terrain: no camera can stand there; no_time)."""
         return self._pose_and_rng(number)[0]
 
     def odometry(self, poses: Sequence[Pose], *, sigma_1: float, floor_m: float) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from startrack.core.types import Array
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-STYLE: dict[Any, Any] = {
+PLOT_STYLE: dict[Any, Any] = {
     "figure.constrained_layout.use": True, "figure.dpi": 100, "axes.titlesize": 11, "legend.fontsize": 8
 }  # fmt: skip
 DARK, GOOD, BAD, LINE = "#1b2430", "#0072b2", "#d55e00", "#009e73"
@@ -32,7 +32,7 @@ def report_png(calibration: Calibration) -> bytes:
     from matplotlib.figure import Figure
 
     drawn = io.BytesIO()
-    with rc_context(STYLE):
+    with rc_context(PLOT_STYLE):
         figure = Figure(figsize=(13.0, 11.0))
         axes = figure.subplots(2, 2)
         _draw_vectors(axes[0, 0], calibration)

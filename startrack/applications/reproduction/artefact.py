@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-STYLE: dict[Any, Any] = {
+FIGURE_STYLE: dict[Any, Any] = {
     "figure.constrained_layout.use": True, "figure.dpi": 100, "axes.titlesize": 10, "legend.frameon": False
 }  # fmt: skip
 EDGE_COLOUR = "#1a9641"  # the thesis draws the crater's edge in green
 STAR, OTHER_STAR = "#20304a", "#b9c0cc"
 CENTRE = PUBLISHED = "#d7191c"  # and centres of mass in red
-COLOURS = 128  # of a PNG's palette: enough for these drawings, at a third of the size
+PALETTE_SIZE = 128  # of a PNG's palette: enough for these drawings, at a third of the size
 
 
 @dataclass(frozen=True)
@@ -80,14 +80,14 @@ class Picture:
         from PIL import Image
 
         drawn, packed = io.BytesIO(), io.BytesIO()
-        with rc_context(STYLE):
+        with rc_context(FIGURE_STYLE):
             figure = Figure(figsize=self.size_in)
             self.draw(figure)
             lines = textwrap.wrap(self.caption, int(13.7 * self.size_in[0]))
             figure.supxlabel("\n".join(lines), fontsize=9, x=0.02, ha="left")
             figure.savefig(drawn, format="png", metadata={"Software": None})
         picture = Image.open(drawn).convert("RGB")
-        picture = picture.quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        picture = picture.quantize(PALETTE_SIZE, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
         picture.save(packed, format="PNG", optimize=True)
         return packed.getvalue()
 

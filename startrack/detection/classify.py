@@ -90,12 +90,10 @@ def select_brightest_per_position(xy_px: Array, flux: Array, closer_px: float) -
     """Which sources (n,) to keep: of several that converged to one position the brightest."""
     from scipy.spatial import cKDTree
 
-    rank = np.empty(len(flux), dtype=np.int64)
-    rank[np.argsort(-flux, kind="stable")] = np.arange(len(flux))
-    pairs = cKDTree(xy_px).query_pairs(closer_px, output_type="ndarray")
-    fainter = np.zeros(len(flux), dtype=bool)
-    fainter[np.where(rank[pairs[:, 0]] > rank[pairs[:, 1]], pairs[:, 0], pairs[:, 1])] = True
-    return ~fainter
+    one, later = cKDTree(xy_px).query_pairs(closer_px, output_type="ndarray").T
+    brightest = np.ones(len(flux), dtype=bool)
+    brightest[np.where(flux[one] < flux[later], one, later)] = False
+    return brightest
 
 
 def reject_wing_misfits(xy_px: Array, flux: Array, height: Array, sigma: float, threshold: float) -> Bools:

@@ -112,8 +112,8 @@ class Detector:
             raise TooFewStars(NOTHING_SEEN)
         saturated = np.zeros(len(stars.flux), dtype=bool)
         if frame.dead is not None:
-            column, row = np.rint(stars.xy_px).astype(int).T
-            saturated = frame.dead[np.clip(row, 0, image.shape[0] - 1), np.clip(column, 0, image.shape[1] - 1)]
+            column, row = nearest_pixels(stars.xy_px, frame.shape, 0).T
+            saturated = frame.dead[row, column]
         return complete(
             xy_px=stars.xy_px, covariance_px2=stars.covariance[:, :2, :2], flux_e=stars.flux,
             flux_sigma_e=np.sqrt(stars.covariance[:, 2, 2]), snr=stars.snr, saturated=saturated, psf_sigma_px=sigma,

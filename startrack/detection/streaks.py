@@ -75,10 +75,8 @@ def find_streaks(frame: Frame) -> Streaks | None:
     quiet = 1.0 / np.sqrt(4.0 * np.pi * SMOOTH_PX**2)
     mask = (smooth > CLIPPED_SIGMA * 2.0 * quiet).astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
-    area = stats[:, cv2.CC_STAT_AREA]
-    left, top = stats[:, cv2.CC_STAT_LEFT], stats[:, cv2.CC_STAT_TOP]
-    off_border = (left > 1) & (top > 1)
-    off_border &= (left + stats[:, cv2.CC_STAT_WIDTH] < width - 1) & (top + stats[:, cv2.CC_STAT_HEIGHT] < height - 1)
+    left, top, wide, high, area = stats.T
+    off_border = (left > 1) & (top > 1) & (left + wide < width - 1) & (top + high < height - 1)
     rows, columns = np.nonzero(cv2.dilate(mask, np.ones((3, 3), np.uint8)))
     label = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8))[rows, columns].astype(np.int64)
     signal = (frame.image[rows, columns] - frame.background[rows, columns]).astype(np.float64)

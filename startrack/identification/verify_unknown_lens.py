@@ -230,7 +230,5 @@ def _count_unexplained(centroids: Centroids, camera: Camera, stars: Stars, R: Ar
         return 0
     faintest = zero_mag - 2.5 * np.log10(centroids.flux_e[significant].min()) + UNEXPLAINED_MARGIN_MAG
     px, inside = camera.project(stars.rays_icrs[: int(np.searchsorted(stars.v_mag, faintest))] @ R.T)
-    if not inside.any():
-        return len(significant)
     distance, _ = cKDTree(px[inside]).query(centroids.xy_px[significant], distance_upper_bound=INLIER_PX)
     return int(np.count_nonzero(~np.isfinite(distance)))

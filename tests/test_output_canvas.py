@@ -99,7 +99,7 @@ def test_the_view_keeps_pixel_centres():
 
 
 def test_north_is_up_and_east_is_right():
-    view = Map.around(Canvas(600, 600), (100, 200, 500, 400), (1000.0, -500.0), 50.0)
+    view = Map.of_extent(Canvas(600, 600), (100, 200, 500, 400), (1000.0, -500.0), 50.0)
     np.testing.assert_allclose(view.canvas_px((1000.0, -500.0)), (300.0, 300.0))
     np.testing.assert_allclose(view.canvas_px((1050.0, -450.0)), (400.0, 200.0))
 
@@ -179,7 +179,7 @@ def test_the_edge_of_the_ground_is_smooth():
     terrain = Ramp(0.3)
     object.__setattr__(terrain, "allowed", disc)
     canvas = Canvas(601, 601)
-    view = Map.around(canvas, (0, 0, 600, 600), (0.0, 0.0), 1000.0)
+    view = Map.of_extent(canvas, (0, 0, 600, 600), (0.0, 0.0), 1000.0)
     view.draw_relief(*view.ground(terrain))
     light = canvas.pixels.max(axis=-1).astype(float)
     half = (light.max() + light[0, 0]) / 2
@@ -194,7 +194,7 @@ def test_the_edge_of_the_ground_is_smooth():
 
 def test_contours_stand_at_their_heights_with_their_names():
     terrain, canvas = Ramp(0.3), Canvas(601, 601)
-    view = Map.around(canvas, (0, 0, 600, 600), (0.0, 0.0), 1000.0)
+    view = Map.of_extent(canvas, (0, 0, 600, 600), (0.0, 0.0), 1000.0)
     assert "each 50 m" in view.draw_heights(terrain)  # from -300 to 300 m
     row = canvas.pixels[200].astype(int).sum(axis=-1)
     lines = np.flatnonzero((row > sum(Ink.PAPER) + 60) & (row >= np.roll(row, 1)) & (row > np.roll(row, -1)))

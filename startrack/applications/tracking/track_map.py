@@ -17,7 +17,7 @@ REST_WIDEST = 25.0  # the map of a camera at rest, in half axes of the last elli
 
 def draw_track_map(canvas: Canvas, box: Box, track: Track, odometry_m: Array | None) -> tuple[Map, Legend]:
     """Draw the map into the box; returns it and its legend."""
-    drawn = Map.around(canvas, box, *track_extent(track, odometry_m))
+    drawn = Map.of_extent(canvas, box, *track_extent(track, odometry_m))
     drawn.draw_ground(track.terrain)
     x, y = box[2] - 2 * TEXT_PX, box[1] + 2 * TEXT_PX
     canvas.reserve(box_around((x, y), 2.5 * TEXT_PX))

@@ -24,7 +24,7 @@ from startrack.output.html.details import (
     Horizon,
     ground_map,
     picture_of,
-    rounded,
+    round_values,
     sectors_of,
     skyline_of,
     star_table_of,
@@ -137,7 +137,7 @@ def _detail(found: Found, terrains: Mapping[str, Terrain], size: tuple[int, int,
     horizon, line = _horizon(found, terrains), None
     if horizon is not None:
         elevation_rad = horizon(np.linspace(0.0, 2 * np.pi, azimuths))  # both ends included
-        line = rounded(np.degrees(elevation_rad), 3) if np.isfinite(elevation_rad).all() else None
+        line = round_values(np.degrees(elevation_rad), 3) if np.isfinite(elevation_rad).all() else None
         horizon = None if line is None else horizon  # a position off the map
     files = (found.companion(end) for end in FILES)
     return {

@@ -117,7 +117,7 @@ def sectors_of(stars: MeasuredStars, horizon: Horizon) -> dict[str, Any] | None:
     def total(chosen: Bools) -> list[float]:
         chosen = near & chosen
         weights = np.abs(stars.llr[chosen])
-        return rounded(np.bincount(sector[chosen], weights=weights, minlength=PAGE_SECTORS))
+        return round_values(np.bincount(sector[chosen], weights=weights, minlength=PAGE_SECTORS))
 
     sure = np.isfinite(above_rad) & (np.abs(stars.llr) > SURE_LLR)
     return {
@@ -127,7 +127,7 @@ def sectors_of(stars: MeasuredStars, horizon: Horizon) -> dict[str, Any] | None:
         "below": {status: count(~above, status) for status in ("seen", "hidden")},
         "supports": total(agrees),
         "opposes": total(~agrees),
-        "nats": rounded(_nats_by_sector(stars.azimuth_rad[sure], above_rad[sure], stars.llr[sure])),
+        "nats": round_values(_nats_by_sector(stars.azimuth_rad[sure], above_rad[sure], stars.llr[sure])),
     }
 
 
@@ -166,9 +166,9 @@ def skyline_of(path: Path, horizon: Horizon | None, stars: dict[str, Any] | None
         np.radians([float(row[f"{name}_deg"]) for row in rows]) for name in ("azimuth", "elevation", "sigma")
     )
     found: dict[str, Any] = {
-        "az": rounded(np.degrees(azimuth), 2),
-        "el": rounded(np.degrees(elevation), 3),
-        "sigma": rounded(np.degrees(sigma), 4),
+        "az": round_values(np.degrees(azimuth), 2),
+        "el": round_values(np.degrees(elevation), 3),
+        "sigma": round_values(np.degrees(sigma), 4),
         "source": [SOURCES.index(row["source"]) for row in rows],
     }
     if horizon is None:
@@ -179,8 +179,10 @@ def skyline_of(path: Path, horizon: Horizon | None, stars: dict[str, Any] | None
     if "az" in columns and "el" in columns:
         heights = np.radians(columns["el"]) - horizon(np.radians(columns["az"]))
         which = np.flatnonzero(np.abs(heights) < half)
-        near = [[k, height] for k, height in zip(which.tolist(), rounded(np.degrees(heights[which]), 3), strict=True)]
-    shown = {"above": rounded(np.degrees(above), 4), "half": round(float(np.degrees(half)), 3), "near": near}
+        near = [
+            [k, height] for k, height in zip(which.tolist(), round_values(np.degrees(heights[which]), 3), strict=True)
+        ]
+    shown = {"above": round_values(np.degrees(above), 4), "half": round(float(np.degrees(half)), 3), "near": near}
     return found | shown
 
 
@@ -237,6 +239,6 @@ def data_uri(pixels: NDArray[np.uint8]) -> str:
     return f"data:image/webp;base64,{base64.b64encode(data).decode('ascii')}"
 
 
-def rounded(values: NDArray[Any], decimals: int = 2) -> list[Any]:
+def round_values(values: NDArray[Any], decimals: int = 2) -> list[Any]:
     """Values for JSON, None for nan."""
     return [round(value, decimals) + 0.0 if np.isfinite(value) else None for value in values.tolist()]

@@ -150,10 +150,11 @@ def row_of(found: Found, real: Position | None, detailed: bool) -> list[Any]:
     return [
         record["image"], found.stem, record["status"], record.get("reason"),
         str(record.get("message") or "")[:MESSAGE_LETTERS], at("provenance.time_utc"), at("provenance.terrain"),
-        *(_rounded(value, 4) for value in known), _rounded(at("position.radius999_m"), 2),
-        _rounded(at("stars.rms_px"), 3), _rounded(sum(times) / 1e3 if times else None, 3),
-        *(_rounded(value, 2) for value in real or (None, None)), _rounded(error_m, 2), _rounded(nees, 3),
-        *(_rounded(value, decimals + 1 if decimals else None) for value, decimals in listed), found.kind, detailed,
+        *(_round_number(value, 4) for value in known), _round_number(at("position.radius999_m"), 2),
+        _round_number(at("stars.rms_px"), 3), _round_number(sum(times) / 1e3 if times else None, 3),
+        *(_round_number(value, 2) for value in (*(real or (None, None)), error_m)), _round_number(nees, 3),
+        *(_round_number(value, decimals + 1 if decimals else None) for value, decimals in listed), found.kind,
+        detailed,
     ]  # fmt: skip
 
 
@@ -204,5 +205,5 @@ def images_with_details(found: Sequence[Found], most: int) -> set[int]:
     return set(first + solved[: most - len(first)])
 
 
-def _rounded(value: float | None, decimals: int | None) -> float | None:
+def _round_number(value: float | None, decimals: int | None) -> float | None:
     return None if value is None else round(value, decimals)

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from startrack.chain import Detected, Identified, Inputs, Located, Measured, Oriented, Outcome, last_value
 from startrack.core.errors import BadInput
+from startrack.estimation.attitude import AttitudeFit
 from startrack.exposure import insert_png_chunks, png_chunks
+from startrack.output.picture.axes import GAP_PX, multiples, nice_step
 from startrack.output.picture.backdrop import View, bare_picture, fit_to_canvas
 from startrack.output.picture.canvas import (
     LARGE_PX,
@@ -29,11 +31,12 @@ from startrack.output.picture.canvas import (
     Ink,
     Legend,
     encoded_bytes,
+    mix_colours,
     png_bytes,
     text_width,
     wrap_text,
 )
-from startrack.output.picture.maps import draw_overview, draw_residuals, draw_zoom
+from startrack.output.picture.maps import draw_overview, draw_zoom
 from startrack.output.picture.marks import draw_marks, overlay_of
 from startrack.output.record import at_stage, image_name
 from startrack.output.text import Rows, rows
@@ -43,6 +46,7 @@ PANEL_WIDTH, PANEL_HEIGHT = 620, 1160
 FACT_STEP_PX = 2 * TEXT_PX
 STATUS = {"ok": Ink.GREEN, "ambiguous": Ink.ORANGE, "refused": Ink.VERMILLION}
 OVERVIEW_PART = 0.58  # of the height left for maps
+WIDEST_RMS = 4.5  # residuals beyond this many rms are outliers and would squeeze the rest
 MAX_MODES, MAX_LINES = 4, 8  # of positions that fit, and of a message
 BARE_CHUNK, MARKS_CHUNK = b"stPX", b"stOV"  # a JPEG; compressed JSON
 EastNorth = tuple[float, float] | None  # east and north [m] of the true position, where a caller knows it
@@ -54,14 +58,14 @@ def annotate(outcome: Outcome, truth_enu_m: EastNorth = None) -> NDArray[np.uint
     `truth_enu_m` (east, north) [m] is drawn if it is given.
     """
     value = last_value(outcome)
-    return _annotated(outcome, truth_enu_m, bare_picture(value), overlay_of(value))
+    return _draw_picture(outcome, truth_enu_m, bare_picture(value), overlay_of(value))
 
 
 def annotated_png(outcome: Outcome, truth_enu_m: EastNorth = None) -> bytes:
     """The picture of `annotate` as a PNG file with the layers of `layers_of`."""
     value = last_value(outcome)
     bare, overlay = bare_picture(value), overlay_of(value)
-    png = png_bytes(_annotated(outcome, truth_enu_m, bare, overlay))
+    png = png_bytes(_draw_picture(outcome, truth_enu_m, bare, overlay))
     jpeg = encoded_bytes(".jpg", bare[:, :, ::-1], cv2.IMWRITE_JPEG_QUALITY, QUALITY)
     text = json.dumps(overlay, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     return insert_png_chunks(png, [(BARE_CHUNK, jpeg), (MARKS_CHUNK, zlib.compress(text.encode("utf-8")))])
@@ -88,7 +92,7 @@ def layers_of(png: bytes) -> Layers | None:
     return None if bare is None else Layers(np.asarray(bare[:, :, ::-1], dtype=np.uint8), overlay)
 
 
-def _annotated(
+def _draw_picture(
     outcome: Outcome, truth_enu_m: EastNorth, bare: NDArray[np.uint8], overlay: dict[str, Any]
 ) -> NDArray[np.uint8]:
     value = last_value(outcome)
@@ -152,7 +156,7 @@ def _draw_figures(canvas: Canvas, room: Box, value: Inputs, truth: EastNorth) ->
     if value.terrain is None:
         if not isinstance(value, Oriented):
             return top
-        draw_residuals(canvas, (left, top, right, bottom), value.attitude_fit)
+        _draw_residuals(canvas, (left, top, right, bottom), value.attitude_fit)
         return bottom + TEXT_PX
     split = top + (OVERVIEW_PART if zoomed else 1.0) * (bottom - top)
     fix = value.fix if isinstance(value, Located) else None
@@ -165,6 +169,24 @@ def _draw_figures(canvas: Canvas, room: Box, value: Inputs, truth: EastNorth) ->
             start = position + TEXT_PX * toward / np.linalg.norm(toward)
             canvas.line(np.stack([start, corner]), Ink.FAINT)
     return bottom + TEXT_PX
+
+
+def _draw_residuals(canvas: Canvas, box: Box, fit: AttitudeFit) -> None:
+    """Measured minus predicted pixels of the stars that the attitude rests on, with rings to read them by."""
+    left, top, right, bottom = box
+    window, middle = canvas.window(box), np.array([(left + right) / 2, (top + bottom) / 2])
+    window.rectangle(box, Ink.PAPER)
+    reach_px = WIDEST_RMS * max(fit.rms_px, 1e-3)
+    scale = 0.5 * min(right - left, bottom - top) / reach_px
+    step = nice_step(reach_px / 2)
+    for radius in multiples(step, 2 * reach_px, step):
+        window.circle(middle, radius * scale, Ink.GRID)
+    window.mark(middle, "plus", max(right - left, bottom - top), Ink.GRID, 1)
+    for position in middle + scale * fit.residual_px[fit.used]:
+        window.circle(position, 2.0, mix_colours(Ink.IDENTIFIED, Ink.PLAIN, 0.15), -1)
+    canvas.rectangle(box, Ink.FAINT, 1)
+    canvas.text((left + GAP_PX, top + GAP_PX), "measured minus predicted", anchor="lt", halo=True)
+    canvas.text(middle + step * scale * np.array([2**0.5, -(2**0.5)]), f"{2 * step:g} px", Ink.PLAIN, "mm", halo=True)
 
 
 def _has_circle(value: Inputs) -> bool:

@@ -1,4 +1,4 @@
-"""Maps: the search area with the position, the position with its error, residuals of the stars, relief of a terrain."""
+"""Maps: the search area with the position, the position with its error, relief of a terrain."""
 
 from __future__ import annotations
 
@@ -11,21 +11,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from startrack.core.errors import length_text
 from startrack.core.types import Array, Bools, Fix
-from startrack.estimation.attitude import AttitudeFit
 from startrack.output.picture.axes import GAP_PX, NICE, multiples, nice_step
 from startrack.output.picture.canvas import TEXT_PX, Box, Canvas, Colour, Ink, box_around, mix_colours
 from startrack.output.picture.relief import (
     Image,
     edge_cover,
-    enlarge,
-    extrapolate,
+    enlarge_image,
+    extrapolate_values,
     ground_cells,
     hill_shading,
     inner_cells,
 )
 from startrack.terrain import Terrain
 
-WIDEST_RMS = 4.5  # residuals beyond this many rms are outliers and would squeeze the rest
 CIRCLE_RAD = np.linspace(0.0, 2 * np.pi, 181)
 SIDE_PX, MARGIN_PX, BELOW_PX = 860.0, 4 * TEXT_PX, 3 * TEXT_PX  # of a picture of one map, and beside it, for its scales
 SEARCH_MARGIN = 1.07  # of a map, in radii of the search area
@@ -43,7 +41,7 @@ class Map:
     metres_per_px: float
 
     @classmethod
-    def around(cls, canvas: Canvas, box: Box, centre_m: tuple[float, float], half_m: float) -> Map:
+    def of_extent(cls, canvas: Canvas, box: Box, centre_m: tuple[float, float], half_m: float) -> Map:
         """A map in the `box` of the `canvas` that shows `half_m` in every direction from `centre_m`, east and north."""
         left, top, right, bottom = box
         return cls(canvas, box, centre_m, 2 * half_m / min(right - left, bottom - top))
@@ -92,7 +90,7 @@ class Map:
     def draw_relief(self, ground_m: Image, known: Bools) -> None:
         """The relief; the map's colour where there is no ground."""
         size = self.window.size
-        lit = (enlarge(hill_shading(ground_m, known, self.half_m), size) * edge_cover(known, size))[:, :, None]
+        lit = (enlarge_image(hill_shading(ground_m, known, self.half_m), size) * edge_cover(known, size))[:, :, None]
         paper = np.array(Ink.PAPER)
         self.window.pixels[:] = (paper + lit * (RELIEF_LIGHT * np.array(Ink.FLOOR) - paper)).astype(np.uint8)
 
@@ -106,7 +104,7 @@ class Map:
         if high - low < 1.0:
             return ""
         step_m = next(one for one in NICE if one * MAX_LEVELS >= high - low)
-        fine = enlarge(extrapolate(ground_m, known), self.window.size)
+        fine = enlarge_image(extrapolate_values(ground_m, known), self.window.size)
         inside = edge_cover(inner_cells(known), self.window.size) > 0.5
         levels = {level: f"{level:g}" for level in multiples(low, high, step_m) if low < level < high}
         self.draw_contours(fine, levels, inside, mix_colours(Ink.FLOOR, Ink.DIM, 0.7))
@@ -183,7 +181,7 @@ def draw_overview(
     All positions of the fix are drawn if it is ambiguous. `truth` (2,) is the true one, east and north [m].
     """
     reach = max(min(terrain.search_radius_m, terrain.reach_m), terrain.rim_radius_m or 0.0)
-    drawn = Map.around(canvas, box, (0.0, 0.0), SEARCH_MARGIN * reach)
+    drawn = Map.of_extent(canvas, box, (0.0, 0.0), SEARCH_MARGIN * reach)
     drawn.draw_ground(terrain)
     if truth is not None:
         drawn.window.mark(drawn.canvas_px(truth), "plus", GAP_PX, Ink.TRUTH)
@@ -203,7 +201,7 @@ def draw_zoom(canvas: Canvas, box: Box, fix: Fix, truth: ArrayLike | None) -> Ma
     half = 1.3 * fix.radius95_m
     if truth is not None:  # as far out as that is still a zoom
         half = max(half, min(1.3 * float(np.linalg.norm(np.subtract(truth, position))), 4 * half))
-    drawn = Map.around(canvas, box, position, half)
+    drawn = Map.of_extent(canvas, box, position, half)
     window = drawn.window
     window.rectangle(box, Ink.PAPER)
     drawn.draw_grid()
@@ -217,24 +215,6 @@ def draw_zoom(canvas: Canvas, box: Box, fix: Fix, truth: ArrayLike | None) -> Ma
         canvas.label(drawn.canvas_px(truth), "truth", Ink.TRUTH, TEXT_PX, box)
     drawn.draw_frame(f"95 % within {length_text(fix.radius95_m, 3)}")
     return drawn
-
-
-def draw_residuals(canvas: Canvas, box: Box, fit: AttitudeFit) -> None:
-    """Measured minus predicted pixels of the stars that the attitude rests on, with rings to read them by."""
-    left, top, right, bottom = box
-    window, middle = canvas.window(box), np.array([(left + right) / 2, (top + bottom) / 2])
-    window.rectangle(box, Ink.PAPER)
-    reach_px = WIDEST_RMS * max(fit.rms_px, 1e-3)
-    scale = 0.5 * min(right - left, bottom - top) / reach_px
-    step = nice_step(reach_px / 2)
-    for radius in multiples(step, 2 * reach_px, step):
-        window.circle(middle, radius * scale, Ink.GRID)
-    window.mark(middle, "plus", max(right - left, bottom - top), Ink.GRID, 1)
-    for position in middle + scale * fit.residual_px[fit.used]:
-        window.circle(position, 2.0, mix_colours(Ink.IDENTIFIED, Ink.PLAIN, 0.15), -1)
-    canvas.rectangle(box, Ink.FAINT, 1)
-    canvas.text((left + GAP_PX, top + GAP_PX), "measured minus predicted", anchor="lt", halo=True)
-    canvas.text(middle + step * scale * np.array([2**0.5, -(2**0.5)]), f"{2 * step:g} px", Ink.PLAIN, "mm", halo=True)
 
 
 def relief_picture(terrain: Terrain, position_m: tuple[float, float] | None = None) -> NDArray[np.uint8]:

@@ -16,7 +16,7 @@ from startrack.frames import Site, latlon_from_enu
 from startrack.output.picture.axes import NICE, Axes
 from startrack.output.picture.canvas import LINE_PX, TEXT_PX, TITLE_PX, Canvas, Colour, Ink, rgb_colours
 from startrack.output.picture.maps import BELOW_PX, MARGIN_PX, SEARCH_MARGIN, SIDE_PX, Map, ring
-from startrack.output.picture.relief import cell_points, edge_cover, extrapolate, hill_shading
+from startrack.output.picture.relief import cell_points, edge_cover, extrapolate_values, hill_shading
 
 if TYPE_CHECKING:
     from startrack.terrain import Raster, Terrain
@@ -41,7 +41,7 @@ def prediction_picture(
     box = (MARGIN_PX, HEAD_PX, MARGIN_PX + SIDE_PX, HEAD_PX + SIDE_PX)
     canvas = _headed_canvas(round(box[2] + KEY_PX), round(box[3] + BELOW_PX), title, lines)
     half_m = SEARCH_MARGIN * max(terrain.search_radius_m, terrain.rim_radius_m or 0.0)
-    drawn, bounds_m = Map.around(canvas, box, (0.0, 0.0), half_m), class_bounds_m(radius95_m.heights_m)
+    drawn, bounds_m = Map.of_extent(canvas, box, (0.0, 0.0), half_m), class_bounds_m(radius95_m.heights_m)
     at = np.rint(np.linspace(0, len(COLOURS) - 1, len(bounds_m) + 1)).astype(int) if bounds_m else [0]
     colours = [*(COLOURS[k] for k in at), Ink.VERMILLION]  # the last: no position
     radius = _radius_of_pixels(drawn, site, radius95_m)
@@ -85,12 +85,10 @@ def _radius_of_pixels(drawn: Map, site: Site, radius95_m: Raster) -> Array:
     at = radius95_m.row_column(*latlon_from_enu(site, east, north, 0.0)).astype(np.float32)
     row, column = (np.ascontiguousarray(at[..., k]) for k in (0, 1))
     known = np.isfinite(radius95_m.heights_m)
+    finite = extrapolate_values(np.where(known, radius95_m.heights_m, 0.0).astype(np.float32), known)
     filled, nowhere = (
         cv2.remap(values.astype(np.float32), column, row, method, borderMode=cv2.BORDER_REPLICATE)
-        for values, method in (
-            (extrapolate(np.where(known, radius95_m.heights_m, 0.0).astype(np.float32), known), cv2.INTER_LINEAR),
-            (np.isinf(radius95_m.heights_m), cv2.INTER_NEAREST),
-        )
+        for values, method in ((finite, cv2.INTER_LINEAR), (np.isinf(radius95_m.heights_m), cv2.INTER_NEAREST))
     )
     return np.where(nowhere > 0, np.inf, filled)
 

@@ -41,12 +41,12 @@ def hill_shading(ground_m: Image, known: Bools, half_m: ArrayLike) -> Image:
     facing, inner = east / east_m + down / north_m, inner_cells(known)
     steep = max(float(np.percentile(np.abs(facing[inner]), 95)) if inner.any() else 0.0, GENTLE_SLOPE)
     light = np.maximum(0.5 + 0.5 * np.tanh(1.2 * facing / steep), 0.05)
-    return extrapolate(light.astype(np.float32), inner)
+    return extrapolate_values(light.astype(np.float32), inner)
 
 
 def edge_cover(known: Bools, size: tuple[int, int]) -> Array:
     """1 on known ground and 0 beside it, (H, W) of the given size (W, H), with a smooth edge."""
-    soft = enlarge(np.asarray(cv2.GaussianBlur(known.astype(np.float32), (0, 0), 1.5)), size)
+    soft = enlarge_image(np.asarray(cv2.GaussianBlur(known.astype(np.float32), (0, 0), 1.5)), size)
     return np.clip((soft - 0.5) * 4 + 0.5, 0, 1).astype(np.float64)
 
 
@@ -55,7 +55,7 @@ def inner_cells(known: Bools) -> Bools:
     return cv2.erode(known.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE) > 0
 
 
-def extrapolate(values: Image, known: Bools) -> Image:
+def extrapolate_values(values: Image, known: Bools) -> Image:
     """Known values, carried a few cells beyond their edge."""
     filled, weight = np.where(known, values, 0).astype(np.float32), known.astype(np.float32)
     for reach in (3, 7, 15):
@@ -66,6 +66,6 @@ def extrapolate(values: Image, known: Bools) -> Image:
     return filled
 
 
-def enlarge(image: Image, size: tuple[int, int]) -> Image:
+def enlarge_image(image: Image, size: tuple[int, int]) -> Image:
     """The image, smooth, in a `size` (W, H)."""
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), dtype=np.float32)

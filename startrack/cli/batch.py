@@ -91,7 +91,7 @@ def _locate_images(
             records = shown.take(runner, tasks)
         stopped = shown.halted if len(records) < len(tasks) else None
         try:
-            _write_tables(out, _tasks(sorted({*whole, *found}), out, facts, args), records, facts, args)
+            _write_tables(args, out, _tasks(sorted({*whole, *found}), out, facts, args), records)
             lack = "" if batch.has_parquet() else " (no results.parquet: the extra parquet is missing)"
             tables = f"tables in {out}{lack}"
         except BadInput as cause:
@@ -216,20 +216,14 @@ class _Shown:
         return f"{self.total} images: {', '.join(self._numbers())}{kept}{warned}"
 
 
-def _write_tables(
-    out: Path,
-    tasks: Sequence[Task],
-    records: Sequence[dict[str, Any]],
-    facts: dict[str, Any],
-    args: argparse.Namespace,
-) -> None:
-    """Write the tables of the whole folder; print a line on stderr for each kind of result that they lack.
+def _write_tables(args: argparse.Namespace, out: Path, tasks: Sequence[Task], records: list[dict[str, Any]]) -> None:
+    """Write the tables of the whole folder's `tasks`; print a line on stderr for each kind of result that they lack.
 
     Raises BadInput if they cannot be written.
     """
     of_flags = {  # without paths of this machine
         key: str(value) if key in ("time_utc", "time_sigma_s", "exposure_s") else Path(value).name
-        for key, value in facts.items()
+        for key, value in tasks[0].facts.items()
     }
     method = {"localizer": args.localizer, "evidence": args.evidence}
     near = {} if args.near is None else {"near": list(args.near)}

@@ -34,7 +34,7 @@ SELF_TEST_LIMIT_M = 40.0
 def run(args: argparse.Namespace) -> int:
     """Run the checks; 0 if all pass, else 1."""
     checks: dict[str, Callable[[], str]] = {
-        "packages": lambda: ", ".join(f"{name} {metadata.version(name)}" for name in REQUIRED),
+        "packages": lambda: _versions(REQUIRED),
         "extras": _extras,
         "catalogue": _catalogue,
         "cameras": lambda: _check_shipped_files("calib"),
@@ -43,36 +43,38 @@ def run(args: argparse.Namespace) -> int:
         "kernels": lambda: _kernels(args),
         "self-test": _self_test,
     }
-    done = [_run_check(name, check) for name, check in checks.items()]
+    done: list[dict[str, Any]] = []
+    for name, check in checks.items():
+        try:
+            done.append({"name": name, "ok": True, "message": check()})
+        except Exception as cause:  # noqa: BLE001 - doctor reports every error
+            done.append({"name": name, "ok": False, "message": f"{type(cause).__name__}: {cause}"})
     if args.json:
         record = {"version": __version__, "python": platform.python_version(), "checks": done}
         print(json.dumps(record, indent=2))
     elif not args.quiet:
         where = f"{platform.system()} {platform.machine()}"
         print(f"startrack {__version__}, Python {platform.python_version()} on {where}")
-    for check in () if args.json else done:
-        if not args.quiet or not check["ok"]:
-            print(f"  {'ok  ' if check['ok'] else 'FAIL'}  {check['name']:<10} {check['message']}")
-    return 0 if all(check["ok"] for check in done) else 1
+    for one in () if args.json else done:
+        if not args.quiet or not one["ok"]:
+            print(f"  {'ok  ' if one['ok'] else 'FAIL'}  {one['name']:<10} {one['message']}")
+    return 0 if all(one["ok"] for one in done) else 1
 
 
-def _run_check(name: str, check: Callable[[], str]) -> dict[str, Any]:
-    try:
-        return {"name": name, "ok": True, "message": check()}
-    except Exception as cause:  # noqa: BLE001 - doctor reports every error
-        return {"name": name, "ok": False, "message": f"{type(cause).__name__}: {cause}"}
+def _versions(names: tuple[str, ...]) -> str:
+    return ", ".join(f"{name} {metadata.version(name)}" for name in names)
 
 
 def _extras() -> str:
     """Each extra with the versions of its packages; one that is missing is no failure."""
-    return "; ".join(f"{extra} ({purpose}): {_state(names)}" for extra, (names, purpose) in OPTIONAL.items())
-
-
-def _state(names: tuple[str, ...]) -> str:
-    try:
-        return ", ".join(f"{name} {metadata.version(name)}" for name in names)
-    except metadata.PackageNotFoundError as cause:
-        return f"not installed ({cause.name})"
+    texts = []
+    for extra, (names, purpose) in OPTIONAL.items():
+        try:
+            state = _versions(names)
+        except metadata.PackageNotFoundError as cause:
+            state = f"not installed ({cause.name})"
+        texts.append(f"{extra} ({purpose}): {state}")
+    return "; ".join(texts)
 
 
 def _catalogue() -> str:

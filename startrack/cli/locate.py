@@ -89,11 +89,19 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve) -> int:
 
 
 def _solve_image(args: argparse.Namespace, path: str, out: Path, solve: Solve) -> Outcome:
-    """Read and solve the image, and write its results with the record `out`."""
+    """Read and solve the image, and write its results with the record `out`; only -O replaces those of another image.
+
+    Raises BadInput. A folder that takes no results is a usage error.
+    """
     start, is_located = time.perf_counter(), args.command == "locate"
     exposure = read(path, args)
     camera = None if is_located else _camera_of(args, exposure)
-    _prepare_results(args, out, exposure)
+    try:
+        make_folder(out.parent)
+    except BadOutput as cause:
+        args.usage_error(str(cause))
+    remedy = "choose another -D, or replace it with -O"  # before anything is computed
+    output.prepare_folder(out, exposure.sha256, overwrite=args.overwrite, remedy=remedy)
     read_s = time.perf_counter() - start
     if is_located and exposure.time_utc is not None and exposure.camera is not None:
         prepare_reference(exposure.terrain, args)
@@ -122,21 +130,6 @@ def _camera_of(args: argparse.Namespace, exposure: Exposure) -> Camera | None:
     if args.command == "detect":
         return None
     raise BadInput("no_calibration", "no camera file is known: give -c FILE or a sidecar with camera")
-
-
-def _prepare_results(args: argparse.Namespace, out: Path, exposure: Exposure) -> None:
-    """Make the folder of a result. A result of the same image is replaced, that of another only with -O.
-
-    Raises BadInput (bad_image, for lack of a better code) before anything is computed. A folder that takes no results
-    is a usage error.
-    """
-    try:
-        make_folder(out.parent)
-    except BadOutput as cause:
-        args.usage_error(str(cause))
-    output.prepare_folder(
-        out, exposure.sha256, overwrite=args.overwrite, remedy="choose another -D, or replace it with -O"
-    )
 
 
 def _found_fov_text(camera: Camera, fovs_rad: tuple[float, ...]) -> str:

@@ -18,7 +18,7 @@ from startrack.core.files import check_output, write_atomically
 from startrack.core.types import TIME_SIGMA_S
 from startrack.exposure import with_facts, write_exposure, write_sidecar
 from startrack.frames import format_utc, heading_pitch_roll_from_R_body_enu, parse_utc, tum_line
-from startrack.rendering import Drive, Pose, Scene, Series, Truth
+from startrack.rendering import Drive, Pose, Series
 from startrack.terrain import load_terrain
 
 SUFFIXES = {"png": ".png", "tiff": ".tif", "fits": ".fits"}
@@ -40,7 +40,10 @@ TRUTH_HEAD = "# time tx ty tz qx qy qz qw (Unix seconds UTC as stated in the ima
 def run(args: argparse.Namespace) -> int:
     """Render and write the images; 0. Raises BadInput for files and values that cannot be used, BadOutput for paths."""
     drive = _read_drive(args)
-    images = _targets(args, _count_images(args, drive))
+    along = 1 if drive is None else drive.count_frames(args.every)
+    if drive is not None and args.count is not None and args.count > along:
+        args.usage_error(f"--count {args.count}: the path has {along} exposures")
+    images = _targets(args, args.count or along)
     series = _series(args, drive)
     written = [p for image in images for p in (image, image.with_suffix(".json"), *rendering.truth_paths(image))]
     if args.every is not None:
@@ -77,14 +80,6 @@ def _read_drive(args: argparse.Namespace) -> Drive | None:
 def _given_flags(args: argparse.Namespace, *names: str) -> list[str]:
     """Flags among the `names` of arguments that are not None."""
     return [f"--{name.replace('_', '-')}" for name in names if getattr(args, name) is not None]
-
-
-def _count_images(args: argparse.Namespace, drive: Drive | None) -> int:
-    """Number of images: --count, or all along the path. A usage error for more than the path has."""
-    along = 1 if drive is None else drive.count_frames(args.every)
-    if drive is not None and args.count is not None and args.count > along:
-        args.usage_error(f"--count {args.count}: the path has {along} exposures")
-    return int(args.count or along)
 
 
 def _targets(args: argparse.Namespace, count: int) -> list[Path]:
@@ -125,20 +120,10 @@ def _render_one(args: argparse.Namespace, series: Series, number: int, image: Pa
     if args.time_sigma is not None or args.clock_offset != 0.0:  # else a right clock, which is exact
         sigma_s = TIME_SIGMA_S if args.time_sigma is None else args.time_sigma
         exposure = replace(exposure, time_sigma_s=sigma_s, time_sigma_is_stated=args.time_sigma is not None)
-    pose = {**_pose(scene, truth), "clock_offset_s": args.clock_offset}
     write_exposure(image, exposure, overwrite=args.overwrite)
     write_sidecar(image, exposure, overwrite=args.overwrite)
-    settings = {name: getattr(args, name) for name in SETTINGS}
-    facts = {**pose, "seed": args.seed, "number": number, "catalog": series.catalog.name, "settings": settings}
-    pose_path, table_path = rendering.write_truth(
-        image, truth, facts, to_v_mag=args.truth_mag, overwrite=args.overwrite
-    )
-    return {"image": str(image), "truth": str(pose_path), "table": str(table_path), **facts}
-
-
-def _pose(scene: Scene, truth: Truth) -> dict[str, Any]:
     heading, pitch, roll = heading_pitch_roll_from_R_body_enu(scene.camera.R_body_cam @ scene.R_cam_enu)
-    return {
+    facts = {
         "time_utc": None if scene.time_utc is None else format_utc(scene.time_utc),
         "exposure_s": scene.exposure_s,
         "east_m": float(truth.position_enu_m[0]),
@@ -146,7 +131,16 @@ def _pose(scene: Scene, truth: Truth) -> dict[str, Any]:
         "heading_deg": math.degrees(heading),
         "pitch_deg": math.degrees(pitch),
         "roll_body_deg": math.degrees(roll),
+        "clock_offset_s": args.clock_offset,
+        "seed": args.seed,
+        "number": number,
+        "catalog": series.catalog.name,
+        "settings": {name: getattr(args, name) for name in SETTINGS},
     }
+    pose_path, table_path = rendering.write_truth(
+        image, truth, facts, to_v_mag=args.truth_mag, overwrite=args.overwrite
+    )
+    return {"image": str(image), "truth": str(pose_path), "table": str(table_path), **facts}
 
 
 def _line(summary: dict[str, Any]) -> str:

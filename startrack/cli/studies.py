@@ -36,7 +36,10 @@ POINTS_OF_PATH = 25  # of the default spacing
 def predict(args: argparse.Namespace) -> int:
     """Predict, write the files and print the summary; 0, or 5 if the run was stopped."""
     _check_prediction(args)
-    conditions, inputs = _conditions(args), _inputs(args)
+    conditions = _conditions(args)
+    cameras = [absolute_reference(one) for one in (args.camera, args.compare) if one is not None]
+    hashes = input_hashes(os.path.join(args.dir, "predict.json"), cameras, conditions.terrain)
+    inputs = tuple(sorted({(Path(path).name, sha256) for path, sha256 in hashes.items()}))  # of the files of flags
     report = prediction.Report.begin(conditions, inputs, _places(args, conditions))
     out = make_folder(args.dir)
     report.check_folder(out, overwrite=args.overwrite)
@@ -53,7 +56,7 @@ def predict(args: argparse.Namespace) -> int:
             if args.depth:
                 conditions, depth = predictions.depth(conditions, args.target_radius95)
             first = predictions.cells(conditions, "predict")
-            others = {other: predictions.cells(other, "compare") for other in _variants(args, conditions)}
+            others = {other: predictions.cells(other, "compare") for other in _variants(args, conditions, cameras)}
             report = report.finish(conditions, first, others, depth)
     except RunStopped as cause:
         print(f"startrack predict: {cause}; the same command goes on", file=sys.stderr)
@@ -102,11 +105,10 @@ def _conditions(args: argparse.Namespace) -> Conditions:
     )
 
 
-def _variants(args: argparse.Namespace, conditions: Conditions) -> Sequence[Conditions]:
+def _variants(args: argparse.Namespace, conditions: Conditions, cameras: list[str]) -> Sequence[Conditions]:
     """All cameras and exposures that are compared; none without a comparison."""
     if args.compare is None and args.exposures is None:
         return []
-    cameras = [conditions.camera] + ([] if args.compare is None else [absolute_reference(args.compare)])
     exposures = args.exposures or [conditions.exposure_s]
     return [replace(conditions, camera=camera, exposure_s=one) for camera in cameras for one in exposures]
 
@@ -119,13 +121,6 @@ def _places(args: argparse.Namespace, conditions: Conditions) -> Any:
     drive = read_drive(args.path, 1.0)
     spacing_m = args.spacing or float(drive.distance_m[-1]) / POINTS_OF_PATH
     return prediction.path_points(drive, terrain, spacing_m)
-
-
-def _inputs(args: argparse.Namespace) -> tuple[tuple[str, str], ...]:
-    """Name and SHA-256 of the files that the flags name, and of the maps that these name."""
-    cameras = [absolute_reference(one) for one in (args.camera, args.compare) if one is not None]
-    found = input_hashes(os.path.join(args.dir, "predict.json"), cameras, absolute_reference(args.terrain))
-    return tuple(sorted({(Path(path).name, sha256) for path, sha256 in found.items()}))
 
 
 def reproduce(args: argparse.Namespace) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import stat
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -144,18 +143,11 @@ def _image_names(root: Path, excluded: str | None) -> list[str]:
     for parent, folders, files in os.walk(root, followlinks=True):
         here = Path(parent)
         folders[:] = [name for name in sorted(folders) if is_entered(here / name)]
-        found += [
-            (here / name).relative_to(root).as_posix() for name in files if _is_image(name) and _is_file(here, name)
-        ]
+        for path in (here / name for name in files if _is_image(name)):
+            # A pipe would block the reader; a broken link is an image that will be refused.
+            if os.path.isfile(path) or not os.path.exists(path):
+                found.append(path.relative_to(root).as_posix())
     return sorted(found)
-
-
-def _is_file(folder: Path, name: str) -> bool:
-    """Whether it is no pipe, which would block the reader. A broken link is an image that will be refused."""
-    try:
-        return stat.S_ISREG((folder / name).stat().st_mode)
-    except OSError:
-        return True
 
 
 def _is_image(name: str) -> bool:

@@ -137,11 +137,15 @@ def _parquet(records: Sequence[Record]) -> bytes:
 
 
 def _trajectories(records: Sequence[Record]) -> dict[str, list[str]]:
-    """File name to poses in the order of time: one file a terrain, whose origin the coordinates count from."""
+    """File name to poses (body to enu, TUM) in the order of time: one file a terrain, whose origin is that of enu."""
     poses: dict[tuple[str, ...], list[str]] = {}
     for record in records:
         if record["status"] == "ok" and record["provenance"]["time_utc"] is not None:
-            poses.setdefault(_terrain_key(record), []).append(_pose(record))
+            position, attitude = record["position"], record["attitude"]
+            seconds = datetime.fromisoformat(record["provenance"]["time_utc"]).timestamp()
+            position_m = np.array([position["east_m"], position["north_m"], position["up_m"]])
+            line = tum_line(seconds, position_m, R_from_quat_xyzw(attitude["quat_xyzw_body_enu"]).T)
+            poses.setdefault(_terrain_key(record), []).append(line)
     if len(poses) <= 1:
         return {TRAJECTORY: sorted(next(iter(poses.values()), []))}
     keys = sorted(poses)
@@ -156,14 +160,6 @@ def _terrain_key(record: Record) -> tuple[str, ...]:
     return stem, *sorted(sha256 for path, sha256 in inputs.items() if PurePath(path).name == f"{stem}.toml")
 
 
-def _pose(record: Record) -> str:
-    """A line of TUM's format: seconds of UTC, position, and the rotation from the rover's body to enu."""
-    position, attitude = record["position"], record["attitude"]
-    seconds = datetime.fromisoformat(record["provenance"]["time_utc"]).timestamp()
-    position_m = np.array([position["east_m"], position["north_m"], position["up_m"]])
-    return tum_line(seconds, position_m, R_from_quat_xyzw(attitude["quat_xyzw_body_enu"]).T)
-
-
 def _timings(records: Sequence[Record]) -> bytes:
     table = [Column("image", [record["image"] for record in records], "string")]
     for stage in STAGES:
@@ -175,9 +171,7 @@ def _timings(records: Sequence[Record]) -> bytes:
 def _manifest(records: Sequence[Record], settings: dict[str, Any]) -> bytes:
     images = [
         {
-            "image": record["image"],
-            RESULT: record.get(RESULT),
-            "status": record["status"],
+            **{key: record.get(key) for key in ("image", RESULT, "status")},
             "image_sha256": record.get("provenance", {}).get("image_sha256"),
             JOB: record.get(JOB),
         }

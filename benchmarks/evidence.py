@@ -140,9 +140,16 @@ def _ablations(result: Measured) -> Iterator[tuple[str, Evidence, ExactPosterior
     lonely = _photometry(result, visible=np.zeros(len(result.stars)))  # neighbours that are never visible
     yield "without crowding", lonely.evidence(), full
     yield "without flux uncertainty", _photometry(result, certain=True).evidence(), full
-    with patch.multiple(star_evidence, MISSING_PROBABILITY=0.0, ANOMALY_PROBABILITY=0.0, CAP=np.inf):
-        plain = _photometry(result).evidence()
-    yield "without caps", plain, full
+    yield "without caps", _photometry(result, settings=_Uncapped()).evidence(), full
+
+
+class _Uncapped(StarEvidence):
+    """Plain Gaussian ratios; whether neighbours are visible is guessed as always."""
+
+    def judge(self, found: Any, light: Any) -> StarPhotometry:
+        none = {"MISSING_PROBABILITY": 0.0, "ANOMALY_PROBABILITY": 0.0, "CAP": np.inf}
+        with patch.multiple(star_evidence, **none), np.errstate(divide="ignore"):
+            return super().judge(found, light)
 
 
 def _list_evidence(photometry: StarPhotometry, threshold: float) -> Evidence:
@@ -162,14 +169,16 @@ def _list_evidence(photometry: StarPhotometry, threshold: float) -> Evidence:
     )
 
 
-def _photometry(result: Measured, *, visible: Array | None = None, certain: bool = False) -> StarPhotometry:
+def _photometry(
+    result: Measured, *, visible: Array | None = None, certain: bool = False, settings: StarEvidence | None = None
+) -> StarPhotometry:
     """The frame's evidence once more, with a part left out."""
     stars, scale = result.stars, flux_scale(result.detections, result.camera, result.stars, result.identification)
     extra_px = result.attitude_fit.extra_sigma_px
     if certain:
         stars, scale = replace(stars, v_sigma_mag=np.zeros(len(stars))), replace(scale, scatter=0.0)
         extra_px = 0.0
-    return StarEvidence()(
+    return (settings or StarEvidence())(
         result.detections, result.camera, stars, list(result.bodies),
         result.attitude_fit.attitude.R_cam_icrs, result.R_enu_icrs, scale, extra_px, visible,
     )  # fmt: skip

@@ -73,8 +73,15 @@ def orient_frames(
     for exposure in exposures:
         require_time(exposure)
         require_body(exposure, site)
-        outcome = _identify(exposure, catalog, site, identified[0].camera if identified else camera, fov_rad)
+        known = identified[0].camera if identified else camera
+        outcome = (
+            identify(exposure, known, catalog, site=site)
+            if known is not None
+            else identify_blind(exposure, fov_rad or 0.0, catalog)
+        )
         if isinstance(outcome, Refused):
+            if outcome.reason.exit_code == Reason.BAD_IMAGE.exit_code:
+                raise BadInput(outcome.reason, f"{exposure.name}: {outcome.message}")
             left_out.append(LeftOut(name=exposure.name, reason=outcome.reason, message=outcome.message))
         else:
             _require_above_horizon(outcome, site)
@@ -93,20 +100,6 @@ def orient_frames(
     return found, tuple(left_out)
 
 
-def _identify(
-    exposure: Exposure, catalog: StarCatalog, site: Site, camera: Camera | None, fov_rad: float | None
-) -> Oriented | Refused:
-    """Stars with the camera, if there is one, else without; raises BadInput for an image that cannot be used."""
-    outcome = (
-        identify(exposure, camera, catalog, site=site)
-        if camera is not None
-        else identify_blind(exposure, fov_rad or 0.0, catalog)
-    )
-    if isinstance(outcome, Refused) and outcome.reason.exit_code == Reason.BAD_IMAGE.exit_code:
-        raise BadInput(outcome.reason, f"{exposure.name}: {outcome.message}")
-    return outcome
-
-
 def _require_above_horizon(one: Oriented, site: Site) -> None:
     """Raises BadInput (inconsistent_evidence) where identified stars are below the horizon of the `site`."""
     rays = one.stars.rays_icrs[one.identification.star]
@@ -122,7 +115,6 @@ def _require_above_horizon(one: Oriented, site: Site) -> None:
 def _sky_frame(k: int, one: Oriented, joint: JointFit, camera: Camera, catalog: StarCatalog, site: Site) -> SkyFrame:
     time_utc = require_time(one.exposure)
     sky = sky_at(catalog, time_utc, site, LOWEST_STAR_RAD)
-    R = R_enu_icrs(site, time_utc)
     hip_of_match = joint.frames[k].sky.stars.hip[joint.matches[k].star]
     order = np.argsort(sky.stars.hip)
     return SkyFrame(
@@ -130,7 +122,7 @@ def _sky_frame(k: int, one: Oriented, joint: JointFit, camera: Camera, catalog: 
         detections=one.detections,
         camera=camera,
         R_cam_icrs=joint.fit.R_cam_icrs[k],
-        R_enu_icrs=R,
+        R_enu_icrs=R_enu_icrs(site, time_utc),
         attitude_sigma_rad=float(np.sqrt(np.max(np.diag(joint.fit.pose_covariance_rad2[k])))),
         extra_sigma_px=joint.fit.extra_sigma_px,
         sky=sky,

@@ -46,6 +46,7 @@ from startrack.terrain import Terrain, load_terrain, write_bands
 RECORD_FILE, MAP, CELL_TABLE, MAP_PICTURE = "predict.json", "predict.tif", "predict.ecsv", "predict.png"
 COMPARISON_TABLE, COMPARISON_PICTURE = "predict-compare.ecsv", "predict-compare.png"
 PREDICTION_FILES = {MAP, CELL_TABLE, RECORD_FILE, MAP_PICTURE, COMPARISON_TABLE, COMPARISON_PICTURE}
+NO_RADIUS = "no position at half of the places"
 PATH_CURVES = {FILTERED: "images so far, and odometry", SMOOTHED: "all images, and odometry"}
 SETTINGS = ("kind", "terrain", "camera", "first_time_utc", "last_time_utc", "spacing_m", "places")  # of one prediction
 
@@ -92,8 +93,8 @@ class Report:
         variants = []
         for other, found in others.items():
             known = predictor_of(other)
-            depth_there = {"exposure_s": known.exposure_s, "limiting_v_mag": known.limiting_v_mag}
-            variants.append({"camera": known.camera.name, **depth_there, "summary": summarize_cells(found)})
+            light = {"exposure_s": known.exposure_s, "limiting_v_mag": known.limiting_v_mag}
+            variants.append({"camera": known.camera.name, **light, "summary": summarize_cells(found)})
         return replace(self, conditions=conditions, cells=cells, variants=variants, depth=depth)
 
     def with_odometry(self, odometry: OdometryErrors) -> Report:
@@ -160,8 +161,9 @@ class Report:
         if self.odometry is not None:
             radii = [self.record["odometry"][f"median_{name}"] for name in (FILTERED, SMOOTHED)]
             texts = [length_text(one, 3) for one in radii if one is not None]
-            known = f"median 95 % radius {texts[0]} at each place, {texts[-1]} by all images" if len(texts) == 2 else ""
-            lines.append(f"with odometry: {known or 'no position at half of the places'}")
+            known = len(texts) == len(radii)
+            text = f"median 95 % radius {texts[0]} at each place, {texts[1]} by all images" if known else NO_RADIUS
+            lines.append(f"with odometry: {text}")
         if (depth := self.depth) is not None:
             reached = f"not reached by any exposure to {depth['tried'][-1]['exposure_s']:.3g} s"
             if depth["exposure_s"] is not None:
@@ -176,7 +178,7 @@ class Report:
 
 def _median_error_text(radius95_m: float | None) -> str:
     if radius95_m is None:
-        return "no position at half of the places"
+        return NO_RADIUS
     return f"median 95 % radius {length_text(radius95_m, 3)}"
 
 

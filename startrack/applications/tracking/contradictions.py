@@ -137,14 +137,14 @@ def _frame_doubt(
         residual, covariance = found.frame_residual[number], found.frame_covariance[number]
         doubt[k] = wrong_log_odds(residual, covariance, estimate, placed=bool(placed[k])) + EARLIER_NATS * k
     for k in np.flatnonzero(mode < 0).tolist():
-        predicted = [_beside(found, k, one, observations.height_sigma_m) for one in modes[k]]
+        predicted = [_mode_residual(found, k, one, observations.height_sigma_m) for one in modes[k]]
         odds = [wrong_log_odds(*r, e, placed=bool(placed[k])) for r, e in zip(predicted, modes[k], strict=True)]
         if odds:
             best[k], doubt[k] = int(np.argmin(odds)), min(odds) + EARLIER_NATS * k
     return best, doubt
 
 
-def _beside(found: Smoothed, k: int, estimate: FrameEstimate, height_sigma_m: float) -> tuple[Array, Array]:
+def _mode_residual(found: Smoothed, k: int, estimate: FrameEstimate, height_sigma_m: float) -> tuple[Array, Array]:
     """Residual of an `estimate` of frame k beside a track `found` without it, and its covariance."""
     known = np.zeros((estimate.parameters, estimate.parameters))
     known[:2, :2], known[2:, 2:] = found.covariance_m2[k], found.shared_covariance

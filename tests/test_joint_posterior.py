@@ -55,7 +55,7 @@ def behind(rows: Evidence, place_m: Array, from_deg: float, width_deg: float, he
 
 
 def model_of(rows: Evidence, reference_m: Array = PLACE, half_m: float = 120.0, terrain: Terrain = CRATER) -> Any:
-    return SkylineModel(terrain, rows, reference_m, half_m, SharedErrors.of(terrain, rows.clock))
+    return SkylineModel.of(terrain, rows, reference_m, half_m, SharedErrors.of(terrain, rows.clock))
 
 
 @pytest.fixture(scope="module")
@@ -74,15 +74,15 @@ def test_the_chain_is_the_trace_of_its_matrix_product(obstructed: SkylineModel) 
     rng = np.random.default_rng(2)
     smooth = np.cos(np.outer(rng.uniform(1, 4, 30), MIDDLES_RAD) + rng.uniform(0, 6, (30, 1)))
     shifts = np.radians(0.06) * rng.normal(size=(30, 1)) * smooth
-    by_matrices = slow_chain(np.array([emissions(obstructed.profiles, shift) for shift in shifts]))
+    by_matrices = slow_chain(np.array([emissions(obstructed.seen.profiles, shift) for shift in shifts]))
     assert np.ptp(by_matrices) > 20.0
     likely = by_matrices > by_matrices.max() - 15.0
     assert obstructed.log_likelihood_of(shifts)[likely] == pytest.approx(by_matrices[likely], abs=0.05)
 
 
 def test_states_have_the_probabilities_of_all_paths(obstructed: SkylineModel) -> None:
-    e, T = emissions(obstructed.profiles, np.zeros(SECTORS)), transitions()
-    found = state_probabilities(obstructed.profiles, np.zeros(SECTORS))
+    e, T = emissions(obstructed.seen.profiles, np.zeros(SECTORS)), transitions()
+    found = state_probabilities(obstructed.seen.profiles, np.zeros(SECTORS))
     assert found.sum(axis=1) == pytest.approx(np.ones(SECTORS))
     for sector in (0, 46, 60, 75, 180):
         product = np.eye(STATES)
@@ -184,8 +184,8 @@ def test_stars_are_compared_with_the_skyline_at_their_own_azimuths(obstructed: S
     """The likelihood about a reference is that of horizons computed for each star and position."""
     rng = np.random.default_rng(5)
     points = PLACE + 12.0 * rng.normal(size=(150, 2))
-    slow = slow_chain_scores(points, obstructed.rows, CRATER, PLACE)
-    off = (obstructed.log_likelihood(points) + obstructed.log_offset) - slow
+    slow = slow_chain_scores(points, obstructed.seen.rows, CRATER, PLACE)
+    off = (obstructed.log_likelihood(points) + obstructed.seen.log_offset) - slow
     weight = np.exp(slow - slow.max()) / np.exp(slow - slow.max()).sum()
     off -= weight @ off
     assert np.sqrt(weight @ np.square(off)) < 0.4
@@ -197,7 +197,7 @@ def test_references_are_comparable() -> None:
     rows = evidence_at((3000.0, -2000.0), 2)
     points = PLACE + 15.0 * np.random.default_rng(6).normal(size=(200, 2))
     one, other = (model_of(rows, PLACE + np.array([x, 0.3 * x]), 260.0) for x in (-75.0, 75.0))
-    logs = [model.log_likelihood(points) + model.log_offset for model in (one, other)]
+    logs = [model.log_likelihood(points) + model.seen.log_offset for model in (one, other)]
     likely = logs[0] > logs[0].max() - 6.0
     assert np.mean(logs[0][likely] - logs[1][likely]) == pytest.approx(0.0, abs=0.15)
     means = [np.exp(log - log.max()) @ points / np.exp(log - log.max()).sum() for log in logs]
@@ -213,7 +213,7 @@ def test_evidence_and_moments_are_those_of_a_grid(seed: int) -> None:
     line, root = np.linspace(-6, 6, 161), np.linalg.cholesky(spread)
     step = line[1] - line[0]
     points = centre + np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2) @ root.T
-    log = found.model.log_likelihood(points) + found.model.log_offset - np.log(np.pi * CRATER.reach_m**2)
+    log = found.model.log_likelihood(points) + found.model.seen.log_offset - np.log(np.pi * CRATER.reach_m**2)
     weight = np.exp(log - log.max())
     evidence = log.max() + np.log(weight.sum() * step**2 * np.prod(np.diag(root)))
     assert found.found.log_evidence == pytest.approx(evidence, abs=0.1)
@@ -257,7 +257,7 @@ def test_slopes_of_the_clock_are_those_of_turned_rows(name: str) -> None:
     slope = errors.slopes_rad(terrain, place, MIDDLES_RAD, horizon)[-1]
     values = np.zeros((1, len(errors)))
     values[0, -1] = later_s
-    turned, at = turn_evidence(rows, later_s), errors.turned(place[None], values)
+    turned, at = turn_evidence(rows, later_s), errors.true_positions(place[None], values)
     higher = np.asarray(terrain.horizon_rad(at, turned.azimuth_rad)).ravel() - turned.elevation_rad
     if terrain.axisymmetric:
         assert higher == pytest.approx(later_s * slope, abs=2e-5 * later_s * np.linalg.norm(clock.turn_rad_s))
@@ -277,7 +277,7 @@ def test_a_free_skyline_is_preferred_to_a_wrong_crater_only() -> None:
             points = PLACE + np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
             best = points[np.argmax(model.log_likelihood(points))]
             shift = model.shifts(best[None])
-            gains[kind].append(free_log_likelihood(model.profiles, shift[0]) - model.log_likelihood_of(shift)[0])
+            gains[kind].append(free_log_likelihood(model.seen.profiles, shift[0]) - model.log_likelihood_of(shift)[0])
     assert max(gains["true"]) < np.log(0.1)
     assert np.mean(np.array(gains["obstacle"]) < np.log(0.1)) > 0.8
     assert min(gains["wrong"]) > np.log(0.1)
@@ -285,6 +285,6 @@ def test_a_free_skyline_is_preferred_to_a_wrong_crater_only() -> None:
 
 def test_levels_and_the_wrong_sector_leave_no_sector_without_likelihood(obstructed: SkylineModel) -> None:
     """However wrong a sector is, it costs no more than the logarithm of the wrong sector's probability."""
-    far = emissions(obstructed.profiles, np.full(SECTORS, np.radians(-5.0)))
+    far = emissions(obstructed.seen.profiles, np.full(SECTORS, np.radians(-5.0)))
     assert far.min() >= WRONG_SECTOR
     assert np.all(np.diff(LEVELS_RAD) > 0)

@@ -128,7 +128,7 @@ def test_an_error_of_the_width_scales_the_position_with_the_crater() -> None:
     slopes = errors.slopes_rad(silent, place, azimuth, level)
     for number, one in enumerate(errors.listed):
         values = 1e-3 * (np.arange(len(errors)) == number)
-        (moved,) = errors.turned(place[None], values[None])
+        (moved,) = errors.true_positions(place[None], values[None])
         named = {error.name: value for error, value in zip(errors.listed, values, strict=True)}
         ground = silent.with_shape(np.array([named.get(error.name, 0.0) for error in silent.shape_errors]))
         rise = ground.horizon_rad(moved[None], azimuth).ravel() - level

@@ -26,3 +26,8 @@ def robust_sigma(values: Any, centre: Any = None, axis: Any = None) -> Any:
 def relative_weights(log_weights: Array, axis: int | None = None) -> Array:
     """Exponentials (...) of `log_weights` (...), the largest of them, or of those along `axis`, scaled to 1."""
     return np.asarray(np.exp(log_weights - log_weights.max(axis=axis, keepdims=True)))
+
+
+def shares(log_weights: Array) -> Array:
+    """Exponentials (n,) of `log_weights` (n,), scaled so that their sum is 1."""
+    return np.asarray(np.exp(log_weights - np.logaddexp.reduce(log_weights)))

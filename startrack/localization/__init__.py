@@ -12,7 +12,7 @@ from startrack.localization.pseudo_gradient import PseudoGradient, descend
 from startrack.localization.sector_likelihood import Sectors
 from startrack.localization.sector_moments import solve_linear
 from startrack.localization.shared_errors import ErrorBasis, SharedErrors
-from startrack.localization.skyline_model import NO_IMAGE_ERRORS, SkylineModel
+from startrack.localization.skyline_model import SkylineModel
 from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD
 from startrack.localization.summary import camera_at
 from startrack.terrain import Terrain
@@ -72,7 +72,6 @@ __all__ = [
     "LOCALIZERS",
     "LOW_RAD",
     "MIN_ROW_NATS",
-    "NO_IMAGE_ERRORS",
     "RISK",
     "ErrorBasis",
     "ExactPosterior",

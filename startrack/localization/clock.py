@@ -11,8 +11,7 @@ from startrack.core.types import Array, Clock, Evidence, NotLocated
 from startrack.frames import R_from_rotvec, Site, sky_rotvec_rad, turn_azel
 from startrack.localization.horizon_bias import LinearSolution, at_likeliest_bias
 from startrack.localization.likelihood import PositionLikelihood
-from startrack.localization.search import BEAMS, Explored, Guess, beam_search, local_posterior
-from startrack.localization.sector_moments import solve_linear
+from startrack.localization.search import BEAMS, Explored, Guess, beam_search, choose_apart, local_posterior
 from startrack.localization.shared_errors import is_noticeable
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain
@@ -168,8 +167,8 @@ def explore_times(plain: PositionLikelihood, evidence: Evidence, clock: Clock) -
 
 
 def turned_model(model: SkylineModel, later_s: float, is_rough: bool = False) -> SkylineModel:
-    """The model with its rows turned to a later time; see `SkylineModel.is_rough`."""
-    return model.with_rows(turn_evidence(model.rows, later_s), is_rough)
+    """The model with its rows turned to a later time; see `SectorRows.is_rough`."""
+    return model.with_rows(turn_evidence(model.seen.rows, later_s), is_rough)
 
 
 def turned_models(model: SkylineModel, clock: Clock) -> list[SkylineModel]:
@@ -185,21 +184,10 @@ def turned_models(model: SkylineModel, clock: Clock) -> list[SkylineModel]:
 
 def _fit(model: SkylineModel) -> float:
     """Log-likelihood of the rows where position and shared errors suit them, by the linear model of the sectors."""
-    k = 2 + len(model.basis)
-    design = np.vstack([model.position_slopes, model.slopes_rad]).T
-    prior = np.diag(np.r_[np.full(2, model.terrain.reach_m**-2.0), np.ones(k - 2)])
-    parameters, _, _ = solve_linear(model.moments, design, np.zeros(k), prior)
-    parameters[:2] += model.reference_m
-    return float(model.log_likelihood(parameters[None])[0]) + model.log_offset
+    return float(model.log_likelihood(model.solve()[0][None])[0]) + model.seen.log_offset
 
 
 def _peaks(later_s: Array, fits: Array, clock: Clock) -> list[int]:
     """The likeliest times that are apart from each other."""
     apart_s = TIME_STEP_RAD / float(np.linalg.norm(clock.turn_rad_s))
-    chosen: list[int] = []
-    for at in np.argsort(-fits):
-        if fits[at] < fits.max() - TIME_NATS or len(chosen) == MOST_TIMES:
-            break
-        if all(abs(later_s[at] - later_s[other]) > apart_s for other in chosen):
-            chosen.append(int(at))
-    return chosen
+    return choose_apart(later_s[:, None], fits, apart_s, TIME_NATS, MOST_TIMES)

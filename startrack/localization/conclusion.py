@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from startrack.core.statistics import relative_weights, shares
 from startrack.core.types import Array, Blocked, ClockError, Fix, Ints, Mode, NotLocated, ShownError, UnstatedFact
 from startrack.localization.hypothesis import Hypothesis
 from startrack.localization.importance_sampling import ROUNDS, moments
@@ -39,8 +40,7 @@ class Posterior:
     @cached_property
     def share(self) -> Array:
         """(n,) of the probability."""
-        logs = np.concatenate([one.log_weight for one in self.hypotheses])
-        return np.asarray(np.exp(logs - np.logaddexp.reduce(logs)))
+        return shares(np.concatenate([one.log_weight for one in self.hypotheses]))
 
     @property
     def best(self) -> Hypothesis:
@@ -110,7 +110,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
     if not ambiguous and radius95 > USELESS_FRACTION * terrain.search_radius_m:
         raise NotLocated(_useless_text(whole))
     integrity = None
-    if not best.model.rows.is_first_look:
+    if not best.model.seen.rows.is_first_look:
         require_files(found, parameters, clear)
         if not ambiguous:
             integrity = assess_integrity(best.model, parameters, near[:2, :2], clear, covariance, radius999)
@@ -119,7 +119,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
         position_enu_m=camera_at(middle, terrain), covariance_m2=covariance, radius95_m=radius95, radius999_m=radius999,
         modes=modes, ambiguous=ambiguous, dropped_probability=dropped_probability, search=explored.search,
         horizon_error_rad=_mean_error(best, "bias_rad"), clock=_clock(whole), blocked=blocked if blocked else None,
-        integrity=integrity, unstated=_unstated_facts(whole), raised_rad=best.model.raised_rad(parameters),
+        integrity=integrity, unstated=_unstated_facts(whole), raised_rad=best.model.rise_rad(parameters),
         at_time_m=parameters[:2], shown=_shown_errors(best), samples=_support(whole, explored, dropped_probability),
     )  # fmt: skip
 
@@ -169,26 +169,19 @@ def _list_modes(whole: Posterior) -> tuple[Mode, ...]:
 
 
 def _mean_error(best: Hypothesis, name: str) -> float:
-    for number, one in enumerate(best.model.errors.listed):
-        if one.name == name:
-            return float(_share(best) @ best.values[:, number])
-    return 0.0
-
-
-def _share(one: Hypothesis) -> Array:
-    """(n,) of a hypothesis's points in its own probability."""
-    return np.asarray(np.exp(one.log_weight - np.logaddexp.reduce(one.log_weight)))
+    is_named = np.array([one.name == name for one in best.model.errors.listed], dtype=bool)
+    return float((shares(best.log_weight) @ best.values[:, is_named]).sum())
 
 
 def _clock(whole: Posterior) -> ClockError | None:
     """The error of the clock by the points of the best hypothesis."""
     best = whole.best
-    stated, errors = best.model.rows.clock, best.model.errors
+    stated, errors = best.model.seen.rows.clock, best.model.errors
     if stated is None:
         return None
     if errors.clock is None:
         return ClockError(stated.offset_s, stated.sigma_s)
-    later, share = best.values[:, -1], _share(best)
+    later, share = best.values[:, -1], shares(best.log_weight)
     mean = float(share @ later)
     return ClockError(stated.offset_s + mean, float(np.sqrt(share @ np.square(later - mean))))
 
@@ -201,24 +194,24 @@ def _unstated_facts(whole: Posterior) -> tuple[UnstatedFact, ...]:
         if not parts:
             continue
         positions, logs = (np.concatenate(part) for part in zip(*parts, strict=True))
-        share = np.exp(logs - np.logaddexp.reduce(logs))
+        share = shares(logs)
         found.append(UnstatedFact(fact, whole.radii(positions, share, share @ positions)[1]))
     return tuple(sorted(found, key=lambda one: one.radius999_m_if_exact))
 
 
 def _positions_without_fact(one: Hypothesis, fact: str) -> Array:
     """Positions (n, 2) of a hypothesis's points with the errors of a fact taken out, by linear regression."""
-    own = np.flatnonzero([error.fact == fact for error in one.model.errors.listed])
-    _, covariance = moments(np.hstack([one.unturned_m, one.values[:, own]]), _share(one))
+    own = one.model.errors.is_of_fact(fact)
+    _, covariance = moments(np.hstack([one.unturned_m, one.values[:, own]]), shares(one.log_weight))
     drift = np.linalg.pinv(covariance[2:, 2:], hermitian=True) @ covariance[2:, :2]
     values = one.values.copy()
     values[:, own] = 0.0
-    return one.model.errors.turned(one.unturned_m - one.values[:, own] @ drift, values)
+    return one.model.errors.true_positions(one.unturned_m - one.values[:, own] @ drift, values)
 
 
 def _shown_errors(best: Hypothesis) -> tuple[ShownError, ...]:
     """The errors that nobody states and that the image shows to be larger than their default."""
-    mean, covariance = moments(best.values - best.model.errors.mean, _share(best))
+    mean, covariance = moments(best.values - best.model.errors.mean, shares(best.log_weight))
     sigma = np.sqrt(np.diag(covariance))
     return tuple(
         ShownError(one.name, one.fact, float(mean[k]), float(sigma[k]))
@@ -232,7 +225,7 @@ def _support(whole: Posterior, explored: Explored, dropped_probability: float) -
     one = whole.best
     order = np.argsort(-one.found.log_weight)[:SUPPORT]
     points, log = one.found.points[order, :2], one.found.log_weight[order]
-    spread = np.sqrt(max(float(np.linalg.eigvalsh(moments(points, np.exp(log - log.max()))[1])[0]), 1e-6))
+    spread = np.sqrt(max(float(np.linalg.eigvalsh(moments(points, relative_weights(log))[1])[0]), 1e-6))
     return explored._replace(
         centres_m=points, half_m=0.5 * spread, log_likelihood=log, dropped_probability=dropped_probability
     )

@@ -8,16 +8,14 @@ import numpy as np
 
 from startrack.core.types import Array, Evidence
 from startrack.localization.likelihood import PositionLikelihood
+from startrack.localization.neighbourhood import Neighbourhood, SectorRows
 from startrack.localization.search import BEAMS, Guess, beam_search
 from startrack.localization.sector_moments import solve_linear
 from startrack.localization.shared_errors import SharedErrors
-from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain
 
 NEARBY_M = 40.0  # horizons are prepared that far about a position
-EXPLAINED_NATS = (
-    -0.57
-)  # mean over the sectors with rows; true positions: -0.10 to -0.52, the best false one seen: -0.62
+EXPLAINED_NATS = -0.57  # mean over the sectors with rows; true positions: -0.10 to -0.52, the best false one: -0.62
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +30,10 @@ class LinearSolution:
     def near(cls, rows: Evidence, terrain: Terrain, position_m: Array) -> LinearSolution:
         """About a position (2,)."""
         errors = SharedErrors.of(terrain, rows.clock)
-        model = SkylineModel(terrain, rows, position_m, NEARBY_M, errors)
-        design = np.vstack([model.position_slopes, model.error_slopes_rad]).T
+        around = Neighbourhood(terrain, position_m, NEARBY_M)
+        design = np.vstack([around.slopes, around.error_slopes_rad(errors)]).T
         prior = np.diag(np.r_[np.full(2, terrain.reach_m), errors.sigma()] ** -2.0)
-        found, _, _ = solve_linear(model.moments, design, np.append(np.zeros(2), errors.mean), prior)
+        found, _, _ = solve_linear(SectorRows(around, rows).moments, design, np.append(np.zeros(2), errors.mean), prior)
         values = {one.name: float(value) for one, value in zip(errors.listed, found[2:], strict=True)}
         return cls(position_m + found[:2], values.get("bias_rad", 0.0), values.get("clock_s", 0.0))
 

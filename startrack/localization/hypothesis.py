@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from startrack.core.statistics import shares
 from startrack.core.types import Array, Clock
 from startrack.localization.clock import TIME_ROUNDS, is_linear, turned_model, turned_models
 from startrack.localization.free_skyline import free_log_likelihood
 from startrack.localization.importance_sampling import FEW, Gaussian, WeightedPoints, moments, normal_sequence, sample
-from startrack.localization.sector_moments import solve_linear
 from startrack.localization.skyline_model import SkylineModel
 
 HIDDEN_COPIES = 6  # of each point, with values of the errors that the rows do not show
@@ -65,50 +65,34 @@ class Hypothesis:
     @cached_property
     def positions_m(self) -> Array:
         """(n, 2)."""
-        return self.model.errors.turned(self.unturned_m, self.values)
+        return self.model.errors.true_positions(self.unturned_m, self.values)
 
     @property
     def later_s(self) -> float:
         """How much later the true time is than the stated one, in the mean."""
-        return float(self.found.share @ self.values[:: self.copies, -1]) + self.model.later_s
+        return float(self.found.share @ self.values[:: self.copies, -1]) + self.model.errors.later_s
 
     @property
     def suits_map(self) -> bool:
         """Whether the map's skyline explains the rows far better than any other one does, so that no time does."""
         shift = self.model.shift_of(self.found.share @ self.found.points)
         by_map = float(self.model.log_likelihood_of(shift[None])[0])
-        return free_log_likelihood(self.model.profiles, shift) < by_map - DOUBTFUL_NATS
-
-
-def solve_model(model: SkylineModel) -> tuple[Array, Array, Array]:
-    """Parameters (2 + a,) by the linear model of the sectors, their covariance, and weights (SECTORS,)."""
-    k = 2 + len(model.basis)
-    mean, prior = np.zeros(k), np.diag(np.r_[np.full(2, model.terrain.reach_m**-2.0), np.ones(k - 2)])
-    design = np.vstack([model.position_slopes, model.slopes_rad]).T
-    if model.image_errors is not None:
-        j = len(model.image_errors.mean)
-        design, mean = np.hstack([design, model.image_rise]), np.append(mean, model.image_errors.mean)
-        whole = np.zeros((k + j, k + j))
-        whole[:k, :k], whole[k:, k:] = prior, np.linalg.inv(model.image_errors.covariance)
-        prior = whole
-    parameters, covariance, weight = solve_linear(model.moments, design, mean, prior)
-    parameters[:2] += model.reference_m
-    return parameters[:k], covariance[:k, :k], weight
+        return free_log_likelihood(self.model.seen.profiles, shift) < by_map - DOUBTFUL_NATS
 
 
 def sample_hypothesis(model: SkylineModel, references_m: Array, modes: Sequence[Gaussian], **how: Any) -> Hypothesis:
     """A hypothesis sampled, as `sample` is told `how`, where its reference is the nearest of all (g, 2)."""
-    near, basis = model.rows.near, model.basis
+    near, basis, reference_m = model.seen.rows.near, model.basis, model.around.reference_m
     area = float(np.log(np.pi * model.terrain.reach_m**2))
 
     def log_density(parameters: Array) -> Array:
         position = parameters[:, :2]
         inside = np.asarray(model.terrain.allowed(position))
         away = np.linalg.norm(position[:, None] - references_m, axis=2)
-        inside &= away.min(axis=1) == np.linalg.norm(position - model.reference_m, axis=1)
+        inside &= away.min(axis=1) == np.linalg.norm(position - reference_m, axis=1)
         value = np.full(len(parameters), -np.inf)
         if inside.any():
-            value[inside] = model.log_likelihood(parameters[inside]) + model.log_offset - area
+            value[inside] = model.log_likelihood(parameters[inside]) + model.seen.log_offset - area
             value[inside] += basis.log_prior(parameters[inside, 2:])
             if near is not None:
                 value[inside] += near.log_density(position[inside])
@@ -121,9 +105,8 @@ def sample_gross_errors(plain: Hypothesis, references_m: Array) -> list[Hypothes
     """The hypotheses of one gross error each."""
     model, found = plain.model, []
     for gross in model.errors.facts:
-        own = np.array([one.fact == gross for one in model.errors.listed])
-        other = model.with_gross(gross)
-        if not model.error_slopes_rad[own].any():  # nothing shows it: the points are the same
+        other, slopes = model.with_gross(gross), model.error_slopes_rad[model.errors.is_of_fact(gross)]
+        if not slopes.any():  # nothing shows it: the points are the same
             less = other.basis.log_probability - model.basis.log_probability
             found.append(Hypothesis(other, replace(plain.found, log_weight=plain.found.log_weight + less)))
         else:
@@ -162,7 +145,7 @@ def _sample_settled_time(plain: Hypothesis, model: SkylineModel, clock: Clock, r
     """The hypothesis of a gross error of the clock, with the rows turned to the time that it shows."""
     for _ in range(TIME_ROUNDS):
         found = sample_hypothesis(model, references_m, _gross_modes(plain, model))
-        off_s = found.later_s - model.later_s
+        off_s = found.later_s - model.errors.later_s
         if is_linear(clock, off_s):
             break
         model = turned_model(model, off_s)
@@ -170,18 +153,21 @@ def _sample_settled_time(plain: Hypothesis, model: SkylineModel, clock: Clock, r
 
 
 def _gross_modes(plain: Hypothesis, other: SkylineModel) -> list[Gaussian]:
-    """The mode with which the sampling of a gross error begins: the plain points, drawn out along what it does.
+    """Modes with which the sampling of a gross error begins: the plain points, drawn out along what it does.
 
-    The linear model tells how position and other errors follow a gross one, though its own solution may be far off.
+    Of one the points are moved besides, by a Newton step from the prior of the plain hypothesis to the wider one: far
+    too far where the skyline is not linear. How position and other errors follow is told by the linear model, whose
+    own solution may be far off.
     """
-    _, linear, _ = solve_model(other)
-    known = {one.name: number for number, one in enumerate(plain.model.errors.listed)}
-    place = [known.get(one.name, -1) for one in other.errors.listed]
-    errors = np.pad(plain.found.points[:, 2:] @ plain.model.basis.shown.T, ((0, 0), (0, 1)))[:, place]
-    points = np.hstack([plain.found.points[:, :2], errors @ np.linalg.pinv(other.basis.shown).T])
-    mean, same = moments(points, plain.found.share)
-    gross = [one.fact == other.gross for one in other.errors.listed]
-    picked = np.pad(other.basis.shown[gross], ((0, 0), (2, 0)))
+    _, linear, _ = other.solve()
+    errors = np.zeros((len(plain.values), len(other.errors)))
+    for number, one in enumerate(other.errors.listed):
+        errors[:, number] = plain.values[:, [known.name == one.name for known in plain.model.errors.listed]].sum(axis=1)
+    mean, same = moments(other.basis.parameters(plain.unturned_m, errors), shares(plain.log_weight))
+    own = other.errors.is_of_fact(other.gross)
+    picked = np.pad(other.basis.shown[own], ((0, 0), (2, 0)))
+    before, after = (other.errors.sigma(gross)[own] ** -2.0 for gross in ("", other.gross))
     follow = linear @ picked.T
     drawn_out = follow @ np.linalg.pinv(picked @ follow) @ follow.T
-    return [(mean, WIDER * same + drawn_out + LINEAR_PART * linear)]
+    spread = WIDER * same + drawn_out + LINEAR_PART * linear
+    return [(mean, spread), (mean + follow @ ((before - after) * (picked @ mean)), spread)]

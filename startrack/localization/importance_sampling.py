@@ -15,6 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
+from startrack.core.statistics import shares
 from startrack.core.types import Array
 
 DEGREES, FAR_DEGREES = 5.0, 3.0  # of freedom of the t distributions
@@ -143,7 +144,7 @@ class WeightedPoints:
     @property
     def share(self) -> Array:
         """(n,) parts of the whole."""
-        return np.exp(self.log_weight - self.log_evidence)
+        return shares(self.log_weight)
 
     @property
     def effective(self) -> float:
@@ -154,6 +155,16 @@ class WeightedPoints:
 def effective_points(log_weight: Array) -> float:
     weight = np.exp(log_weight - log_weight.max())
     return float(weight.sum() ** 2 / np.square(weight).sum())
+
+
+def temper_weights(log_weight: Array, effective: float) -> Array:
+    """Shares (n,) of points by weights that are drawn together until so many effective points count."""
+    flat = log_weight - log_weight.max()
+    most = 0.5 * np.count_nonzero(np.isfinite(flat))  # nothing gives more to points of no density
+    while effective_points(flat) < min(effective, most):
+        flat = 0.6 * flat
+    weight = np.exp(flat)
+    return np.asarray(weight / weight.sum())
 
 
 def moments(points: Array, weight: Array) -> Gaussian:
@@ -232,12 +243,7 @@ def _weigh(points: Array, density: Array, parts: Sequence[Distribution]) -> Weig
 
 def _move(found: WeightedPoints, modes: Sequence[Gaussian]) -> list[Gaussian]:
     """The modes moved to the weighted points nearest to each."""
-    flat = found.log_weight - found.log_weight.max()
-    most = 0.5 * np.count_nonzero(np.isfinite(flat))  # no tempering gives more to points of no density
-    while effective_points(flat) < min(TEMPERED * found.points.shape[1] * len(modes) ** 0.5, most):
-        flat = 0.6 * flat
-    weight = np.exp(flat)
-    weight /= weight.sum()
+    weight = temper_weights(found.log_weight, TEMPERED * found.points.shape[1] * len(modes) ** 0.5)
     roots = [np.linalg.cholesky(covariance) for _, covariance in modes]
     away = [
         np.square(np.linalg.solve(root, (found.points - mean).T)).sum(axis=0)

@@ -80,7 +80,7 @@ def _sector_logs(model: SkylineModel, parameters: Array, offsets: Array, clear: 
     """Log-likelihoods (n, SECTORS) of the sectors at offsets (n, 2), and logarithms (n,) of the errors' densities."""
     moved = model.with_likely_errors(parameters[:2] + offsets, clear)
     shifts, prior = model.with_image_errors(model.shifts(moved))
-    return clear_logs(model.profiles, shifts, clear), prior + model.basis.log_prior(moved[:, 2:])
+    return clear_logs(model.seen.profiles, shifts, clear), prior + model.basis.log_prior(moved[:, 2:])
 
 
 @njit(cache=True, nogil=True)

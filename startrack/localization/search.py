@@ -124,11 +124,22 @@ def refine_boxes(likelihood: PositionLikelihood, centres_m: Array, half_m: float
             step_m /= 2
         around = found[np.argmax(score)] + square_grid(step_m, 3)
         new = around[np.abs(around[:, None] - found).max(axis=2).min(axis=1) > 0.1 * LAST_STEP_M]
+    chosen = choose_apart(found, score, APART_M)
+    return Guess(found[chosen], score[chosen])
+
+
+def choose_apart(points: Array, score: Array, apart: float, nats: float = np.inf, most: int | None = None) -> list[int]:
+    """The best of points (n, d) with a score (n,) that are farther `apart` from each other along an axis.
+
+    Those that are worse than the best by more than `nats` do not count; `most` of them are chosen.
+    """
     chosen: list[int] = []
     for i in np.argsort(-score, kind="stable"):
-        if all(np.abs(found[i] - found[k]).max() > APART_M for k in chosen):
+        if score[i] < score.max() - nats or len(chosen) == most:
+            break
+        if all(np.abs(points[i] - points[k]).max() > apart for k in chosen):
             chosen.append(int(i))
-    return Guess(found[chosen], score[chosen])
+    return chosen
 
 
 def local_posterior(likelihood: PositionLikelihood, guess: Guess, log_open: float) -> Explored:

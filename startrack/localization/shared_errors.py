@@ -12,14 +12,13 @@ from functools import cached_property
 
 import numpy as np
 
-from startrack.core.types import Array, Clock, Ints
+from startrack.core.types import Array, Bools, Clock, Ints
 from startrack.frames import R_from_rotvec, turn_azel
 from startrack.localization.sector_moments import SectorMoments
 from startrack.terrain import ShapeError, Terrain
 
 SCALE_STEP = 1e-3  # of a crater's size, at which the skyline's change with it is taken
 TURN_STEP_RAD = 2e-3  # of the sky, at which the skyline's change with the time is taken: its crests are no narrower
-ROUGH_RAD = np.radians(0.002)  # of ground that nobody states as exact: 0.35 m of a rim 10 km away
 CLOCK_FACT = "time_sigma_s"
 RESIDUAL_PART = 1e-3  # of a gross error: the sigma of an error that is zero unless it is gross
 NEGLIGIBLE_M = 0.05  # by which an error of the clock moves a row over the search area, without an effect on the fix
@@ -64,19 +63,26 @@ class SharedErrors:
         """Facts with a gross part, which no file states."""
         return tuple(dict.fromkeys(error.fact for error in self.listed if error.gross_probability > 0.0))
 
+    def is_of_fact(self, fact: str) -> Bools:
+        """(k,) which errors are those of a fact."""
+        return np.array([one.fact == fact for one in self.listed], dtype=bool)
+
     def sigma(self, gross: str = "") -> Array:
         """Standard deviations (k,); those of the fact `gross` as of a gross error."""
-        least = [max(one.sigma, RESIDUAL_PART * one.gross_sigma) for one in self.listed]
-        return np.array(
-            [one.gross_sigma if one.fact == gross else low for one, low in zip(self.listed, least, strict=True)]
-        )
+        wide = np.array([one.gross_sigma for one in self.listed])
+        least = np.maximum([one.sigma for one in self.listed], RESIDUAL_PART * wide)
+        return np.where(self.is_of_fact(gross), wide, least)
+
+    @property
+    def later_s(self) -> float:
+        """How much later than stated the time is that the rows are turned to."""
+        return 0.0 if self.clock is None else self.clock.offset_s
 
     @cached_property
     def mean(self) -> Array:
         """(k,) expected values: zero, but for rows that are turned to another time than the stated one."""
         found = np.zeros(len(self.listed))
-        if self.clock is not None:
-            found[-1] = -self.clock.offset_s
+        found[-1:] = -self.later_s
         return found
 
     def log_probability(self, gross: str = "") -> float:
@@ -115,7 +121,7 @@ class SharedErrors:
         """Which errors scale a round crater, and the position with it."""
         return np.flatnonzero([one.scales and self.axisymmetric for one in self.listed])
 
-    def turned(self, points: Array, values: Array) -> Array:
+    def true_positions(self, points: Array, values: Array) -> Array:
         """The positions `points` (n, 2) turned and scaled by the `values` (n, k) of the errors, in a round crater."""
         points = points * (1.0 + values[:, self._scales].sum(axis=1, keepdims=True))
         if self.clock is None or not self.axisymmetric:
@@ -123,27 +129,6 @@ class SharedErrors:
         angle = self.clock.turn_rad_s[2] * values[:, -1]
         c, s = np.cos(angle), np.sin(angle)
         return np.stack([c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]], axis=1)
-
-    @staticmethod
-    def map_sigma_rad(terrain: Terrain, position_m: Array, azimuth_rad: Array) -> Array:
-        """Error (n,) of the skyline of a `terrain` at `azimuth_rad` (n,), as if independent of the others.
-
-        The skyline is that at `position_m` (2,). Ground of which facts are not stated is rough by ROUGH_RAD besides.
-
-        Posts that make the skyline at several azimuths err there together: each azimuth is given the variance that
-        the sum over its neighbours has, which is right for errors that go far around the compass, as of a position.
-        """
-        rough = 0.0 if all(one.is_stated for one in terrain.shape_errors) else ROUGH_RAD
-        posts = terrain.horizon_posts(position_m, azimuth_rad)
-        if not terrain.height_sigma_m or not np.isfinite(posts.horizon_rad).any():
-            return np.hypot(np.asarray(terrain.horizon_sigma_rad(position_m[None], azimuth_rad)).ravel(), rough)
-        used = posts.post >= 0
-        numbers, of = np.unique(posts.post[used], return_inverse=True)
-        azimuth = np.broadcast_to(np.arange(len(azimuth_rad))[:, None], posts.post.shape)[used]
-        by_post = posts.rad_per_m[used]
-        total = np.bincount(of, weights=by_post, minlength=len(numbers))
-        variance = np.bincount(azimuth, weights=by_post * total[of], minlength=len(azimuth_rad))
-        return np.hypot(terrain.height_sigma_m * np.sqrt(variance), rough)
 
 
 def _known_errors(terrain: Terrain, clock: Clock | None) -> list[ShapeError]:
@@ -217,6 +202,12 @@ class ErrorBasis:
     def values(self, shown: Array, hidden: Array) -> Array:
         """Values (n, k) of the errors at coordinates (n, a) and (n, b)."""
         return np.asarray(self.mean + shown @ self.shown.T + hidden @ self.hidden.T)
+
+    def parameters(self, positions_m: Array, values: Array) -> Array:
+        """Parameters (n, 2 + a) of positions (n, 2), before the turn of a round crater, with `values` (n, k)."""
+        at = np.linalg.solve(np.hstack([self.shown, self.hidden]), (values - self.mean).T).T
+        shown, hidden = np.split(at, [len(self)], axis=1)
+        return np.hstack([positions_m - hidden @ self.drift_m, shown])
 
     def log_prior(self, shown: Array) -> Array:
         """Logarithm (n,) of the prior density of coordinates (n, a), with the probability of the hypothesis."""

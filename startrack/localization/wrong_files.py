@@ -26,13 +26,13 @@ def require_files(found: Sequence[Hypothesis], parameters: Array, clear: Array) 
         clear: (SECTORS,) probability that the map's skyline shows.
     """
     wrong, model = Blocked(1.0 - clear), found[0].model
-    if np.average(wrong.whole, weights=model.moments.information) > MOST_BLOCKED:
+    if np.average(wrong.whole, weights=model.seen.moments.information) > MOST_BLOCKED:
         raise NotLocated(
             f"something on no map hides {360.0 * wrong.whole.mean():.0f} degrees of the skyline, or terrain, time or "
             "camera file are wrong",
             reason="inconsistent_evidence",
         )
-    better = free_log_likelihood(model.profiles, model.shift_of(parameters)) - _log_map(found[0], parameters)
+    better = free_log_likelihood(model.seen.profiles, model.shift_of(parameters)) - _log_map(found[0], parameters)
     if better > 0.0:
         where = f", most at azimuths {wrong.text}" if wrong else ""
         raise NotLocated(
@@ -54,7 +54,7 @@ def _log_map(best: Hypothesis, parameters: Array) -> float:
     value = float(model.log_likelihood_of(model.shift_of(parameters)[None])[0])
     if not best.gross:
         return value
-    own = np.array([one.fact == best.gross for one in model.errors.listed])
+    own = model.errors.is_of_fact(best.gross)
     sigma, z = model.errors.sigma(best.gross)[own], parameters[2:] @ model.basis.shown[own].T
     return value - float(np.sum(0.5 * np.square(z / sigma) + np.log(sigma * np.sqrt(2 * np.pi) / WIDE_SHAPE)))
 
@@ -65,15 +65,15 @@ def weigh_wrong_facts(found: Sequence[Hypothesis]) -> Iterator[tuple[str, float]
     Both are integrals over position and errors. Facts that are certainly right are left out.
     """
     best = found[0].model
-    near = [one for one in found if one.model.ground is best.ground]
+    near = [one for one in found if one.model.around is best.around]
     plain = min(near, key=lambda one: one.gross != "")
     by_files = _log_evidence(near)
-    for fact in SharedErrors.doubtable(best.terrain, best.rows.clock):
+    for fact in SharedErrors.doubtable(best.terrain, best.seen.rows.clock):
         other = plain.model.with_gross(fact)
         better = -np.inf
         for rounds in FEW_ROUNDS, GROSS_ROUNDS:
             if len(other.basis):
-                doubted = sample_gross_error(plain, other, best.reference_m[None], rounds)
+                doubted = sample_gross_error(plain, other, best.around.reference_m[None], rounds)
                 better = _log_evidence(doubted) - by_files
             if better < 0.0:
                 break

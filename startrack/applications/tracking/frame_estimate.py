@@ -19,7 +19,6 @@ from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, Ints
 from startrack.estimation.observations import UNKNOWN_M, FrameEstimate
 from startrack.localization import (
-    NO_IMAGE_ERRORS,
     ErrorBasis,
     Gaussian,
     SkylineModel,
@@ -54,19 +53,19 @@ class FrameModel:
     ) -> Self:
         """Of `evidence` with its errors of the image, for positions within `half_m` of a reference (2,)."""
         image = errors.of_image(evidence.image_errors)
-        model = SkylineModel(terrain, evidence, reference_m, half_m, errors.listed, image_errors=image)
-        model.basis = ErrorBasis.whole(errors.listed)
-        return cls(model, errors)
+        basis = ErrorBasis.whole(errors.listed)
+        return cls(SkylineModel.of(terrain, evidence, reference_m, half_m, errors.listed, image, basis), errors)
 
     @cached_property
     def rise_rad(self) -> Array:
         """(SECTORS, k) rise of the skyline by one standard deviation of each shared error."""
-        edge = np.zeros(SECTORS) if self.model.image_errors is None else self.model.image_rise[:, 0]
+        rise = self.model.seen.image_rise
+        edge = rise[:, 0] if rise.shape[1] else np.zeros(SECTORS)
         return self.errors.rise_rad(self.model.slopes_rad, edge)
 
     def shifts(self, parameters: Array) -> Array:
         """(n, SECTORS) of the map's skyline, without errors of the image's own."""
-        found = self.model.shifts(self.errors.to_model(parameters, self.model.rows))
+        found = self.model.shifts(self.errors.to_model(parameters, self.model.seen.rows))
         if self.errors.uses_sky:
             found = found + np.outer(parameters[:, -1], self.rise_rad[:, -1])
         return found
@@ -78,14 +77,15 @@ class FrameModel:
 
     def is_allowed(self, parameters: Array) -> Array:
         """(n,) whether a camera can stand there, in the neighbourhood."""
-        in_units = self.errors.to_model(parameters, self.model.rows)
-        positions = self.model.errors.turned(in_units[:, :2], in_units[:, 2:])
-        near = np.abs(parameters[:, :2] - self.model.reference_m).max(axis=1) < self.model.half_m
+        in_units = self.errors.to_model(parameters, self.model.seen.rows)
+        positions = self.model.errors.true_positions(in_units[:, :2], in_units[:, 2:])
+        near = np.abs(parameters[:, :2] - self.model.around.reference_m).max(axis=1) < self.model.around.half_m
         return near & np.asarray(self.model.terrain.allowed(positions))
 
     def settle(self, parameters: Array) -> None:
         """Take the states of the chain, which decide where the circle is cut, at parameters (2 + k,)."""
-        self.clear = self.model.states(self.errors.to_model(parameters[None], self.model.rows)[0])[:, 0]
+        states = self.model.states(self.errors.to_model(parameters[None], self.model.seen.rows)[0])
+        self.model, self.clear = self.model.with_closing(states), states[:, 0]
 
     def slopes(self, parameters: Array, share: Array) -> Array:
         """(n, SECTORS) change of the log-likelihood with the skyline [1/rad] at points with `share` (n,) of the weight.
@@ -95,9 +95,9 @@ class FrameModel:
         """
         shifts, _ = self.model.with_image_errors(self.shifts(parameters))
         spread = np.sqrt(share @ np.square(shifts - share @ shifts))
-        step = np.maximum(STEP_SIGMAS * np.hypot(spread, self.model.map_sigma_rad), LEAST_STEP_RAD)
+        step = np.maximum(STEP_SIGMAS * np.hypot(spread, self.model.around.map_sigma_rad), LEAST_STEP_RAD)
         all_clear = np.ones(SECTORS)
-        higher, lower = (clear_logs(self.model.profiles, shifts + sign * step, all_clear) for sign in (1.0, -1.0))
+        higher, lower = (clear_logs(self.model.seen.profiles, shifts + sign * step, all_clear) for sign in (1.0, -1.0))
         return np.asarray(self.clear * (higher - lower) / (2 * step))
 
     def information(self) -> tuple[Array, Array]:
@@ -105,15 +105,16 @@ class FrameModel:
 
         Positions are relative to the reference. Sets how much each sector counts for the errors of the image.
         """
-        model, image = self.model, self.model.image_errors or NO_IMAGE_ERRORS
-        design, own = np.hstack([model.position_slopes.T, self.rise_rad]), model.image_rise
+        seen, around, image = self.model.seen, self.model.around, self.model.seen.image_errors
+        design, own = np.hstack([around.slopes.T, self.rise_rad]), seen.image_rise
         known, d = np.asarray(np.linalg.inv(image.covariance)), design.shape[1]
-        height = model.moments.mean_rad - self.shifts(np.r_[model.reference_m, np.zeros(d - 2)][None])[0]
+        height = seen.moments.mean_rad - self.shifts(np.r_[around.reference_m, np.zeros(d - 2)][None])[0]
         prior = np.diag(np.r_[np.full(2, UNKNOWN_M**-2), np.ones(d - 2), np.zeros(len(known))])
         prior[d:, d:] = known
-        left, mean = model.moments._replace(mean_rad=height), np.append(np.zeros(d), image.mean)
-        _, _, model.clear = solve_linear(left, np.hstack([design, own]), mean, prior)
-        weight = model.clear / model.moments.variance_rad2
+        left, mean = seen.moments._replace(mean_rad=height), np.append(np.zeros(d), image.mean)
+        _, _, clear = solve_linear(left, np.hstack([design, own]), mean, prior)
+        self.model = replace(self.model, clear=clear)
+        weight = clear / seen.moments.variance_rad2
         explained = np.linalg.solve((own.T * weight) @ own + known, own.T * weight)  # by the image's own errors
         weighted = np.asarray(design.T * weight - ((design.T * weight) @ own) @ explained)
         return weighted @ design, weighted @ (height - own @ image.mean)
@@ -129,7 +130,7 @@ def sample_together(models: Sequence[FrameModel], position_m: Array, covariance_
     drift = np.linalg.solve(covariance[:2, :2], covariance[:2, 2:]).T  # of the errors with the position
     alone = covariance[2:, 2:] - drift @ covariance[:2, 2:]
     wide = covariance[:2, :2] + covariance_m2
-    mean = np.r_[position_m, best[2:] + drift @ (position_m - models[0].model.reference_m - best[:2])]
+    mean = np.r_[position_m, best[2:] + drift @ (position_m - models[0].model.around.reference_m - best[:2])]
     for model in models:
         model.settle(mean)
 
@@ -200,7 +201,7 @@ def observe_together(models: Sequence[FrameModel], found: WeightedPoints) -> Fra
         slopes = model.slopes(points, share)
         common = ((points - plain) * share[:, None]).T @ (slopes - share @ slopes)
         own = covariance @ np.linalg.solve(spread, common)
-        counted += (own * np.square(model.model.map_sigma_rad)) @ own.T
+        counted += (own * np.square(model.model.around.map_sigma_rad)) @ own.T
         by_horizon += own
     noise = clipped_noise(by_evidence - counted, by_evidence) + ROUNDING * covariance
     post, by_post = _posts(models[0], by_horizon, covariance)
@@ -237,7 +238,7 @@ def clipped_noise(noise: Array, whole: Array) -> Array:
 
 def _posts(model: FrameModel, by_horizon: Array, covariance: Array) -> tuple[Ints, Array]:
     """Posts (c,) of the crests and of the camera's ground, and the response (d, c) of the mean to their heights."""
-    terrain, at = model.model.terrain, model.model.reference_m
+    terrain, at = model.model.terrain, model.model.around.reference_m
     if not terrain.height_sigma_m:
         return np.zeros(0, dtype=np.int64), np.zeros((len(by_horizon), 0))
     parts = [terrain.horizon_posts(at, MIDDLES_RAD), terrain.ground_posts(at, MIDDLES_RAD)]

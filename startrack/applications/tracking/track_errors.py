@@ -99,5 +99,6 @@ class TrackErrors:
         """
         m, small = len(self.listed), 1e-3
         points, one = np.tile(position_m, (m, 1)), small * np.diag(self.sigma[:m])
-        found = (self.listed.turned(points, one) - self.listed.turned(points, -one)).T / (2 * small)
+        to = self.listed.true_positions
+        found = (to(points, one) - to(points, -one)).T / (2 * small)
         return np.pad(found, ((0, 0), (0, len(self) - m)))

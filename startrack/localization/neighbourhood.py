@@ -1,0 +1,134 @@
+"""The skyline of a map about a reference position, and how rows stand above it, sector by sector."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, ImageErrors
+from startrack.localization.sector_moments import SectorMoments, measure_moments
+from startrack.localization.shared_errors import SharedErrors
+from startrack.localization.skyline_profiles import HIGH_RAD, ROW_NATS, Profiles, profiles_of
+from startrack.terrain import Terrain
+
+SAMPLES = 6 * SECTORS  # of the skyline around the reference, between which rows are compared with it
+TRACED_RAD = np.radians(0.7)  # rows this near the skyline are compared with its own elevation at their azimuth
+NODES_ACROSS = 5  # traced horizons along each side of the neighbourhood
+ROUGH_RAD = np.radians(0.002)  # of ground that nobody states as exact: 0.35 m of a rim 10 km away
+
+NO_IMAGE_ERRORS = ImageErrors(np.zeros((SECTORS, 0)), np.zeros(0), np.zeros((0, 0)), np.full(SECTORS, np.inf))
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbourhood:
+    """A terrain about a reference position (2,)."""
+
+    terrain: Terrain
+    reference_m: Array
+    half_m: float  # horizons are prepared for positions so far from the reference
+
+    @cached_property
+    def ground(self) -> Terrain:
+        """The terrain, prepared for the neighbourhood."""
+        return self.terrain.near(self.reference_m, self.half_m, MIDDLES_RAD, NODES_ACROSS).interpolated()
+
+    @cached_property
+    def horizon_rad(self) -> Array:
+        """(SECTORS,) of the map at the reference."""
+        return self.horizons_rad(self.reference_m[None])[0]
+
+    def horizons_rad(self, points_m: Array) -> Array:
+        """(n, SECTORS) of the map at points (n, 2)."""
+        return np.asarray(self.ground.horizon_rad(np.ascontiguousarray(points_m)[:, None], MIDDLES_RAD))
+
+    @cached_property
+    def slopes(self) -> Array:
+        """(2, SECTORS) rise of the skyline by a metre east and north [rad/m]."""
+        step = max(0.02 * self.half_m, 1.0)
+        horizon = self.horizons_rad(self.reference_m + step * np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]]))
+        return np.stack([horizon[0] - horizon[1], horizon[2] - horizon[3]]) / (2 * step)
+
+    def error_slopes_rad(self, errors: SharedErrors) -> Array:
+        """(k, SECTORS) rise of the skyline by one unit of each of the shared `errors`."""
+        return errors.slopes_rad(self.terrain, self.reference_m, MIDDLES_RAD, self.horizon_rad)
+
+    @cached_property
+    def skyline_rad(self) -> Array:
+        """(SAMPLES,) of the map at the reference, from north eastward."""
+        around = np.linspace(0.0, 2 * np.pi, SAMPLES, endpoint=False)
+        return np.asarray(self.terrain.horizon_rad(self.reference_m[None], around)).ravel()
+
+    @cached_property
+    def map_sigma_rad(self) -> Array:
+        """(SECTORS,) error of the map's skyline, as if independent between the sectors.
+
+        Ground of which facts are not stated is rough by ROUGH_RAD besides. Posts that make the skyline at several
+        azimuths err there together: each azimuth is given the variance that the sum over its neighbours has, which is
+        right for errors that go far around the compass, as of a position.
+        """
+        terrain = self.terrain
+        rough = 0.0 if all(one.is_stated for one in terrain.shape_errors) else ROUGH_RAD
+        posts = terrain.horizon_posts(self.reference_m, MIDDLES_RAD)
+        if not terrain.height_sigma_m or not np.isfinite(posts.horizon_rad).any():
+            return np.hypot(np.asarray(terrain.horizon_sigma_rad(self.reference_m[None], MIDDLES_RAD)).ravel(), rough)
+        used = posts.post >= 0
+        numbers, of = np.unique(posts.post[used], return_inverse=True)
+        sector = np.broadcast_to(np.arange(SECTORS)[:, None], posts.post.shape)[used]
+        by_post = posts.rad_per_m[used]
+        total = np.bincount(of, weights=by_post, minlength=len(numbers))
+        variance = np.bincount(sector, weights=by_post * total[of], minlength=SECTORS)
+        return np.hypot(terrain.height_sigma_m * np.sqrt(variance), rough)
+
+
+@dataclass(frozen=True, eq=False)
+class SectorRows:
+    """The rows of an image about the skyline of a neighbourhood."""
+
+    around: Neighbourhood
+    rows: Evidence
+    image_errors: ImageErrors = NO_IMAGE_ERRORS
+    is_rough: bool = False  # rows are compared with samples of the skyline alone
+
+    @cached_property
+    def above_rad(self) -> Array:
+        """(n,) how far the rows stand above the skyline at the reference."""
+        rows, terrain = self.rows, self.around.terrain
+        line, around = self.around.skyline_rad, np.linspace(0.0, 2 * np.pi, SAMPLES + 1)
+        above = rows.elevation_rad - np.interp(rows.azimuth_rad, around, np.append(line, line[0]))
+        if not terrain.axisymmetric and not self.is_rough:  # crests are narrower than the samples
+            near = np.flatnonzero(np.abs(above) < TRACED_RAD)
+            traced = terrain.horizon_rad(self.around.reference_m[None], rows.azimuth_rad[near])
+            above[near] = rows.elevation_rad[near] - np.asarray(traced).ravel()
+        return above
+
+    @cached_property
+    def profiles(self) -> Profiles:
+        """How well each height of the skyline explains the rows of each sector."""
+        return profiles_of(self.rows, self.above_rad, self.around.map_sigma_rad)
+
+    @cached_property
+    def moments(self) -> SectorMoments:
+        """Heights of the skyline that the rows show."""
+        return measure_moments(self.profiles)
+
+    @cached_property
+    def log_offset(self) -> float:
+        """What makes log-likelihoods of different references and times comparable: they see other windows of rows."""
+        rows = self.rows
+        high = (self.above_rad >= HIGH_RAD) & (rows.extended_nats == 0.0)
+        return float(self.profiles.free.sum() + np.clip(rows.llr[high], -ROW_NATS, ROW_NATS).sum())
+
+    @cached_property
+    def image_rise(self) -> Array:
+        """(SECTORS, j) rise of the skyline that stars and sky's light show together, by one unit of each image error.
+
+        The share of the sky's light must not vary with its noise: errors that look like a displacement would not.
+        """
+        if not len(self.image_errors.mean):
+            return NO_IMAGE_ERRORS.raised_rad
+        stars = np.flatnonzero(self.rows.extended_nats == 0.0)
+        by_stars = measure_moments(profiles_of(self.rows.take(stars), self.above_rad[stars], np.zeros(SECTORS)))
+        share = by_stars.variance_rad2 / (by_stars.variance_rad2 + self.image_errors.variance_rad2)
+        return np.asarray(share[:, None] * self.image_errors.raised_rad)

@@ -26,7 +26,7 @@ from startrack.terrain import (
     load_terrain,
 )
 from startrack.terrain import table_cache as cache
-from startrack.terrain.derived_maps import DeformedMap
+from startrack.terrain.derived_maps import DeformedMap, HorizonInterpolator
 from startrack.terrain.ground import ground_up_m
 from startrack.terrain.raster import ORTHOGRAPHIC, polar_stereographic
 
@@ -104,7 +104,8 @@ def test_without_the_table_horizons_are_the_same_bits_before_and_after_it(shackl
     for one in (terrain, replace(terrain, camera_height_m=1.8 + 0.3)):
         one.prepare()
     assert np.array_equal(form(terrain).without_table().horizon_rad(places, azimuths), before)
-    assert form(terrain).horizon_rad(places, azimuths) == pytest.approx(before, abs=1e-4)
+    between_nodes = isinstance(form(terrain), HorizonInterpolator)  # 100 m apart, near crests
+    assert form(terrain).horizon_rad(places, azimuths) == pytest.approx(before, abs=5e-4 if between_nodes else 1e-4)
 
 
 def test_far_crests_are_found_with_the_table_too():

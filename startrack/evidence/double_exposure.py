@@ -138,7 +138,7 @@ def find_double_exposure(light: StarPhotometry, terrain: Terrain, position_m: Ar
         return None
     near = np.abs(above_rad) < PAIRED_RAD
     reach_m = TRACED_REACH * terrain.search_radius_m
-    ground = terrain.near(position_m, reach_m, azimuth[near], TRACED_NODES).interpolated()
+    ground = terrain.near(position_m, reach_m, azimuth[near], TRACED_NODES)
     return _best_pair(rows(near), ground, position_m)
 
 

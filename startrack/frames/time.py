@@ -58,5 +58,5 @@ def as_utc(time: datetime) -> datetime:
 
 
 def seconds_since_2000(time: datetime) -> float:
-    """UTC seconds since 2000-01-01T12:00:00Z, leap seconds not counted [s]."""
+    """UTC seconds of a `time` since 2000-01-01T12:00:00Z, leap seconds not counted [s]."""
     return (as_utc(time) - datetime(2000, 1, 1, 12, tzinfo=UTC)) / timedelta(seconds=1)

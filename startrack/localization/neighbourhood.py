@@ -32,7 +32,7 @@ class Neighbourhood:
     @cached_property
     def ground(self) -> Terrain:
         """The terrain, prepared for the neighbourhood."""
-        return self.terrain.near(self.reference_m, self.half_m, MIDDLES_RAD, NODES_ACROSS).interpolated()
+        return self.terrain.near(self.reference_m, self.half_m, MIDDLES_RAD, NODES_ACROSS)
 
     @cached_property
     def horizon_rad(self) -> Array:

@@ -204,7 +204,7 @@ class ErrorBasis:
         return np.asarray(self.mean + shown @ self.shown.T + hidden @ self.hidden.T)
 
     def parameters(self, positions_m: Array, values: Array) -> Array:
-        """Parameters (n, 2 + a) of positions (n, 2), before the turn of a round crater, with `values` (n, k)."""
+        """Parameters (n, 2 + a) of `positions_m` (n, 2), before the turn of a round crater, with `values` (n, k)."""
         at = np.linalg.solve(np.hstack([self.shown, self.hidden]), (values - self.mean).T).T
         shown, hidden = np.split(at, [len(self)], axis=1)
         return np.hstack([positions_m - hidden @ self.drift_m, shown])

@@ -74,7 +74,11 @@ class SkylineModel:
         image_errors: ImageErrors | None = None,
         basis: ErrorBasis | None = None,
     ) -> SkylineModel:
-        """Of `rows` on a `terrain`, for positions within `half_m` of a reference (2,); see the fields."""
+        """Of `rows` on a `terrain`, for positions within `half_m` of `reference_m` (2,).
+
+        The `errors` are shared, the `image_errors` those of the rows of extended light. `basis`: directions of the
+        shared errors; None: those that the rows show.
+        """
         around = Neighbourhood(terrain, reference_m, half_m)
         seen = SectorRows(around, rows, image_errors or NO_IMAGE_ERRORS)
         return cls(seen, errors, around.error_slopes_rad(errors), stated_basis=basis)

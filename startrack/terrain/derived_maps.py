@@ -133,7 +133,6 @@ class HorizonInterpolator(ForwardingTerrain):
     half_m: float
     azimuths_rad: Array  # (n,) ascending
     across: int  # nodes along each side
-    interpolated = Terrain.interpolated  # itself: forwarded, it would be the whole map
 
     @cached_property
     def nodes(self) -> Nodes:

@@ -151,7 +151,7 @@ class Terrain(ABC):
     def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = 3) -> Terrain:
         """The same ground, prepared for positions within `half_m` of a centre (2,), at the azimuths (n,).
 
-        The terrain itself where horizons cost little; else horizons at `across` x `across` points may be computed.
+        The terrain itself where horizons cost little; else they may be interpolated between `across` x `across` points.
         """
         return self
 
@@ -178,10 +178,6 @@ class Terrain(ABC):
         None where the visible ground of a ray is not a disk of one radius for all rays.
         """
         return None
-
-    def interpolated(self) -> Terrain:
-        """As this one, with horizons interpolated where `near` prepared them and tracing would take long."""
-        return self
 
     @property
     def is_prepared(self) -> bool:

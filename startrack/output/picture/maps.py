@@ -88,7 +88,7 @@ class Map:
             self.window.line(self.canvas_px(ring((0.0, 0.0), terrain.search_radius_m)), Ink.DIM, dashed=True)
 
     def draw_relief(self, ground_m: Image, known: Bools) -> None:
-        """The relief; the map's colour where there is no ground."""
+        """The relief of heights `ground_m` (n, n) [m] where they are `known` (n, n), elsewhere the map's colour."""
         size = self.window.size
         lit = (enlarge_image(hill_shading(ground_m, known, self.half_m), size) * edge_cover(known, size))[:, :, None]
         paper = np.array(Ink.PAPER)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import resource
 import signal
 import subprocess
@@ -11,13 +12,14 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from batch_helpers import frames
 
 from startrack.cli.main import main
-from startrack.core.errors import BadInput
+from startrack.core.errors import BadInput, BadOutput, NotLocated
 from startrack.exposure import read_exposure
 from startrack.output import remove_companions, write_results
 
@@ -184,3 +186,17 @@ def test_a_colour_jpeg_takes_a_bounded_memory(tmp_path):
 def test_devices_are_no_images(tmp_path):
     with time_limit(20), pytest.raises(BadInput, match="/dev/zero"):
         read_exposure("/dev/zero")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        BadInput("bad_image", "no picture"),
+        BadOutput("bad_terrain", "name another folder", "give -D"),
+        NotLocated("two positions", reason="inconsistent_evidence"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_failures_pass_between_processes(error: Any) -> None:
+    again = pickle.loads(pickle.dumps(error))
+    assert (type(again), str(again), vars(again)) == (type(error), str(error), vars(error))

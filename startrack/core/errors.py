@@ -6,6 +6,7 @@ table in docs/formats.md are made from `Reason`; a new reason is one entry here.
 
 from __future__ import annotations
 
+import copyreg
 import re
 from decimal import Decimal
 from enum import StrEnum
@@ -136,6 +137,10 @@ class BadInput(Exception):
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
         self.reason = Reason(reason)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """So that it passes between processes: exceptions are made anew of their message alone."""
+        return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # type: ignore[attr-defined]
 
 
 class BadOutput(BadInput):

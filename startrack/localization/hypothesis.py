@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from startrack.core.statistics import shares
 from startrack.core.types import Array, Clock
 from startrack.localization.clock import TIME_ROUNDS, is_linear, turned_model, turned_models
 from startrack.localization.free_skyline import free_log_likelihood
@@ -121,7 +120,9 @@ def sample_gross_error(
     clock = _gross_clock(other)
     if clock is not None and not plain.suits_map:
         return _sample_other_times(plain, other, clock, references_m)
-    return [sample_hypothesis(other, references_m, _gross_modes(plain, other), rounds=rounds, enough=FEW)]
+    modes = _gross_modes(plain, other)
+    rounds = [len(modes) * count for count in rounds]
+    return [sample_hypothesis(other, references_m, modes, rounds=rounds, enough=FEW)]
 
 
 def _sample_other_times(plain: Hypothesis, model: SkylineModel, clock: Clock, references_m: Array) -> list[Hypothesis]:
@@ -155,19 +156,24 @@ def _sample_settled_time(plain: Hypothesis, model: SkylineModel, clock: Clock, r
 def _gross_modes(plain: Hypothesis, other: SkylineModel) -> list[Gaussian]:
     """Modes with which the sampling of a gross error begins: the plain points, drawn out along what it does.
 
-    Of one the points are moved besides, by a Newton step from the prior of the plain hypothesis to the wider one: far
-    too far where the skyline is not linear. How position and other errors follow is told by the linear model, whose
-    own solution may be far off.
+    Of a second one the points are moved besides, by a Newton step from the prior of the plain hypothesis to the wider
+    one, if it leads far; too far where the skyline is not linear. How position and other errors follow is told by the
+    linear model, whose own solution may be far off.
     """
     _, linear, _ = other.solve()
-    errors = np.zeros((len(plain.values), len(other.errors)))
+    points = plain.found.points
+    off = points[:, 2:] @ plain.model.basis.shown.T  # errors that the rows do not show keep their prior: 0 in the mean
+    errors = np.zeros((len(off), len(other.errors)))
     for number, one in enumerate(other.errors.listed):
-        errors[:, number] = plain.values[:, [known.name == one.name for known in plain.model.errors.listed]].sum(axis=1)
-    mean, same = moments(other.basis.parameters(plain.unturned_m, errors), shares(plain.log_weight))
+        errors[:, number] = off[:, [known.name == one.name for known in plain.model.errors.listed]].sum(axis=1)
+    parameters = other.basis.parameters(points[:, :2], other.errors.mean + errors)
+    mean, same = moments(parameters, plain.found.share)
     own = other.errors.is_of_fact(other.gross)
     picked = np.pad(other.basis.shown[own], ((0, 0), (2, 0)))
     before, after = (other.errors.sigma(gross)[own] ** -2.0 for gross in ("", other.gross))
     follow = linear @ picked.T
     drawn_out = follow @ np.linalg.pinv(picked @ follow) @ follow.T
     spread = WIDER * same + drawn_out + LINEAR_PART * linear
-    return [(mean, spread), (mean + follow @ ((before - after) * (picked @ mean)), spread)]
+    moved = follow @ ((before - after) * (picked @ mean))
+    is_far = moved @ np.linalg.solve(spread, moved) > 1.0
+    return [(mean, spread), *([(mean + moved, spread)] if is_far else [])]

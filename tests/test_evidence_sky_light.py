@@ -12,7 +12,7 @@ from scipy.special import ndtr
 from sky_helpers import EDGE_PX, ELEVATION_RAD, GROUND_E, NOISE_E, PX_PER_RAD, level_horizon, paint_pixels
 
 from startrack.core.kernels import normal_cdf
-from startrack.core.types import MIDDLES_RAD, SECTORS, Array
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, sector_of
 from startrack.evidence import BAND_PX, Skyline
 from startrack.evidence.sky_light import CELL_PX, LEVELS, SkyLight, measure_sky_light, sectors_with_step
 from startrack.evidence.sky_pixels import (
@@ -24,7 +24,6 @@ from startrack.evidence.sky_pixels import (
     measure_levels,
     pixels_near_skyline,
     scale_across,
-    sector_of,
 )
 from startrack.frames import rays_from_azel
 

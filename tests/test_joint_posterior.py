@@ -12,7 +12,7 @@ from localization_helpers import slow_chain, slow_chain_scores
 from scipy.special import ndtr
 from test_localization_shape import evidence_at
 
-from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Clock, Evidence
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Clock, Evidence, sector_of
 from startrack.frames import Site, sky_rotvec_rad
 from startrack.localization import ExactPosterior, importance_sampling
 from startrack.localization.clock import turn_evidence
@@ -36,7 +36,6 @@ from startrack.localization.skyline_profiles import (
     integral_to,
     log_at,
     profiles_of,
-    sector_of,
 )
 from startrack.terrain import Cylinder, Terrain, load_terrain
 

@@ -8,7 +8,17 @@ import numpy as np
 
 from startrack.chain.measurement import fix_position
 from startrack.chain.stages import Located, Measured
-from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Bools, Evidence, ImageErrors, MeasuredSkyline, NotLocated
+from startrack.core.types import (
+    MIDDLES_RAD,
+    SECTORS,
+    Array,
+    Bools,
+    Evidence,
+    ImageErrors,
+    MeasuredSkyline,
+    NotLocated,
+    sector_of,
+)
 from startrack.evidence import (
     CLIP_SHIFT_PX,
     NEEDED_SECTORS,
@@ -20,7 +30,6 @@ from startrack.evidence import (
     measure_star_offsets,
     offset_terms,
     pixels_near_skyline,
-    sector_of,
     sectors_with_step,
 )
 from startrack.localization import Localizer

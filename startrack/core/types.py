@@ -28,6 +28,13 @@ __all__ = [
 MOST_ELEVATION_RAD = np.pi / 2 + 0.6
 SECTORS = 240  # of azimuth, 1.5 degrees each: an obstacle on no map hides what is in one together
 MIDDLES_RAD = (np.arange(SECTORS) + 0.5) * 2 * np.pi / SECTORS
+
+
+def sector_of(azimuth_rad: Array) -> Ints:
+    """Sector (n,) of each `azimuth_rad` (n,)."""
+    return np.asarray((azimuth_rad * (SECTORS / (2 * np.pi))).astype(np.int64) % SECTORS)
+
+
 TIME_SIGMA_S = 1.0  # of the clock, where nothing is stated
 MAX_PIXELS = 200_000_000  # contract: a larger image is refused from its header, before anything is decoded
 

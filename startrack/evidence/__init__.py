@@ -18,7 +18,7 @@ from startrack.evidence.sky_light import (
     measure_sky_light,
     sectors_with_step,
 )
-from startrack.evidence.sky_pixels import pixels_near_skyline, sector_of
+from startrack.evidence.sky_pixels import pixels_near_skyline
 from startrack.evidence.sky_step import (
     BAND_PX,
     Horizon,
@@ -47,6 +47,6 @@ __all__ = [
     "StarEvidence", "StarPhotometry", "average_shifts", "check_single_skyline", "expect_stars", "expected_flux_scale",
     "filtered_noise_e", "flux_scale", "half_width", "height_above_px", "measure_noise", "measure_response",
     "measure_sky_light", "measure_sky_step", "measure_star_offsets", "neighbour_profiles", "offset_terms",
-    "order_by_cell", "pixels_near_skyline", "profiles_of", "reliable_azimuths", "sector_of", "sectors_with_step",
+    "order_by_cell", "pixels_near_skyline", "profiles_of", "reliable_azimuths", "sectors_with_step",
     "subtract_sky_step",
 ]  # fmt: skip

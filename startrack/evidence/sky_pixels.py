@@ -152,11 +152,6 @@ class SkyLevels:
         return np.asarray(self.level_e[SKY] - self.level_e[GROUND])
 
 
-def sector_of(azimuth_rad: Array) -> Ints:
-    """Sector (n,) of each `azimuth_rad` (n,)."""
-    return (azimuth_rad * (SECTORS / (2 * np.pi))).astype(np.int64) % SECTORS
-
-
 def measure_levels(pixels: SkyPixels, sector: Ints) -> SkyLevels:
     """Levels on both sides of the skyline by `pixels` (n,) of these sectors (n,), outliers left out.
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from startrack.core.kernels import njit
-from startrack.core.types import SECTORS, Array, Evidence, Ints
+from startrack.core.types import SECTORS, Array, Evidence, Ints, sector_of
 from startrack.localization.sector_likelihood import EDGE_SIGMAS
 from startrack.localization.sky_profiles import SkyProfiles
 
@@ -41,11 +41,6 @@ class Profiles(NamedTuple):
     bend: Array  # (m,) 4 (F in the middle - mean of both)
     integral: Array  # (m,) of exp(F - free) from the lowest height to x
     free: Array  # (SECTORS,) R
-
-
-def sector_of(azimuth_rad: Array) -> Ints:
-    """Sector (n,) of each azimuth."""
-    return np.asarray((azimuth_rad * (SECTORS / (2 * np.pi))).astype(np.int64) % SECTORS)
 
 
 def profiles_of(rows: Evidence, above_rad: Array, map_sigma_rad: Array) -> Profiles:

@@ -166,8 +166,7 @@ def _gross_modes(plain: Hypothesis, other: SkylineModel) -> list[Gaussian]:
     errors = np.zeros((len(off), len(other.errors)))
     for number, one in enumerate(other.errors.listed):
         errors[:, number] = off[:, [known.name == one.name for known in plain.model.errors.listed]].sum(axis=1)
-    parameters = other.basis.parameters(points[:, :2], other.errors.mean + errors)
-    mean, same = moments(parameters, plain.found.share)
+    mean, same = moments(other.basis.parameters(points[:, :2], errors), plain.found.share)
     own = other.errors.is_of_fact(other.gross)
     picked = np.pad(other.basis.shown[own], ((0, 0), (2, 0)))
     before, after = (other.errors.sigma(gross)[own] ** -2.0 for gross in ("", other.gross))

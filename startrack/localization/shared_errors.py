@@ -203,9 +203,12 @@ class ErrorBasis:
         """Values (n, k) of the errors at coordinates (n, a) and (n, b)."""
         return np.asarray(self.mean + shown @ self.shown.T + hidden @ self.hidden.T)
 
-    def parameters(self, positions_m: Array, values: Array) -> Array:
-        """Parameters (n, 2 + a) of `positions_m` (n, 2), before the turn of a round crater, with `values` (n, k)."""
-        at = np.linalg.solve(np.hstack([self.shown, self.hidden]), (values - self.mean).T).T
+    def parameters(self, positions_m: Array, off: Array) -> Array:
+        """Parameters (n, 2 + a) of `positions_m` (n, 2), before the turn of a round crater, with errors `off` the mean.
+
+        `off` is (n, k).
+        """
+        at = np.linalg.solve(np.hstack([self.shown, self.hidden]), off.T).T
         shown, hidden = np.split(at, [len(self)], axis=1)
         return np.hstack([positions_m - hidden @ self.drift_m, shown])
 

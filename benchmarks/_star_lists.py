@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from startrack.camera import Camera
+from startrack.core.smooth_image import SmoothImage
 from startrack.core.types import Detections, Stars
 
 CLOSE_PX = 3.0
@@ -36,7 +37,7 @@ class StarList:
             xy_px=self.xy_px, covariance_px2=np.tile(self.noise_px**2 * np.eye(2), (n, 1, 1)), flux_e=flux,
             flux_sigma_e=np.sqrt(flux + 1e8), snr=flux / np.sqrt(flux + 1e8), saturated=np.zeros(n, dtype=bool),
             psf_sigma_px=1.0, image_e=np.zeros((2, 2), np.float32), dead=np.zeros((2, 2), bool),
-            background_e=np.zeros((2, 2), np.float32), noise_e=np.ones((2, 2), np.float32),
+            background=SmoothImage.of(np.zeros((2, 2), np.float32)), noise=SmoothImage.of(np.ones((2, 2), np.float32)),
         )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial import cKDTree
 from star_painter import cramer_rao, isolated_stars, plain_camera
 
+from startrack.core.smooth_image import SmoothImage
 from startrack.detection import Detector
 from startrack.detection.classify import detection_threshold
 from startrack.detection.frame import Frame, SourceNoise, bin_frame, binning_factor
@@ -44,10 +45,11 @@ def test_binned_frames_keep_flux_and_noise() -> None:
     dead = np.zeros(image.shape, dtype=bool)
     dead[11, 20] = True
     flat = np.ones_like(image)
-    small = bin_frame(Frame(image, 50 * flat, np.sqrt(50) * flat, dead, SourceNoise(per_unit=0.0)), 4)
+    background, noise = SmoothImage.of(50 * flat), SmoothImage.of(np.sqrt(50 * flat))
+    small = bin_frame(Frame(image, background, noise, dead, SourceNoise(per_unit=0.0)), 4)
     assert small.shape == (50, 75)
     assert small.image[3, 5] == pytest.approx(image[12:16, 20:24].sum())
-    assert np.std(small.image - small.background) == pytest.approx(float(small.noise[0, 0]), rel=0.05)
+    assert np.std(small.image - small.background.whole()) == pytest.approx(float(small.noise.rows[0, 0]), rel=0.05)
     assert np.argwhere(small.dead).tolist() == [[2, 5]]
     assert [binning_factor(s) for s in (0.6, 1.7, 1.8, 3.5, 3.6, 8.0)] == [1, 1, 2, 2, 4, 8]
 
@@ -68,8 +70,9 @@ def test_bright_pixels_are_those_of_stars_not_hot_ones() -> None:
         image[y - 1 : y + 2, x - 1 : x + 2] += 15
         image[y, x] += 20
     image[70, 70] = 200.0
-    frame = Frame(image, np.zeros_like(image), np.ones_like(image), None, SourceNoise(per_unit=0.0))
-    assert sorted(map(tuple, bright_pixels(frame, 8.0, 10, 1).tolist())) == sorted(positions)
+    zero, one = (SmoothImage.of(np.full_like(image, value)) for value in (0, 1))
+    frame = Frame(image, zero, one, None, SourceNoise(per_unit=0.0))
+    assert sorted(map(tuple, bright_pixels(frame, 8.0, 10).tolist())) == sorted(positions)
 
 
 def test_skew_noise_raises_the_threshold_and_wide_stars_lower_it() -> None:

@@ -13,6 +13,7 @@ from scipy.special import expit
 from scipy.stats import norm
 from star_painter import cramer_rao, paint
 
+from startrack.core.smooth_image import SmoothImage
 from startrack.core.types import Body, Detections, Identification, Stars
 from startrack.evidence import FluxScale, StarEvidence, StarPhotometry, flux_scale
 from startrack.evidence.photometry import Photometry, Sources, half_width, measure
@@ -31,7 +32,8 @@ def without_sources(
     return Detections(
         xy_px=np.zeros((0, 2)), covariance_px2=np.zeros((0, 2, 2)), flux_e=none, flux_sigma_e=none, snr=none,
         saturated=np.zeros(0, bool), psf_sigma_px=sigma_px, image_e=image,
-        dead=np.zeros(image.shape, bool) if dead is None else dead, background_e=np.zeros_like(noise), noise_e=noise,
+        dead=np.zeros(image.shape, bool) if dead is None else dead,
+        background=SmoothImage.of(np.zeros_like(noise)), noise=SmoothImage.of(noise),
     )  # fmt: skip
 
 
@@ -227,7 +229,7 @@ def frame(stars: Stars, shines: np.ndarray, rng: np.random.Generator) -> Detecti
     on = inside & shines
     paint(light, px[on], 10 ** (-0.4 * (stars.v_mag[on] - SCALE.zero_mag)), 1.0)
     found = without_sources(add_noise(light, rng) + BACKGROUND_E, np.full((512, 512), 10.0, np.float32))
-    return replace(found, background_e=np.full((512, 512), BACKGROUND_E))
+    return replace(found, background=SmoothImage.of(np.full((512, 512), BACKGROUND_E)))
 
 
 def measure_frame(
@@ -335,7 +337,7 @@ def scale_from(
         xy_px=xy, covariance_px2=np.zeros((n, 2, 2)), flux_e=flux, flux_sigma_e=sigma, snr=flux / sigma,
         saturated=np.zeros(n, bool) if saturated is None else saturated, psf_sigma_px=1.0,
         image_e=np.zeros((2, 2), np.float32), dead=np.zeros((2, 2), bool),
-        background_e=np.zeros((2, 2), np.float32), noise_e=np.ones((2, 2), np.float32),
+        background=SmoothImage.of(np.zeros((2, 2), np.float32)), noise=SmoothImage.of(np.ones((2, 2), np.float32)),
     )  # fmt: skip
     found = Identification(
         detection=np.arange(n), star=np.arange(n), R_cam_icrs=np.eye(3), false_alarm_probability=0.0, unexplained=0

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from startrack.camera import Camera, Pinhole, load_camera
+from startrack.core.smooth_image import SmoothImage
 from startrack.core.types import Detections
 from startrack.evidence import height_above_px, measure_sky_step, reliable_azimuths, subtract_sky_step
 from startrack.frames import azel_from_rays
@@ -49,7 +50,8 @@ def frame():
         xy_px=np.empty((0, 2)), covariance_px2=np.empty((0, 2, 2)), flux_e=np.empty(0), flux_sigma_e=np.empty(0),
         snr=np.empty(0), saturated=np.empty(0, dtype=bool), psf_sigma_px=1.0,
         image_e=image, dead=np.zeros(image.shape, bool),
-        background_e=np.full(image.shape, STEP_E / 2, np.float32), noise_e=np.full(image.shape, NOISE_E, np.float32),
+        background=SmoothImage.of(np.full(image.shape, STEP_E / 2, np.float32)),
+        noise=SmoothImage.of(np.full(image.shape, NOISE_E, np.float32)),
     )  # fmt: skip
     return image, found, above, light
 

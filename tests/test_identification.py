@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from startrack.camera import Camera, Pinhole, load_camera
 from startrack.catalog import load_catalog
+from startrack.core.smooth_image import SmoothImage
 from startrack.core.types import Detections, Identification, NotIdentified, Stars
 from startrack.estimation.false_alarm import coincidence_probability, density_per_sr, log_p_value
 from startrack.frames import angle_between_rad
@@ -85,7 +86,7 @@ def make_detections(xy_px: np.ndarray, v_mag: np.ndarray, sigma_px: float) -> De
         xy_px=xy_px, covariance_px2=np.tile(sigma_px**2 * np.eye(2), (n, 1, 1)), flux_e=flux,
         flux_sigma_e=np.sqrt(flux + 1e8), snr=flux / np.sqrt(flux + 1e8), saturated=np.zeros(n, dtype=bool),
         psf_sigma_px=1.0, image_e=np.zeros((2, 2), np.float32), dead=np.zeros((2, 2), bool),
-        background_e=np.zeros((2, 2), np.float32), noise_e=np.ones((2, 2), np.float32),
+        background=SmoothImage.of(np.zeros((2, 2), np.float32)), noise=SmoothImage.of(np.ones((2, 2), np.float32)),
     )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ from startrack.camera import Camera, KannalaBrandt, Lens, Pinhole
 from startrack.catalog import load_catalog
 from startrack.chain import identify_blind as identify_picture
 from startrack.cli.main import main
+from startrack.core.smooth_image import SmoothImage
 from startrack.core.types import Detections, NotIdentified, Stars
 from startrack.estimation.attitude import solve_attitude
 from startrack.exposure import read_exposure
@@ -82,7 +83,7 @@ def detections(xy_px: np.ndarray, flux: np.ndarray, psf_sigma_px: float = 1.0) -
         xy_px=xy_px, covariance_px2=np.tile(0.04 * np.eye(2), (n, 1, 1)), flux_e=flux,
         flux_sigma_e=np.sqrt(np.abs(flux) + 1), snr=np.sqrt(np.abs(flux)), saturated=np.zeros(n, dtype=bool),
         psf_sigma_px=psf_sigma_px, image_e=np.zeros((2, 2), np.float32), dead=np.zeros((2, 2), bool),
-        background_e=np.zeros((2, 2), np.float32), noise_e=np.ones((2, 2), np.float32),
+        background=SmoothImage.of(np.zeros((2, 2), np.float32)), noise=SmoothImage.of(np.ones((2, 2), np.float32)),
     )  # fmt: skip
 
 

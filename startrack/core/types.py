@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from startrack.core.errors import BadInput, NoSolution, NotIdentified, NotLocated, TooFewStars
 from startrack.core.fix import Blocked, Clock, ClockError, Fix, Integrity, Mode, PositionPrior, ShownError, UnstatedFact
+from startrack.core.smooth_image import Image, SmoothImage
 from startrack.core.values import Array, Bools, Ints, Rows, Value, array
 
 __all__ = [
@@ -128,9 +130,19 @@ class Detections(Centroids):
     flux_sigma_e: Array = array("n")
     image_e: NDArray[np.float32]  # (H, W) the exposure [e], pedestal included
     dead: NDArray[np.bool_]  # (H, W) saturated and masked pixels
-    background_e: NDArray[np.float32]  # (H, W) smooth background [e], pedestal included
-    noise_e: NDArray[np.float32]  # (H, W) noise of one pixel [e]
+    background: SmoothImage  # [e], pedestal included
+    noise: SmoothImage  # of one pixel [e]
     mask: Mask | None = None  # of camera and image together; masked pixels of `image_e` hold their surroundings
+
+    @cached_property
+    def background_e(self) -> Image:
+        """The background (H, W) [e], pixel by pixel."""
+        return self.background.whole()
+
+    @cached_property
+    def noise_e(self) -> Image:
+        """The noise (H, W) of one pixel [e]."""
+        return self.noise.whole()
 
 
 @dataclass(frozen=True, kw_only=True)

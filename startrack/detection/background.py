@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from startrack.core.kernels import REORDERED_SUMS, njit
+from startrack.core.smooth_image import Image, SmoothImage
 
 BAND_PIXELS = 2**18
 BLOCK_PX = 16  # side of the blocks for a PSF up to 1.5 WIDEST_PX
@@ -20,14 +19,13 @@ MIN_NOISE_STEPS = 1.0  # noise in units of the smallest step below which the pix
 LOW_QUANTILE, HIGH_QUANTILE = 0.05, 0.65  # quantiles of the pixels between which the noise is measured
 COARSE_PX = BLOCK_PX // 4  # the local level is a mean over squares of this side
 CLIPPED_SIGMA = 2.5  # beyond, a value is no noise
-Image = NDArray[np.float32]
 # From -1/2 to 1/2 evenly, in an order without a pattern: 101 is a prime, so that each number comes once.
 ORDER = np.arange(BLOCK_PX**2) * 101 % BLOCK_PX**2
 PART_STEPS = ((ORDER - 0.5 * (len(ORDER) - 1)) / len(ORDER)).astype(np.float32).reshape(BLOCK_PX, BLOCK_PX)
 
 
-def background_and_noise(image: Image, quantum: float, sigma_px: float) -> tuple[Image, Image]:
-    """Background (H, W) and standard deviation of one pixel (H, W), both in the image's unit.
+def background_and_noise(image: Image, quantum: float, sigma_px: float) -> tuple[SmoothImage, SmoothImage]:
+    """Background and standard deviation of one pixel of an image (H, W), both in its unit.
 
     `quantum` is the smallest step of the image's values. Medians over blocks (larger for a wide PSF, so that no star
     fills one), median-filtered so that stars, tracks and saturated blobs drop out but a step (the skyline, the edge of
@@ -39,12 +37,12 @@ def background_and_noise(image: Image, quantum: float, sigma_px: float) -> tuple
     level, spread = _measure_blocks(image, side, quantum, _median_and_spread)
     level_map = cv2.medianBlur(level.reshape(shape), 3)
     spread_map = cv2.medianBlur(spread.reshape(shape), 5)
-    background = _enlarge(level_map, side, image.shape)
+    background = SmoothImage.from_blocks(level_map, side, image.shape)
     # Blocks between which the level changes by more than the noise: a slope within a block is no noise.
     rows, columns = np.abs(np.diff(level_map, axis=0)), np.abs(np.diff(level_map, axis=1))
     steep = [step > spread for step, spread in ((rows, spread_map[1:]), (columns, spread_map[:, 1:]))]
     if max(float(np.mean(s)) if s.size else 0.0 for s in steep) > STEEP_FRACTION:
-        _, spread = _measure_blocks(image - background, side, quantum, _median_and_spread)
+        _, spread = _measure_blocks(image - background.whole(), side, quantum, _median_and_spread)
         spread_map = np.minimum(spread_map, cv2.medianBlur(spread.reshape(shape), 5))
     rounding = quantum**2 / 12.0
     if np.median(spread_map) < MIN_NOISE_STEPS * quantum:
@@ -57,7 +55,7 @@ def background_and_noise(image: Image, quantum: float, sigma_px: float) -> tuple
         (spread,) = _measure_blocks(image, side, quantum, measure_spread)
         spread_map = cv2.medianBlur(spread.reshape(shape), 5)
     noise_map = np.sqrt(np.maximum(np.square(spread_map) - rounding, rounding), dtype=np.float32)
-    return background, _enlarge(noise_map, side, image.shape)
+    return background, SmoothImage.from_blocks(noise_map, side, image.shape)
 
 
 def block_side(sigma_px: float) -> int:
@@ -65,21 +63,18 @@ def block_side(sigma_px: float) -> int:
     return BLOCK_PX * max(1, round(sigma_px / WIDEST_PX))
 
 
-def local_level(standardised: Image, width_px: int) -> Image:
-    """Mean over a box of residuals in units of the noise, without stars: the background that block medians miss.
+def smooth_level(means: Image, width_px: int, shape: tuple[int, ...]) -> SmoothImage:
+    """Mean over a box of residuals (H, W), from their `clipped_means`: the background that block medians miss.
 
     Boxes are made of whole squares of COARSE_PX, which costs a third of the time and no more than their coarseness.
     """
-    height, width = standardised.shape
-    coarse = np.empty((-(-height // COARSE_PX), -(-width // COARSE_PX)), dtype=np.float32)
-    _clipped_means(standardised, coarse)
     side = coarse_width(width_px)
-    smooth = cv2.boxFilter(coarse, -1, (side, side), borderType=cv2.BORDER_REFLECT)
-    return _enlarge(smooth, COARSE_PX, standardised.shape)
+    smooth = cv2.boxFilter(means, -1, (side, side), borderType=cv2.BORDER_REFLECT)
+    return SmoothImage.from_blocks(np.asarray(smooth, dtype=np.float32), COARSE_PX, shape)
 
 
-@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS)
-def _clipped_means(values, means):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
+def clipped_means(values, means):  # type: ignore[no-untyped-def]
     """Fill means (h, w) with those of squares of COARSE_PX of the values (H, W), at the borders of what there is.
 
     Values beyond CLIPPED_SIGMA count as zero, not as the nearest value: stars are all on one side.
@@ -149,11 +144,16 @@ def _fill_blocks(image, side, part_steps, blocks):  # type: ignore[no-untyped-de
     """Fill blocks (rows, columns, BLOCK_PX, BLOCK_PX) with squares of two by two of the image, and the part-steps."""
     apart = 2 * side // BLOCK_PX  # the squares
     for i in range(blocks.shape[0]):
-        for j in range(blocks.shape[1]):
-            for r in range(BLOCK_PX):
-                row, left = i * side + r // 2 * apart + r % 2, j * side
-                for c in range(BLOCK_PX):
-                    blocks[i, j, r, c] = image[row, left + c // 2 * apart + c % 2] + part_steps[r, c]
+        for r in range(BLOCK_PX):
+            line, steps = image[i * side + r // 2 * apart + r % 2], part_steps[r]
+            for j in range(blocks.shape[1]):
+                block, part = blocks[i, j, r], line[j * side : (j + 1) * side]
+                if apart == 2:  # the whole block
+                    for c in range(BLOCK_PX):
+                        block[c] = part[c] + steps[c]
+                else:
+                    for c in range(BLOCK_PX):
+                        block[c] = part[c // 2 * apart + c % 2] + steps[c]
 
 
 @cache
@@ -170,13 +170,6 @@ def _scale_weights() -> Image:
     inside = expected != 0.0
     expected[inside] -= expected[inside].mean()
     return (expected / np.sum(np.square(expected))).astype(np.float32)
-
-
-def _enlarge(block_map: NDArray[Any], side: int, shape: tuple[int, ...]) -> Image:
-    """Bilinear interpolation between block centres to the full image."""
-    rows, columns = block_map.shape
-    full: Any = cv2.resize(block_map, (columns * side, rows * side), interpolation=cv2.INTER_LINEAR)
-    return full[: shape[0], : shape[1]]
 
 
 def smallest_step(image: Image) -> float:

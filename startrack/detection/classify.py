@@ -140,9 +140,9 @@ def noise_skewness(frame: Frame) -> float:
     """Skewness of the pixel noise, from the photons of the background; USUAL_SKEWNESS without a gain."""
     if frame.source_noise.per_unit != 1.0:  # not in electrons
         return USUAL_SKEWNESS
-    some = slice(None, None, 64), slice(None, None, 64)
-    noise = float(np.median(frame.noise[some]))
-    photons = min(max(float(np.median(frame.background[some])), 0.0), noise**2)
+    some = np.ix_(*(np.arange(0, length, 64) for length in frame.shape))
+    noise = float(np.median(frame.noise.at(*some)))
+    photons = min(max(float(np.median(frame.background.at(*some))), 0.0), noise**2)
     return min(photons / max(noise, 1e-6) ** 3, LARGEST_SKEWNESS)
 
 

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from startrack.camera import Camera
 from startrack.core.kernels import njit
+from startrack.core.smooth_image import Image
 from startrack.core.statistics import NORMAL_BY_MEDIAN
 from startrack.core.types import Array, Bools, Exposure, Ints, TooFewStars
-from startrack.detection.background import BLOCK_PX, CLIPPED_SIGMA, MIN_NOISE_STEPS, Image, smallest_step
+from startrack.detection.background import BLOCK_PX, CLIPPED_SIGMA, MIN_NOISE_STEPS, smallest_step
 
 PROBE_PX, STRIDE_PX = BLOCK_PX // 2, 4 * BLOCK_PX  # of the tiles looked at first: dead parts of 72 px hold one
 MOST_EQUAL = 0.8  # of the tiles: with more of one value the noise is removed

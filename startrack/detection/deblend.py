@@ -38,7 +38,7 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = 
     from scipy.spatial import cKDTree
 
     radius, centres = radius_for(sigma), peaks.centres
-    data, variance = frame.data(centres, radius), frame.variance(centres, radius)
+    data, variance = frame.cut_light(centres, radius)
     stamps = Stamps(data, variance, frame.usable_pixels(centres, radius), centres, peaks.surround)
     last = np.zeros_like(data)  # neighbours' signal subtracted in the last fit
     refined = 0 if known is None else len(known.flux)

@@ -9,8 +9,9 @@ from math import ceil
 import numpy as np
 
 from startrack.camera import Camera
+from startrack.core.smooth_image import Image, SmoothImage
 from startrack.core.types import Array, Bools, Detections, Exposure, Mask, TooFewStars
-from startrack.detection.background import Image, background_and_noise, block_side, smallest_step
+from startrack.detection.background import background_and_noise, block_side, smallest_step
 from startrack.detection.classify import (
     NOMINAL_HEIGHT,
     detection_threshold,
@@ -92,7 +93,7 @@ class Detector:
         frame, sigma, side = candidates.frame, candidates.sigma, candidates.side
         complete = partial(
             Detections, image_e=image, dead=dead if mask is None else dead | mask.masked,
-            background_e=frame.background, noise_e=frame.noise, mask=mask,
+            background=frame.background, noise=frame.noise, mask=mask,
         )  # fmt: skip
         centres = side * candidates.fitted.stamps.centres + side // 2
         if are_elongated(frame, centres) and (streaks := find_streaks(frame)) is not None:
@@ -117,7 +118,7 @@ class Detector:
         return complete(
             xy_px=stars.xy_px, covariance_px2=stars.covariance[:, :2, :2], flux_e=stars.flux,
             flux_sigma_e=np.sqrt(stars.covariance[:, 2, 2]), snr=stars.snr, saturated=saturated, psf_sigma_px=sigma,
-            background_e=frame.background, noise_e=frame.noise,
+            background=frame.background, noise=frame.noise,
         )  # fmt: skip
 
     def _candidates(self, source: _FrameSource, expected: float | None) -> _Candidates:
@@ -183,7 +184,7 @@ class _FrameSource:
         self, image: Image, quantum: float, dead: Bools | None, source_noise: SourceNoise, masked: Bools | None
     ) -> None:
         self.image, self.quantum, self.dead, self.source_noise, self.masked = image, quantum, dead, source_noise, masked
-        self._kept: dict[int, tuple[Image, Image]] = {}
+        self._kept: dict[int, tuple[SmoothImage, SmoothImage]] = {}
 
     def frame(self, sigma: float, found: Image | None = None) -> Frame:
         """The prepared frame; stars in `found` are excluded from background and noise."""

@@ -17,7 +17,7 @@ SQRT_2PI = math.sqrt(2.0 * math.pi)
 ERF_SCALE, A1, A2, A3, A4, A5 = float(ERF_T), *(float(a) for a in ERF_COEFFICIENTS)
 
 
-@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS)
+@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
 def fit_stamps(
     data, variance, usable, start_px, sigma_px, per_unit, model_error, rounds, surround, xy_px, values, covariance
 ) -> None:

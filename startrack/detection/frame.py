@@ -10,14 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
+from startrack.core.smooth_image import Image, SmoothImage
 from startrack.core.types import Bools, Exposure, Ints
-from startrack.detection.background import Image
+from startrack.detection.residual_kernel import cut_light, fill_residuals
 from startrack.psf import stamp_radius
 
 Pixels = NDArray[np.floating[Any]]  # stamps, in either precision
 SATURATED_FRACTION = 0.98
 MIN_BINNED_SIGMA_PX = 1.8  # PSF width from which the frame is binned
 RESIDUAL_FRACTION = 0.1  # of a known star's signal: error of its subtraction
+NOTHING = np.zeros((0, 0), dtype=np.float32)
 MODEL_ERROR = 0.03  # of a star's signal: difference between real PSFs and the Gaussian
 
 
@@ -34,8 +36,8 @@ class Frame:
     """One exposure prepared for detection."""
 
     image: Image
-    background: Image
-    noise: Image  # standard deviation of one pixel
+    background: SmoothImage
+    noise: SmoothImage  # standard deviation of one pixel
     dead: NDArray[np.bool_] | None  # saturated: no weight in fits; None where no pixel is
     source_noise: SourceNoise
     masked: Bools | None = None  # filled with its surroundings; a star that touches it is left out
@@ -46,22 +48,21 @@ class Frame:
         """(H, W)."""
         return self.image.shape[0], self.image.shape[1]
 
-    def standardise(self, rows: slice) -> Image:
-        """Rows minus background and known stars, in units of the noise of both."""
-        residual = self.image[rows] - self.background[rows]
-        if self.found is None:
-            return np.asarray(cv2.divide(residual, self.noise[rows], dst=residual))
-        own, found = self.source_noise, self.found[rows]
-        variance = np.square(self.noise[rows]) + found * (own.per_unit + RESIDUAL_FRACTION**2 * found)
-        return np.asarray((residual - found) / np.sqrt(variance))
+    def fill_residuals(self, out: Image, first: int, level: SmoothImage | None = None) -> None:
+        """Fill out (h, W) with the rows from `first` on, minus background and known stars, in units of both's noise.
 
-    def data(self, centres: Ints, radius: int) -> Image:
-        """Stamps (n, s, s) without their background."""
-        return cut_stamps(self.image, centres, radius) - cut_stamps(self.background, centres, radius)
+        `level`, in the same unit, is subtracted too.
+        """
+        found = NOTHING if self.found is None else self.found
+        more, side = (NOTHING, 1) if level is None else (level.rows, level.side)
+        fill_residuals(
+            self.image, self.background.rows, self.noise.rows, self.noise.side, found,
+            np.float32(self.source_noise.per_unit), np.float32(RESIDUAL_FRACTION), more, side, first, out,
+        )  # fmt: skip
 
-    def variance(self, centres: Ints, radius: int) -> Image:
-        """Stamps (n, s, s) of the pixels' variance without the sources' own signal."""
-        return np.square(cut_stamps(self.noise, centres, radius))
+    def cut_light(self, centres: Ints, radius: int) -> tuple[Image, Image]:
+        """Stamps (n, s, s) without their background, and their variance without the sources' own signal."""
+        return cut_light(self.image, self.background, self.noise, centres, radius)
 
     def usable_pixels(self, centres: Ints, radius: int) -> Bools | None:
         """Stamps (n, s, s) of the pixels that may be used; None where all may."""
@@ -75,10 +76,12 @@ def electrons(exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray
     """
     pixels_adu, ceiling = exposure.pixels_adu, exposure.saturation_adu or np.inf
     recorded_adu, correction = exposure.recorded_adu, exposure.correction
-    if camera is None or camera.sensor is None:
-        return pixels_adu, recorded_adu >= SATURATED_FRACTION * ceiling
-    sensor = camera.sensor
-    saturated = recorded_adu >= SATURATED_FRACTION * min(ceiling, sensor.saturation_adu)
+    sensor = None if camera is None else camera.sensor
+    highest = SATURATED_FRACTION * (ceiling if sensor is None else min(ceiling, sensor.saturation_adu))
+    is_dark = recorded_adu.max() < highest
+    saturated = np.zeros(recorded_adu.shape, dtype=np.bool_) if is_dark else recorded_adu >= highest
+    if sensor is None:
+        return pixels_adu, saturated
     if sensor.gain_e_per_adu == 1.0 and sensor.bias_adu == 0.0:
         return pixels_adu, saturated
     image = pixels_adu * np.float32(sensor.gain_e_per_adu)
@@ -125,8 +128,10 @@ def bin_frame(frame: Frame, side: int) -> Frame:
     found = None if frame.found is None else _sums(frame.found[whole], side)
     # Background and noise are smooth: one pixel of a square represents its mean.
     middle = slice(side // 2, height, side), slice(side // 2, width, side)
-    background = frame.background[middle] * np.float32(side**2)
-    noise = frame.noise[middle] * np.float32(side)
+    background, noise = (
+        SmoothImage(smooth.whole()[middle] * np.float32(factor), 1, height // side)
+        for smooth, factor in ((frame.background, side**2), (frame.noise, side))
+    )
     return Frame(_sums(frame.image[whole], side), background, noise, dead, frame.source_noise, found=found)
 
 

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.kernels import njit
+from startrack.core.smooth_image import Image, SmoothImage
 from startrack.core.types import Array, Ints
-from startrack.detection.background import COARSE_PX, coarse_width, local_level
-from startrack.detection.frame import Frame, Image, radius_for
+from startrack.detection.background import COARSE_PX, clipped_means, coarse_width, smooth_level
+from startrack.detection.frame import Frame, radius_for
 from startrack.psf import filter_kernel
 
-PEAK_ROWS = 320
+STRIP_PIXELS = 2**17  # that are looked at together
+NO_PIXELS = np.zeros((0, 0), dtype=np.bool_)
+RUN_PX = 32  # without a peak, that are passed over together
 MAX_STAMP_PIXELS = 2_500_000  # of all candidates together: bounds time and memory, for any content of the frame
 MAX_BLOBS = 1000  # saturated; the largest
 MAX_DEAD_GROUPED_PX = 20_000  # pixels up to which they are grouped without looking at the whole mask
@@ -45,25 +47,22 @@ def find_peaks(frame: Frame, sigma: float, lowest: float, most: int, known: Arra
     kernel = filter_kernel(sigma)
     squared = float(np.sum(kernel.astype(np.float64) ** 2))
     width = COARSE_PX * coarse_width(6 * margin + 1)
-    pad = COARSE_PX * -(-(width // 2 + 2 * COARSE_PX + len(kernel)) // COARSE_PX)
-    strips = [
-        _strip_peaks(frame, slice(top, min(top + PEAK_ROWS, frame.shape[0])), pad, kernel, lowest * squared, width)
-        for top in range(0, frame.shape[0], PEAK_ROWS)
-    ]
-    pixels, height, offset, level = (np.concatenate(part) for part in zip(*strips, strict=True))
+    level = _level_of_surroundings(frame, width)
+    pixels, height, offset = _peaks_above(frame, lowest * squared, kernel, level)
     chosen = np.argsort(-height, kind="stable")[:most]
-    peaks, start, surround = pixels[chosen], (pixels + offset)[chosen], level[chosen]
+    peaks, start = pixels[chosen], (pixels + offset)[chosen]
     blobs = _saturated_blobs(frame.dead, margin)
     if known is not None:
         # Peaks on a known star are the PSF's misfit.
         away = cKDTree(known).query(start)[0] > OWN_RESIDUE_SIGMAS * sigma
-        peaks, start, surround = peaks[away], start[away], surround[away]
+        peaks, start = peaks[away], start[away]
         blobs = np.concatenate([known, blobs])
-    noise = frame.noise[peaks[:, 1], peaks[:, 0]].astype(np.float64)
+    column, row = peaks.T
+    surround = level.at(row, column).astype(np.float64) * frame.noise.at(row, column)
     return Peaks(
         centres=np.concatenate([nearest_pixels(blobs, frame.shape, margin), peaks]),
         start_xy_px=np.concatenate([blobs, start]),
-        surround=np.concatenate([np.zeros(len(blobs)), surround * noise]),
+        surround=np.concatenate([np.zeros(len(blobs)), surround]),
         own_part=min(float(1.0 / squared**2) / width**2, 0.5),
     )
 
@@ -73,82 +72,97 @@ def nearest_pixels(xy_px: Array, shape: tuple[int, int], margin: int) -> Ints:
     return np.clip(np.rint(xy_px).astype(np.int64), margin, np.array([shape[1], shape[0]]) - 1 - margin)
 
 
-def bright_pixels(frame: Frame, lowest: float, most: int, margin: int) -> Ints:
-    """Pixels (n, 2) brighter than `lowest` sigma and than their neighbours: the highest, `margin` (1 or more) inside.
+def bright_pixels(frame: Frame, lowest: float, most: int) -> Ints:
+    """Pixels (n, 2) brighter than `lowest` sigma and than their neighbours: the highest, none at the border.
 
     Hot pixels, none of whose neighbours is bright too, are left out.
     """
-    height, width = frame.shape
-    found, level = [], []
-    for top in range(margin, height - margin, PEAK_ROWS):
-        rows = slice(top, min(top + PEAK_ROWS, height - margin))
-        limit = cv2.scaleAdd(frame.noise[rows], lowest, frame.background[rows])
-        row, column = np.divmod(np.flatnonzero(frame.image[rows] > limit), width)
-        inside = (column >= margin) & (column < width - margin)
-        pixels = np.stack([column, row + top], axis=1)[inside]
-        light = frame.data(pixels, 1) / frame.noise[pixels[:, 1], pixels[:, 0], None, None]
-        own = light[:, 1, 1]
-        highest = (own[:, None, None] >= light).all(axis=(1, 2))
-        beside = np.maximum(light[:, 1, ::2].max(axis=1), light[:, ::2, 1].max(axis=1))
-        highest &= beside > np.float32(ONE_PIXEL_FRACTION) * own
-        found.append(pixels[highest])
-        level.append(own[highest])
-    pixels = np.concatenate(found) if found else np.zeros((0, 2), dtype=np.int64)
-    if not len(pixels):
-        return pixels
-    if frame.dead is not None:
-        alive = ~frame.dead[pixels[:, 1], pixels[:, 0]]
-        pixels, level = pixels[alive], [np.concatenate(level)[alive]]
-    return pixels[np.argsort(-np.concatenate(level), kind="stable")[:most]]
+    pixels, level, _ = _peaks_above(frame, lowest)
+    light, _ = frame.cut_light(pixels, 1)
+    beside = np.maximum(light[:, 1, ::2].max(axis=1), light[:, ::2, 1].max(axis=1))
+    pixels, level = (values[beside > np.float32(ONE_PIXEL_FRACTION) * light[:, 1, 1]] for values in (pixels, level))
+    return pixels[np.argsort(-level, kind="stable")[:most]]
 
 
-def _strip_peaks(
-    frame: Frame, rows: slice, pad: int, kernel: Image, lowest: float, width: int
-) -> tuple[Ints, Array, Array, Array]:
-    """Peaks of some rows: pixels (n, 2), heights, offsets (n, 2) of the tops [px], levels of the surroundings [sigma].
+def _level_of_surroundings(frame: Frame, width: int) -> SmoothImage:
+    """Level of the background that block medians miss, in units of the noise: the mean over boxes of a width [px]."""
+    means = np.empty([-(-length // COARSE_PX) for length in frame.shape], dtype=np.float32)
+    rows = _rows_at_a_time(frame)
+    residuals = np.empty((rows, frame.shape[1]), dtype=np.float32)
+    for top in range(0, frame.shape[0], rows):
+        strip = residuals[: frame.shape[0] - top]
+        frame.fill_residuals(strip, top)
+        clipped_means(strip, means[top // COARSE_PX : -(-(top + rows) // COARSE_PX)])
+    return smooth_level(means, width, frame.shape)
 
-    Strip by strip everything stays in the processor's cache.
+
+def _rows_at_a_time(frame: Frame) -> int:
+    """Rows of the frame that stay in the processor's cache: whole squares of COARSE_PX."""
+    return COARSE_PX * max(1, STRIP_PIXELS // (COARSE_PX * frame.shape[1]))
+
+
+def _peaks_above(
+    frame: Frame, lowest: float, kernel: Image | None = None, level: SmoothImage | None = None
+) -> tuple[Ints, Array, Array]:
+    """Local maxima above `lowest` of the residuals minus `level`, filtered by a `kernel` in x and in y.
+
+    Returns their pixels (n, 2), heights, and the offsets (n, 2) [px] of the tops of parabolas through their neighbours.
+    Those that need light from beyond the border are left out.
     """
-    first = max(rows.start - pad, 0)
-    standardised = frame.standardise(slice(first, rows.stop + pad))
-    level = local_level(standardised, width)
-    above = cv2.subtract(standardised, level, dst=standardised)
-    filtered = cv2.sepFilter2D(above, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT)
-    own = filtered[rows.start - first : rows.stop - first]
-    row, column = np.divmod(np.flatnonzero(own > np.float32(lowest)), own.shape[1])
-    row += rows.start
-    (height, right), margin = frame.shape, len(kernel) // 2 + 1
-    good = (row >= margin) & (row < height - margin) & (column >= margin) & (column < right - margin)
-    if frame.dead is not None:
-        good &= ~frame.dead[row, column]
-    row -= first
-    _require_highest(filtered, row, column, good)
-    row, column = row[good], column[good]
-    offset = _parabola(filtered, row, column)
-    pixels = np.stack([column, row + first], axis=1).astype(np.int64)
-    return pixels, filtered[row, column].astype(np.float64), offset, level[row, column].astype(np.float64)
+    margin = 1 + (0 if kernel is None else len(kernel) // 2)
+    (height, width), rows = frame.shape, _rows_at_a_time(frame)
+    residuals, filtered = np.empty((2, rows + 2 * margin, width), dtype=np.float32)
+    peaks = np.empty((rows * width, 5), dtype=np.float32)
+    dead = NO_PIXELS if frame.dead is None else frame.dead
+    found = [peaks[:0]]
+    for first in range(0, height - 2 * margin, rows):
+        strip = residuals[: height - first]
+        frame.fill_residuals(strip, first, level)
+        if kernel is not None:
+            cv2.sepFilter2D(strip, -1, kernel, kernel, dst=filtered[: len(strip)])
+            strip = filtered[: len(strip)]
+        found.append(peaks[: _collect_peaks(strip, np.float32(lowest), margin, dead, first, peaks)].copy())
+    column, row, top, x, y = np.concatenate(found).astype(np.float64).T
+    return np.stack([column, row], axis=1).astype(np.int64), top, np.stack([x, y], axis=1)
 
 
-@njit(cache=True, nogil=True)
-def _require_highest(image, row, column, good):  # type: ignore[no-untyped-def]
-    """Clear those of good (n,) whose pixel any of its eight neighbours exceeds."""
-    for k in range(len(good)):
-        if good[k]:
-            y, x = row[k], column[k]
-            for i in range(y - 1, y + 2):
-                for j in range(x - 1, x + 2):
-                    good[k] = good[k] and image[y, x] >= image[i, j]
+@njit(cache=True, nogil=True, error_model="numpy")
+def _collect_peaks(image, lowest, margin, dead, first, peaks):  # type: ignore[no-untyped-def]
+    """Fill peaks (n, 5) with column, row, height and offsets of the local maxima `margin` inside; return their number.
+
+    The rows of the image are the frame's from `first` on. Runs of pixels below `lowest` are passed over as one.
+    """
+    count, width = 0, image.shape[1]
+    for i in range(margin, image.shape[0] - margin):
+        line = image[i]
+        for start in range(margin, width - margin, RUN_PX):
+            end = min(start + RUN_PX, width - margin)
+            above = np.int32(0)
+            for j in range(start, end):
+                above |= np.int32(line[j] > lowest)
+            if above == 0:
+                continue
+            for j in range(start, end):
+                value = line[j]
+                if not value > lowest or (len(dead) and dead[first + i, j]):
+                    continue
+                highest = True
+                for k in range(i - 1, i + 2):
+                    for m in range(j - 1, j + 2):
+                        highest = highest and value >= image[k, m]
+                if highest:
+                    peaks[count, 0], peaks[count, 1], peaks[count, 2] = j, first + i, value
+                    peaks[count, 3] = _top(line[j - 1], value, line[j + 1])
+                    peaks[count, 4] = _top(image[i - 1, j], value, image[i + 1, j])
+                    count += 1
+    return count
 
 
-def _parabola(filtered: Any, y: Ints, x: Ints) -> Array:
-    """Offsets (n, 2) [px] of the top of parabolas through the peaks and their neighbours in x and in y."""
-    offset = np.zeros((len(x), 2))
-    middle = filtered[y, x]
-    neighbours = ((filtered[y, x - 1], filtered[y, x + 1]), (filtered[y - 1, x], filtered[y + 1, x]))
-    for axis, (low, high) in enumerate(neighbours):
-        bend = low - 2 * middle + high
-        offset[:, axis] = np.divide(0.5 * (low - high), bend, out=np.zeros_like(bend), where=bend < 0)
-    return np.clip(offset, -0.5, 0.5)
+@njit(inline="always")
+def _top(low, middle, high):  # type: ignore[no-untyped-def]
+    """Offset [px] of the top of the parabola through three neighbours, at most half a pixel."""
+    bend = low - np.float32(2.0) * middle + high
+    return min(max(np.float32(0.5) * (low - high) / bend, -0.5), 0.5) if bend < 0.0 else 0.0
 
 
 def _saturated_blobs(dead: NDArray[np.bool_] | None, margin: int) -> Array:

@@ -42,8 +42,8 @@ def measure_psf_width(frame: Frame, centres: Ints, fits: PointFits, sigma: float
     if len(bright) < MIN_BRIGHT_SOURCES:
         return None
     pixels = centres[bright]
-    data = frame.data(pixels, radius)
-    weights = 1.0 / (frame.variance(pixels, radius) + np.float32(frame.source_noise.per_unit) * np.maximum(data, 0.0))
+    data, variance = frame.cut_light(pixels, radius)
+    weights = 1.0 / (variance + np.float32(frame.source_noise.per_unit) * np.maximum(data, 0.0))
     offset = fits.xy_px[bright] - pixels
     widths, inside, part = fit_widths(data, weights, offset, sigma * NEAR_WIDTHS)
     if inside.mean() < 1.0 - MAX_END_FRACTION:
@@ -100,7 +100,7 @@ def guess_psf_width(prepare: Callable[[float], Frame], sigma: float) -> float:
     `prepare` returns the frame with the background for a given PSF width.
     """
     frame = prepare(sigma)
-    pixels = bright_pixels(frame, BRIGHT_PIXEL_SIGMAS, MAX_BRIGHT_PIXELS, 1)
+    pixels = bright_pixels(frame, BRIGHT_PIXEL_SIGMAS, MAX_BRIGHT_PIXELS)
     if len(pixels) < MIN_BRIGHT_PIXELS:  # too few stand out by one pixel
         found = find_peaks(frame, sigma, WIDTH_SNR, MAX_BRIGHT_PIXELS).centres
         pixels = found if len(found) > len(pixels) else pixels
@@ -112,7 +112,7 @@ def guess_psf_width(prepare: Callable[[float], Frame], sigma: float) -> float:
         centres = pixels[((pixels >= radius) & (pixels <= last - radius)).all(axis=1)]
         if not len(centres):
             break
-        data, variance = frame.data(centres, radius), frame.variance(centres, radius)
+        data, variance = frame.cut_light(centres, radius)
         stamps = Stamps(data, variance, frame.usable_pixels(centres, radius), centres, np.zeros(len(centres)))
         fits = fit_points(stamps, centres.astype(np.float64), sigma, frame.source_noise, 0.0, FIT_ROUNDS_AGAIN)
         measured = measure_psf_width(frame, centres, fits, sigma)
@@ -131,7 +131,7 @@ def _width_by_fall(frame: Frame, pixels: Ints) -> float | None:
     For a Gaussian of variance s^2 the product of the values left and right of a pixel is the square of the pixel's
     value times exp(-1 / s^2), independent of the centre.
     """
-    signal = np.maximum(frame.data(pixels, 1), 0.0)
+    signal = np.maximum(frame.cut_light(pixels, 1)[0], 0.0)
     peak = np.maximum(signal[:, 1, 1], 1e-9)
     beside = np.stack([signal[:, 1, 0], signal[:, 1, 2], signal[:, 0, 1], signal[:, 2, 1]], axis=1) / peak[:, None]
     falls = -0.5 * float(np.median(np.log(np.maximum(beside, MIN_BESIDE)).sum(axis=1)))

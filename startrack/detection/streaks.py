@@ -49,8 +49,8 @@ def are_elongated(frame: Frame, centres: Ints) -> bool:
     centres = centres[margin >= ELONGATION_RADIUS_PX][:MAX_BRIGHT_SOURCES]
     if len(centres) < MIN_STREAKS:
         return False
-    signal, noise = frame.data(centres, ELONGATION_RADIUS_PX), np.sqrt(frame.variance(centres, ELONGATION_RADIUS_PX))
-    signal = np.where(signal > ELONGATION_SIGMAS * noise, signal, 0.0)
+    signal, variance = frame.cut_light(centres, ELONGATION_RADIUS_PX)
+    signal = np.where(signal > ELONGATION_SIGMAS * np.sqrt(variance), signal, 0.0)
     offset = np.arange(-ELONGATION_RADIUS_PX, ELONGATION_RADIUS_PX + 1)
     x, y = np.meshgrid(offset, offset)
     total = np.maximum(signal.sum(axis=(1, 2)), 1e-9)
@@ -68,7 +68,8 @@ def find_streaks(frame: Frame) -> Streaks | None:
     and are rejected.
     """
     height, width = frame.shape
-    whole = frame.standardise(slice(0, height))
+    whole = np.empty_like(frame.image)
+    frame.fill_residuals(whole, 0)
     if frame.dead is not None:
         whole = np.where(frame.dead, np.float32(50.0), whole)
     smooth = cv2.GaussianBlur(whole, (0, 0), SMOOTH_PX)
@@ -79,8 +80,8 @@ def find_streaks(frame: Frame) -> Streaks | None:
     off_border = (left > 1) & (top > 1) & (left + wide < width - 1) & (top + high < height - 1)
     rows, columns = np.nonzero(cv2.dilate(mask, np.ones((3, 3), np.uint8)))
     label = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8))[rows, columns].astype(np.int64)
-    signal = (frame.image[rows, columns] - frame.background[rows, columns]).astype(np.float64)
-    variance = np.square(frame.noise[rows, columns].astype(np.float64))
+    signal = (frame.image[rows, columns] - frame.background.at(rows, columns)).astype(np.float64)
+    variance = np.square(frame.noise.at(rows, columns).astype(np.float64))
     variance += frame.source_noise.per_unit * np.maximum(signal, 0.0)
     blobs = _moments(label, np.stack([columns, rows], axis=1).astype(np.float64), signal, variance, count)
     flux, flux_sigma, xy, spread, covariance = blobs

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from startrack.camera import Camera
 from startrack.core.kernels import njit
+from startrack.core.smooth_image import SmoothImage
 from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Bools, Detections, Ints
 from startrack.evidence.expected_stars import SURE_SIGMAS
@@ -117,7 +118,7 @@ def measure_sky_step(detections: Detections, camera: Camera, R_cam_enu: Array, h
     if all(map(len, sides)):
         (sky, sky_sigma), (ground, ground_sigma) = (_grouped_median(side) for side in sides)
         light_e, sigma_e = sky - ground, float(np.hypot(sky_sigma, ground_sigma))
-    noise_e = float(np.median(detections.noise_e[rows, columns]))
+    noise_e = float(np.median(detections.noise.at(rows, columns)))
     return SkyStep(horizon, light_e, sigma_e, noise_e, float(np.median(angle[inside.any(axis=0)])))
 
 
@@ -148,7 +149,7 @@ def subtract_sky_step(detections: Detections, camera: Camera, R_cam_enu: Array, 
     ratio = _medians(np.abs(rest - profile) / spread, across, steps) / MEDIAN_ABS_NORMAL
     ratio = np.where(ratio > 0, ratio, 1.0)
     noise.reshape(-1)[pixel] *= ratio[across].astype(np.float32)
-    return replace(detections, background_e=background, noise_e=noise)
+    return replace(detections, background=SmoothImage.of(background), noise=SmoothImage.of(noise))
 
 
 def reliable_azimuths(

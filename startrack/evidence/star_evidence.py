@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
+from startrack.core.smooth_image import SmoothImage
 from startrack.core.types import Array, Body, Bools, Detections, Evidence, Ints, NoSolution, Stars
 from startrack.evidence.expected_stars import BAD_PIXELS, USABLE, ExpectedStars, FluxScale, expect_stars
 from startrack.evidence.photometry import Photometry, Sources, measure
@@ -130,7 +131,8 @@ class StarEvidence:
 
 def filtered_noise_e(detections: Detections) -> float:
     """Typical noise [e] of a star's flux: that of a pixel of the `detections`, through the matched filter."""
-    pixel_e = float(np.median(detections.noise_e[::NOISE_BLOCK_PX, ::NOISE_BLOCK_PX]))
+    some = np.ix_(*(np.arange(0, length, NOISE_BLOCK_PX) for length in detections.image_e.shape))
+    pixel_e = float(np.median(detections.noise.at(*some)))
     return pixel_e * float(np.sqrt(noise_area_px(detections.psf_sigma_px)))
 
 
@@ -140,7 +142,7 @@ def _guess_visibility(detections: Detections, sources: Sources) -> Array:
     It weights their light in their neighbours' measurements; one half for the faint ones.
     """
     shining = np.full(len(sources.flux_e), 0.5)
-    noise_e = detections.noise_e[tuple(np.rint(sources.xy_px).astype(int).T[::-1])]
+    noise_e = detections.noise.at(*np.rint(sources.xy_px).astype(int).T[::-1])
     area_px = noise_area_px(detections.psf_sigma_px)
     bright = np.flatnonzero(sources.flux_e > DECIDABLE_SNR * noise_e * np.sqrt(area_px))
     if len(bright):
@@ -215,7 +217,7 @@ def measure_noise(detections: Detections) -> Detections:
     spread = cv2.medianBlur(kept.std(axis=1).astype(np.float32).reshape(rows, columns), 5)
     usual = float(np.median(spread[spread > 0])) if spread.any() else 1.0
     noise: NDArray[np.float32] = cv2.resize(np.maximum(spread, SMALLEST_NOISE * usual), padded.shape[::-1])  # type: ignore[assignment]
-    return replace(detections, noise_e=np.ascontiguousarray(noise[:height, :width]))
+    return replace(detections, noise=SmoothImage.of(np.ascontiguousarray(noise[:height, :width])))
 
 
 def measure_response(light: StarPhotometry) -> DamagedResponse:

@@ -86,10 +86,12 @@ def label_modes(points_m: Array, share: Array) -> Ints:
         label = link_points(points, max(gap, 1e-3))
     mass = np.bincount(label, weights=weight)
     heavy = [int(i) for i in np.argsort(-mass, kind="stable") if mass[i] > NEGLIGIBLE_MODE] or [int(np.argmax(mass))]
+    if len(heavy) == 1:
+        return np.zeros(len(points_m), dtype=np.int64)
     from scipy.spatial import cKDTree
 
-    trees = [cKDTree(points[label == i]).query(points_m)[0] for i in heavy]
-    return np.asarray(np.argmin(trees, axis=0))
+    away = [cKDTree(points[label == i]).query(points_m)[0] for i in heavy]
+    return np.asarray(np.argmin(away, axis=0))
 
 
 def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, dropped_probability: float) -> Fix:

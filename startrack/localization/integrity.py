@@ -85,12 +85,12 @@ def _sector_logs(model: SkylineModel, parameters: Array, offsets: Array, clear: 
 
 @njit(cache=True, nogil=True)
 def clear_logs(profiles, shifts, clear):
-    found, cell = np.empty(shifts.shape), profiles.first[:-1].copy()
-    for i in range(shifts.shape[0]):
-        fill_clear_emissions(profiles, shifts[i], cell, found[i])
-        for s in range(shifts.shape[1]):
-            found[i, s] = log(clear[s] * found[i, s] + 1.0 - clear[s])
-    return found
+    found = np.empty(shifts.T.shape)
+    fill_clear_emissions(profiles, shifts.T.copy(), found)
+    for s in range(found.shape[0]):
+        for i in range(found.shape[1]):
+            found[s, i] = log(clear[s] * found[s, i] + 1.0 - clear[s])
+    return found.T
 
 
 def _moments(offsets_m: Array, logs: Array) -> tuple[Array, Array]:

@@ -24,6 +24,7 @@ START = 0.03 / SECTORS  # of an obstacle, a sector: 0.03 obstacles around the ci
 STOP, KEEP, NEAR = 0.05, 0.84, 0.14  # an obstacle ends; else its level stays, or goes to a neighbour
 WRONG_SECTOR = 1e-3  # probability that the skyline of a sector is anywhere
 NODES = 33  # of shifts, at which the emissions of the levels are prepared
+BLOCK = 64  # points that are computed together
 CLEAR = 1e-3  # least probability of a state over which the circle is closed
 
 
@@ -47,13 +48,13 @@ class Levels(NamedTuple):
     """Emissions of the risen states at shifts of the map's skyline, prepared on nodes closer to each other about 0."""
 
     reach: Array  # (SECTORS,) largest shift
-    table: Array  # (SECTORS, NODES, STATES - 1), float32
+    table: Array  # (SECTORS, STATES - 1, NODES), float32
 
 
 @njit(cache=True, nogil=True)
 def prepare_levels(profiles, reach):
-    """Emissions (SECTORS, NODES, STATES - 1) of the risen states at shifts up to `reach` (SECTORS,)."""
-    table, to = np.zeros((len(reach), NODES, STATES - 1), dtype=np.float32), np.empty(len(LEVELS_RAD))
+    """Emissions (SECTORS, STATES - 1, NODES) of the risen states at shifts up to `reach` (SECTORS,)."""
+    table, to = np.zeros((len(reach), STATES - 1, NODES), dtype=np.float32), np.empty(len(LEVELS_RAD))
     for s in range(len(reach)):
         for i in range(NODES):
             u = 2.0 * i / (NODES - 1) - 1.0
@@ -62,8 +63,8 @@ def prepare_levels(profiles, reach):
                 to[j] = integral_to(profiles, s, shift + LEVELS_RAD[j])
             for j in range(STATES - 2):
                 mean = (to[j + 1] - to[j]) / (LEVELS_RAD[j + 1] - LEVELS_RAD[j])
-                table[s, i, j] = (1.0 - WRONG_SECTOR) * mean + WRONG_SECTOR
-            table[s, i, STATES - 2] = (1.0 - WRONG_SECTOR) * exp(-profiles.free[s]) + WRONG_SECTOR
+                table[s, j, i] = (1.0 - WRONG_SECTOR) * mean + WRONG_SECTOR
+            table[s, STATES - 2, i] = (1.0 - WRONG_SECTOR) * exp(-profiles.free[s]) + WRONG_SECTOR
     return table
 
 
@@ -98,84 +99,98 @@ def emissions(profiles, shift):
 def chain_log_likelihoods(profiles, levels, moves, shifts, cut, closing, found):
     """Fill found (n,) with the log-likelihoods at shifts (n, SECTORS) of the map's skyline.
 
-    The circle is cut at the sector `cut` and closed over its states `closing`. The risen states are held with a zero
-    on either side, so that all have two neighbours; in float32, which is right to 1e-5 nats.
+    The circle is cut at the sector `cut` and closed over its states `closing`. Blocks of points go from sector to
+    sector together, so that processors compute several points at a time. The risen states are held with a zero on
+    either side; in float32, which is right to 1e-5 nats.
     """
-    sectors, risen_states = shifts.shape[1], STATES - 1
-    a, b = np.zeros(STATES + 1, dtype=np.float32), np.zeros(STATES + 1, dtype=np.float32)
+    count, sectors = shifts.shape
     start, stop, jump = np.float32(moves.start), np.float32(moves.stop), np.float32(moves.jump)
-    keep, near, stay = np.float32(moves.keep), np.float32(moves.near), np.float32(1.0 - moves.start * risen_states)
-    cell = profiles.first[:-1].copy()  # of the last point: that of the next one is near
-    reach, table, clear_emissions = levels.reach, levels.table, np.empty(sectors)
-    for p in range(len(shifts)):
-        fill_clear_emissions(profiles, shifts[p], cell, clear_emissions)
-        total = -np.inf
+    keep, near, stay = np.float32(moves.keep), np.float32(moves.near), np.float32(1.0 - moves.start * (STATES - 1))
+    risen, moved = np.zeros((STATES + 1, BLOCK), dtype=np.float32), np.zeros((STATES + 1, BLOCK), dtype=np.float32)
+    clear, total = np.empty(BLOCK, dtype=np.float32), np.empty(BLOCK, dtype=np.float32)
+    part, node = np.empty(BLOCK, dtype=np.float32), np.empty(BLOCK, dtype=np.int64)
+    reach, table = levels.reach, levels.table
+    logs, product, clear_emissions = np.empty(BLOCK), np.empty(BLOCK), np.empty((sectors, BLOCK))
+    for first in range(0, count, BLOCK):
+        shift = shifts[first : first + BLOCK].T.copy()
+        points = shift.shape[1]
+        fill_clear_emissions(profiles, shift, clear_emissions)
+        found[first : first + BLOCK] = -np.inf
         for k in closing:
-            logs, product, clear = 0.0, 1.0, np.float32(0.0)
-            for j in range(STATES + 1):
-                a[j] = 0.0
+            clear[:], logs[:], product[:] = 0.0, 0.0, 1.0
+            risen[:], moved[:] = 0.0, 0.0
             for step in range(sectors + 1):
                 s = cut + step if cut + step < sectors else cut + step - sectors
                 if step > 0:
-                    risen = np.float32(0.0)
-                    for j in range(risen_states):
-                        risen += a[j + 1]
-                    common = start * clear + jump * risen
-                    clear = stay * clear + stop * risen
-                    for j in range(risen_states):
-                        b[j + 1] = common + keep * a[j + 1] + near * (a[j] + a[j + 2])
-                    b[2] += near * a[1]  # the outermost levels have one neighbour, to which they go twice as often
-                    b[risen_states - 1] += near * a[risen_states]
+                    total[:] = 0.0
+                    for j in range(1, STATES):
+                        for p in range(points):
+                            total[p] += risen[j, p]
+                    for j in range(1, STATES):
+                        for p in range(points):
+                            common = start * clear[p] + jump * total[p]
+                            moved[j, p] = common + keep * risen[j, p] + near * (risen[j - 1, p] + risen[j + 1, p])
+                    for p in range(points):  # the outermost levels have one neighbour, to which they go twice as often
+                        moved[2, p] += near * risen[1, p]
+                        moved[STATES - 2, p] += near * risen[STATES - 1, p]
+                        clear[p] = stay * clear[p] + stop * total[p]
                 if step == sectors:
                     break
-                d = shifts[p, s]
-                emission = np.float32(clear_emissions[s])
-                u = sqrt(min(abs(d) / reach[s], 0.999))
-                at = ((u if d > 0.0 else -u) + 1.0) * 0.5 * (NODES - 1)
-                i = int(at)
-                part = np.float32(at - i)
+                for p in range(points):
+                    d = shift[s, p]
+                    u = sqrt(min(abs(d) / reach[s], 0.999))
+                    at = ((u if d > 0.0 else -u) + 1.0) * 0.5 * (NODES - 1)
+                    node[p] = int(at)
+                    part[p] = at - node[p]
                 if step == 0:
-                    clear = emission if k == 0 else np.float32(0.0)
-                    if k > 0:
-                        a[k] = table[s, i, k - 1] + part * (table[s, i + 1, k - 1] - table[s, i, k - 1])
-                    continue
-                clear *= emission
-                for j in range(risen_states):
-                    a[j + 1] = b[j + 1] * (table[s, i, j] + part * (table[s, i + 1, j] - table[s, i, j]))
-                if step % 4 == 0:
-                    scale = clear
-                    for j in range(risen_states):
-                        scale += a[j + 1]
-                    product *= scale
-                    clear /= scale
-                    for j in range(risen_states):
-                        a[j + 1] /= scale
-                    if step % 32 == 0:
-                        logs += log(product)
-                        product = 1.0
-            value = logs + log(product) + log(max(clear if k == 0 else b[k], np.float32(1e-37)))
-            top = max(value, total)
-            total = top + log(exp(value - top) + exp(total - top))
-        found[p] = total
+                    clear[:] = 1.0 if k == 0 else 0.0
+                    moved[k] = 1.0 if k > 0 else 0.0
+                for j in range(1, STATES):
+                    emission = table[s, j - 1]
+                    for p in range(points):
+                        low = emission[node[p]]
+                        risen[j, p] = moved[j, p] * (low + part[p] * (emission[node[p] + 1] - low))
+                for p in range(points):
+                    clear[p] *= clear_emissions[s, p]
+                if step % 4 == 3:
+                    total[:] = clear
+                    for j in range(1, STATES):
+                        for p in range(points):
+                            total[p] += risen[j, p]
+                    for p in range(points):
+                        product[p] *= total[p]
+                        clear[p] /= total[p]
+                    for j in range(1, STATES):
+                        for p in range(points):
+                            risen[j, p] /= total[p]
+                if step % 32 == 31:
+                    for p in range(points):
+                        logs[p] += log(product[p])
+                        product[p] = 1.0
+            last = clear if k == 0 else moved[k]
+            for p in range(points):
+                value = logs[p] + log(product[p]) + log(max(last[p], np.float32(1e-37)))
+                top = max(value, found[first + p])
+                found[first + p] = top + log(exp(value - top) + exp(found[first + p] - top))
 
 
 @njit(cache=True, nogil=True)
-def fill_clear_emissions(profiles, shift, cell, found):
-    """Fill found (SECTORS,) with `clear_emission` at shifts (SECTORS,), searched from the last `cell` of each on.
+def fill_clear_emissions(profiles, shifts, found):
+    """Fill found (SECTORS, n) with `clear_emission` at shifts (SECTORS, n).
 
     The arrays are taken out of the tuple once: numba counts references at each access, which took two thirds of the
     time.
     """
-    first, x, left, right, bend, _, free = profiles
-    for s in range(len(shift)):
-        k, at = cell[s], shift[s]
-        if at >= x[k + 1] or at < x[k]:
-            k = cell[s] = cell_at(first, x, s, at, 0)
-        value, rise = left[k], right[k] - left[k]
-        if rise != 0.0 or bend[k] != 0.0:
-            u = min(max((at - x[k]) / (x[k + 1] - x[k]), 0.0), 1.0)
-            value += u * rise + u * (1.0 - u) * bend[k]
-        found[s] = (1.0 - WRONG_SECTOR) * exp(value - free[s]) + WRONG_SECTOR
+    _, x, left, right, bend, _, free, guide = profiles
+    for s in range(len(shifts)):
+        for p in range(shifts.shape[1]):
+            at = shifts[s, p]
+            k = cell_at(x, guide, s, at)
+            value, rise = left[k], right[k] - left[k]
+            if rise != 0.0 or bend[k] != 0.0:
+                u = min(max((at - x[k]) / (x[k + 1] - x[k]), 0.0), 1.0)
+                value += u * rise + u * (1.0 - u) * bend[k]
+            found[s, p] = (1.0 - WRONG_SECTOR) * exp(value - free[s]) + WRONG_SECTOR
 
 
 def transitions(moves: Moves = MOVES) -> Array:

@@ -41,7 +41,7 @@ def measure_moments(profiles: Profiles) -> SectorMoments:
 def _fill_moments(profiles, reach, mean, variance):
     for s in range(len(mean)):
         last = profiles.first[s + 1] - 1
-        begin = cell_at(profiles.first, profiles.x, s, -reach, 0)
+        begin = cell_at(profiles.x, profiles.guide, s, -reach)
         top, k = -np.inf, begin
         while k < last and profiles.x[k] < reach:
             top = max(top, profiles.left[k], profiles.right[k])

@@ -9,7 +9,7 @@ all heights of the window: the evidence for x against a skyline that is anywhere
 from __future__ import annotations
 
 # mypy: disable-error-code="no-untyped-def"
-from math import erf, exp, sqrt
+from math import copysign, erf, exp, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +24,7 @@ ROW_NATS = 6.0  # most that one star counts: one in 400 is variable, misnamed or
 SKY_STEP_PX = 0.1  # of the edge's width: cells of the sky's light, quadratic in each, right to 0.02 nats
 SOFT_BINS = np.linspace(-3.5, 3.5, 15)  # of a normal error of the map, whose mean is taken bin by bin
 SOFT_REACH_RAD = np.radians(0.3)  # beside EDGE_SIGMAS, about the map's skyline, where its error is averaged over
+GUIDE = 256  # heights of the guide to the cells, to each side
 LEAST_MEAN = 1e-8  # of exp (F - R) over such an error: differences of the integral have no more digits
 SOFT_STEP, MOST_SOFT_CELLS = 0.5, 120.0  # of the error: cells of the average; at most, to each side
 
@@ -41,6 +42,7 @@ class Profiles(NamedTuple):
     bend: Array  # (m,) 4 (F in the middle - mean of both)
     integral: Array  # (m,) of exp(F - free) from the lowest height to x
     free: Array  # (SECTORS,) R
+    guide: Ints  # (SECTORS, 2 GUIDE + 1) cells of heights closer to each other about 0, where a search begins
 
 
 def profiles_of(rows: Evidence, above_rad: Array, map_sigma_rad: Array) -> Profiles:
@@ -142,7 +144,7 @@ def _fill_cells(above, llr, starts, sky_low, sky_step, cell, sky_values):
 
 @njit(cache=True, nogil=True)
 def _integrate(first, x, left, right, bend):
-    """The cells with `free` and the integral; each cell by Simpson's rule."""
+    """The cells with `free`, the guide and the integral; each cell by Simpson's rule."""
     sectors = len(first) - 1
     integral, free = np.zeros(len(x)), np.zeros(sectors)
     for s in range(sectors):
@@ -159,20 +161,33 @@ def _integrate(first, x, left, right, bend):
         free[s] = top + np.log(total / (HIGH_RAD - LOW_RAD))
         for k in range(first[s], last + 1):
             integral[k] *= (HIGH_RAD - LOW_RAD) / total
-    return first, x, left, right, bend, integral, free
+    return first, x, left, right, bend, integral, free, _guide_to(first, x)
 
 
 @njit(cache=True, nogil=True)
-def cell_at(first, x, s, height, begin):
-    """The cell of a sector that holds a height, at or after the cell `begin`."""
-    low, high = max(first[s], begin), first[s + 1] - 1
-    while high - low > 1:
-        middle = (low + high) >> 1
-        if x[middle] <= height:
-            low = middle
-        else:
-            high = middle
-    return low
+def _guide_to(first, x):
+    """The `guide`: the cell (SECTORS, 2 GUIDE + 1) that holds each of its heights."""
+    found = np.empty((len(first) - 1, 2 * GUIDE + 1), dtype=np.int32)
+    for s in range(len(found)):
+        k, last = first[s], first[s + 1] - 2
+        for i in range(2 * GUIDE + 1):
+            u = i / GUIDE - 1.0
+            while k < last and x[k + 1] <= u * abs(u) * HIGH_RAD:
+                k += 1
+            found[s, i] = k
+    return found
+
+
+@njit(cache=True, nogil=True, inline="always")
+def cell_at(x, guide, s, height):
+    """The cell of a sector that holds a height, or the nearest one."""
+    u = copysign(sqrt(abs(height) * (1.0 / HIGH_RAD)), height)
+    i = min(max(int((u + 1.0) * GUIDE), 0), 2 * GUIDE - 1)
+    k, last = guide[s, i], guide[s, i + 1]
+    k += k < last and x[k + 1] <= height
+    while k < last and x[k + 1] <= height:
+        k += 1
+    return k
 
 
 @njit(cache=True, nogil=True)
@@ -180,7 +195,7 @@ def log_at(profiles, s, height):
     """F - R of a sector at a height."""
     if height >= HIGH_RAD:
         return -profiles.free[s]
-    k = cell_at(profiles.first, profiles.x, s, height, 0)
+    k = cell_at(profiles.x, profiles.guide, s, height)
     u = min(max((height - profiles.x[k]) / (profiles.x[k + 1] - profiles.x[k]), 0.0), 1.0)
     value = profiles.left[k] + u * (profiles.right[k] - profiles.left[k]) + u * (1.0 - u) * profiles.bend[k]
     return value - profiles.free[s]
@@ -192,7 +207,7 @@ def integral_to(profiles, s, height):
     if height >= HIGH_RAD:
         last = profiles.first[s + 1] - 1
         return profiles.integral[last] + (height - HIGH_RAD) * exp(-profiles.free[s])
-    k = cell_at(profiles.first, profiles.x, s, height, 0)
+    k = cell_at(profiles.x, profiles.guide, s, height)
     u = (height - profiles.x[k]) / (profiles.x[k + 1] - profiles.x[k])
     return profiles.integral[k] + u * (profiles.integral[k + 1] - profiles.integral[k])
 
@@ -239,7 +254,7 @@ def _average_over_map(profiles, sigma, bins):
             before = after
             n += 1
         end = low[s] + count * step[s]
-        k = cell_at(profiles.first, profiles.x, s, end, 0)
+        k = cell_at(profiles.x, profiles.guide, s, end)
         x[n] = end
         left[n] = log_at(profiles, s, end) + profiles.free[s]
         right[n] = profiles.right[k]

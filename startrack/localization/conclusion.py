@@ -11,7 +11,7 @@ import numpy as np
 from startrack.core.statistics import relative_weights, shares
 from startrack.core.types import Array, Blocked, ClockError, Fix, Ints, Mode, NotLocated, ShownError, UnstatedFact
 from startrack.localization.hypothesis import Hypothesis
-from startrack.localization.importance_sampling import ROUNDS, moments
+from startrack.localization.importance_sampling import moments
 from startrack.localization.integrity import assess_integrity
 from startrack.localization.search import Explored
 from startrack.localization.summary import camera_at, link_points, require_inside
@@ -22,7 +22,7 @@ AMBIGUOUS_MASS = 0.01
 NEGLIGIBLE_MODE = 2e-3  # of the probability: points apart that hold less belong to the nearest mode
 USELESS_FRACTION = 0.5  # a 95 % circle wider than this part of the search radius says nothing worth having
 SHOWN_SIGMAS = 2.0  # by which an error that nobody states is beyond its default
-SUPPORT = ROUNDS[0]  # points of a fix with which a later search of the same image begins
+SUPPORT = 200  # points of a fix with which a later search of the same image begins
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +227,7 @@ def _support(whole: Posterior, explored: Explored, dropped_probability: float) -
     one = whole.best
     order = np.argsort(-one.found.log_weight)[:SUPPORT]
     points, log = one.found.points[order, :2], one.found.log_weight[order]
-    spread = np.sqrt(max(float(np.linalg.eigvalsh(moments(points, relative_weights(log))[1])[0]), 1e-6))
+    spread = np.sqrt(max(float(np.linalg.eigvalsh(moments(points, relative_weights(log))[1])[1]), 1e-6))
     return explored._replace(
         centres_m=points, half_m=0.5 * spread, log_likelihood=log, dropped_probability=dropped_probability
     )

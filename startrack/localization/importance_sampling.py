@@ -20,7 +20,7 @@ from startrack.core.types import Array
 
 DEGREES, FAR_DEGREES = 5.0, 3.0  # of freedom of the t distributions
 FAR_PART, FAR, FAR_OTHERS = 0.4, 4.0, 1.4  # of the points; how much farther out, in position and in the others
-ROUNDS = (200, 400, 800, 1000, 1200)  # points
+ROUNDS = (120, 120, 160, 200, 240, 320, 400, 520, 640, 880)  # points
 MORE_POINTS = 0.3  # part by which each further dimension has more
 ENOUGH, FEW = 600.0, 60.0  # effective points that end the rounds, and those of a less likely hypothesis
 TEMPERED = 7.0  # effective points a dimension to which weights are tempered before the distributions move
@@ -185,18 +185,19 @@ def sample(
 
     The first round draws from the distributions `first` besides; `enough` effective points end the rounds.
     """
-    points: list[Array] = []
-    density: list[Array] = []
+    d = len(modes[0][0])
+    points, density, drawn_by = np.zeros((0, d)), np.zeros(0), np.zeros(0)
     parts: list[Distribution] = []
     modes = list(modes)
-    more = 1.0 + MORE_POINTS * (len(modes[0][0]) - 2)
+    more = 1.0 + MORE_POINTS * (d - 2)
     for number, count in enumerate(rounds):
         new = [*_parts(modes, round(more * count)), *(first if number == 0 else ())]
-        drawn = _draw(new, sum(len(one) for one in points))
+        drawn = _draw(new, len(points))
+        drawn_by = np.logaddexp(drawn_by, _log_mixture(new, points)) if number else drawn_by
         parts.extend(new)
-        points.append(drawn)
-        density.append(log_density(drawn))
-        found = _weigh(np.concatenate(points), np.concatenate(density), parts)
+        points, density = np.concatenate([points, drawn]), np.concatenate([density, log_density(drawn)])
+        drawn_by = np.concatenate([drawn_by, _log_mixture(parts, drawn)])
+        found = WeightedPoints(points, density - drawn_by, drawn_by)
         if not np.isfinite(found.log_weight).any():
             continue
         if found.effective > enough:
@@ -235,10 +236,9 @@ def _draw(parts: Sequence[Distribution], first: int) -> Array:
     return np.concatenate(drawn)
 
 
-def _weigh(points: Array, density: Array, parts: Sequence[Distribution]) -> WeightedPoints:
-    """Weights of points by the mixture of all distributions that any of them was drawn from."""
-    mixture = np.asarray(np.logaddexp.reduce([log(part.count) + part.log_density(points) for part in parts], axis=0))
-    return WeightedPoints(points, density - mixture, mixture)
+def _log_mixture(parts: Sequence[Distribution], points: Array) -> Array:
+    """Logarithm (n,) of how many points of the distributions are expected, a unit of the parameters, at each point."""
+    return np.asarray(np.logaddexp.reduce([log(part.count) + part.log_density(points) for part in parts], axis=0))
 
 
 def _move(found: WeightedPoints, modes: Sequence[Gaussian]) -> list[Gaussian]:

@@ -10,7 +10,15 @@ import numpy as np
 from startrack.core.types import Array, Evidence, NotLocated
 from startrack.localization.horizon_bias import NEARBY_M
 from startrack.localization.hypothesis import WIDER, Hypothesis, sample_gross_errors, sample_hypothesis
-from startrack.localization.importance_sampling import FEW, ROUNDS, BoxDistribution, Gaussian, moments, temper_weights
+from startrack.localization.importance_sampling import (
+    ENOUGH,
+    FEW,
+    ROUNDS,
+    BoxDistribution,
+    Gaussian,
+    moments,
+    temper_weights,
+)
 from startrack.localization.search import NATS, Explored, choose_apart
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel
@@ -20,7 +28,7 @@ REACH_M = 300.0  # of a group of boxes about its best one, with one neighbourhoo
 NEIGHBOURHOOD_SIGMAS = 16.0  # of a neighbourhood in which the posterior is sampled
 MOST_GROUPS, MOST_MODES = 6, 4  # groups of boxes, and modes of a group
 MOST_BOXES = 160  # of a group, that the chain is computed at; and the points drawn from them
-FIRST_ROUNDS = ROUNDS[:2]  # that show whether a group of boxes is likely, and how wide the posterior is
+FIRST_ROUNDS = ROUNDS[:4]  # that show whether a group of boxes is likely, and how wide the posterior is
 APART_BOXES = 3.0  # between two modes that sampling begins with
 FEW_BOXES = 6.0  # that count at least, of the distribution of boxes
 
@@ -118,20 +126,20 @@ def _sample_group(start: Start, references_m: Array, best: float, is_first: bool
     the last rounds are in a neighbourhood as small as the posterior, because horizons are interpolated in it.
     """
     model = start.model
-    rounds = FIRST_ROUNDS if model.seen.rows.is_first_look else ROUNDS
-    sample_at_start = partial(sample_hypothesis, model, references_m, start.modes, first=[start.boxes])
+    enough = FEW if model.seen.rows.is_first_look else ENOUGH
+    sample_at_start = partial(sample_hypothesis, model, references_m, start.modes, first=[start.boxes], enough=enough)
     if is_first and model.terrain.axisymmetric:
-        return sample_at_start(rounds=rounds)
+        return sample_at_start()
     plain = sample_at_start(rounds=FIRST_ROUNDS)
     if plain.found.log_evidence < best - NATS:
         return plain
     mean, covariance = _moments_of(plain)
     reach_m = max(NEIGHBOURHOOD_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1])), NEARBY_M)
     if model.terrain.axisymmetric or reach_m > 0.5 * model.around.half_m:
-        return sample_at_start(rounds=rounds)
+        return sample_at_start()
     is_own = (references_m == model.around.reference_m).all(axis=1)
     closer, mode = _begin_closer(model, mean, covariance, reach_m)
-    return sample_hypothesis(closer, np.where(is_own[:, None], mean[:2], references_m), [mode], rounds=rounds)
+    return sample_hypothesis(closer, np.where(is_own[:, None], mean[:2], references_m), [mode], enough=enough)
 
 
 def _begin_closer(model: SkylineModel, mean: Array, covariance: Array, reach_m: float) -> tuple[SkylineModel, Gaussian]:

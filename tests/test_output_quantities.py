@@ -15,7 +15,6 @@ from startrack.core.errors import Reason
 from startrack.core.types import Attitude
 from startrack.frames import R_from_rotvec, heading_pitch_roll_from_R_body_enu
 from startrack.output import (
-    POSITIVE,
     SCHEMAS,
     Quantity,
     at_stage,
@@ -38,7 +37,7 @@ ARCSEC = np.pi / 648_000
 
 def test_a_new_quantity_is_one_entry(located, monkeypatch):
     new = Quantity(
-        "position.twice_m", "m", Located, lambda v: 2 * v.fix.radius95_m, "twice the radius", POSITIVE, optional=True,
+        "position.twice_m", "m", Located, lambda v: 2 * v.fix.radius95_m, "twice the radius", "positive", optional=True,
         form="%.2f", shown=show_everywhere("Twice", "{:.1f} m", "error"),
         listed=Listed("Twice", 1),
     )  # fmt: skip

@@ -24,28 +24,23 @@ from startrack.output.picture.prediction import comparison_picture, path_picture
 from startrack.output.quantities import QUANTITIES, table_columns
 from startrack.output.quantity import (
     ABSENT,
-    CHANCE,
-    COUNT,
-    FLAG,
-    NUMBER,
-    POSITIVE,
-    TEXT,
-    TIME,
+    Column,
+    Kind,
     Quantity,
     Schema,
-    TableColumn,
     file_schema,
+    list_schema,
     markdown_table,
     object_schema,
     or_null,
     record_from,
     schema_of,
+    schema_of_kind,
     show_everywhere,
 )
 from startrack.output.record import at_stage, detection_dict, identification_dict, record_of, refused_dict, result_dict
 from startrack.output.schema import SCHEMAS
 from startrack.output.tables import (
-    Column,
     ecsv_text,
     format_values,
     quantity_columns,
@@ -71,16 +66,16 @@ from startrack.output.write import (
 )
 
 __all__ = [
-    "ABSENT", "ARCSEC_PER_RAD", "CHANCE", "COMPANIONS", "COUNT", "FLAG", "MARGIN_PX", "NUMBER", "PICTURES",
-    "POSITIVE", "QUANTITIES", "SCHEMAS", "SIDE_PX", "SKYLINE_FILES", "TEXT", "TEXT_PX", "TIME", "TITLE_PX", "Axes",
-    "Box", "Canvas", "Colour", "Column", "Found", "Ink", "Legend", "Map", "Quantity", "R_body_enu", "Rows", "Schema",
-    "TableColumn", "annotate", "at_stage", "boresight_rad", "box_around", "comparison_picture", "detection_dict",
-    "draw_overview", "ecsv_text", "ellipse_m", "explain", "feature", "file_schema", "filled_frame", "format_values",
-    "geojson_text", "ground_map", "horizon_picture", "identification_dict", "json_text", "lens_text",
-    "markdown_table", "mix_colours", "nice_step", "object_schema", "or_null", "page_text", "path_picture",
-    "png_bytes", "prediction_picture", "prepare_folder", "quantity_columns", "record_from", "record_of",
-    "refusal_line", "refused_dict", "relief_picture", "remove_companions", "result_at", "result_dict",
-    "results_under", "rows", "schema_of", "show_everywhere", "skyline_picture", "skyline_table_text",
-    "skyline_texts_deg", "star_table_text", "summary_line", "table_columns", "verbose_text", "write_annotated",
-    "write_geo", "write_json", "write_page", "write_results", "write_star_table", "write_wcs",
+    "ABSENT", "ARCSEC_PER_RAD", "COMPANIONS", "MARGIN_PX", "PICTURES", "QUANTITIES", "SCHEMAS", "SIDE_PX",
+    "SKYLINE_FILES", "TEXT_PX", "TITLE_PX", "Axes", "Box", "Canvas", "Colour", "Column", "Found", "Ink", "Kind",
+    "Legend", "Map", "Quantity", "R_body_enu", "Rows", "Schema", "annotate", "at_stage", "boresight_rad",
+    "box_around", "comparison_picture", "detection_dict", "draw_overview", "ecsv_text", "ellipse_m", "explain",
+    "feature", "file_schema", "filled_frame", "format_values", "geojson_text", "ground_map", "horizon_picture",
+    "identification_dict", "json_text", "lens_text", "list_schema", "markdown_table", "mix_colours", "nice_step",
+    "object_schema", "or_null", "page_text", "path_picture", "png_bytes", "prediction_picture", "prepare_folder",
+    "quantity_columns", "record_from", "record_of", "refusal_line", "refused_dict", "relief_picture",
+    "remove_companions", "result_at", "result_dict", "results_under", "rows", "schema_of", "schema_of_kind",
+    "show_everywhere", "skyline_picture", "skyline_table_text", "skyline_texts_deg", "star_table_text",
+    "summary_line", "table_columns", "verbose_text", "write_annotated", "write_geo", "write_json", "write_page",
+    "write_results", "write_star_table", "write_wcs",
 ]  # fmt: skip

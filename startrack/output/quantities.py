@@ -11,114 +11,108 @@ from startrack.chain import Detected, Identified, Inputs, Located, Measured, Ori
 from startrack.frames import format_utc
 from startrack.output.quantities_pose import ATTITUDE_QUANTITIES, POSITION_QUANTITIES
 from startrack.output.quantity import (
-    CHANCE,
-    COUNT,
-    NUMBER,
-    POSITIVE,
-    TEXT,
-    TIME,
+    Column,
     Listed,
     Quantity,
     Show,
-    TableColumn,
-    numbers,
+    list_schema,
     show_everywhere,
 )
 from startrack.output.values import blocked_deg, chance_text, predicted_visible, ranges_text
 
 Q = Quantity
 LIGHT_QUANTITIES: tuple[Quantity, ...] = (
-    Q("stars.detected", "", Detected, lambda v: len(v.detections), "point sources", COUNT, before=0, form="%d",
+    Q("stars.detected", "", Detected, lambda v: len(v.detections), "point sources", "count", before=0, form="%d",
       shown=(Show("summary", "sources", "{} point sources", "stars.identified"),
              Show("text", "stars", "{} point sources"), Show("panel", "Stars", "{:,} point sources"),
              Show("page", "Point sources", "{:,}"))),
-    Q("stars.identified", "", Identified, lambda v: len(v.identification), "point sources with a name", COUNT, before=0,
-      form="%d",
+    Q("stars.identified", "", Identified, lambda v: len(v.identification), "point sources with a name", "count",
+      before=0, form="%d",
       shown=(Show("summary", "stars", "{} stars"), Show("text", "stars", ", {} identified"),
              Show("panel", "Stars", ", {:,} identified"), Show("page", "Named", "{:,}")), listed=Listed("Stars", 0)),
     Q("stars.unexplained", "", Identified, lambda v: v.identification.unexplained,
-      "significant point sources that no catalogue star explains; null: not identified", COUNT, before=None,
+      "significant point sources that no catalogue star explains; null: not identified", "count", before=None,
       shown=(Show("text", "stars", ", {} significant ones unexplained"), Show("page", "Unexplained", "{:,}"))),
     Q("stars.measured", "", Measured, lambda v: int(v.light.usable.sum()), "catalogue stars whose light was measured",
       recorded=False,
       shown=(Show("text", "evidence", "{} catalogue stars measured"), Show("panel", "Evidence", "{:,} stars"))),
     Q("stars.predicted_visible", "", Located, predicted_visible,
       "stars whose light was measured and which stand above the skyline of the fix; 0 without a fix, null of "
-      "`identify` and `detect`", COUNT, before=lambda v: None if v.terrain is None else 0,
+      "`identify` and `detect`", "count", before=lambda v: None if v.terrain is None else 0,
       shown=(Show("text", "evidence", ", {} above the skyline of the fix"),
              Show("panel", "Evidence", ", {:,} above the skyline"),
              Show("page", "Above the skyline", "{:,}"))),
     Q("stars.rms_px", "px", Oriented, lambda v: v.attitude_fit.rms_px,
-      "of the identified stars, per axis; null: not identified", POSITIVE, before=None, form="%.5f",
+      "of the identified stars, per axis; null: not identified", "positive", before=None, form="%.5f",
       shown=(Show("text", "stars", "; rms {:.3f} px"), Show("panel", "Residual", "{:.2f} px"),
              Show("page", "Residual", "{:.3f} px"))),
     Q("stars.false_alarm_probability", "", Identified, lambda v: v.identification.false_alarm_probability,
       "that chance would match as many; numbers below 1e-100 (none is below 1e-300) mean only that, and are "
-      "printed so; null: not identified", CHANCE, before=None,
+      "printed so; null: not identified", "chance", before=None,
       shown=(Show("text", "stars", lambda p: f"; false alarm {chance_text(p)}"),
              Show("panel", "Residual", lambda p: f"   false alarm {chance_text(p)}"),
              Show("page", "Chance match", chance_text))),
     Q("evidence.blocked", "deg", Located, blocked_deg,
       "list of [from, to]: azimuths in which something on no map more likely hides the map's skyline than not; across "
-      "north `to` is the smaller", {"type": "array", "items": numbers(2)}, optional=True,
+      "north `to` is the smaller", list_schema(list_schema("number", count=2)), optional=True,
       shown=(Show("text", "evidence", lambda a: f"; blocked {ranges_text(a)}" if a else ""),
              Show("page", "Blocked azimuths", ranges_text))),
     Q("evidence.damage", "", Inputs, lambda v: None if v.damage is None else v.damage.cause,
       "what processing did to the pixels, where the evidence is measured on the frame itself; null: nothing shows",
-      TEXT, nullable=True, optional=True),
+      "text", nullable=True, optional=True),
     Q("sky.brightness_mag_arcsec2", "mag/arcsec^2", Located, lambda v: v.sky_brightness_mag_arcsec2,
       "V of the sky beyond that of the ground at the skyline, by the camera's zero point and the exposure's duration; "
       "null where the image shows no step of light there, or one of the two is not known",
-      NUMBER, nullable=True, form="%.4f", columns={"sky_mag_arcsec2": ()},
+      "number", nullable=True, form="%.4f", columns={"sky_mag_arcsec2": ()},
       shown=show_everywhere("Sky", "{:.2f} mag/arcsec2", "evidence")),
     Q("sky.unused", "", Located, lambda v: v.sky_unused or None,
-      "why the light of the sky is not evidence of the position; null: it is, or was not asked for", TEXT,
+      "why the light of the sky is not evidence of the position; null: it is, or was not asked for", "text",
       nullable=True, optional=True,
       shown=(Show("text", "evidence", "; sky not used: {}"), Show("page", "Sky not used", "{}"))),
 )  # fmt: skip
 RUN_QUANTITIES: tuple[Quantity, ...] = (
     Q("clock.offset_s", "s", Located, lambda v: None if v.fix.clock is None else v.fix.clock.offset_s,
       "true minus stated time: mean of the posterior; 0 in a round crater, where the image does not show it; null: a "
-      "method without a posterior", NUMBER, nullable=True, form="%.6g", columns={"clock_offset_s": ()},
+      "method without a posterior", "number", nullable=True, form="%.6g", columns={"clock_offset_s": ()},
       shown=(Show("text", "clock", "offset {:+.3f} s"), Show("notebook page", "clock", "{:+.3f} s"))),
     Q("clock.sigma_s", "s", Located, lambda v: None if v.fix.clock is None else v.fix.clock.sigma_s,
       "standard deviation of the offset; as stated (`provenance.time_sigma_s`) where the image does not show it; null: "
-      "as above", POSITIVE, nullable=True, form="%.6g", columns={"clock_sigma_s": ()},
+      "as above", "positive", nullable=True, form="%.6g", columns={"clock_sigma_s": ()},
       shown=(Show("text", "clock", "; sigma {:.3f} s"), Show("notebook page", "clock", " ± {:.3f} s"))),
-    Q("provenance.version", "", Inputs, lambda v: __version__, "of startrack", TEXT),
+    Q("provenance.version", "", Inputs, lambda v: __version__, "of startrack", "text"),
     Q("provenance.image_sha256", "", Inputs, lambda v: v.exposure.sha256,
-      "of the file; of an array: of its type, shape and values", TEXT, form="%s"),
+      "of the file; of an array: of its type, shape and values", "text", form="%s"),
     Q("provenance.camera", "", Inputs, lambda v: v.exposure.camera or (v.camera.name if v.camera is not None else None),
-      "camera file or name", TEXT, before=None, form="%s"),
+      "camera file or name", "text", before=None, form="%s"),
     Q("provenance.terrain", "", Inputs,
-      lambda v: v.exposure.terrain or (v.terrain.name if v.terrain is not None else None), "terrain file or name", TEXT,
-      before=None, form="%s"),
-    Q("provenance.catalog", "", Inputs, lambda v: v.catalog_name or None, "star catalogue", TEXT, before=None),
+      lambda v: v.exposure.terrain or (v.terrain.name if v.terrain is not None else None), "terrain file or name",
+      "text", before=None, form="%s"),
+    Q("provenance.catalog", "", Inputs, lambda v: v.catalog_name or None, "star catalogue", "text", before=None),
     Q("provenance.localizer", "", Inputs, lambda v: v.localizer_name or None,
       "method of localization, by its name for `--localizer`; of one of your own the name of its class or function; "
-      "null: of `identify` and `detect`", TEXT, before=None, optional=True),
+      "null: of `identify` and `detect`", "text", before=None, optional=True),
     Q("provenance.near", "m", Measured, lambda v: None if v.near is None else str(v.near),
-      "`EAST,NORTH,SIGMA` of the prior of the position that the posterior contains; null: none was given", TEXT,
+      "`EAST,NORTH,SIGMA` of the prior of the position that the posterior contains; null: none was given", "text",
       nullable=True, optional=True),
     Q("provenance.time_utc", "", Inputs,
       lambda v: None if v.exposure.time_utc is None else format_utc(v.exposure.time_utc),
-      "middle of the exposure; null: not known", TIME, before=None, form="%s"),
+      "middle of the exposure; null: not known", "time", before=None, form="%s"),
     Q("provenance.time_sigma_s", "s", Inputs,
       lambda v: None if v.exposure.time_utc is None else v.exposure.time_sigma_s,
-      "standard deviation of the clock's error, as stated, or 1; null: no time is known", POSITIVE, before=None,
+      "standard deviation of the clock's error, as stated, or 1; null: no time is known", "positive", before=None,
       optional=True, form="%.9g"),
-    Q("provenance.exposure_s", "s", Inputs, lambda v: v.exposure.exposure_s, "null: not known", NUMBER, before=None,
+    Q("provenance.exposure_s", "s", Inputs, lambda v: v.exposure.exposure_s, "null: not known", "number", before=None,
       form="%.9g"),
     Q("provenance.mask_sha256", "", Detected,
       lambda v: None if v.detections.mask is None else v.detections.mask.sha256 or None,
       "of the file of the mask, or of the array that is masked; with the camera's and the image's mask both, joined by "
-      "`+`; null: every pixel counts", TEXT, before=None, nullable=True, optional=True),
+      "`+`; null: every pixel counts", "text", before=None, nullable=True, optional=True),
     Q("provenance.dark_sha256", "", Inputs,
       lambda v: None if v.exposure.correction is None else v.exposure.correction.dark_sha256,
-      "of the file of the dark frame; null: none was subtracted", TEXT, before=None, nullable=True, optional=True),
+      "of the file of the dark frame; null: none was subtracted", "text", before=None, nullable=True, optional=True),
     Q("provenance.flat_sha256", "", Inputs,
       lambda v: None if v.exposure.correction is None else v.exposure.correction.flat_sha256,
-      "of the file of the flat field; null: none was used", TEXT, before=None, nullable=True, optional=True),
+      "of the file of the flat field; null: none was used", "text", before=None, nullable=True, optional=True),
 )  # fmt: skip
 QUANTITIES: tuple[Quantity, ...] = POSITION_QUANTITIES + ATTITUDE_QUANTITIES + LIGHT_QUANTITIES + RUN_QUANTITIES
 BY_PATH = {one.path: one for one in QUANTITIES}
@@ -131,7 +125,7 @@ FIRST_COLUMNS = (
 )  # fmt: skip
 
 
-def table_columns() -> list[TableColumn]:
+def table_columns() -> list[Column]:
     """The columns of the batch's table, in their order."""
     order = {name: k for k, name in enumerate(FIRST_COLUMNS)}
     found = [column for one in QUANTITIES for column in one.table_columns]

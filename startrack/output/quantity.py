@@ -4,42 +4,54 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 Schema = dict[str, Any]
-NUMBER: Schema = {"type": "number"}
-ABOVE_0: Schema = {"type": "number", "exclusiveMinimum": 0}
-POSITIVE: Schema = {"type": "number", "minimum": 0}
-COUNT: Schema = {"type": "integer", "minimum": 0}
-CHANCE: Schema = {"type": "number", "minimum": 0, "maximum": 1}
-TURN: Schema = {"type": "number", "minimum": 0, "exclusiveMaximum": 360}
-LATITUDE: Schema = {"type": "number", "minimum": -90, "maximum": 90}
-LONGITUDE: Schema = {"type": "number", "minimum": -180, "maximum": 180}
-TEXT: Schema = {"type": "string"}
-TIME: Schema = {"type": "string", "format": "date-time"}
-FLAG: Schema = {"type": "boolean"}
+Kind = str | Schema  # a schema, or its word in KINDS
+KINDS: dict[str, Schema] = {
+    "number": {"type": "number"},
+    "positive": {"type": "number", "minimum": 0},
+    "count": {"type": "integer", "minimum": 0},
+    "chance": {"type": "number", "minimum": 0, "maximum": 1},
+    "turn": {"type": "number", "minimum": 0, "exclusiveMaximum": 360},
+    "latitude": {"type": "number", "minimum": -90, "maximum": 90},
+    "longitude": {"type": "number", "minimum": -180, "maximum": 180},
+    "text": {"type": "string"},
+    "time": {"type": "string", "format": "date-time"},
+    "flag": {"type": "boolean"},
+}
 
 
-def numbers(count: int, each: Schema = NUMBER) -> Schema:
-    """An array of `count` items that fit the schema `each`."""
-    return {"type": "array", "items": each, "minItems": count, "maxItems": count}
+def schema_of_kind(kind: Kind, description: str = "") -> Schema:
+    """The schema of a `kind`, with a `description` unless it is empty."""
+    schema = KINDS[kind] if isinstance(kind, str) else kind
+    return {**schema, "description": description} if description else schema
 
 
-QUATERNION: Schema = {**numbers(4, {"type": "number", "minimum": -1, "maximum": 1}), "description": "x, y, z, w"}
+def list_schema(each: Kind, description: str = "", count: int | None = None) -> Schema:
+    """An array of `count` items of the kind `each` (None: any number), with a `description` unless it is empty."""
+    lengths = {} if count is None else {"minItems": count, "maxItems": count}
+    return schema_of_kind({"type": "array", "items": schema_of_kind(each), **lengths}, description)
 
 
-def or_null(one: Schema, description: str) -> Schema:
-    """The schema of `one` or null, with a `description`."""
-    return {"anyOf": [one, {"type": "null"}], "description": description}
+KINDS["quaternion"] = list_schema({"type": "number", "minimum": -1, "maximum": 1}, "x, y, z, w", 4)
 
 
-def object_schema(required: Schema, description: str = "", optional: Schema | None = None) -> Schema:
+def or_null(one: Kind, description: str) -> Schema:
+    """The schema of the kind `one` or null, with a `description`."""
+    return {"anyOf": [schema_of_kind(one), {"type": "null"}], "description": description}
+
+
+def object_schema(
+    required: Mapping[str, Kind], description: str = "", optional: Mapping[str, Kind] = MappingProxyType({})
+) -> Schema:
     """An object with the keys of `required` and `optional`, and a `description` unless it is empty.
 
     Further keys are no error: a later version may add some.
     """
-    d: Schema = {"type": "object", "properties": {**required, **(optional or {})}, "required": list(required)}
-    return {**d, "description": description} if description else d
+    properties = {key: schema_of_kind(kind) for key, kind in {**required, **optional}.items()}
+    return schema_of_kind({"type": "object", "properties": properties, "required": list(required)}, description)
 
 
 def file_schema(title: str, body: Schema) -> Schema:
@@ -86,7 +98,7 @@ class Quantity:
     since: type[Any] | Callable[[Any], bool]  # the values that determine it: of a class, or those that fulfil this
     value: Callable[[Any], Any]  # of such a value; where `derived`, of the function from paths to values
     description: str
-    schema: Schema = field(default_factory=dict)
+    schema: Kind = field(default_factory=dict)
     before: Any = ABSENT  # in the record of a value that has not come as far: ABSENT, None, a number, or a function
     nullable: bool = False  # whether it may be null of a value that has come as far
     optional: bool = False  # whether records of earlier stages or versions lack it although they have its section
@@ -112,28 +124,29 @@ class Quantity:
         return isinstance(value, self.since) if isinstance(self.since, type) else self.since(value)
 
     @property
-    def table_columns(self) -> list[TableColumn]:
+    def table_columns(self) -> list[Column]:
         """Its columns in a table; none without a format."""
         if not self.form:
             return []
         kind, unit = {"d": "int64", "s": "string"}.get(self.form[-1], "float64"), ASTROPY_UNITS.get(self.unit)
         columns = self.columns or {self.key: ()}
         return [
-            TableColumn(name, kind, unit, self.form, (*self.path.split("."), *at), self.description)
+            Column(name, (), kind, unit, self.form, self.description, (*self.path.split("."), *at))
             for name, at in columns.items()
         ]
 
 
 @dataclass(frozen=True)
-class TableColumn:
-    """A column of a table of records."""
+class Column:
+    """A column of a table: its heading and its values, None, nan or an empty text where there is none."""
 
     name: str
-    datatype: str  # as ECSV names it
-    unit: str | None  # as astropy spells it
-    form: str  # printf format
-    path: tuple[Any, ...]  # keys and indices that lead to the value in a record
+    values: Iterable[Any] = ()
+    datatype: str = "float64"  # or int64, string, bool, as ECSV names them
+    unit: str | None = None  # as astropy spells it
+    form: str = "%s"  # printf format of a value
     description: str = ""
+    path: tuple[Any, ...] = ()  # keys and indices that lead to the value in a record
 
     def value(self, record: Any) -> Any:
         """The value in a `record`; None if that lacks it."""
@@ -176,9 +189,9 @@ def schema_of(quantities: Iterable[Quantity], section: str = "", description: st
     for one in quantities:
         if one.section == section and not one.derived and one.recorded:
             words = f"{one.description} [{one.unit}]" if units and one.unit else one.description
-            schema = {**one.schema, "description": words}
+            schema = {**schema_of_kind(one.schema), "description": words}
             if one.nullable:  # a list of types, so that a validator names what is wrong with an array
-                schema["type"] = [one.schema["type"], "null"]
+                schema["type"] = [schema["type"], "null"]
             elif one.before is None or callable(one.before):
                 schema = or_null(one.schema, words)
             (optional if one.optional else required)[one.key] = schema

@@ -10,7 +10,7 @@ from startrack.chain import STAGES, Detected, Identified, Inputs, Outcome, last_
 from startrack.core.errors import Reason
 from startrack.core.types import Exposure
 from startrack.output.quantities import BY_PATH, QUANTITIES
-from startrack.output.quantity import Schema, record_from
+from startrack.output.quantity import Schema, record_from, schema_of_kind
 from startrack.output.values import At
 
 FORMATS = {kind: f"startrack.{kind}/1" for kind in ("fix", "identification", "detection")}
@@ -123,7 +123,7 @@ def at_record(result: Mapping[str, Any]) -> At:
             return one.value(value_at)
         part = result.get(one.section) if one.section else result
         value = part.get(one.key) if isinstance(part, Mapping) else None
-        return value if _has_type(value, one.schema) else None
+        return value if _has_type(value, schema_of_kind(one.schema)) else None
 
     return value_at
 

@@ -8,17 +8,13 @@ from startrack.core.errors import Reason
 from startrack.exposure import SIDECAR as SIDECAR_KEYS
 from startrack.output.quantities import BY_PATH, QUANTITIES
 from startrack.output.quantity import (
-    COUNT,
-    NUMBER,
-    POSITIVE,
-    QUATERNION,
-    TEXT,
     Schema,
     file_schema,
-    numbers,
+    list_schema,
     object_schema,
     or_null,
     schema_of,
+    schema_of_kind,
 )
 from startrack.output.record import FORMATS
 from startrack.terrain import MAKERS, TERRAIN_KEYS
@@ -39,22 +35,18 @@ SECTIONS = {
     }.items()
 }
 COMMON: Schema = {
-    "image": TEXT,
+    "image": "text",
     "status": {"enum": ["ok", "ambiguous", "refused"]},
     "reason": {"enum": [None, *(one.value for one in Reason)]},
-    "message": TEXT,
+    "message": "text",
 }
 # An image that could not even be read has no more than the common keys.
 STAGE_KEYS: Schema = {
     "stars": SECTIONS["stars"],
-    "timing_ms": object_schema(dict.fromkeys(STAGES, POSITIVE)),
+    "timing_ms": object_schema(dict.fromkeys(STAGES, "positive")),
     "provenance": SECTIONS["provenance"],
 }
-ADVICE_TEXT: Schema = {"type": "string", "description": "what to do next, by the reason; absent where the status is ok"}
-
-
-def _list_of(items: Schema, description: str = "") -> Schema:
-    return {"type": "array", "items": items} | ({"description": description} if description else {})
+ADVICE_TEXT = schema_of_kind("text", "what to do next, by the reason; absent where the status is ok")
 
 
 def _if_status(status: str, then: Schema) -> Schema:
@@ -63,7 +55,7 @@ def _if_status(status: str, then: Schema) -> Schema:
 
 def _result(kind: str, title: str, own: Schema, rules: list[Schema]) -> Schema:
     keys = {"format": {"const": FORMATS[kind]}, **COMMON}
-    warnings = _list_of(TEXT, "what was found in the image's file and not used")
+    warnings = list_schema("text", "what was found in the image's file and not used")
     found = object_schema(keys, optional={"advice": ADVICE_TEXT, **own, **STAGE_KEYS, "warnings": warnings})
     by_status = [
         _if_status("ok", {"properties": {"reason": {"const": None}}, "required": [*STAGE_KEYS]}),
@@ -75,26 +67,26 @@ def _result(kind: str, title: str, own: Schema, rules: list[Schema]) -> Schema:
 
 MATCH = object_schema({
     "hip": or_null({"type": "integer", "minimum": 1}, "Hipparcos number; null: the star has none"),
-    "x_px": NUMBER,
-    "y_px": NUMBER,
+    "x_px": "number",
+    "y_px": "number",
 })  # fmt: skip
-POINT_SOURCE = object_schema({"x_px": NUMBER, "y_px": NUMBER, "flux_e": NUMBER, "snr": NUMBER})
+POINT_SOURCE = object_schema({"x_px": "number", "y_px": "number", "flux_e": "number", "snr": "number"})
 HORIZON = object_schema(
     {
         "format": {"const": "startrack.horizon/1"},
         "status": {"enum": ["ok", "refused"]},
         "reason": COMMON["reason"],
-        "message": TEXT,
+        "message": "text",
     },
     optional={
         "advice": ADVICE_TEXT,
-        "output": TEXT,
-        "images": _list_of(TEXT),
-        "left_out": _list_of(object_schema({"image": TEXT, "reason": {"enum": REFUSALS}, "message": TEXT})),
-        "azimuths": object_schema(dict.fromkeys(("known", "stars", "sky_light", "both"), COUNT)),
-        "median_sigma_deg": or_null(POSITIVE, "of the known azimuths"),
-        "lowest_deg": or_null(NUMBER, "apparent elevation"),
-        "highest_deg": or_null(NUMBER, "apparent elevation"),
+        "output": "text",
+        "images": list_schema("text"),
+        "left_out": list_schema(object_schema({"image": "text", "reason": {"enum": REFUSALS}, "message": "text"})),
+        "azimuths": object_schema(dict.fromkeys(("known", "stars", "sky_light", "both"), "count")),
+        "median_sigma_deg": or_null("positive", "of the known azimuths"),
+        "lowest_deg": or_null("number", "apparent elevation"),
+        "highest_deg": or_null("number", "apparent elevation"),
     },
 )
 _HORIZON_RULES = [
@@ -108,9 +100,9 @@ SCHEMAS: dict[str, Schema] = {
         "Position and attitude of one image",
         {
             "position": SECTIONS["position"],
-            "modes": {**BY_PATH["modes"].schema, "description": BY_PATH["modes"].description},
+            "modes": schema_of_kind(BY_PATH["modes"].schema, BY_PATH["modes"].description),
             **{name: SECTIONS[name] for name in ("search", "attitude", "evidence", "sky", "clock")},
-            "explain": _list_of(TEXT, "with --explain: what a refused or wide answer would need"),
+            "explain": list_schema("text", "with --explain: what a refused or wide answer would need"),
         },
         [
             _if_status("ok", {"required": ["position", "attitude"]}),
@@ -124,20 +116,20 @@ SCHEMAS: dict[str, Schema] = {
         {
             "attitude": SECTIONS["attitude"],
             "camera": {"title": "Camera file", **camera_keys().schema()},
-            "matches": _list_of(MATCH),
+            "matches": list_schema(MATCH),
         },
         [_if_status("ok", {"required": ["attitude", "camera", "matches"]})],
     ),
     "detection": _result(
         "detection",
         "Point sources of one image",
-        {"detections": _list_of(POINT_SOURCE)},
+        {"detections": list_schema(POINT_SOURCE)},
         [_if_status("ok", {"required": ["detections"]})],
     ),
     "horizon": file_schema("Summary of a measured skyline", HORIZON | {"allOf": _HORIZON_RULES}),
     "truth": file_schema(
         "What is true of a rendered image, for tests and scorers",
-        object_schema({"position_enu_m": numbers(3), "quat_xyzw_cam_icrs": QUATERNION})
+        object_schema({"position_enu_m": list_schema("number", count=3), "quat_xyzw_cam_icrs": "quaternion"})
         | {"additionalProperties": True},
     ),
     "sidecar": file_schema("Facts beside an image", SIDECAR_KEYS.schema()),

@@ -7,7 +7,7 @@ in a tenth of the time that astropy takes. Comma-separated; an empty field is a 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from startrack.catalog import star_names
 from startrack.chain import Inputs, Measured, Oriented
 from startrack.core.types import Array, Ints, MeasuredSkyline
 from startrack.evidence import SEEN_LLR
-from startrack.output.quantity import Quantity
+from startrack.output.quantity import Column, Quantity
 
 if TYPE_CHECKING:
     from startrack.evidence import StarPhotometry
@@ -26,18 +26,6 @@ STAR_STATUSES = ("seen", "hidden", "uncertain", "unusable")
 FAINTER_THAN_FAINTEST_MATCH_MAG = 0.5
 QUOTE = '"'
 LEAST_HALF_RAD, MOST_HALF_RAD = np.radians(0.02), np.radians(5.0)
-
-
-@dataclass(frozen=True)
-class Column:
-    """One column: its heading and its values, None, nan or an empty text where there is none."""
-
-    name: str
-    values: Iterable[Any]
-    datatype: str = "float64"  # or int64, string, bool
-    unit: str | None = None  # as astropy spells it
-    form: str = "%s"  # of a value
-    description: str = ""
 
 
 def ecsv_text(columns: Sequence[Column]) -> str:
@@ -57,7 +45,7 @@ def ecsv_text(columns: Sequence[Column]) -> str:
 def quantity_columns(quantities: Iterable[Quantity], values: Mapping[str, Iterable[Any]]) -> list[Column]:
     """Columns of the `quantities` that have `values`, by the names of the columns; empty for None and nan."""
     return [
-        Column(one.name, values[one.name], one.datatype, one.unit, one.form, one.description)
+        replace(one, values=values[one.name])
         for quantity in quantities
         for one in quantity.table_columns
         if one.name in values

@@ -16,7 +16,6 @@ from startrack.evidence import DECIDABLE_SNR
 from startrack.frames import rays_from_azel
 from startrack.localization import duration
 from startrack.output.quantities import QUANTITIES
-from startrack.output.quantity import TURN
 from startrack.output.record import at_stage, image_name
 from startrack.output.values import DOMINANT, Angle, At
 
@@ -49,7 +48,7 @@ def rows(place: str, at: At, sections: Collection[str] | None = None) -> Rows:
             value = at(one.path)
             if value is None:
                 continue
-            value = Angle(value) if one.schema is TURN else value
+            value = Angle(value) if one.schema == "turn" else value
             text = show.form(value) if callable(show.form) else show.form.format(value)
             row = show.row[0].upper() + show.row[1:] if place == "page" else show.row
             found[row] = found[row] + text if row in found else text.lstrip(" ,;")

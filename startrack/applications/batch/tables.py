@@ -10,7 +10,7 @@ import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path, PurePath
@@ -25,7 +25,7 @@ from startrack.applications.batch.task import INPUTS, JOB, Record, Task, is_solv
 from startrack.chain import STAGES, content_sha256
 from startrack.core.files import write_atomically
 from startrack.frames import R_from_quat_xyzw, tum_line
-from startrack.output import Column, TableColumn, ecsv_text, format_values, table_columns
+from startrack.output import Column, ecsv_text, table_columns
 
 FORMAT = "startrack.manifest/1"
 MANIFEST = "manifest.json"
@@ -35,7 +35,7 @@ PARQUET = "results.parquet"
 NOT_IN_TABLES = ("modes", "message", "warnings", "format")
 FILES = ("provenance.camera", "provenance.terrain")  # names or paths of files: the tables hold the stem, no path
 COLUMNS = [
-    *(TableColumn(name, "string", None, "%s", (name,)) for name in ("image", "status", "reason")),
+    *(Column(name, datatype="string", path=(name,)) for name in ("image", "status", "reason")),
     *table_columns(),
 ]
 
@@ -106,7 +106,7 @@ def reference_stem(reference: str) -> str:
     return PurePath(reference.replace("\\", "/")).name.removesuffix(".toml")
 
 
-def column_values(column: TableColumn, records: Sequence[Record]) -> list[Any]:
+def column_values(column: Column, records: Sequence[Record]) -> list[Any]:
     """The values of a `column`, one a record, None if it has none."""
     values = [column.value(record) for record in records]
     is_file = ".".join(map(str, column.path)) in FILES
@@ -114,10 +114,7 @@ def column_values(column: TableColumn, records: Sequence[Record]) -> list[Any]:
 
 
 def _results(records: Sequence[Record]) -> bytes:
-    table = [
-        Column(one.name, format_values(one.form, column_values(one, records)), one.datatype, one.unit)
-        for one in COLUMNS
-    ]
+    table = [replace(one, values=column_values(one, records), description="") for one in COLUMNS]
     return ecsv_text(table).encode()
 
 
@@ -164,7 +161,7 @@ def _timings(records: Sequence[Record]) -> bytes:
     table = [Column("image", [record["image"] for record in records], "string")]
     for stage in STAGES:
         times = [record.get("timing_ms", {}).get(stage) for record in records]
-        table.append(Column(f"{stage}_ms", format_values("%.3f", times), "float64", "ms"))
+        table.append(Column(f"{stage}_ms", times, unit="ms", form="%.3f"))
     return ecsv_text(table).encode()
 
 

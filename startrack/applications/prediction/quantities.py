@@ -10,19 +10,15 @@ import numpy as np
 
 from startrack.core.types import Array
 from startrack.output import (
-    CHANCE,
-    COUNT,
-    NUMBER,
-    POSITIVE,
-    TEXT,
-    TIME,
     Quantity,
     Schema,
     file_schema,
+    list_schema,
     object_schema,
     or_null,
     record_from,
     schema_of,
+    schema_of_kind,
 )
 
 Cells = dict[str, Array]  # the quantities of places (k,), by the names of CELL_QUANTITIES; and ERROR_RATIO
@@ -34,7 +30,7 @@ UNKNOWN = "over the places; null: half of the places or more have no radius"
 
 def _cell(name: str, unit: str, description: str, form: str = "%.6g") -> Quantity:
     """A quantity of places, a band and a column."""
-    return Quantity(name, unit, dict, itemgetter(name), description, NUMBER, form=form)
+    return Quantity(name, unit, dict, itemgetter(name), description, "number", form=form)
 
 
 PLACE_QUANTITIES = (
@@ -74,7 +70,7 @@ def _rms_or_none(ratio: Array) -> float | None:
 
 def _cells_quantity(key: str, unit: str, value: Callable[[Cells], Any], description: str, **more: Any) -> Quantity:
     """A quantity of the summary of places."""
-    return Quantity(key, unit, dict, value, description, **{"schema": CHANCE, "form": "%.6g", **more})
+    return Quantity(key, unit, dict, value, description, **{"schema": "chance", "form": "%.6g", **more})
 
 
 def _share_below(bound: int) -> Callable[[Cells], float]:
@@ -87,7 +83,7 @@ def _mean(name: str) -> Callable[[Cells], float]:
 
 SUMMARY_QUANTITIES = (
     _cells_quantity("median_radius95_m", "m", lambda cells: median_or_none(cells["radius95_m"]), UNKNOWN,
-              schema=POSITIVE, before=None),
+              schema="positive", before=None),
     *(
         _cells_quantity(f"share_below_{bound}_m", "", _share_below(bound),
                   f"of the places: those with radius95_m below {bound} m")
@@ -96,7 +92,7 @@ SUMMARY_QUANTITIES = (
     *(_cells_quantity(name, "", _mean(name), "mean over the places") for name in ("p_ok", "p_ambiguous", "p_refused")),
     _cells_quantity(ERROR_RATIO, "", lambda cells: _rms_or_none(cells[ERROR_RATIO]),
               "errors of the draws over the stated ones, root mean square over the places: near 1 where the stated "
-              "ones are right; null: no draw has a position", schema=POSITIVE, before=None),
+              "ones are right; null: no draw has a position", schema="positive", before=None),
 )  # fmt: skip
 
 
@@ -107,27 +103,27 @@ def summarize_cells(cells: Cells) -> dict[str, Any]:
 
 SUMMARY = schema_of(SUMMARY_QUANTITIES)
 VARIANT: Schema = object_schema({
-    "camera": TEXT,
-    "exposure_s": POSITIVE,
-    "limiting_v_mag": {**NUMBER, "description": "of a star on the axis at 5 sigma"},
+    "camera": "text",
+    "exposure_s": "positive",
+    "limiting_v_mag": schema_of_kind("number", "of a star on the axis at 5 sigma"),
     "summary": SUMMARY,
 })  # fmt: skip
 DEPTH: Schema = object_schema({
-    "target_radius95_m": POSITIVE,
-    "share": {**CHANCE, "description": "of the places that must reach the target"},
-    "exposure_s": or_null(POSITIVE, "shortest that reaches the target; null: none within the limits"),
-    "limiting_v_mag": or_null(NUMBER, "of this exposure: a star on the axis at 5 sigma"),
-    "tried": {"type": "array", "items": object_schema({"exposure_s": POSITIVE, "share": CHANCE})},
+    "target_radius95_m": "positive",
+    "share": schema_of_kind("chance", "of the places that must reach the target"),
+    "exposure_s": or_null("positive", "shortest that reaches the target; null: none within the limits"),
+    "limiting_v_mag": or_null("number", "of this exposure: a star on the axis at 5 sigma"),
+    "tried": list_schema(object_schema({"exposure_s": "positive", "share": "chance"})),
 })  # fmt: skip
 ALONG_PATH: Schema = object_schema({
-    "sigma": {**NUMBER, "description": "error of a move on each axis, as a part of its length"},
-    "floor_m": {**NUMBER, "description": "beside that, in quadrature"},
-    f"median_{FILTERED}": or_null(POSITIVE, UNKNOWN),
-    f"median_{SMOOTHED}": or_null(POSITIVE, "the same, by all images"),
+    "sigma": schema_of_kind("number", "error of a move on each axis, as a part of its length"),
+    "floor_m": schema_of_kind("number", "beside that, in quadrature"),
+    f"median_{FILTERED}": or_null("positive", UNKNOWN),
+    f"median_{SMOOTHED}": or_null("positive", "the same, by all images"),
 })  # fmt: skip
 INPUTS: Schema = {
     "type": "object",
-    "additionalProperties": TEXT,
+    "additionalProperties": schema_of_kind("text"),
     "description": "SHA-256 of the camera's, terrain's and map files by name; shipped ones belong to the version",
 }
 PREDICTION = file_schema(
@@ -136,21 +132,21 @@ PREDICTION = file_schema(
         {
             "format": {"const": FORMAT},
             "kind": {"enum": ["area", "path"]},
-            "terrain": TEXT,
-            "camera": TEXT,
-            "first_time_utc": TIME,
-            "last_time_utc": TIME,
-            "exposure_s": POSITIVE,
+            "terrain": "text",
+            "camera": "text",
+            "first_time_utc": "time",
+            "last_time_utc": "time",
+            "exposure_s": "positive",
             "limiting_v_mag": VARIANT["properties"]["limiting_v_mag"],
-            "sky_mag_arcsec2": NUMBER,
-            "spacing_m": POSITIVE,
-            "places": COUNT,
-            "draws": COUNT,
-            "seed": COUNT,
-            "localizer": TEXT,
+            "sky_mag_arcsec2": "number",
+            "spacing_m": "positive",
+            "places": "count",
+            "draws": "count",
+            "seed": "count",
+            "localizer": "text",
             "summary": SUMMARY,
-            "provenance": object_schema({"version": TEXT, "inputs": INPUTS}),
+            "provenance": object_schema({"version": "text", "inputs": INPUTS}),
         },
-        optional={"variants": {"type": "array", "items": VARIANT}, "depth": DEPTH, "odometry": ALONG_PATH},
+        optional={"variants": list_schema(VARIANT), "depth": DEPTH, "odometry": ALONG_PATH},
     ),
 )

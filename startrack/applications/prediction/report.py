@@ -32,10 +32,8 @@ from startrack.core.files import write_atomically
 from startrack.frames import format_utc, latlon_from_enu
 from startrack.output import (
     Column,
-    TableColumn,
     comparison_picture,
     ecsv_text,
-    format_values,
     path_picture,
     png_bytes,
     prediction_picture,
@@ -226,15 +224,12 @@ def _comparison_table(variants: list[dict[str, Any]]) -> str:
     """One row a camera and exposure: the summary of the same places."""
     rows = [{**one, **one["summary"]} for one in variants]
     columns = [
-        TableColumn("camera", "string", None, "%s", ("camera",)),
-        TableColumn("exposure_s", "float64", "s", "%.6g", ("exposure_s",)),
-        TableColumn("limiting_v_mag", "float64", "mag", "%.3f", ("limiting_v_mag",)),
+        Column("camera", datatype="string", path=("camera",)),
+        Column("exposure_s", unit="s", form="%.6g", path=("exposure_s",)),
+        Column("limiting_v_mag", unit="mag", form="%.3f", path=("limiting_v_mag",)),
     ]
     columns += [column for quantity in SUMMARY_QUANTITIES for column in quantity.table_columns]
-    return ecsv_text([
-        Column(one.name, format_values(one.form, [one.value(row) for row in rows]), one.datatype, one.unit)
-        for one in columns
-    ])  # fmt: skip
+    return ecsv_text([replace(one, values=[one.value(row) for row in rows], description="") for one in columns])
 
 
 def _picture(report: Report) -> Any:

@@ -14,14 +14,10 @@ from startrack.core.types import Array
 from startrack.frames import format_utc, latlon_from_enu
 from startrack.output import (
     ABSENT,
-    COUNT,
-    FLAG,
-    NUMBER,
-    POSITIVE,
-    TEXT,
+    Kind,
     Quantity,
-    Schema,
     file_schema,
+    list_schema,
     object_schema,
     or_null,
     record_from,
@@ -47,7 +43,7 @@ class FrameValues(NamedTuple):
 
 
 def _frame(
-    key: str, unit: str, form: str, description: str, value: Value, schema: Schema = NUMBER, known: bool = False
+    key: str, unit: str, form: str, description: str, value: Value, schema: Kind = "number", known: bool = False
 ) -> Quantity:
     """A quantity of a frame; one that is not always `known` may be None."""
     before = ABSENT if known else None
@@ -84,8 +80,8 @@ def _trajectory(name: str, prefix: str, when: str) -> list[Quantity]:
 
 
 FRAME_QUANTITIES = (
-    _frame("image", "", "%s", "name of the image", lambda v: v.frame.name, TEXT, known=True),
-    _frame("time_utc", "", "%s", "middle of the exposure", lambda v: format_utc(v.frame.time_utc), TEXT, known=True),
+    _frame("image", "", "%s", "name of the image", lambda v: v.frame.name, "text", known=True),
+    _frame("time_utc", "", "%s", "middle of the exposure", lambda v: format_utc(v.frame.time_utc), "text", known=True),
     _frame(
         "status", "", "%s", "used; left_out: contradicts the track, or ambiguous to the end; refused: no position",
         lambda v: v.frame.status, {"enum": list(STATUSES)}, known=True,
@@ -94,7 +90,7 @@ FRAME_QUANTITIES = (
         "reason", "", "%s", "of a frame that is not used", lambda v: v.frame.reason or None,
         {"enum": [None, *(one.value for one in Reason)]}, known=True,
     ),
-    _frame("message", "", "%s", "the same in words", lambda v: v.frame.message or None, TEXT),
+    _frame("message", "", "%s", "the same in words", lambda v: v.frame.message or None, "text"),
     _frame(
         "slipped", "", "%d", "1: the odometry's move to this frame is judged wheel slip",
         lambda v: int(v.k > 0 and bool(v.track.slipped[v.k - 1])), {"enum": [0, 1]}, known=True,
@@ -117,20 +113,20 @@ TRACK = file_schema(
     "Trajectory of a camera",
     object_schema({
         "format": {"const": FORMAT},
-        "terrain": TEXT,
-        "at_rest": FLAG,
+        "terrain": "text",
+        "at_rest": "flag",
         "odometry": or_null(
-            object_schema({"file": TEXT, "sigma": POSITIVE, "floor_m": POSITIVE}), "its file and stated errors"
+            object_schema({"file": "text", "sigma": "positive", "floor_m": "positive"}), "its file and stated errors"
         ),
-        "counts": object_schema(dict.fromkeys(("frames", *STATUSES, "slips"), COUNT)),
-        "horizon": object_schema({"error_deg": NUMBER, "sigma_deg": POSITIVE}, "true horizon less the map's"),
-        "clock": or_null(object_schema({"offset_s": NUMBER, "sigma_s": POSITIVE}), "true time less the stated one"),
+        "counts": object_schema(dict.fromkeys(("frames", *STATUSES, "slips"), "count")),
+        "horizon": object_schema({"error_deg": "number", "sigma_deg": "positive"}, "true horizon less the map's"),
+        "clock": or_null(object_schema({"offset_s": "number", "sigma_s": "positive"}), "true time less the stated one"),
         "depth": or_null(
-            object_schema({"error_percent": NUMBER, "sigma_percent": POSITIVE}),
+            object_schema({"error_percent": "number", "sigma_percent": "positive"}),
             "true depth of a crater less that of its file; null where that is taken as exact",
         ),
-        "frames": {"type": "array", "items": schema_of(FRAME_QUANTITIES, units=True)},
-        "provenance": object_schema({"version": TEXT}),
+        "frames": list_schema(schema_of(FRAME_QUANTITIES, units=True)),
+        "provenance": object_schema({"version": "text"}),
     }),
 )  # fmt: skip
 

@@ -94,10 +94,10 @@ def _place(one: Class, stated: Terrain, rng: np.random.Generator) -> tuple[float
 
 def _answer(found: StarFix, position_m: Array) -> Row:
     """What a fix states, beside its error."""
-    if found.fix.ambiguous or found.integrity is None:
+    if found.fix.ambiguous or found.fix.integrity is None:
         return {"status": "ambiguous", "reason": "ambiguous"}
     fix, off = found.fix, (found.fix.position_enu_m - position_m)[:2]
-    level_m = found.integrity.protection_level_m
+    level_m = found.fix.integrity.protection_level_m
     return {
         "status": "ok", "error_m": float(np.hypot(*off)), "radius95_m": float(fix.radius95_m),
         "radius999_m": float(fix.radius999_m), "level_m": float(level_m) if np.isfinite(level_m) else None,

@@ -76,7 +76,7 @@ def compare(name: str, number: int, draws: int) -> tuple[Row, list[Row]] | None:
 def score(found: StarFix, scene: Scene) -> Row:
     """Error and stated uncertainty of a position."""
     fix, off = found.fix, (found.fix.position_enu_m - scene.position_enu_m)[:2]
-    level = found.integrity.protection_level_m if isinstance(found.integrity, Integrity) else np.inf
+    level = found.fix.integrity.protection_level_m if isinstance(found.fix.integrity, Integrity) else np.inf
     nees = float(off @ np.linalg.solve(fix.covariance_m2, off))
     return {"squared_m2": float(off @ off), "nees": nees, "circle_m": fix.radius95_m, "level_m": level}
 

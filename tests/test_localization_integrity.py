@@ -158,7 +158,7 @@ def test_results_state_the_level(located) -> None:
 @pytest.mark.parametrize("level_m", [np.inf, None])
 def test_an_unknown_level_is_null(located, level_m: float | None) -> None:
     """Infinite: one group alone holds the fix; None: not assessed."""
-    integrity = None if level_m is None else replace(located.result.integrity, protection_level_m=level_m)
+    integrity = None if level_m is None else replace(located.result.fix.integrity, protection_level_m=level_m)
     record = result_dict(replace(located.result, fix=replace(located.result.fix, integrity=integrity)))
     Draft202012Validator(SCHEMAS["fix"]).validate(json.loads(json.dumps(record)))
     assert record["position"]["protection_level_m"] is None

@@ -104,7 +104,7 @@ def test_a_masked_ridge_that_hugs_the_horizon_does_not_move_the_fix(located, cat
     known, hidden = located.result, ridge(located)
     exposure = paint(known.exposure, hidden, DARK_ADU)
     unmasked = pipeline.locate(exposure, known.camera, known.terrain, catalog)
-    assert unmasked.status != "ok" or unmasked.blocked is not None  # the stars that it hides are noticed
+    assert unmasked.status != "ok" or unmasked.fix.blocked is not None  # the stars that it hides are noticed
     right = pipeline.locate(with_facts(exposure, mask=mask_of(hidden)), known.camera, known.terrain, catalog)
     assert nees(right, located) < EVERY_CHI2_2DOF
 

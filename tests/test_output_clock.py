@@ -15,7 +15,7 @@ from startrack.chain.stages import Measured, Refused, extend
 from startrack.core.types import ClockError, Mode
 from startrack.output import SCHEMAS, detection_dict, identification_dict, result_dict, verbose_text
 from startrack.output.html.rows import facts_of
-from startrack.output.record import at_record
+from startrack.output.record import record_values
 
 CLOCK = ClockError(offset_s=-12.3456, sigma_s=0.25)
 CHECK = Draft202012Validator(SCHEMAS["fix"])
@@ -33,7 +33,7 @@ def test_a_fix_with_a_clock_states_its_error(located):
     assert record["clock"] == {"offset_s": -12.3456, "sigma_s": 0.25}
     assert record["provenance"]["time_sigma_s"] == 20.0
     assert "  clock      offset -12.346 s; sigma 0.250 s\n" in verbose_text(result)
-    assert dict(dict(facts_of(at_record(record)))["Position"])["Clock"] == "−12.346 s ± 0.250 s"
+    assert dict(dict(facts_of(record_values(record)))["Position"])["Clock"] == "−12.346 s ± 0.250 s"
 
 
 def test_a_fix_without_a_clock_has_null(located):
@@ -42,7 +42,7 @@ def test_a_fix_without_a_clock_has_null(located):
     CHECK.validate(record)
     assert record["clock"] == {"offset_s": None, "sigma_s": None}
     assert "\n  clock " not in verbose_text(result)
-    assert "Clock" not in dict(dict(facts_of(at_record(record)))["Position"])
+    assert "Clock" not in dict(dict(facts_of(record_values(record)))["Position"])
 
 
 @pytest.mark.parametrize("wrong", [{"sigma_s": -1.0}, {"offset_s": "late"}])

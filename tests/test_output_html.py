@@ -24,7 +24,7 @@ from startrack.localization.rim_plane import point_fix
 from startrack.output import page_text, result_at, result_dict, results_under, write_json, write_results
 from startrack.output.html.details import SOURCES, ground_map, skyline_of
 from startrack.output.html.rows import COLUMNS, facts_of
-from startrack.output.record import at_record
+from startrack.output.record import record_values
 from startrack.terrain import load_terrain
 
 VOID = {"meta", "link", "input", "br", "img"}
@@ -132,7 +132,7 @@ def test_a_position_without_a_circle_has_an_error_only(located, tmp_path):
     assert [row[key] for key in ("radius95_m", "radius999_m", "cov_ee", "nees")] == [None] * 4
     assert row["error_m"] == pytest.approx(np.linalg.norm(located_at - [6010.0, -2507.0]), abs=0.01)
     assert head["errors"]["inside95"] is head["errors"]["mean_nees"] is None
-    facts = dict(dict(facts_of(at_record(result_dict(point))))["Position"])
+    facts = dict(dict(facts_of(record_values(result_dict(point))))["Position"])
     assert facts["95 % within"] == "no circle" and facts["Search"] == "approximate"
     assert not {"Sigma", "99.9 % within"} & set(facts)
 

@@ -17,18 +17,18 @@ from startrack.frames import R_from_rotvec, heading_pitch_roll_from_R_body_enu
 from startrack.output import (
     SCHEMAS,
     Quantity,
-    at_stage,
     quantities,
     record,
     result_dict,
     rows,
     schema_of,
     show_everywhere,
+    stage_values,
     table_columns,
     text,
 )
 from startrack.output.quantity import Listed
-from startrack.output.record import at_record
+from startrack.output.record import record_values
 from startrack.output.values import body_sigmas_deg
 
 ROOT = Path(__file__).parent.parent
@@ -45,13 +45,13 @@ def test_a_new_quantity_is_one_entry(located, monkeypatch):
     for module in (quantities, record, text):
         monkeypatch.setattr(module, "QUANTITIES", table)
     monkeypatch.setitem(quantities.BY_PATH, new.path, new)
-    at, found = at_stage(located.result), result_dict(located.result)
+    at, found = stage_values(located.result), result_dict(located.result)
     assert found["position"]["twice_m"] == 2 * located.result.fix.radius95_m
     assert schema_of(table, "position")["properties"]["twice_m"]["minimum"] == 0
     assert table_columns()[-1].name == "twice_m"
     words = f"{2 * located.result.fix.radius95_m:.1f} m"
     assert f"; twice {words}" in dict(rows("text", at))["error"]
-    for place, values in (("panel", at), ("notebook", at), ("page", at_record(found))):
+    for place, values in (("panel", at), ("notebook", at), ("page", record_values(found))):
         assert dict(rows(place, values))["twice" if place == "notebook" else "Twice"] == words
 
 

@@ -31,9 +31,7 @@ def test_one_line_for_a_fix(located):
 
 def test_a_position_without_a_circle_is_called_approximate(located):
     fix = located.result.fix
-    point = replace(
-        located.result, fix=point_fix(fix.position_enu_m[:2], located.result.terrain), sky_light=None, sky_used=None
-    )
+    point = replace(located.result, fix=point_fix(fix.position_enu_m[:2], located.result.terrain), sky=None)
     line = summary_line(point, seconds=3.14)
     assert re.fullmatch(
         r"small  ok  E \S+ m  N \S+ m  approximate, no circle  heading .* stars  3\.1 s with files", line

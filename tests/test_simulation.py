@@ -95,7 +95,7 @@ def test_positions_of_simulated_stars_err_as_they_state(series: Series):
         off = (fixed.fix.position_enu_m - scene.position_enu_m)[:2]
         nees.append(off @ np.linalg.solve(fixed.fix.covariance_m2, off))
         inside += bool(np.hypot(*off) < fixed.fix.radius95_m)
-        assert np.hypot(*off) < fixed.integrity.protection_level_m
+        assert np.hypot(*off) < fixed.fix.integrity.protection_level_m
     assert 1.1 < np.mean(nees) < 3.2  # 2 is expected; its standard error is 0.37
     assert inside >= 25
 
@@ -122,7 +122,7 @@ def test_the_stars_of_an_image_are_located_as_the_pipeline_locates_them(located:
     by_stars = locate(known.exposure, known.camera, known.terrain, catalog, settings)
     again = locate_rays(extend(by_stars, StarRays))
     assert again.fix.position_enu_m == pytest.approx(by_stars.fix.position_enu_m, abs=1e-9)
-    assert again.integrity.protection_level_m == by_stars.integrity.protection_level_m
+    assert again.fix.integrity.protection_level_m == by_stars.fix.integrity.protection_level_m
 
 
 def test_a_scene_without_ground_or_time_is_refused(series: Series):

@@ -130,7 +130,7 @@ def answer(rays: Any, localizer: Any = None) -> dict[str, Any]:
         found = locate_rays(rays, localizer)
     except NoSolution as refusal:
         return {"reason": str(refusal.reason)}
-    fix, level = found.fix, None if found.integrity is None else float(found.integrity.protection_level_m)
+    fix, level = found.fix, None if found.fix.integrity is None else float(found.fix.integrity.protection_level_m)
     place: list[Array] = [fix.position_enu_m, fix.covariance_m2.ravel()]
     return {
         "position": np.concatenate(place).tolist(), "circles": [fix.radius95_m, fix.radius999_m], "level": level,

@@ -131,7 +131,7 @@ class Solution:
 
     def _shown(self, *groups: str) -> output.Rows:
         """The rows of the notebook's table of these groups of quantities."""
-        return output.rows("notebook", output.at_stage(last_value(self.result)), groups)
+        return output.rows("notebook", output.stage_values(last_value(self.result)), groups)
 
     @cached_property
     def modes(self) -> QTable | None:

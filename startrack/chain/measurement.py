@@ -134,8 +134,8 @@ def remeasure_near_skyline(measured: Located, step: SkyStep, photometry: StarEvi
     azimuth, elevation = light.azimuth_rad, light.elevation_rad
     above_px, is_reliable = height_above_px(azimuth, elevation, camera, R, horizon), reliable(azimuth)
     wanted = (np.abs(above_px) < BAND_PX) & is_reliable
-    if measured.blocked is not None:
-        wanted &= ~measured.blocked.hides(azimuth)
+    if measured.fix.blocked is not None:
+        wanted &= ~measured.fix.blocked.hides(azimuth)
     around = np.abs(above_px) < BAND_PX + NEIGHBOURS_PX
     # The fix determines the visibility of neighbours better than their faint flux does, except next to the skyline.
     undecided = (np.abs(above_px) < UNDECIDED_PX) | ~is_reliable
@@ -171,7 +171,7 @@ def _photometry(
     )
     light = light if only is None else replace(light, star=only[light.star])
     rays = light.azimuth_rad, light.elevation_rad
-    return light if terrain.is_informative(*rays).all() else light.masked(terrain.mask_reason(*rays))
+    return light if terrain.is_informative(*rays).all() else light.mask_stars(terrain.mask_reason(*rays))
 
 
 def locate_rays(rays: StarRays, localizer: Localizer | None = None) -> StarFix:

@@ -86,7 +86,7 @@ def _refine(located: Located, is_newer: bool, settings: Settings) -> Located:
     by_stars = settings.evidence_sources == "stars"
     if not by_stars:
         located = refine_by_sky_light(located, settings.localizer, settings.evidence_sources == "both")
-    if located.sky_light is None and (is_newer or not by_stars):
+    if located.sky is None and (is_newer or not by_stars):
         return fix_position(located, Located, settings.localizer)
     return located
 
@@ -103,7 +103,7 @@ def locate_exposure(exposure: Exposure, settings: Settings | None = None) -> Loc
         raise BadInput("bad_terrain", "no terrain file is known: give -t FILE or a sidecar with terrain")
     camera, terrain = load_camera(exposure.camera), load_terrain(exposure.terrain)
     read_ms = 1e3 * (clock.perf_counter() - start)
-    return with_timing(locate(exposure, camera, terrain, load_catalog(), settings), read=read_ms)
+    return add_timing(locate(exposure, camera, terrain, load_catalog(), settings), read=read_ms)
 
 
 def identify(
@@ -145,7 +145,7 @@ def detect(exposure: Exposure, camera: Camera | None, settings: Settings | None 
     return run.outcome(lambda: run.run_stage("detect", detect_sources, run.reached, camera, detector))
 
 
-def with_timing(outcome: Any, **more_ms: float) -> Any:
+def add_timing(outcome: Any, **more_ms: float) -> Any:
     """The same `outcome` with `more_ms`, wall times [ms] by stage, added to its stages' times."""
     times = dict(outcome.timing_ms)
     for stage, ms in more_ms.items():

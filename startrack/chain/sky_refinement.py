@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from startrack.chain.measurement import fix_position
-from startrack.chain.stages import Located, Measured
+from startrack.chain.stages import Located, Measured, SkyEvidence
 from startrack.core.types import (
     MIDDLES_RAD,
     SECTORS,
@@ -58,27 +58,21 @@ def refine_by_sky_light(located: Located, localizer: Localizer, stars: bool = Tr
         _require_refinable(located)
         for _ in range(SKY_ROUNDS):
             before = located
-            sky, used, errors = _measure(located)
-            rows = sky.evidence(used)
+            sky = _measure_sky(located)
+            rows = sky.light.evidence(sky.used)
             parts = (located.evidence(), rows) if stars else (rows,)
             evidence = replace(
-                Evidence.concatenate(*parts), image_errors=errors, support=located.fix.samples, clock=located.clock,
+                Evidence.concatenate(*parts), image_errors=sky.errors, support=located.fix.samples, clock=located.clock,
                 near=located.near,
             )  # fmt: skip
-            located = replace(
-                fix_position(located, Located, localizer, evidence),
-                sky_light=sky,
-                sky_used=used,
-                image_errors=errors,
-                by_stars=stars,
-            )
-            if _moved_px(before, located, sky) < MOVED_PX:
+            located = replace(fix_position(located, Located, localizer, evidence), sky=sky, by_stars=stars)
+            if _motion_px(before, located, sky.light) < MOVED_PX:
                 return located
         raise NoSkyLight("it points to no single position")
     except NoSkyLight as cause:
         if not stars:
             raise NotLocated(f"the light of the sky gives no position: {cause}") from cause
-        return replace(located, sky_unused=str(cause), sky_light=None, sky_used=None, image_errors=None)
+        return replace(located, sky_unused=str(cause), sky=None)
 
 
 def predicted_skyline(located: Located) -> Skyline:
@@ -98,7 +92,7 @@ def _require_refinable(located: Located) -> None:
         raise NoSkyLight("the method of localization has no posterior")
 
 
-def _measure(located: Located) -> tuple[SkyLight, Bools, ImageErrors]:
+def _measure_sky(located: Located) -> SkyEvidence:
     """The light of the sky at the predicted skyline, the sectors where it counts, and errors of the image."""
     horizon = predicted_skyline(located)
     pixels = pixels_near_skyline(located.detections, located.camera, located.R_cam_enu, horizon, located.light)
@@ -108,7 +102,7 @@ def _measure(located: Located) -> tuple[SkyLight, Bools, ImageErrors]:
     used = sectors_with_step(sky) & located.terrain.is_informative(MIDDLES_RAD, sky.elevation_rad)
     if np.count_nonzero(used) < NEEDED_SECTORS:
         raise NoSkyLight(_too_few_text(sky, used))
-    return sky, used, _image_errors(located, sky, used)
+    return SkyEvidence(sky, used, _image_errors(located, sky, used))
 
 
 def _image_errors(measured: Measured, sky: SkyLight, used: Bools) -> ImageErrors:
@@ -128,7 +122,7 @@ def _image_errors(measured: Measured, sky: SkyLight, used: Bools) -> ImageErrors
     )  # fmt: skip
 
 
-def _moved_px(before: Located, after: Located, sky: SkyLight) -> float:
+def _motion_px(before: Located, after: Located, sky: SkyLight) -> float:
     """By how much the predicted skyline moves from one fix to the next, at most, where the sky's light is used."""
     moved = predicted_skyline(after)(MIDDLES_RAD) - predicted_skyline(before)(MIDDLES_RAD)
     return float(np.quantile(np.abs(moved) * sky.px_per_rad, 0.9))
@@ -155,9 +149,9 @@ def measured_skyline(located: Located) -> MeasuredSkyline | None:
     horizon = Skyline.trace(located.position_at_time_m, located.terrain)
     elevation, sigma = _skyline_by_stars(located.evidence(), horizon)
     source = np.where(sigma < MOST_SIGMA_RAD, "stars", "").astype("<U9")
-    sky, used, errors = located.sky_light, located.sky_used, located.image_errors
-    if sky is not None and used is not None and errors is not None:
-        used = used if located.blocked is None else used & ~located.blocked.whole
+    if located.sky is not None:
+        sky, used, errors = located.sky
+        used = used if located.fix.blocked is None else used & ~located.fix.blocked.whole
         by_image = np.einsum("ni,ij,nj->n", errors.raised_rad, errors.covariance, errors.raised_rad)
         by_sky = sky.elevation_rad + sky.shift_px / sky.px_per_rad - errors.raised_rad @ errors.mean
         sky_sigma = np.sqrt(sky.variance_px2 / np.square(sky.px_per_rad) + by_image)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
-from typing import Any, Self, TypeAlias, TypeVar, cast
+from typing import Any, NamedTuple, Self, TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from startrack.core.errors import Reason
 from startrack.core.types import (
     Array,
     Attitude,
-    Blocked,
     Body,
     Bools,
     Clock,
@@ -30,7 +29,6 @@ from startrack.core.types import (
     Fix,
     Identification,
     ImageErrors,
-    Integrity,
     MeasuredSkyline,
     PositionPrior,
     Stars,
@@ -171,7 +169,7 @@ class StarRays:
         """The same under the sky of a time later by `seconds`, which is right to `reach_s`."""
         R = R_from_rotvec(seconds * self.clock.turn_rad_s)
         clock = replace(self.clock, offset_s=self.clock.offset_s + seconds, reach_s=reach_s)
-        return replace(self, R_enu_icrs=R @ self.R_enu_icrs, light=self.light.turned(R), clock=clock)
+        return replace(self, R_enu_icrs=R @ self.R_enu_icrs, light=self.light.turn_frame(R), clock=clock)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -179,16 +177,6 @@ class StarFix(StarRays):
     """The position that explains the stars, and its integrity."""
 
     fix: Fix
-
-    @property
-    def integrity(self) -> Integrity | None:
-        """Of the fix; None: not assessed, of several positions or without a posterior."""
-        return self.fix.integrity
-
-    @property
-    def blocked(self) -> Blocked | None:
-        """Parts of the view that something on no map blocks; None: nothing is blocked."""
-        return self.fix.blocked
 
     @property
     def status(self) -> str:
@@ -214,13 +202,19 @@ class Measured(StarRays, Oriented):
         return [*super().warnings, *self.terrain.masked_sectors(), *self.terrain.error_warnings()]
 
 
+class SkyEvidence(NamedTuple):
+    """The light of the sky as evidence of a position."""
+
+    light: SkyLight  # of the image at the skyline
+    used: Bools  # (SECTORS,) where it is used
+    errors: ImageErrors  # of it
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Located(StarFix, Measured):
     """The whole solution: evidence and the position that explains it."""
 
-    sky_light: SkyLight | None = None  # of the image at the skyline; None: not used for the fix
-    sky_used: Bools | None = None  # (SECTORS,) where it is used
-    image_errors: ImageErrors | None = None  # of it
+    sky: SkyEvidence | None = None  # None: not used for the fix
     by_stars: bool = True  # whether the stars' rows are in the posterior too
     sky_unused: str = ""  # why the sky's light is not used
     skyline: MeasuredSkyline | None = None  # that the image shows; None: not one position, or not right to its error
@@ -237,14 +231,14 @@ class Located(StarFix, Measured):
     @property
     def warnings(self) -> list[str]:
         """Those of `Measured`, what blocks the view, and errors beyond the defaults of facts that no file states."""
-        blocked = [f"blocked and left out: {self.blocked.text}"] if self.blocked else []
+        blocked = [f"blocked and left out: {self.fix.blocked.text}"] if self.fix.blocked else []
         shown = [f"the image shows {one.text}, which no file states: it is estimated" for one in self.fix.shown]
         return [*super().warnings, *blocked, *shown]
 
     @property
     def evidence_source(self) -> str:
         """What the position is from: stars, sky (the light of the sky), or both."""
-        if self.sky_light is None:
+        if self.sky is None:
             return "stars"
         return "both" if self.by_stars else "sky"
 

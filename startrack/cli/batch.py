@@ -86,7 +86,7 @@ def _locate_images(
         _prepare(tasks[0], args)
     runner: Runner[Task, ImageDone] = Runner(batch.locate_image, jobs=args.jobs or cores(), cluster=args.cluster)
     shown = _Shown(args, len(tasks), runner.stop)
-    with shown.halted_by_signals():
+    with shown.halt_by_signals():
         with runner:
             records = shown.take(runner, tasks)
         stopped = shown.halted if len(records) < len(tasks) else None
@@ -146,7 +146,7 @@ class _Shown:
         self._stop()
 
     @contextmanager
-    def halted_by_signals(self) -> Iterator[None]:
+    def halt_by_signals(self) -> Iterator[None]:
         """In the block the first Ctrl-C or SIGTERM halts after the images in progress, a later one at once."""
         first_s: float | None = None
 

@@ -7,12 +7,11 @@ import math
 from collections.abc import Callable
 from typing import TypeVar
 
-from startrack.core import MAX_EXPOSURE_S
+from startrack.core import MAX_COUNT, MAX_EXPOSURE_S
 from startrack.core.declaration import LARGEST, SHOWN_CHARS
 
 T = TypeVar("T")
 SCHEMES = ("", "tcp", "tls", "ucx", "ws", "wss")  # of Dask's addresses
-MAX_COUNT = 1_000_000
 MAX_MAGNITUDE = 100.0
 FIELD_TOLERANCE_1 = 0.1  # as startrack.identification.unknown_lens has it; written here so that help is quick
 
@@ -39,30 +38,30 @@ def count(text: str) -> int:
     return value
 
 
-def limited(convert: Callable[[str], T], is_allowed: Callable[[T], bool], fault: str) -> Callable[[str], T]:
+def limit_type(convert: Callable[[str], T], is_allowed: Callable[[T], bool], fault: str) -> Callable[[str], T]:
     """The type of the values that `is_allowed`; `fault` is the message about another one, "{}" in it the text."""
 
-    def checked(text: str) -> T:
+    def convert_allowed(text: str) -> T:
         value = convert(text)
         if not is_allowed(value):
             raise argparse.ArgumentTypeError(fault.format(text[:SHOWN_CHARS]))
         return value
 
-    return checked
+    return convert_allowed
 
 
-amount = limited(number, lambda value: value >= 0, "{!r} is negative")
-positive_number = limited(number, lambda value: value > 0, "{!r} is not above 0")
-magnitude = limited(
+amount = limit_type(number, lambda value: value >= 0, "{!r} is negative")
+positive_number = limit_type(number, lambda value: value > 0, "{!r} is not above 0")
+magnitude = limit_type(
     number,
     lambda value: abs(value) <= MAX_MAGNITUDE,
     f"{{!r}} is no magnitude from -{MAX_MAGNITUDE:g} to {MAX_MAGNITUDE:g}",
 )
-seconds = limited(
+seconds = limit_type(
     number, lambda value: 0 < value <= MAX_EXPOSURE_S, f"{{!r}} is not above 0 and up to {MAX_EXPOSURE_S:g} seconds"
 )
-positive_count = limited(count, lambda value: value > 0, "{!r} is not above 0")
-limited_count = limited(count, lambda value: value <= MAX_COUNT, f"{{}} is more than {MAX_COUNT}")
+positive_count = limit_type(count, lambda value: value > 0, "{!r} is not above 0")
+limited_count = limit_type(count, lambda value: value <= MAX_COUNT, f"{{}} is more than {MAX_COUNT}")
 
 
 def time_sigma_s(text: str) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from startrack.cli import flags
-from startrack.cli.flag_types import amount, field_of_view_rad, limited, number, positive_number
+from startrack.cli.flag_types import amount, field_of_view_rad, limit_type, number, positive_number
 from startrack.cli.flags import Command, Either, flag, function_at
 
 CALIBRATE = """usage: startrack calibrate [ACTION] ... (startrack calibrate --help lists the flags of each action)
@@ -90,7 +90,7 @@ COMMANDS = (
                     "--calibrated-angle DEG",
                     "with --from: angle off the axis up to which the lens was calibrated, which no such file states "
                     "(default: that of the frame's nearest edge)",
-                    limited(number, lambda deg: 0 < deg <= 180, "{} is not above 0 and up to 180 degrees"),
+                    limit_type(number, lambda deg: 0 < deg <= 180, "{} is not above 0 and up to 180 degrees"),
                 ),
             ),
             "output": (flags.FILE, NAME, flags.DIR, flags.OVERWRITE),
@@ -107,7 +107,7 @@ COMMANDS = (
                 flag("--pattern CxR", "inner corners of a chessboard; squares of a ChArUco board"),
                 flag("--charuco DICT", "ChArUco with this dictionary, such as DICT_5X5_100"),
                 flag("--marker PART", "marker's side over square's",
-                     limited(number, lambda part: 0 < part < 1, "{} is not between 0 and 1"), default=0.75),
+                     limit_type(number, lambda part: 0 < part < 1, "{} is not between 0 and 1"), default=0.75),
             ),
             "output": CAMERA_OUTPUT,
             "more": flags.MORE,

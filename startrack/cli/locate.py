@@ -23,8 +23,8 @@ from startrack.core.errors import INTERNAL_ERROR, BadInput, BadOutput
 from startrack.core.files import make_folder
 from startrack.core.types import Exposure, PositionPrior
 from startrack.exposure import split_bag_path
+from startrack.identification import WIDE_FIELD_RAD
 
-WIDE_RAD = math.radians(100.0)  # from here up the field of view is that of the image circle
 Solve = Callable[[Exposure, Camera | None], chain.Outcome]
 
 
@@ -106,7 +106,7 @@ def _solve_image(args: argparse.Namespace, path: str, out: Path, solve: Solve) -
     if is_located and exposure.time_utc is not None and exposure.camera is not None:
         prepare_reference(exposure.terrain, args)
     start = time.perf_counter()
-    result = chain.with_timing(solve(exposure, camera), read=1e3 * read_s)
+    result = chain.add_timing(solve(exposure, camera), read=1e3 * read_s)
     more = {"explain": output.explain(result)} if is_located and args.explain else {}
     record = output.write_results(result, out, plots=not args.no_plots, more=more)
     if is_located:
@@ -137,6 +137,6 @@ def _found_fov_text(camera: Camera, fovs_rad: tuple[float, ...]) -> str:
     middle, right = camera.centre_px[1], camera.size_px[0] - 0.5
     width_rad = float(camera.angle_rad(np.array([[-0.5, middle], [right, middle]])).sum())
     closest = min(
-        fovs_rad, key=lambda fov: abs(math.log(fov / (width_rad if fov < WIDE_RAD else 2 * camera.max_angle_rad)))
+        fovs_rad, key=lambda fov: abs(math.log(fov / (width_rad if fov < WIDE_FIELD_RAD else 2 * camera.max_angle_rad)))
     )
     return f"{math.degrees(closest):.4g}"

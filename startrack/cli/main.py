@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, io.TextIOWrapper):  # LC_ALL=C and a name beyond ASCII: escaped, no failure
                 stream.reconfigure(errors="backslashreplace")
-        with _ended_by_interrupt():
+        with _end_by_interrupt():
             parser, commands = _parser()
         if "_ARGCOMPLETE" in os.environ and importlib.util.find_spec("argcomplete") is not None:
             import argcomplete  # of the extra `completion`: the shell requests words
@@ -121,7 +121,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 @contextmanager
-def _ended_by_interrupt() -> Iterator[None]:
+def _end_by_interrupt() -> Iterator[None]:
     """In the block Ctrl-C ends the process: while modules are loaded, Python can lose a KeyboardInterrupt."""
     is_main_thread = threading.current_thread() is threading.main_thread()
     if signal.getsignal(signal.SIGINT) is not signal.default_int_handler or not is_main_thread:

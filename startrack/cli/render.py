@@ -18,12 +18,11 @@ from startrack.core.files import check_output, write_atomically
 from startrack.core.types import TIME_SIGMA_S
 from startrack.exposure import with_facts, write_exposure, write_sidecar
 from startrack.frames import format_utc, heading_pitch_roll_from_R_body_enu, parse_utc, tum_line
-from startrack.rendering import Drive, Pose, Series
+from startrack.rendering import FAINTEST_V_MAG, Drive, Pose, Series
 from startrack.terrain import load_terrain
 
 SUFFIXES = {"png": ".png", "tiff": ".tif", "fits": ".fits"}
 KNOWN_SUFFIXES = {*SUFFIXES.values(), ".tiff", ".fit", ".fts"}
-CATALOG_V_MAG = 10.0  # catalogue stars drawn when there are no faint ones to go with them
 ANGLES = ("heading", "pitch", "roll")
 SETTINGS = (  # flags that determine the pixels, without those of the pose and of the files' names
     "max_tilt", "sky_mag", "sky_gradient", "sky_gradient_azimuth", "wall_reflectance", "faint_stars", "no_faint_stars",
@@ -100,7 +99,7 @@ def _series(args: argparse.Namespace, drive: Drive | None) -> Series:
     faint = None if args.no_faint_stars else args.faint_stars
     return Series(
         camera=load_camera(args.camera), terrain=load_terrain(args.terrain),
-        catalog=catalog.brighter_than(CATALOG_V_MAG if faint is None else faint), seed=args.seed,
+        catalog=catalog.brighter_than(FAINTEST_V_MAG if faint is None else faint), seed=args.seed,
         time_utc=None if args.time is None else parse_utc(args.time), east_m=args.east, north_m=args.north,
         **{f"{name}_rad": math.radians(deg) for name in ANGLES if (deg := getattr(args, name)) is not None},
         max_tilt_rad=math.radians(args.max_tilt), exposure_s=args.exposure, sky_v_mag_arcsec2=args.sky_mag,

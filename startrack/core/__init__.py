@@ -1,4 +1,5 @@
 """What every package uses: values, errors with exit codes, files and locks, settings, compiled code, processes."""
 
 MAX_EXPOSURE_S = 1e6  # of an image
+MAX_COUNT = 1_000_000  # of frames, cells or draws: more is a wrong unit
 REPORTED_IMAGES = 30  # on a page, with their pictures

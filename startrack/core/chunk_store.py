@@ -53,7 +53,7 @@ class ChunkStore(Runner[Task, Chunk]):
 
     def chunks(self, what: str, tasks: Sequence[Task]) -> Iterator[Chunk]:
         """The chunks of `what` in the order of the tasks; missing ones are computed. Raises RunStopped."""
-        missing = self.missing(tasks)
+        missing = self.missing_tasks(tasks)
         with self.progress(what, sum(map(len, missing))) as bar:
             for task, chunk in self.results(missing):
                 if isinstance(chunk, Died):
@@ -66,7 +66,7 @@ class ChunkStore(Runner[Task, Chunk]):
             with np.load(self._path(task)) as stored:
                 yield {key: stored[key] for key in stored.files}
 
-    def missing(self, tasks: Iterable[Task]) -> list[Task]:
+    def missing_tasks(self, tasks: Iterable[Task]) -> list[Task]:
         """The tasks without a chunk."""
         return [task for task in tasks if not self._path(task).exists()]
 

@@ -19,6 +19,7 @@ PACKAGE = Path(__file__).resolve().parents[1]
 MAX_TEXT_BYTES = 2**20  # camera and terrain files have a few kilobytes
 MAX_CAUSE_CHARS = 200  # of a library's message
 MAX_STEM_BYTES = 200  # file systems take names of 255, and a suffix follows
+TIFF_COMPRESSIONS = {1, 8, 32773, 32946}  # none, deflate, PackBits, deflate: tifffile needs nothing more for these
 FULL_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}  # errors of writing that are not the path's
 FOREIGN_CAMERA_SUFFIXES = ".yaml", ".yml", ".xml", ".txt"  # of other programs' camera files
 FilePath = str | os.PathLike[str]

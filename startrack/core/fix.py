@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from startrack.core.values import Array, Bools, Value, array
+from startrack.core.values import Array, Bools, Value, array, vector
 
 CARRIED_PART = 0.5  # of the information, by the groups that are named
 
@@ -52,7 +52,7 @@ class Clock(Value):
     also what the error would be if a stated `sigma_s` were wrong.
     """
 
-    turn_rad_s: Array = array(3)  # rotation vector in enu: by one second that the true time is later
+    turn_rad_s: Array = vector()  # rotation vector in enu: by one second that the true time is later
     sigma_s: float  # of the stated time
     offset_s: float = 0.0  # by which the directions' time is later than the stated one
     reach_s: float = np.inf  # the true time is no farther from the directions' time
@@ -165,7 +165,7 @@ class Integrity:
 class Fix(Value):
     """Posterior of the camera's position."""
 
-    position_enu_m: Array = array(3)  # posterior mean of the main mode (east, north) and the camera's height there
+    position_enu_m: Array = vector()  # posterior mean of the main mode (east, north) and the camera's height there
     covariance_m2: Array = array(2, 2)  # (east, north), without gross errors; infinite of a method that states none
     radius95_m: float  # circle about the position that holds 95 % of the posterior
     radius999_m: float

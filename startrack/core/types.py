@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from startrack.core.errors import BadInput, NoSolution, NotIdentified, NotLocated, TooFewStars
 from startrack.core.fix import Blocked, Clock, ClockError, Fix, Integrity, Mode, PositionPrior, ShownError, UnstatedFact
 from startrack.core.smooth_image import Image, SmoothImage
-from startrack.core.values import Array, Bools, Ints, Rows, Value, array
+from startrack.core.values import Array, Bools, Ints, Rows, Value, array, rotation, vector
 
 __all__ = [
     "Array", "Attitude", "BadInput", "Blocked", "Body", "Bools", "Centroids", "Clock", "ClockError", "Correction",
     "Detections", "Evidence", "Exposure", "Fix", "Identification", "ImageErrors", "Integrity", "Ints", "Mask",
     "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified", "NotLocated", "PositionPrior", "Rows", "ShownError",
-    "Stars", "TooFewStars", "UnstatedFact", "Value", "array",
+    "Stars", "TooFewStars", "UnstatedFact", "Value", "array", "rotation", "vector",
 ]  # fmt: skip
 
 # Beyond the zenith: the search for an error of the horizon shifts the rows, by three sigma at most.
@@ -37,6 +37,7 @@ def sector_of(azimuth_rad: Array) -> Ints:
     return np.asarray((azimuth_rad * (SECTORS / (2 * np.pi))).astype(np.int64) % SECTORS)
 
 
+STAR_COUNT_SLOPE = 1.08  # natural logarithm of the stars per magnitude, V 6 to 10: 2.9 times as many
 TIME_SIGMA_S = 1.0  # of the clock, where nothing is stated
 MAX_PIXELS = 200_000_000  # contract: a larger image is refused from its header, before anything is decoded
 
@@ -161,7 +162,7 @@ class Body(Value):
     """A planet, the Earth, the Sun or the Moon as a light source."""
 
     name: str
-    ray_icrs: Array = array(3)  # apparent direction (light time and aberration applied)
+    ray_icrs: Array = vector()  # apparent direction (light time and aberration applied)
     v_mag: float
 
 
@@ -169,7 +170,7 @@ class Body(Value):
 class Attitude(Value):
     """Rotation of the camera with the covariance of small rotations about the camera's own axes."""
 
-    R_cam_icrs: Array = array(3, 3)
+    R_cam_icrs: Array = rotation()
     covariance_rad2: Array = array(3, 3)  # of the rotation vector w about cam x, y, z: R_true = exp(w) R
 
 
@@ -179,7 +180,7 @@ class Identification(Rows):
 
     detection: Ints = array("n", dtype=np.int64)  # index into Detections
     star: Ints = array("n", dtype=np.int64)  # index into Stars
-    R_cam_icrs: Array = array(3, 3)  # attitude at which the matches were verified
+    R_cam_icrs: Array = rotation()  # attitude at which the matches were verified
     false_alarm_probability: float  # that a sky of random detections would be accepted as well matched
     unexplained: int  # significant detections that no catalogue star explains
 

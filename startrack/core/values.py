@@ -26,6 +26,16 @@ def array(
     return field(metadata=metadata) if default is None else field(default=None, metadata=metadata)
 
 
+def vector(**more: Any) -> Any:
+    """A checked field (3,), the components of a vector in a frame; `more` as in `array`."""
+    return array(3, **more)
+
+
+def rotation() -> Any:
+    """A checked field (3, 3), a rotation from one frame to another."""
+    return array(3, 3)
+
+
 def _is_locked(given: Any, dtype: Any) -> bool:
     """Whether an array is immutable and of this type of numbers: it then needs no copy."""
     if type(given) is not np.ndarray or given.flags.writeable or not given.flags.c_contiguous:

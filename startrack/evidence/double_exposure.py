@@ -84,15 +84,15 @@ class _Rows:
         """Log-likelihoods (n,) of stars that are visible or hidden without a rule."""
         return np.logaddexp(self.hidden, self.visible) - np.log(2.0)
 
-    def above(self, terrain: Terrain, points_m: Array) -> Array:
+    def find_above(self, terrain: Terrain, points_m: Array) -> Array:
         """1 where a star is above the skyline of a point (m, 2), else 0: (m, n)."""
         return np.where(self.elevation_rad > terrain.horizon_rad(points_m[:, None], self.azimuth_rad), 1.0, 0.0)
 
-    def of_one(self, above: Array) -> Array:
+    def single_fits(self, above: Array) -> Array:
         """Log-likelihoods (m,) of single skylines, `above` (m, n)."""
         return self.hidden.sum() + above @ (self.visible - self.hidden)
 
-    def of_two(self, first: Array, second: Array) -> Array:
+    def pair_fits(self, first: Array, second: Array) -> Array:
         """Log-likelihoods (m, len(EXPOSURE_PARTS)) of pairs of skylines, `first` and `second` (m, n)."""
         hidden, other = self.hidden[:, None], self.dimmed[:, ::-1]
         both = self.visible[:, None] - self.dimmed - other + hidden
@@ -151,19 +151,19 @@ def _best_pair(rows: _Rows, terrain: Terrain, position_m: Array) -> DoubleExposu
     ])  # fmt: skip
 
     def two(pairs_m: Array) -> Array:
-        first, second = (rows.above(terrain, pairs_m[:, k]) for k in (0, 1))
-        fits = rows.of_two(first, second).max(axis=1)
+        first, second = (rows.find_above(terrain, pairs_m[:, k]) for k in (0, 1))
+        fits = rows.pair_fits(first, second).max(axis=1)
         return np.where(terrain.allowed(pairs_m).all(axis=1), fits, -np.inf)
 
     def one(points_m: Array) -> Array:
-        return rows.of_one(rows.above(terrain, points_m[:, 0]))
+        return rows.single_fits(rows.find_above(terrain, points_m[:, 0]))
 
     steps_m = CLIMB_STEPS * terrain.search_radius_m
     starts = pairs[np.argsort(-two(pairs), kind="stable")[:CLIMBS]]
     best, pair = max((_climb(two, start, steps_m) for start in starts), key=lambda found: found[0])
     single = max(_climb(one, start[None], steps_m)[0] for start in (position_m, *pair, pair.mean(axis=0)))
-    first, second = (rows.above(terrain, pair[k][None]) for k in (0, 1))
-    part = int(np.argmax(rows.of_two(first, second)))
+    first, second = (rows.find_above(terrain, pair[k][None]) for k in (0, 1))
+    part = int(np.argmax(rows.pair_fits(first, second)))
     between = (first != second)[0]
     dimmed = np.where(first[0] > 0, rows.dimmed[:, part], rows.dimmed[:, -1 - part])
     free_nats = float((dimmed - rows.free)[between].sum())

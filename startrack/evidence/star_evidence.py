@@ -55,7 +55,7 @@ class StarPhotometry(ExpectedStars):
         """Whether each star (n,) is evidence."""
         return np.asarray(self.cause_code == USABLE)
 
-    def masked(self, reason: NDArray[np.str_]) -> StarPhotometry:
+    def mask_stars(self, reason: NDArray[np.str_]) -> StarPhotometry:
         """The same with no evidence where there is a reason (n,) against it; an earlier cause stays."""
         texts = tuple(np.unique(reason[self.usable & (reason != "")]).tolist())
         code = self.cause_code.copy()
@@ -63,7 +63,7 @@ class StarPhotometry(ExpectedStars):
             code[self.usable & (reason == text)] = number
         return replace(self, cause_code=code, causes=self.causes + texts, llr=np.where(code == USABLE, self.llr, 0.0))
 
-    def turned(self, R: Array) -> StarPhotometry:
+    def turn_frame(self, R: Array) -> StarPhotometry:
         """The same under a sky turned by a rotation `R` (3, 3) in enu."""
         azimuth, elevation = turn_azel(self.azimuth_rad, self.elevation_rad, R)
         return replace(self, azimuth_rad=azimuth, elevation_rad=elevation)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.files import TIFF_COMPRESSIONS
 from startrack.exposure.decoding import (
     Decoded,
     bad_image,
@@ -23,12 +24,10 @@ from startrack.exposure.decoding import (
 )
 from startrack.exposure.facts import facts_in_text
 
-MINISWHITE, MINISBLACK, RGB, MOSAIC = 0, 1, 2, 32803
-REFUSED = {MINISWHITE: "white-is-zero", 3: "palette", 4: "a mask", 5: "CMYK", 6: "YCbCr", 8: "CIELab"}
-CHANNELS = {MINISBLACK: 1, MOSAIC: 1, RGB: 3}
-UNCOMPRESSED = 1
-WITHOUT_IMAGECODECS = {UNCOMPRESSED, 8, 32946, 32773}  # deflate twice, PackBits: tifffile needs nothing more for these
-HORIZONTAL = 2  # the predictor that it has itself
+MOSAIC = 32803
+REFUSED = {0: "white-is-zero", 3: "palette", 4: "a mask", 5: "CMYK", 6: "YCbCr", 8: "CIELab"}  # by photometric type
+CHANNELS = {1: 1, 2: 3, MOSAIC: 1}  # 1: black is zero, 2: red, green, blue
+PREDICTORS = {1, 2}  # none, horizontal: tifffile has these itself
 NOWHERE = logging.NullHandler()  # added once
 READ = "integers of 8, 16 or 32 bits and floating point"
 TYPES = {"uint8", "uint16", "uint32", "int8", "int16", "int32", "float16", "float32", "float64"}
@@ -109,13 +108,13 @@ def _check_strips(page: Any, file_bytes: int) -> None:
     for start, count in zip(starts, counts, strict=True):
         if start <= 0 or count <= 0 or start + count > file_bytes:
             raise bad_image("truncated TIFF: a strip of the picture lies beyond the end of the file")
-    if page.compression == UNCOMPRESSED and sum(counts) < page.size * page.dtype.itemsize:
+    if page.compression == 1 and sum(counts) < page.size * page.dtype.itemsize:
         raise bad_image("damaged TIFF: its strips are shorter than the picture")
 
 
 def _pixels(page: Any, raw: bytes) -> NDArray[Any]:
     """(H, W) or (H, W, 3) as stored, native byte order."""
-    if page.compression in WITHOUT_IMAGECODECS and page.predictor in (1, HORIZONTAL):
+    if page.compression in TIFF_COMPRESSIONS and page.predictor in PREDICTORS:
         stored = page.asarray()
         if page.axes == "SYX":  # channels in separate planes
             stored = np.moveaxis(stored, 0, -1)

@@ -9,13 +9,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from startrack.camera import Camera
-from startrack.core.types import Array, Attitude, Centroids, Identification, Ints, NotIdentified, Stars
+from startrack.core.types import (
+    STAR_COUNT_SLOPE,
+    Array,
+    Attitude,
+    Centroids,
+    Identification,
+    Ints,
+    NotIdentified,
+    Stars,
+)
 from startrack.estimation.attitude import AttitudeFit, solve_attitude
 from startrack.identification.lost_in_space import Identifier
 from startrack.identification.unknown_lens import identify_unknown_lens
 
 DEFAULT_SIGMA_PX = 0.3  # centroid error per axis where none is given
-STAR_COUNT_SLOPE = 1.08  # natural logarithm of the increase of the number of stars per magnitude
 
 
 @dataclass(frozen=True, kw_only=True)

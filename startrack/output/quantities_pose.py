@@ -89,14 +89,14 @@ POSITION_QUANTITIES: tuple[Quantity, ...] = (
       shown=(Show("text", "error", ", {:.1f} m (99.9 %)"), Show("notebook", "99.9 % within", "{:.1f} m"),
              Show("page", "99.9 % within", "{:,.1f} m"))),
     Q("position.protection_level_m", "m", has_position,
-      lambda v: None if v.integrity is None else finite_or_none(v.integrity.protection_level_m),
+      lambda v: None if v.fix.integrity is None else finite_or_none(v.fix.integrity.protection_level_m),
       "radius about the position beyond which the true one lies with probability `protection_risk` at most, also where "
       "the directions within 45 degrees of azimuth show something on no map; null: such a group alone holds the "
       "position in some direction, or a method without a posterior",
       "positive", nullable=True, form="%.4f",
       shown=(Show("text", "protection", "{:.1f} m"), Show("notebook", "protected", "{:.1f} m"),
              Show("page", "Protection level", "{:,.1f} m"))),
-    Q("position.protection_risk", "", has_position, lambda v: None if v.integrity is None else RISK,
+    Q("position.protection_risk", "", has_position, lambda v: None if v.fix.integrity is None else RISK,
       "probability of an error beyond `protection_level_m`", "chance", nullable=True, optional=True,
       shown=(Show("text", "protection", " (risk {:g})"),)),
     Q("position.carried_by", "deg", has_position, carrying_azimuths,

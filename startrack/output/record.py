@@ -101,7 +101,7 @@ def _record(
     }
 
 
-def at_stage(value: Inputs) -> At:
+def stage_values(value: Inputs) -> At:
     """From the path of a quantity to its value in a `value` of the pipeline; None where it is not determined there."""
     known: dict[str, Any] = {}
 
@@ -114,7 +114,7 @@ def at_stage(value: Inputs) -> At:
     return value_at
 
 
-def at_record(result: Mapping[str, Any]) -> At:
+def record_values(result: Mapping[str, Any]) -> At:
     """From the path of a quantity to its value in a `result` record; None where that lacks it or has another type."""
 
     def value_at(path: str) -> Any:

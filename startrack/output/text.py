@@ -11,12 +11,12 @@ import numpy as np
 from startrack.chain import STAGES, Detected, Identified, Located, Measured, Outcome, Refused, last_value
 from startrack.core.errors import Reason, length_text
 from startrack.core.files import printable
-from startrack.core.types import Array, Blocked
+from startrack.core.types import MIDDLES_RAD, Array, Blocked
 from startrack.evidence import DECIDABLE_SNR
 from startrack.frames import rays_from_azel
 from startrack.localization import duration
 from startrack.output.quantities import QUANTITIES
-from startrack.output.record import at_stage, image_name
+from startrack.output.record import image_name, stage_values
 from startrack.output.values import DOMINANT, Angle, At
 
 if TYPE_CHECKING:
@@ -29,7 +29,6 @@ STAR_GROWTH = 0.6  # the number of stars grows with this power of the exposure: 
 ENOUGH_STARS = 30  # point sources with which nearly every image is identified
 GAINS_PART = 0.8  # a fact is named where the circle with it stated is smaller by this factor
 LEAST_HIDDEN_RAD = np.radians(15.0)  # of the skyline out of view
-AZIMUTHS_RAD = np.radians(np.arange(0.75, 360.0, 1.5))
 Rows = list[tuple[str, str]]
 
 
@@ -63,7 +62,7 @@ def summary_line(result: Outcome, seconds: float | None = None) -> str:
     if isinstance(result, Refused):
         return refusal_line(image_name(result.exposure), result.reason, result.message)
     took = f"{sum(result.timing_ms.values()) / 1e3:.1f} s" if seconds is None else f"{seconds:.1f} s with files"
-    parts = [text for _, text in rows("summary", at_stage(result))]
+    parts = [text for _, text in rows("summary", stage_values(result))]
     return "  ".join([image_name(result.exposure), result.status, *parts, took])
 
 
@@ -85,7 +84,7 @@ def lens_text(camera: Camera) -> str:
 
 def verbose_text(result: Outcome) -> str:
     """Indented lines about a `result`: position, attitude, stars and times, as far as they are known."""
-    at = at_stage(last_value(result))
+    at = stage_values(last_value(result))
     lines = rows("text", at)
     when = at("provenance.time_utc")
     lines += [("time", f"{when if when is not None else 'not known'} (middle of the exposure)")]
@@ -110,7 +109,7 @@ def _needs_of(outcome: Outcome) -> Iterator[str]:
     if isinstance(outcome, Located):
         yield from _needs_of_located(outcome)
     elif reason is Reason.INCONSISTENT_EVIDENCE and isinstance(value, Measured):
-        yield from _doubtful(value)
+        yield from _doubtful_facts(value)
     elif isinstance(value, Measured) and isinstance(outcome, Refused):
         yield _longer_exposure(value)
         yield from _more_skyline(value)
@@ -168,7 +167,7 @@ def _longer_exposure(measured: Measured) -> str:
     text = f"{longer}: {then} stars near the skyline{seen_from}, in place of {now}, would show whether they are visible"
     if not isinstance(measured, Located) or measured.fix.ambiguous or not np.isfinite(measured.fix.radius95_m):
         return text
-    gain = LONGER**0.5 if measured.sky_light is not None else max(then, 1) / max(now, 1)
+    gain = LONGER**0.5 if measured.sky is not None else max(then, 1) / max(now, 1)
     stated = " if all facts were stated" if measured.fix.unstated else ""
     return f"{text}, a 95 % circle of about {measured.fix.radius95_m / gain:.1f} m{stated}"
 
@@ -176,30 +175,30 @@ def _longer_exposure(measured: Measured) -> str:
 def _deciding_stars(measured: Measured, longer: float) -> int:
     """Usable stars near the skyline that an exposure longer by a factor shows, by the noise of the background."""
     light, skyline_rad = measured.light, _skyline(measured)
-    above = light.elevation_rad - np.interp(light.azimuth_rad, AZIMUTHS_RAD, skyline_rad, period=2 * np.pi)
+    above = light.elevation_rad - np.interp(light.azimuth_rad, MIDDLES_RAD, skyline_rad, period=2 * np.pi)
     decides = light.expected_e * np.sqrt(longer) > DECIDABLE_SNR * light.sigma_e
     return int(np.count_nonzero(light.usable & decides & (np.abs(above) < NEAR_SKYLINE_RAD)))
 
 
 def _more_skyline(measured: Measured) -> Iterator[str]:
     """Azimuths in which the skyline is not in view, or blocked."""
-    rays_cam = rays_from_azel(AZIMUTHS_RAD, _skyline(measured)) @ measured.R_cam_enu.T
+    rays_cam = rays_from_azel(MIDDLES_RAD, _skyline(measured)) @ measured.R_cam_enu.T
     xy_px, inside = measured.camera.project(rays_cam)
     known = inside & (measured.camera.angle_rad(xy_px) <= measured.camera.calibrated_angle_rad)
     hidden = Blocked(np.where(known, 0.0, 1.0))
     if 2 * np.pi * np.mean(hidden.whole) > LEAST_HIDDEN_RAD:
         yield f"more of the skyline: azimuths {hidden.text} are not in view; look up more steeply, or take a wider lens"
-    if isinstance(measured, Located) and measured.blocked is not None:
-        yield f"a free view: something on no map stands at azimuths {measured.blocked.text}; drive on some metres"
+    if isinstance(measured, Located) and measured.fix.blocked is not None:
+        yield f"a free view: something on no map stands at azimuths {measured.fix.blocked.text}; drive on some metres"
 
 
 def _skyline(measured: Measured) -> Array:
     """Elevation (n,) of the map's skyline at the position, or in the middle of the search area without one."""
     position_m = measured.position_at_time_m if isinstance(measured, Located) else np.zeros(2)
-    return np.asarray(measured.terrain.horizon_rad(position_m[None], AZIMUTHS_RAD)).ravel()
+    return np.asarray(measured.terrain.horizon_rad(position_m[None], MIDDLES_RAD)).ravel()
 
 
-def _doubtful(measured: Measured) -> Iterator[str]:
+def _doubtful_facts(measured: Measured) -> Iterator[str]:
     """The facts of which one is wrong, where they contradict the image."""
     sigma = f"stated to {duration(measured.clock.sigma_s)}"
     if measured.clock.gross_probability > 0.0:

@@ -59,10 +59,10 @@ def boresight_rad(R_cam_icrs: Array) -> tuple[float, float, float]:
 
 def carrying_azimuths(value: Located) -> list[list[float]] | None:
     """First and last azimuth [deg] of the groups of directions that carry the fix of a `value`, the strongest first."""
-    if value.integrity is None:
+    if value.fix.integrity is None:
         return None
-    first, width = np.degrees(value.integrity.first_azimuth_rad), 360.0 / len(value.integrity.part)
-    return [[float(first[g]), float(first[g] + width)] for g in value.integrity.carriers()]
+    first, width = np.degrees(value.fix.integrity.first_azimuth_rad), 360.0 / len(value.fix.integrity.part)
+    return [[float(first[g]), float(first[g] + width)] for g in value.fix.integrity.carriers()]
 
 
 def R_body_enu(value: Measured) -> Array:
@@ -180,7 +180,7 @@ def exact_lens_text(included: bool) -> str:
 
 def blocked_deg(value: Located) -> list[list[float]]:
     """Ranges [from, to] of azimuth [deg] in which something on no map more likely blocks the view than not."""
-    ranges = [] if value.blocked is None else value.blocked.ranges_rad
+    ranges = [] if value.fix.blocked is None else value.fix.blocked.ranges_rad
     return [[round(float(edge), 6) for edge in np.degrees(one)] for one in ranges]
 
 

@@ -8,11 +8,11 @@ from functools import cached_property
 
 import numpy as np
 
+from startrack.core import MAX_COUNT
 from startrack.core.files import FilePath, printable, read_text
 from startrack.core.types import Array, BadInput, Value, array
 
 PATH_COLUMNS = ("east_m", "north_m")
-MAX_FRAMES = 1_000_000  # of a drive: more is a wrong unit
 STEP_ROUNDING_1 = 1e-9  # relative, of a number of steps: a path of whole steps has a frame at its end
 
 
@@ -51,11 +51,11 @@ class Drive(Value):
         """
         duration_s = float(self.distance_m[-1]) / self.speed_m_s
         steps = int(min(duration_s / every_s * (1 + STEP_ROUNDING_1), 1e15))
-        if not 1 <= steps < MAX_FRAMES:
+        if not 1 <= steps < MAX_COUNT:
             raise BadInput(
                 "bad_odometry",
                 f"the path of {self.distance_m[-1]:g} m takes {duration_s:g} s at {self.speed_m_s:g} m/s: one exposure "
-                f"every {every_s:g} s gives {1 + steps}; 2 to {MAX_FRAMES} are possible",
+                f"every {every_s:g} s gives {1 + steps}; 2 to {MAX_COUNT} are possible",
             )
         return 1 + steps
 

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from startrack.camera import Camera, Sensor
-from startrack.core.types import Array, BadInput, Body, Bools, Ints, Stars, Value, array
+from startrack.core.types import Array, BadInput, Body, Bools, Ints, Stars, Value, array, rotation, vector
 from startrack.terrain import Terrain
 
 AZIMUTHS = 1 << 16  # of the skyline: 0.0055 degrees, a sixteenth of a pixel of the widest fisheye
@@ -35,10 +35,10 @@ class Scene(Value):
     stars: Stars  # apparent, with the magnitudes that the catalogue states
     v_error_mag: Array = array("n")  # true minus stated magnitude of each star
     bodies: tuple[Body, ...] = ()
-    position_enu_m: Array = array(3)  # the camera's centre
-    R_cam_enu: Array = array(3, 3)
-    R_enu_icrs: Array = array(3, 3)  # at mid-exposure
-    sky_rotvec_rad: Array = array(3, default=0.0)  # rotation vector in enu of the stars from start to end
+    position_enu_m: Array = vector()  # the camera's centre
+    R_cam_enu: Array = rotation()
+    R_enu_icrs: Array = rotation()  # at mid-exposure
+    sky_rotvec_rad: Array = vector(default=0.0)  # rotation vector in enu of the stars from start to end
     exposure_s: float
     sky_v_mag_arcsec2: float | None  # diffuse light of the sky per square arcsecond; None: a black sky
     sky_gradient: float  # s: the sky is 1 + s cos(elevation) cos(azimuth - sky_gradient_azimuth_rad) of that
@@ -91,9 +91,9 @@ class Scene(Value):
 class Truth(Value):
     """The truth for comparisons; no stage reads it. One row per light source inside the image circle and frame."""
 
-    position_enu_m: Array = array(3)
-    R_cam_enu: Array = array(3, 3)
-    R_cam_icrs: Array = array(3, 3)  # at mid-exposure
+    position_enu_m: Array = vector()
+    R_cam_enu: Array = rotation()
+    R_cam_icrs: Array = rotation()  # at mid-exposure
     sources: Stars  # stars and bodies, as the catalogue states them
     xy_px: Array = array("n", 2)  # at mid-exposure, hidden or not
     flux_e: Array = array("n")  # whole PSF, from the stated magnitude [electrons]

@@ -13,7 +13,7 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.catalog import bodies
-from startrack.core.types import Array, BadInput, Stars, Value, array
+from startrack.core.types import Array, BadInput, Stars, Value, rotation, vector
 from startrack.frames import (
     R_body_enu_from_heading_pitch_roll,
     R_enu_icrs,
@@ -30,7 +30,8 @@ from startrack.terrain import Terrain
 if TYPE_CHECKING:
     from startrack.catalog import StarCatalog
 
-EXPOSURE_V_MAG, EXPOSURE_SNR = 6.0, 5.0  # magnitude and SNR on the axis that define the default exposure
+EXPOSURE_V_MAG = 6.0  # of a star on the axis that the default exposure just shows
+FAINTEST_V_MAG = 10.0  # of the stars in the sky
 RANDOM_TIMES = datetime(2024, 1, 1, tzinfo=UTC), datetime(2034, 1, 1, tzinfo=UTC)
 MAX_POSITION_TRIES = 1000
 # Streams of the seed. Sky and sensor are the same in every exposure of a series: errors that exposures share.
@@ -42,8 +43,8 @@ class Pose(Value):
     """Where the rover is in an exposure."""
 
     time_utc: datetime  # mid-exposure
-    position_enu_m: Array = array(3)  # the camera's centre, which is the body's origin
-    R_body_enu: Array = array(3, 3)
+    position_enu_m: Array = vector()  # the camera's centre, which is the body's origin
+    R_body_enu: Array = rotation()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +71,7 @@ class Series:
     sky_gradient: float = 0.0
     sky_gradient_azimuth_rad: float = 0.0
     wall_reflectance: float = 0.04
-    faint_v_mag: float | None = 10.0  # random stars that Hipparcos lacks are added down to this; None: none
+    faint_v_mag: float | None = FAINTEST_V_MAG  # random stars that Hipparcos lacks are added down to this; None: none
     flux_scatter_mag: float = 0.03  # beyond the catalogue's own errors; 0: neither
     hot_pixels: int = 200
     cosmic_rays: int = 5
@@ -103,7 +104,7 @@ class Series:
             return self.exposure_s
         if self.camera.sensor is None:
             raise BadInput("bad_calibration", f"camera {self.camera.name} has no [sensor]: nothing to render with")
-        return exposure_for_snr(self.camera, self.sky_v_mag_arcsec2, v_mag=EXPOSURE_V_MAG, snr=EXPOSURE_SNR)
+        return exposure_for_snr(self.camera, self.sky_v_mag_arcsec2, v_mag=EXPOSURE_V_MAG)
 
     def scene(
         self, number: int, name: str = "", sky: tuple[Stars, Array] | None = None

@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from startrack.camera import Camera, Sensor
-from startrack.core.types import Array, Body, Bools, Stars
+from startrack.core.types import STAR_COUNT_SLOPE, Array, Body, Bools, Stars
 from startrack.frames import R_from_rotvec, azel_from_rays, off_axis_rad
 from startrack.rendering.scene import Scene
 from startrack.rendering.sky import sky_e_per_s
@@ -18,6 +18,7 @@ from startrack.rendering.sky import sky_e_per_s
 # A stamp ends where a star leaves less than this in a pixel: far under any sensor's noise, even summed over the rim.
 INVISIBLE_E_PER_PX = 0.02
 MIN_RADIUS_PX = 3
+LIMIT_SNR = 5.0  # at which an image just shows a star
 CHUNK_ELEMENTS = 1 << 20  # of stamps spread at a time; keeps the work inside the processor's cache
 TRAIL_VISIBLE_PX = 0.02  # motion during the exposure below which a star is a point
 TRAIL_STEP_PX = 0.2  # a step s adds s^2/12 to the variance of the trail's profile: 0.003 px^2
@@ -25,7 +26,6 @@ DISK_STEP_PX = 0.5  # spacing of the points that make up a disk
 # Mean radius over mean distance: the Sun from 1 au (IAU 2015 nominal radius), Earth and Moon from 384,400 km.
 ANGULAR_RADIUS_RAD = {"Sun": 6.957e8 / 1.495978707e11, "Earth": 6.3710e6 / 3.844e8, "Moon": 1.7374e6 / 3.844e8}
 # Stars brighter than V over the whole sky: N = N_REF e^(GROWTH (V - V_REF)).
-GROWTH_PER_MAG = 1.08  # slope of star counts at V 6-10: 2.9 per magnitude
 V_REF_MAG = 7.0
 N_REF = 15_600  # Hipparcos with the Bright Star Catalogue has 15,479 to V 7.0 and lacks about 1 % there
 # Against an independent list to V 7.5 Hipparcos lacks 0.3 % at V 6.0-6.5 and 1.1 % at 6.5-7.0.
@@ -71,7 +71,7 @@ def add_sources(image_e: Array, scene: Scene) -> None:
         splat(image_e, xy_px, flux, scene.sensor.psf_sigma_px)
 
 
-def exposure_for_snr(camera: Camera, sky_v_mag_arcsec2: float | None, *, v_mag: float, snr: float) -> float:
+def exposure_for_snr(camera: Camera, sky_v_mag_arcsec2: float | None, *, v_mag: float, snr: float = LIMIT_SNR) -> float:
     """Seconds in which a star of `v_mag` on the axis reaches the matched-filter ratio `snr`.
 
     `sky_v_mag_arcsec2` is the brightness of the sky (None: black).
@@ -86,7 +86,9 @@ def exposure_for_snr(camera: Camera, sky_v_mag_arcsec2: float | None, *, v_mag: 
     return float((linear + np.sqrt(linear**2 + 4 * star**2 * constant)) / (2 * star**2))
 
 
-def limiting_v_mag(camera: Camera, sky_v_mag_arcsec2: float | None, *, exposure_s: float, snr: float) -> float:
+def limiting_v_mag(
+    camera: Camera, sky_v_mag_arcsec2: float | None, *, exposure_s: float, snr: float = LIMIT_SNR
+) -> float:
     """Magnitude of the star on the axis of a `camera` that reaches `snr` in `exposure_s`.
 
     The sky has the brightness `sky_v_mag_arcsec2`. The inverse of `exposure_for_snr`.
@@ -193,13 +195,13 @@ def draw_field_stars(stars: Stars, to_v_mag: float, *, rng: np.random.Generator)
     edges = np.arange(FIRST_LACKING_MAG, to_v_mag + 1e-9, BIN_MAG)
     rays, v_mag = np.empty((0, 3)), np.empty(0)
     if len(edges) > 1:
-        expected = np.diff(N_REF * np.exp(GROWTH_PER_MAG * (edges - V_REF_MAG)))
+        expected = np.diff(N_REF * np.exp(STAR_COUNT_SLOPE * (edges - V_REF_MAG)))
         listed = np.histogram(stars.v_mag, edges)[0]
         lacking = rng.poisson(np.maximum(expected - listed, MIN_LACKING * listed))
         low = np.repeat(edges[:-1], lacking)
         # Inverse of the cumulative e^(GROWTH V) within a bin.
-        steep = np.expm1(GROWTH_PER_MAG * BIN_MAG)
-        v_mag = np.sort(low + np.log1p(rng.random(len(low)) * steep) / GROWTH_PER_MAG)
+        steep = np.expm1(STAR_COUNT_SLOPE * BIN_MAG)
+        v_mag = np.sort(low + np.log1p(rng.random(len(low)) * steep) / STAR_COUNT_SLOPE)
         rays = rng.standard_normal((len(v_mag), 3))
         if len(stars):
             rays = stars.rays_icrs[rng.integers(len(stars), size=len(v_mag))] + CLUSTER_RAD * rays

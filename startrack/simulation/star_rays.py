@@ -89,7 +89,7 @@ def simulate_rays(
     measured = photometry.judge(found, light)
     rays = measured.azimuth_rad, measured.elevation_rad
     if not terrain.is_informative(*rays).all():
-        measured = measured.masked(terrain.mask_reason(*rays))
+        measured = measured.mask_stars(terrain.mask_reason(*rays))
     sigma_s = TIME_SIGMA_S if time_sigma_s is None else time_sigma_s
     clock = clock_at(site, when, sigma_s, is_stated=time_sigma_s is not None)
     return StarRays(terrain=terrain, R_enu_icrs=R_enu, clock=clock, light=measured)

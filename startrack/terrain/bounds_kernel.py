@@ -19,7 +19,7 @@ from startrack.terrain.horizon_kernel import (
     exit_of,
     horizon,
     locate,
-    on_map,
+    map_cell,
     surface,
 )
 
@@ -149,7 +149,7 @@ def bounds(
         else:
             step = post_m[m]
             rise = max(low + along_rise, -1.0)
-            column2, row2 = on_map(grid, m, e + step * sin_a, n + step * cos_a, line + rise * step)
+            column2, row2 = map_cell(grid, m, e + step * sin_a, n + step * cos_a, line + rise * step)
             d_column, d_row = (column2 - column) / step, (row2 - row) / step
             least_level = level_of(levels, m, post_m, moon, width, e, n)
             near = whole and s < 6.0 * reach and not probing
@@ -170,7 +170,7 @@ def bounds(
                 at = block_at(blocks, m, least_level, column, row)
                 length = exit_of(column, row, d_column, d_row, 0)
                 stop = s + length
-                side_column, side_row = on_map(grid, m, e + step * cos_a, n - step * sin_a, line)
+                side_column, side_row = map_cell(grid, m, e + step * cos_a, n - step * sin_a, line)
                 to_column, to_row = (side_column - column) / step, (side_row - row) / step
                 right = steepness(slopes, at, slope_unit[m], to_column, to_row)
                 left = steepness(slopes, at, slope_unit[m], -to_column, -to_row)
@@ -201,7 +201,7 @@ def bounds(
                 parts, part_slack = 1, KINK_M * min(width, 1.0)
                 if tilt_to_crest and top >= low and width < FINE_POSTS * post_m[m]:
                     parts = STEP_PARTS
-                    column0, row0 = on_map(grid, m, e, n, moon + z0 + along_rise * s)
+                    column0, row0 = map_cell(grid, m, e, n, moon + z0 + along_rise * s)
                 bend_k = (z0 - 2 * z1 + z2) * 2 / (length * length)
                 rise_k = (z2 - z0) / length - bend_k * length
                 for k in range(parts):

@@ -58,8 +58,8 @@ def pack_maps(site: Site, maps: Sequence[Raster]) -> Ground:
         top, slope = _raise_to_finer_maps(_cell_tops(h), height_map, maps[:number]), _cell_slopes(h, unit)
         while True:
             tops.append(top.ravel())
-            wide.append(_with_neighbours(top).ravel())
-            slopes.append(_with_neighbours(slope).reshape(-1, 8))
+            wide.append(_spread_largest(top).ravel())
+            slopes.append(_spread_largest(slope).reshape(-1, 8))
             block_table.append((first_block, *top.shape))
             first_block += top.size
             if max(top.shape) <= SMALLEST_BLOCKS:
@@ -112,7 +112,7 @@ def merge_blocks(a: np.ndarray, choose: np.ufunc) -> np.ndarray:
     return np.asarray(choose(choose(a[::2, ::2], a[1::2, ::2]), choose(a[::2, 1::2], a[1::2, 1::2])))
 
 
-def _with_neighbours(a: np.ndarray) -> np.ndarray:
+def _spread_largest(a: np.ndarray) -> np.ndarray:
     """The largest values (rows, columns, ...) of blocks and their neighbours."""
     tall = a.copy()
     np.maximum(tall[1:], a[:-1], out=tall[1:])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.core.kernels import njit
-from startrack.terrain.horizon_kernel import block_at, locate, on_map, surface
+from startrack.terrain.horizon_kernel import block_at, locate, map_cell, surface
 
 SHIFT_HEIGHT_M = 1000.0  # height of a sight line above the ground that its place on the map allows for
 MAX_TOUCHED = 25  # cells of a part
@@ -135,7 +135,7 @@ def box_height_bounds(ground, east, north, half, tilted):
             a, b = 0.0, 0.0
             for turn in range(4):  # steepest to the four sides
                 to_e, to_n = post_m[m] * (turn == 0) - post_m[m] * (turn == 1), post_m[m] * (turn > 1) * (5 - 2 * turn)
-                column2, row2 = on_map(grid, m, east + to_e, north + to_n, moon + middle)
+                column2, row2 = map_cell(grid, m, east + to_e, north + to_n, moon + middle)
                 rise = steepness(slopes, at, slope_unit[m], (column2 - column) / post_m[m], (row2 - row) / post_m[m])
                 if turn < 2:
                     a = max(a, abs(rise - slope_e * (1 - 2 * turn)) + 0.03 * abs(rise))

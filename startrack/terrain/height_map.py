@@ -126,12 +126,12 @@ class HeightMap(TracedMap):
         azimuths = np.asarray(azimuths_rad) % (2 * np.pi)
         b = (azimuths / (2 * np.pi) * AZIMUTH_BINS).astype(np.int64) % AZIMUTH_BINS
         above = np.asarray(elevations_rad) > self.table.unknown_rad[b]
-        return np.asarray(above & ~in_sectors(azimuths, self.glare_rad))
+        return np.asarray(above & ~are_in_sectors(azimuths, self.glare_rad))
 
     def mask_reason(self, azimuths_rad: Array, elevations_rad: Array) -> NDArray[np.str_]:
         """Why rays (n,) are not informative; empty where they are."""
         reason = np.where(self.is_informative(azimuths_rad, elevations_rad), "", OFF_MAP)
-        return np.where((reason != "") & in_sectors(azimuths_rad, self.glare_rad), GLARE, reason)
+        return np.where((reason != "") & are_in_sectors(azimuths_rad, self.glare_rad), GLARE, reason)
 
     def masked_sectors(self) -> list[str]:
         """One line of text per range of azimuths that is not informative."""
@@ -183,7 +183,7 @@ class HeightMap(TracedMap):
         return post_positions(self.site, self.maps, posts)
 
 
-def in_sectors(azimuths_rad: Array, sectors_rad: Sectors) -> Bools:
+def are_in_sectors(azimuths_rad: Array, sectors_rad: Sectors) -> Bools:
     """Whether the azimuths (...) are in one of the sectors."""
     azimuths = np.asarray(azimuths_rad)
     inside = np.zeros(azimuths.shape, dtype=bool)

@@ -24,7 +24,7 @@ FIRST_GUESS_M, LAST_GUESS_M, GUESS_RATIO = 300.0, 50_000.0, 1.12
 
 
 @njit(cache=True, nogil=True, inline="always")
-def on_map(grid, m, east, north, up):
+def map_cell(grid, m, east, north, up):
     """(column, row) on map m of the direction of (east, north, up) from the Moon's centre."""
     v1 = grid[m, 1] * east + grid[m, 2] * north + grid[m, 3] * up
     v2 = grid[m, 4] * east + grid[m, 5] * north + grid[m, 6] * up
@@ -45,7 +45,7 @@ def locate(grid, posts, east, north, up):
     found, column, row = -1, 0.0, 0.0
     for m in range(grid.shape[0]):
         if found < 0:
-            column, row = on_map(grid, m, east, north, up)
+            column, row = map_cell(grid, m, east, north, up)
             if 0.0 <= row < posts[m, 1] - 1 and 0.0 <= column < posts[m, 2] - 1:
                 found = m
     return found, column, row
@@ -161,7 +161,7 @@ def horizon(ground, east, north, up, sin_a, cos_a, start_m, end_m, hint_m):
         else:
             step = post_m[m]
             rise = max(tan, -1.0)
-            column2, row2 = on_map(grid, m, e + step * sin_a, n + step * cos_a, z + step * rise)
+            column2, row2 = map_cell(grid, m, e + step * sin_a, n + step * cos_a, z + step * rise)
             d_column, d_row = (column2 - column) / step, (row2 - row) / step
             level = min(level, levels[m] - 1)
             descending = True

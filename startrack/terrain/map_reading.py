@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from startrack.core.files import MAX_CAUSE_CHARS
+from startrack.core.files import MAX_CAUSE_CHARS, TIFF_COMPRESSIONS
 from startrack.core.types import MAX_PIXELS, BadInput
 from startrack.frames import MOON_RADIUS_M
 from startrack.terrain.map_writing import METRE, PROJECTION_CODES
@@ -25,7 +25,6 @@ from startrack.terrain.shape import MAX_LENGTH_M
 WINDOW_HALF_M = 300_000.0  # about the origin; farther away even 10 km mountains are below the horizontal
 METRES = {"m", "meter", "meters", "metre", "metres"}
 STEREOGRAPHIC_CODES = (PROJECTION_CODES[STEREOGRAPHIC], 15, 16)  # oblique, and two variants of the polar one
-DECODED = (1, 8, 32773, 32946)  # codes of compression: none, deflate, PackBits, deflate
 
 
 class Stored(NamedTuple):
@@ -129,7 +128,7 @@ def _read_geotiff(path: Path) -> Stored | None:
         if not isinstance(keys, dict) or "ModelPixelScale" not in keys or "ModelTiepoint" not in keys:
             return None
         parameters = _proj_parameters(keys)
-        decoded = page.compression in DECODED and page.size <= MAX_PIXELS and len(page.shape) == 2
+        decoded = page.compression in TIFF_COMPRESSIONS and page.size <= MAX_PIXELS and len(page.shape) == 2
         if parameters is None or not decoded:
             return None
         scale, offset = _gdal_scale(page.tags.valueof("GDAL_METADATA"))

@@ -25,7 +25,7 @@ LARGEST_MAP_SIGMA_PX = 0.5
 IMAGE_RINGS, IMAGE_SECTORS = 4, 8
 STARS_PER_RING = 3
 STARS_PER_SECTOR = 2
-MIN_IMAGE_SECTORS = 5
+MIN_IMAGE_SECTORS = IMAGE_SECTORS // 2 + 1
 WRONG_ROTATIONS_RAD = tuple(np.radians((-31.0, -17.0, 13.0, 29.0)))  # attitudes at which only chance matches
 MIN_CHANCE_MATCHES = 0.5
 
@@ -215,14 +215,14 @@ def horizon_checks(joint: JointFit, catalog: StarCatalog, site: Site | None) -> 
         return ()
     whole = tuple(replace(f, sky=sky_at(catalog, f.time_utc, None)) for f in joint.frames)
 
-    def below_horizon(rotation_rad: float) -> Bools:
+    def seen_below(rotation_rad: float) -> Bools:
         """Whether the matched stars (n,) are below it."""
         matches = zip(whole, _rotated_matches(joint, whole, rotation_rad), strict=True)
         return np.concatenate([is_below_horizon(f.sky.stars.rays_icrs[m.star], site, f.time_utc) for f, m in matches])
 
-    matched = below_horizon(0.0)
+    matched = seen_below(0.0)
     below, part = int(matched.sum()), float(matched.sum() / max(len(matched), 1))
-    by_chance = _log_p_value(below, (int(below_horizon(angle).sum()) for angle in WRONG_ROTATIONS_RAD))
+    by_chance = _log_p_value(below, (int(seen_below(angle).sum()) for angle in WRONG_ROTATIONS_RAD))
     return (
         Check("part of stars below the horizon", part, f"<= {MOST_BELOW_PART}",
               by_chance > np.log(MAX_FALSE_ALARM) or part <= MOST_BELOW_PART, "inconsistent_evidence",

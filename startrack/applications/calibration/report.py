@@ -149,17 +149,17 @@ def _photometry_table(calibration: Calibration) -> str:
         rows += [
             ["zero point", f"{light.zero_point_adu_per_s:.0f} ADU/s (± {light.zero_point_sigma_mag:.3f} mag)"],
             ["vignetting", f"{light.vignetting[0]:.3f}, {light.vignetting[1]:.3f}"],
-            ["colour term", _with_unit(light.colour_mag, "mag per B-V")],
-            ["extinction", _with_unit(light.extinction_mag, "mag per airmass")],
+            ["colour term", _amount_text(light.colour_mag, "mag per B-V")],
+            ["extinction", _amount_text(light.extinction_mag, "mag per airmass")],
             ["scatter", f"{light.scatter_mag:.3f} mag, {light.stars} stars"],
         ]
     sensor = found.properties
     gain = sensor.transfer.gain_e_per_adu if sensor.transfer is not None else None
     rows += [
-        ["gain (photon transfer)", _with_unit(gain, "e/ADU")],
-        ["dark level", _with_unit(sensor.bias_adu, "ADU")],
-        ["saturation", _with_unit(sensor.saturation_adu, "ADU")],
-        ["PSF sigma", _with_unit(sensor.psf_sigma_px, "px")],
+        ["gain (photon transfer)", _amount_text(gain, "e/ADU")],
+        ["dark level", _amount_text(sensor.bias_adu, "ADU")],
+        ["saturation", _amount_text(sensor.saturation_adu, "ADU")],
+        ["PSF sigma", _amount_text(sensor.psf_sigma_px, "px")],
         ["PSF sigma by ring", ", ".join("–" if v is None else f"{v:.2f}" for v in sensor.psf_by_ring_px) + " px"],
         ["hot pixels", "–" if sensor.hot_px is None else str(len(sensor.hot_px))],
     ]
@@ -167,5 +167,5 @@ def _photometry_table(calibration: Calibration) -> str:
     return _table(["", "measured"], rows) + (f"<ul>{notes}</ul>" if notes else "")
 
 
-def _with_unit(value: float | None, unit: str) -> str:
+def _amount_text(value: float | None, unit: str) -> str:
     return "not measured" if value is None else f"{value:.4g} {unit}"

@@ -78,7 +78,7 @@ def measure_stars(frame: SkyFrame) -> StarLight:
     camera = replace(frame.camera, sensor=None, calibrated_angle_rad=frame.camera.max_angle_rad)
     scale = FluxScale(0.0, 0.0, 0.4 * np.log(10) * dimming.scatter_mag, len(frame.matched_star))
     light = StarEvidence()(
-        frame.detections, camera, _dimmed(frame, dimming), list(frame.bodies), frame.R_cam_icrs, frame.R_enu_icrs,
+        frame.detections, camera, _dim_stars(frame, dimming), list(frame.bodies), frame.R_cam_icrs, frame.R_enu_icrs,
         scale, frame.extra_sigma_px,
     )  # fmt: skip
     rows = light.evidence()
@@ -107,7 +107,7 @@ def _glare(frame: SkyFrame, dimming: Dimming, light: StarPhotometry) -> tuple[Ar
     return np.concatenate([light.xy_px, px[seen]])[bright], radius_px
 
 
-def _dimmed(frame: SkyFrame, dimming: Dimming) -> Stars:
+def _dim_stars(frame: SkyFrame, dimming: Dimming) -> Stars:
     """The catalogue with instrumental magnitudes (zero point 0), brightest first."""
     stars = frame.sky.stars
     angle = off_axis_rad(stars.rays_icrs @ frame.R_cam_icrs.T)

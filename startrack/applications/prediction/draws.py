@@ -14,11 +14,12 @@ import numpy as np
 from startrack.camera import Camera, load_camera
 from startrack.catalog import StarCatalog, has_deep_catalog, load_catalog, load_deep_catalog
 from startrack.chain import COMPLETE_V_MAG, locate_rays
+from startrack.core import MAX_COUNT
 from startrack.core.chunk_store import Chunk, ChunkStore, Progress, settings_digest
 from startrack.core.runner import TASK_LIMIT_S
 from startrack.core.types import Array, BadInput, NoSolution, Stars
 from startrack.localization import require_localizer
-from startrack.rendering import Series, limiting_v_mag, load_sky_catalog
+from startrack.rendering import FAINTEST_V_MAG, Series, limiting_v_mag, load_sky_catalog
 from startrack.simulation import draw_ground, simulate_rays
 from startrack.terrain import Terrain, load_terrain
 
@@ -28,10 +29,7 @@ DRAW_SOURCES = (  # their content is part of a chunk's key
     "localization/*.py", "simulation/*.py", "evidence/*.py", "rendering/*.py", "terrain/*.py", "chain/measurement.py",
     "applications/prediction/draws.py",
 )  # fmt: skip
-FAINTEST_V_MAG = 10.0  # of the stars in the sky, as `render` has it; and
 BELOW_LIMIT_MAG = 3.0  # below the limit at 5 sigma: fainter stars add 2 % to the variance of a star's flux
-SEED_STEP = 1_000_000  # from one seed to the next, in the streams of random numbers: the most draws
-LIMIT_SNR = 5.0
 
 
 class Status(IntEnum):
@@ -104,7 +102,7 @@ class Predictor:
     def limiting_v_mag(self) -> float:
         """Magnitude of a star on the axis at 5 sigma."""
         sky = self.conditions.sky_v_mag_arcsec2
-        return limiting_v_mag(self.camera, sky, exposure_s=self.exposure_s, snr=LIMIT_SNR)
+        return limiting_v_mag(self.camera, sky, exposure_s=self.exposure_s)
 
     @cached_property
     def catalog(self) -> StarCatalog:
@@ -155,7 +153,7 @@ class Predictor:
     def _series_of(self, draw: int, catalog: StarCatalog, faint_v_mag: float | None) -> Series:
         conditions = self.conditions
         return Series(
-            camera=self.camera, terrain=self.terrain, catalog=catalog, seed=SEED_STEP * conditions.seed + draw,
+            camera=self.camera, terrain=self.terrain, catalog=catalog, seed=MAX_COUNT * conditions.seed + draw,
             time_utc=conditions.times_utc[draw], exposure_s=conditions.exposure_s,
             sky_v_mag_arcsec2=conditions.sky_v_mag_arcsec2, faint_v_mag=faint_v_mag, hot_pixels=0, cosmic_rays=0,
         )  # fmt: skip

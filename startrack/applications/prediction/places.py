@@ -9,16 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.applications.prediction.draws import Place
+from startrack.core import MAX_COUNT
 from startrack.core.types import Array, BadInput, Ints
 from startrack.frames import Site, enu_from_latlon, latlon_from_enu
 from startrack.output import nice_step
-from startrack.rendering import Drive
+from startrack.rendering import STEP_ROUNDING_1, Drive
 from startrack.terrain import EQUIRECTANGULAR, Raster, Terrain
 
-MAX_CELLS = 1_000_000
 DEFAULT_CELLS_ACROSS = 10  # of the default spacing
 HEIGHT_STEPS = 4  # the horizontal position of a map's point depends on its height: 1 part in 1000 a step
-LENGTH_ROUNDING_1 = 1e-9  # relative, of a length of whole steps
 PLACES_RING_RAD = np.linspace(0.0, 2 * np.pi, 181)
 
 
@@ -92,8 +91,8 @@ def area_cells(terrain: Terrain, spacing_m: float) -> AreaCells:
     half_x = int(np.ceil(np.max(np.abs(x - middle_x)) / dx))
     half_y = int(np.ceil(np.max(np.abs(y - middle_y)) / dy))
     shape = 2 * half_y + 1, 2 * half_x + 1
-    if shape[0] * shape[1] > MAX_CELLS:
-        raise BadInput("bad_terrain", f"{shape[0]} x {shape[1]} cells of {spacing_m:g} m: more than {MAX_CELLS}")
+    if shape[0] * shape[1] > MAX_COUNT:
+        raise BadInput("bad_terrain", f"{shape[0]} x {shape[1]} cells of {spacing_m:g} m: more than {MAX_COUNT}")
     frame = Raster(
         heights_m=np.zeros(shape, dtype=np.float32), projection=projection, x0_m=float(middle_x - half_x * dx),
         y0_m=float(middle_y + half_y * dy), dx_m=float(dx), dy_m=float(-dy), source=terrain.name,
@@ -118,9 +117,9 @@ def path_points(drive: Drive, terrain: Terrain, spacing_m: float) -> PathPoints:
     Raises BadInput (bad_odometry) where a point is outside of the search area, or no camera can stand there.
     """
     length_m = float(drive.distance_m[-1])
-    count = int(np.ceil(length_m / spacing_m * (1 - LENGTH_ROUNDING_1))) + 1
-    if count > MAX_CELLS:
-        raise BadInput("bad_odometry", f"{count} points on the path: more than {MAX_CELLS}")
+    count = int(np.ceil(length_m / spacing_m * (1 - STEP_ROUNDING_1))) + 1
+    if count > MAX_COUNT:
+        raise BadInput("bad_odometry", f"{count} points on the path: more than {MAX_COUNT}")
     distance_m = np.linspace(0.0, length_m, count)
     points_m = np.stack([drive.position_m(distance / drive.speed_m_s) for distance in distance_m])
     bad = np.hypot(*points_m.T) > terrain.search_radius_m

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from startrack.applications.prediction.draws import (
-    LIMIT_SNR,
     Conditions,
     Place,
     Predictor,
@@ -150,7 +149,7 @@ class Predictions:
         tried: list[dict[str, float]] = []
 
         def exposure_s(v_mag: float) -> float:
-            return exposure_for_snr(camera, conditions.sky_v_mag_arcsec2, v_mag=v_mag, snr=LIMIT_SNR)
+            return exposure_for_snr(camera, conditions.sky_v_mag_arcsec2, v_mag=v_mag)
 
         def reaches(v_mag: float) -> bool:
             conditions_there = replace(conditions, exposure_s=exposure_s(v_mag))

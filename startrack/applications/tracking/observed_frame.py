@@ -82,7 +82,7 @@ def observe_frame(outcome: Outcome, errors: TrackErrors | None = None, terrain: 
         raise ValueError(f"{name}: a track needs the localizer posterior")
     terrain = terrain or value.terrain
     if errors is None:
-        errors = TrackErrors.of(terrain, value.clock, value.sky_light is not None)
+        errors = TrackErrors.of(terrain, value.clock, value.sky is not None)
         errors = errors.with_gross(facts_of(value, errors))
     missing = facts_of(value, errors) - errors.gross
     if missing:
@@ -129,10 +129,10 @@ def _informative_rows(located: Located, terrain: Terrain, position_m: Array) -> 
     They are those of the stars and of the sky's light that the position is from.
     """
     stars = rows = replace(located.evidence(), near=None)
-    if located.sky_light is not None and located.sky_used is not None:
-        light = located.sky_light.evidence(located.sky_used)
+    if located.sky is not None:
+        light = located.sky.light.evidence(located.sky.used)
         rows = Evidence.concatenate(stars, light) if located.by_stars else light
-        rows = replace(rows, clock=stars.clock, image_errors=located.image_errors)
+        rows = replace(rows, clock=stars.clock, image_errors=located.sky.errors)
     azimuth = np.linspace(0.0, 2 * np.pi, 721)
     above = rows.elevation_rad - np.interp(rows.azimuth_rad, azimuth, terrain.horizon_rad(position_m[None], azimuth))
     kept = (np.abs(rows.llr) > MIN_ROW_NATS) | (rows.extended_nats > MIN_ROW_NATS)

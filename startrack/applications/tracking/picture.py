@@ -11,7 +11,7 @@ from startrack.core.errors import length_text
 from startrack.core.types import Array
 from startrack.output import MARGIN_PX, SIDE_PX, TEXT_PX, TITLE_PX, Axes, Box, Canvas, Colour, Ink, Map, draw_overview
 
-PANEL_PX, GRAPH_PX = 360.0, 240.0  # beside and below the map
+PANEL_PX, GRAPH_PX = 22.5 * TEXT_PX, 15 * TEXT_PX  # beside and below the map
 MAP_BOX: Box = (MARGIN_PX, MARGIN_PX, MARGIN_PX + SIDE_PX, MARGIN_PX + SIDE_PX)
 PANEL: Box = (MAP_BOX[2] + 2 * TEXT_PX, MARGIN_PX, MAP_BOX[2] + 2 * TEXT_PX + PANEL_PX, MARGIN_PX + PANEL_PX)
 TRACK_WIDTH_PX, TRACK_HEIGHT_PX = round(PANEL[2] + 2 * TEXT_PX), round(MAP_BOX[3] + 2.5 * MARGIN_PX + GRAPH_PX)

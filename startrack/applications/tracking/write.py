@@ -21,7 +21,7 @@ from startrack.output import (
     Column,
     ecsv_text,
     feature,
-    filled_frame,
+    fill_frame,
     geojson_text,
     ground_map,
     json_text,
@@ -158,4 +158,4 @@ def track_page(track: Track, picture_png: bytes, *, title: str, odometry_m: Arra
         "picture": f"data:image/png;base64,{base64.b64encode(picture_png).decode('ascii')}",
     }
     style, script = ((HERE / name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
-    return filled_frame(f"{title} · startrack", {"results": head}, PAGE_SCRIPTS, style=style, script=script)
+    return fill_frame(f"{title} · startrack", {"results": head}, PAGE_SCRIPTS, style=style, script=script)

@@ -106,10 +106,10 @@ def page_text(
     }
     title = f"{found[0].record['image']} · startrack" if head["single"] else f"{len(found):,} images · startrack"
     data = {"results": head, **{f"detail-{k}": detail for k, detail in details.items()}}
-    return filled_frame(title, data, SCRIPTS)
+    return fill_frame(title, data, SCRIPTS)
 
 
-def filled_frame(
+def fill_frame(
     title: str, data: Mapping[str, Any], scripts: Sequence[str], *, style: str = "", script: str = ""
 ) -> str:
     """A page with a `title`, the `data` by their names, the style, and this room's DRAWING and further `scripts`.
@@ -118,16 +118,16 @@ def filled_frame(
     """
     parts = {
         "TITLE": html.escape(title),
-        "STYLE": _joined(["page.css"]) + style,
+        "STYLE": _join_files(["page.css"]) + style,
         "DATA": "\n".join(_script_of_data(name, value) for name, value in data.items()),
-        "SCRIPT": _joined(dict.fromkeys((*DRAWING, *scripts))) + script,
+        "SCRIPT": _join_files(dict.fromkeys((*DRAWING, *scripts))) + script,
     }
     # Never replaced twice: a result may hold any text.
     pieces = (HERE / "page.html").read_text(encoding="utf-8").split("@@")
     return "".join(parts.get(piece, piece) for piece in pieces)
 
 
-def _joined(names: Iterable[str]) -> str:
+def _join_files(names: Iterable[str]) -> str:
     return "".join((HERE / name).read_text(encoding="utf-8") for name in names)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from startrack.core.files import existing_folder
 from startrack.core.types import BadInput
 from startrack.output.quantities import QUANTITIES
-from startrack.output.record import at_record
+from startrack.output.record import record_values
 from startrack.output.text import rows
 from startrack.output.values import At
 
@@ -40,7 +40,7 @@ class Found:
     @cached_property
     def at(self) -> At:
         """From the path of a quantity to its value in the record, None where that lacks it or has another type."""
-        return at_record(self.record)
+        return record_values(self.record)
 
     @property
     def folder(self) -> Path:

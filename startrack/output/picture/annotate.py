@@ -38,16 +38,17 @@ from startrack.output.picture.canvas import (
 )
 from startrack.output.picture.maps import draw_overview, draw_zoom
 from startrack.output.picture.marks import draw_marks, overlay_of
-from startrack.output.record import at_stage, image_name
+from startrack.output.record import image_name, stage_values
 from startrack.output.text import Rows, rows
 from startrack.output.values import mode_text, modes_record
 
-PANEL_WIDTH, PANEL_HEIGHT = 620, 1160
+PANEL_WIDTH, PANEL_HEIGHT = round(38.75 * TEXT_PX), round(72.5 * TEXT_PX)
 FACT_STEP_PX = 2 * TEXT_PX
 STATUS = {"ok": Ink.GREEN, "ambiguous": Ink.ORANGE, "refused": Ink.VERMILLION}
 OVERVIEW_PART = 0.58  # of the height left for maps
 WIDEST_RMS = 4.5  # residuals beyond this many rms are outliers and would squeeze the rest
-MAX_MODES, MAX_LINES = 4, 8  # of positions that fit, and of a message
+MAX_MODES = 4  # of positions that fit
+MAX_LINES = 2 * MAX_MODES  # of a message
 BARE_CHUNK, MARKS_CHUNK = b"stPX", b"stOV"  # a JPEG; compressed JSON
 EastNorth = tuple[float, float] | None  # east and north [m] of the true position, where a caller knows it
 
@@ -201,7 +202,7 @@ def _facts(value: Inputs) -> Rows:
     if isinstance(value, Located) and value.fix.ambiguous:
         modes = modes_record(value.fix)[:MAX_MODES]
         found += [(f"Position {k + 1}", mode_text(mode)) for k, mode in enumerate(modes)]
-    return found + rows("panel", at_stage(value))
+    return found + rows("panel", stage_values(value))
 
 
 def _legend(value: Inputs, truth: bool) -> Legend:
@@ -217,7 +218,7 @@ def _legend(value: Inputs, truth: bool) -> Legend:
         found += [("ring", Ink.BODY, "planet, Sun, Earth or Moon, where it must be")]
     if isinstance(value, Located) and not value.fix.ambiguous:
         found += [("line", Ink.SKYLINE, "skyline of the terrain seen from the position found")]
-        if value.sky_light is not None:
+        if value.sky is not None:
             found += [("disc", Ink.MEASURED, "skyline where the light of the sky stops")]
         around = "; circle 95 %, ellipse one sigma" if _has_circle(value) else ""
         found += [("place", Ink.POSITION, f"position{around}")]

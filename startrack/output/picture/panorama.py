@@ -18,7 +18,7 @@ from startrack.output.record import image_name
 from startrack.output.tables import half_range_rad, status_of
 from startrack.terrain import Terrain
 
-WIDTH_PX = 1440
+WIDTH_PX = 90 * round(TEXT_PX)
 HEIGHT_PX, ENLARGED_PX = 3 * WIDTH_PX // 10, 2 * WIDTH_PX // 10  # of both plots
 ABOVE_PX, RIGHT_PX = 2 * TEXT_PX, TEXT_PX  # about a plot
 AZIMUTHS_RAD = np.radians(np.linspace(0.0, 360.0, 3601))

@@ -3,3 +3,4 @@
 MAX_EXPOSURE_S = 1e6  # of an image
 MAX_COUNT = 1_000_000  # of frames, cells or draws: more is a wrong unit
 REPORTED_IMAGES = 30  # on a page, with their pictures
+STAR_COUNT_SLOPE = 1.08  # natural logarithm of the stars per magnitude, V 6 to 10: 2.9 times as many

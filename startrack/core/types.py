@@ -37,7 +37,6 @@ def sector_of(azimuth_rad: Array) -> Ints:
     return np.asarray((azimuth_rad * (SECTORS / (2 * np.pi))).astype(np.int64) % SECTORS)
 
 
-STAR_COUNT_SLOPE = 1.08  # natural logarithm of the stars per magnitude, V 6 to 10: 2.9 times as many
 TIME_SIGMA_S = 1.0  # of the clock, where nothing is stated
 MAX_PIXELS = 200_000_000  # contract: a larger image is refused from its header, before anything is decoded
 

@@ -9,16 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from startrack.camera import Camera
-from startrack.core.types import (
-    STAR_COUNT_SLOPE,
-    Array,
-    Attitude,
-    Centroids,
-    Identification,
-    Ints,
-    NotIdentified,
-    Stars,
-)
+from startrack.core import STAR_COUNT_SLOPE
+from startrack.core.types import Array, Attitude, Centroids, Identification, Ints, NotIdentified, Stars
 from startrack.estimation.attitude import AttitudeFit, solve_attitude
 from startrack.identification.lost_in_space import Identifier
 from startrack.identification.unknown_lens import identify_unknown_lens

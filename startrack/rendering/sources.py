@@ -10,7 +10,8 @@ import math
 import numpy as np
 
 from startrack.camera import Camera, Sensor
-from startrack.core.types import STAR_COUNT_SLOPE, Array, Body, Bools, Stars
+from startrack.core import STAR_COUNT_SLOPE
+from startrack.core.types import Array, Body, Bools, Stars
 from startrack.frames import R_from_rotvec, azel_from_rays, off_axis_rad
 from startrack.rendering.scene import Scene
 from startrack.rendering.sky import sky_e_per_s

@@ -25,6 +25,7 @@ TRUTH = Camera(
     calibrated_angle_rad=1.6, lens=KannalaBrandt((-0.03, 0.004)),
 )  # fmt: skip
 COLUMNS, ROWS = 9, 6
+CHESSBOARD = Board(COLUMNS, ROWS, None, 0.75)
 SUPERSAMPLED = 2
 POSES = (  # rotation of the board about cam axes [degrees], position of its centre [squares]
     ((0, 0, 0), (0, 0, 5.5)),
@@ -105,14 +106,14 @@ def chessboards():
 
 def test_drawn_corners_are_found_where_they_are(chessboards):
     """The drawing and OpenCV's detector agree; the other tests rely on both."""
-    found = find_corners(chessboards[1], Board(COLUMNS, ROWS))
+    found = find_corners(chessboards[1], CHESSBOARD)
     position, _ = board_positions(POSES[1], TRUTH.unproject(found.xy_px))
     assert np.median(np.abs(position - np.rint(position))) < 0.005
     assert np.abs(position - np.rint(position)).max() < 0.1
 
 
 def test_chessboards_give_the_lens(chessboards):
-    found = calibrate_board(chessboards, Board(COLUMNS, ROWS))
+    found = calibrate_board(chessboards, CHESSBOARD)
     assert found.accepted, found.failed_checks
     assert len(found.images) >= 7
     assert found.fit.held_out_rms_px < 0.3
@@ -124,7 +125,7 @@ def test_chessboards_give_the_lens(chessboards):
 def test_charuco_boards_give_the_lens():
     colour = charuco(COLUMNS + 1, ROWS + 1)
     pictures = [draw_picture(pose, colour) for pose in POSES[:8]]
-    found = calibrate_board(pictures, Board(COLUMNS + 1, ROWS + 1, charuco="DICT_5X5_100"))
+    found = calibrate_board(pictures, Board(COLUMNS + 1, ROWS + 1, "DICT_5X5_100", 0.75))
     assert len(found.images) >= 5
     assert map_error_px(found.camera) < 0.4
 
@@ -167,9 +168,10 @@ def test_the_command(chessboards, tmp_path, capsys):
 def test_pictures_without_a_board_are_refused(chessboards):
     with pytest.raises(NotIdentified, match="pattern") as refusal:
         calibrate_board(
-            [draw_picture(POSES[0], lambda position: np.full(position.shape[:-1], 0.5))], Board(COLUMNS, ROWS)
+            [draw_picture(POSES[0], lambda position: np.full(position.shape[:-1], 0.5))],
+            CHESSBOARD,
         )
     assert refusal.value.reason == "no_stars"
-    one = calibrate_board(chessboards[:1], Board(COLUMNS, ROWS))
+    one = calibrate_board(chessboards[:1], CHESSBOARD)
     assert not one.accepted
     assert one.failed_checks[0].reason == "insufficient_geometry"

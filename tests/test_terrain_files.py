@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tomli_w
+from map_helpers import polar_stereographic
 
 from startrack.camera import load_camera
 from startrack.cli.main import main
@@ -26,7 +27,7 @@ from startrack.terrain import (
     write_map,
 )
 from startrack.terrain.import_map import MEASURED_PER_ESTIMATE
-from startrack.terrain.raster import ORTHOGRAPHIC, polar_stereographic, projection_of
+from startrack.terrain.raster import ORTHOGRAPHIC, projection_of
 
 ROOT = Path(__file__).parent.parent
 pytestmark = pytest.mark.usefixtures("own_cache")

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from map_helpers import polar_stereographic
 
 from startrack.core.errors import NotLocated
 from startrack.core.types import Evidence
@@ -28,7 +29,7 @@ from startrack.terrain import (
 from startrack.terrain import table_cache as cache
 from startrack.terrain.derived_maps import DeformedMap, HorizonInterpolator
 from startrack.terrain.ground import ground_up_m
-from startrack.terrain.raster import ORTHOGRAPHIC, polar_stereographic
+from startrack.terrain.raster import ORTHOGRAPHIC
 
 DATA = Path(__file__).parent / "data"
 pytestmark = pytest.mark.usefixtures("own_cache")

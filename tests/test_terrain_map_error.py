@@ -6,13 +6,13 @@ import json
 
 import numpy as np
 import pytest
+from map_helpers import polar_stereographic
 from scipy.ndimage import map_coordinates
 
 from startrack.cli.main import main
 from startrack.core.types import Array, BadInput
 from startrack.terrain import Raster, load_terrain, write_map
 from startrack.terrain.map_error import carried_spacing, error_between_posts_m
-from startrack.terrain.raster import polar_stereographic
 
 
 def grid(heights_m: Array, post_m: float = 100.0) -> Raster:

@@ -18,14 +18,14 @@ from typing import Any
 from startrack.applications import batch
 from startrack.applications.batch import Image, ImageDone, Task
 from startrack.cli.console import discard_stdout, progress
-from startrack.cli.flags import check_cluster, check_localizer, cores
+from startrack.cli.flags import check_cluster, check_localizer
 from startrack.cli.images import absolute_facts, compile_kernels, prepare_reference
 from startrack.cli.report import write_page_of
 from startrack.core import errors
 from startrack.core.compilation import is_compiled
 from startrack.core.errors import INTERNAL_ERROR, BadInput
 from startrack.core.files import make_folder
-from startrack.core.runner import Runner, RunStopped
+from startrack.core.runner import Runner, RunStopped, count_cores
 from startrack.exposure import is_bag
 
 SHOWN = ("ok", "ambiguous", "refused", "error")
@@ -84,7 +84,7 @@ def _locate_images(
     tasks = _tasks(found, out, facts, args)
     if args.cluster is None and not all(Path(task.result).exists() for task in tasks):
         _prepare(tasks[0], args)
-    runner: Runner[Task, ImageDone] = Runner(batch.locate_image, jobs=args.jobs or cores(), cluster=args.cluster)
+    runner: Runner[Task, ImageDone] = Runner(batch.locate_image, jobs=args.jobs or count_cores(), cluster=args.cluster)
     shown = _Shown(args, len(tasks), runner.stop)
     with shown.halt_by_signals():
         with runner:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -139,11 +138,6 @@ def check_cluster(args: argparse.Namespace) -> None:
     """A usage error for --cluster where Dask is missing."""
     if args.cluster is not None:
         check_extra(args, "distributed", "cluster", "--cluster needs")
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 IMAGES = flag("images IMAGE", "PNG, TIFF, FITS, JPEG, camera raw, ROS bag, or BAG#NUMBER", nargs="+")

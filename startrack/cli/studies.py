@@ -19,12 +19,12 @@ from startrack.applications.reproduction import ARTEFACTS, Artefact
 from startrack.applications.tracking import ODOMETRY_FLOOR_M
 from startrack.chain import input_hashes
 from startrack.cli.console import progress
-from startrack.cli.flags import check_cluster, check_extra, check_localizer, cores
+from startrack.cli.flags import check_cluster, check_extra, check_localizer
 from startrack.cli.images import absolute_reference, compile_kernels, prepare
 from startrack.core.compilation import announce_compilation, is_compiled
 from startrack.core.errors import EXIT_STOPPED
 from startrack.core.files import make_folder
-from startrack.core.runner import RunStopped
+from startrack.core.runner import RunStopped, count_cores
 from startrack.frames import parse_utc
 from startrack.rendering import read_drive
 from startrack.terrain import load_terrain
@@ -47,7 +47,7 @@ def predict(args: argparse.Namespace) -> int:
     if args.cluster is None and not is_compiled():
         compile_kernels(report.terrain)
     start, bar, depth = time.perf_counter(), partial(progress, shown=not args.quiet), None
-    jobs = args.jobs or cores()
+    jobs = args.jobs or count_cores()
     try:
         with prediction.draw_store(out, draws=args.draws, jobs=jobs, progress=bar, cluster=args.cluster) as store:
             if args.cluster is not None:
@@ -135,7 +135,7 @@ def reproduce(args: argparse.Namespace) -> int:
     announce_compilation()
     if args.ours is not None:
         size = size.limit_ours(args.ours)
-    with reproduction.fix_store(out, jobs=args.jobs or cores(), progress=progress, cluster=args.cluster) as store:
+    with reproduction.fix_store(out, jobs=args.jobs or count_cores(), progress=progress, cluster=args.cluster) as store:
         if args.cluster is not None:
             store.connect()
         for name in (name for name in ARTEFACTS if name in args.what or "all" in args.what):

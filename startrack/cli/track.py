@@ -9,14 +9,13 @@ import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from startrack.applications import tracking
 from startrack.applications.batch import images_under
-from startrack.applications.tracking import FrameStore, ObservedFrame, Odometry, Track, TrackSession
+from startrack.applications.tracking import FrameStore, ObservedFrame, Odometry, OdometryFile, Track, TrackSession
 from startrack.chain import Settings
 from startrack.cli.console import progress, worst_code
 from startrack.cli.images import flag_facts, prepare_reference
@@ -62,44 +61,6 @@ def _check_flags(args: argparse.Namespace) -> None:
         raise BadInput(
             "bad_image", f"{first}: no such file or folder: give images, one folder of images, or one ROS bag"
         )
-
-
-class OdometryFile:
-    """A file of odometry that is read again where it has changed."""
-
-    def __init__(self, path: str, topic: str | None, is_followed: bool) -> None:
-        """Of a `path`, and of a bag the `topic`; `is_followed`: its last line may be incomplete."""
-        self.path, self.topic, self._is_growing = path, topic, is_followed
-        self._has_ended = False
-        self._read: tuple[object, Odometry] | None = None  # with the stamp of the file
-
-    @property
-    def has_changed(self) -> bool:
-        """Whether the file is another one than was read."""
-        return self._read is None or self._read[0] != self._stamp()
-
-    def read(self) -> Odometry:
-        """The odometry as it is now. Raises BadInput as `read_odometry`."""
-        stamp = self._stamp()
-        if self._read is None or self._read[0] != stamp:
-            read = partial(tracking.read_odometry, self.path, self.topic)
-            try:
-                self._read = stamp, read(growing=self._is_growing)
-            except BadInput:
-                if not self._has_ended:
-                    raise
-                self._read = stamp, read(growing=True)  # without the last line
-        return self._read[1]
-
-    def end(self) -> None:
-        """The file grows no more: its last line counts too, if it can be read."""
-        self._has_ended, self._is_growing, self._read = True, False, None
-
-    def _stamp(self) -> object:
-        with suppress(OSError):
-            found = Path(self.path).stat()
-            return found.st_size, found.st_mtime_ns
-        return None
 
 
 class TrackRun:

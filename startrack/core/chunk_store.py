@@ -53,7 +53,7 @@ class ChunkStore(Runner[Task, Chunk]):
 
     def chunks(self, what: str, tasks: Sequence[Task]) -> Iterator[Chunk]:
         """The chunks of `what` in the order of the tasks; missing ones are computed. Raises RunStopped."""
-        missing = self.missing_tasks(tasks)
+        missing = [task for task in tasks if not self._path(task).exists()]
         with self.progress(what, sum(map(len, missing))) as bar:
             for task, chunk in self.results(missing):
                 if isinstance(chunk, Died):
@@ -65,10 +65,6 @@ class ChunkStore(Runner[Task, Chunk]):
         for task in tasks:
             with np.load(self._path(task)) as stored:
                 yield {key: stored[key] for key in stored.files}
-
-    def missing_tasks(self, tasks: Iterable[Task]) -> list[Task]:
-        """The tasks without a chunk."""
-        return [task for task in tasks if not self._path(task).exists()]
 
     def discard(self, tasks: Iterable[Task]) -> None:
         """Remove the chunks of tasks."""

@@ -41,6 +41,11 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 
+def count_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class RunStopped(Exception):
     """No further task can be done: the disk is full, the cluster is gone. The message has the cause."""
 

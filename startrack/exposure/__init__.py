@@ -19,14 +19,7 @@ from startrack.exposure.bag import (
     read_messages,
     split_bag_path,
 )
-from startrack.exposure.correction import (
-    combine_masks,
-    mask_of,
-    read_dark,
-    read_flat,
-    read_mask,
-    touch_masked,
-)
+from startrack.exposure.correction import combine_masks, mask_of, read_dark, read_flat, read_mask, touch_masked
 from startrack.exposure.decoding import are_fractions
 from startrack.exposure.facts import NO_TIME, Facts, check_time_sigma_s, with_facts
 from startrack.exposure.png import insert_png_chunks, png_chunks

@@ -16,13 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.compilation import announce_compilation
-from startrack.exposure.decoding import (
-    Decoded,
-    bad_image,
-    check_size,
-    exif_warnings,
-    grey_float32,
-)
+from startrack.exposure.decoding import Decoded, bad_image, check_size, exif_warnings, grey_float32
 from startrack.exposure.facts import HEADER_KEYS
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"

@@ -16,14 +16,7 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.core.types import Array, Ints, Stars
-from startrack.identification.triangles import (
-    BRIGHT,
-    DEEP,
-    PairIndex,
-    PatternIndex,
-    build_index,
-    build_pairs,
-)
+from startrack.identification.triangles import BRIGHT, DEEP, PairIndex, PatternIndex, build_index, build_pairs
 
 SHALLOWEST_TREE = 1000  # brightest stars in the smallest tree; each next one holds twice as many
 NEIGHBOURS_OF_RAY = 10  # looked up at once; more only in clusters

@@ -25,13 +25,7 @@ from startrack.estimation.match import (
     match_by_brightness,
 )
 from startrack.identification.attitude_search import GATE_PX, INLIER_PX, ONE_SOURCE_SIGMAS, agreement_of
-from startrack.identification.region_growing import (
-    FEWEST,
-    GATE_OVER_SIGMA,
-    fit_camera,
-    match_in_view,
-    with_file_lens,
-)
+from startrack.identification.region_growing import FEWEST, GATE_OVER_SIGMA, fit_camera, match_in_view, with_file_lens
 
 # Gate [px] and number of brightest detections; None: all, which match by brightness too.
 FITS = ((4.0, 200), (2.5, 500), (1.8, 3000), (2.0, None), (INLIER_PX, None))

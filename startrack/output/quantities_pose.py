@@ -7,15 +7,7 @@ import numpy as np
 from startrack.chain import Located, Measured, Oriented
 from startrack.frames import quat_xyzw_from_R
 from startrack.localization import RISK
-from startrack.output.quantity import (
-    Listed,
-    Quantity,
-    Schema,
-    Show,
-    list_schema,
-    object_schema,
-    or_null,
-)
+from startrack.output.quantity import Listed, Quantity, Schema, Show, list_schema, object_schema, or_null
 from startrack.output.values import (
     ARCSEC_PER_RAD,
     R_body_enu,

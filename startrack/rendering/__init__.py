@@ -5,13 +5,7 @@ from startrack.rendering.drive import STEP_ROUNDING_1, Drive, draw_odometry, rea
 from startrack.rendering.scene import HotPixels, Scene, Truth
 from startrack.rendering.series import FAINTEST_V_MAG, Pose, Series, load_sky_catalog
 from startrack.rendering.sky import sky_e_per_s, sky_gradient
-from startrack.rendering.sources import (
-    draw_field_stars,
-    draw_v_errors,
-    exposure_for_snr,
-    flux_e,
-    limiting_v_mag,
-)
+from startrack.rendering.sources import draw_field_stars, draw_v_errors, exposure_for_snr, flux_e, limiting_v_mag
 
 __all__ = [
     "FAINTEST_V_MAG", "STEP_ROUNDING_1", "Drive", "HotPixels", "Pose", "Scene", "Series", "Truth", "draw_field_stars",

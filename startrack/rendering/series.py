@@ -14,13 +14,7 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.catalog import bodies
 from startrack.core.types import Array, BadInput, Stars, Value, rotation, vector
-from startrack.frames import (
-    R_body_enu_from_heading_pitch_roll,
-    R_enu_icrs,
-    Site,
-    observer_velocity_m_s,
-    sky_rotvec_rad,
-)
+from startrack.frames import R_body_enu_from_heading_pitch_roll, R_enu_icrs, Site, observer_velocity_m_s, sky_rotvec_rad
 from startrack.rendering.compose import draw_hot_pixels
 from startrack.rendering.drive import Drive, draw_odometry
 from startrack.rendering.scene import Scene

@@ -11,13 +11,7 @@ import numpy as np
 from startrack.core.declaration import Flag
 from startrack.core.kernels import njit
 from startrack.core.types import Array, BadInput
-from startrack.terrain.crater import (
-    Crater,
-    DeformedCrater,
-    distance_bounds,
-    distance_to_circle,
-    slopes_of_round_crater,
-)
+from startrack.terrain.crater import Crater, DeformedCrater, distance_bounds, distance_to_circle, slopes_of_round_crater
 from startrack.terrain.shape import (
     AMOUNT,
     CAMERA_ERROR,

@@ -17,6 +17,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from startrack.core.files import atomic_file, hold_lock
+from startrack.core.runner import count_cores
 from startrack.core.types import Array, Ints
 from startrack.terrain.horizon_table import (
     AZIMUTH_BINS,
@@ -45,11 +46,6 @@ def cache_dir() -> Path:
     """Folder of the tables: $XDG_CACHE_HOME/startrack/horizons, or ~/.cache/startrack/horizons."""
     base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     return Path(base) / "startrack" / "horizons"
-
-
-def cpu_count() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def key_of_table(ground: TracedMap) -> str:
@@ -159,7 +155,7 @@ def build_table(ground: TracedMap, progress: Progress | None = None) -> HorizonT
         values[part] = quantize_fields(found)
         return len(part)
 
-    pool = ThreadPoolExecutor(cpu_count())
+    pool = ThreadPoolExecutor(count_cores())
     try:
         for count in pool.map(trace, np.array_split(cells, max(1, len(cells) // 64))):
             done += count

@@ -12,6 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from startrack.core.runner import count_cores
 from startrack.core.types import Array, BadInput
 from startrack.frames import Site
 from startrack.terrain.ground import Ground, ground_up_m, pack_maps
@@ -21,7 +22,6 @@ from startrack.terrain.protocol import Progress, Terrain
 from startrack.terrain.raster import Projection, Raster
 from startrack.terrain.table_cache import (
     TABLES_IN_MEMORY,
-    cpu_count,
     discard_table,
     key_of_table,
     load_or_build_table,
@@ -224,7 +224,7 @@ def _flatten(a: Any, shape: tuple[int, ...]) -> Array:
 
 def _run_in_threads(function: Any, fixed: tuple[Any, ...], arrays: tuple[Array, ...]) -> None:
     """Call the function with the fixed arguments and parts of the arrays, on all cores where rays are many."""
-    n, cores = len(arrays[-1]), min(cpu_count(), MAX_THREADS)
+    n, cores = len(arrays[-1]), min(count_cores(), MAX_THREADS)
     if n < MIN_RAYS_FOR_THREADS or cores == 1:
         function(*fixed, *arrays)
         return

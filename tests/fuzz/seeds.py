@@ -169,8 +169,9 @@ def _converted() -> list[bytes]:
 
 def hill_map() -> bytes:
     """A height map of a ring-shaped hill about the south pole, as GeoTIFF."""
+    from map_helpers import polar_stereographic
+
     from startrack.terrain import Raster, write_map
-    from startrack.terrain.raster import polar_stereographic
 
     line = (np.arange(31) - 15) * 200.0
     heights = (800 * np.exp(-((np.hypot(line[:, None], line) - 2000) ** 2) / 500**2)).astype(np.float32)

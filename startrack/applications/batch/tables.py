@@ -84,7 +84,8 @@ def write_tables(out: Path, records: Sequence[Record], settings: dict[str, Any])
     one cannot be.
     """
     records = sorted(records, key=lambda record: str(record["image"]))
-    made = {"results.ecsv": _results(records)} | ({PARQUET: _parquet(records)} if has_parquet() else {})
+    columns = [replace(one, values=column_values(one, records), description="") for one in COLUMNS]
+    made = {"results.ecsv": ecsv_text(columns).encode()} | ({PARQUET: _parquet(records)} if has_parquet() else {})
     made |= {name: "".join(lines).encode() for name, lines in _trajectories(records).items()}
     made |= {"timings.ecsv": _timings(records), MANIFEST: _manifest(records, settings)}
     for former in (out / PARQUET, out / TRAJECTORY, *out.glob("trajectory-*.tum")):
@@ -111,11 +112,6 @@ def column_values(column: Column, records: Sequence[Record]) -> list[Any]:
     values = [column.value(record) for record in records]
     is_file = ".".join(map(str, column.path)) in FILES
     return [value if value is None or not is_file else reference_stem(value) for value in values]
-
-
-def _results(records: Sequence[Record]) -> bytes:
-    table = [replace(one, values=column_values(one, records), description="") for one in COLUMNS]
-    return ecsv_text(table).encode()
 
 
 def _parquet(records: Sequence[Record]) -> bytes:

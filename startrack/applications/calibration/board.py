@@ -38,8 +38,8 @@ class Board:
 
     columns: int  # inner corners of a chessboard, squares of a ChArUco board
     rows: int
-    charuco: str | None = None  # name of the dictionary, such as DICT_5X5_100
-    marker_fraction: float = 0.75  # marker's side over the square's
+    charuco: str | None  # name of the dictionary, such as DICT_5X5_100; None: a chessboard
+    marker_fraction: float  # marker's side over the square's
 
 
 class Corners(NamedTuple):

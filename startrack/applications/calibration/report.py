@@ -10,12 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from startrack.applications.calibration.acceptance import star_coverage
-from startrack.applications.calibration.record import (
-    arcmin_per_px,
-    camera_summary,
-    image_rows,
-    summary,
-)
+from startrack.applications.calibration.record import arcmin_per_px, camera_summary, image_rows, summary
 from startrack.applications.calibration.run import Calibration
 from startrack.core.files import write_atomically
 

@@ -12,12 +12,7 @@ from datetime import timedelta
 
 import numpy as np
 
-from startrack.applications.calibration.acceptance import (
-    IMAGE_RINGS,
-    IMAGE_SECTORS,
-    STARS_PER_RING,
-    rings_and_sectors,
-)
+from startrack.applications.calibration.acceptance import IMAGE_RINGS, IMAGE_SECTORS, STARS_PER_RING, rings_and_sectors
 from startrack.camera import cap_grid, projection_covariance_px2
 from startrack.core.types import Ints
 from startrack.estimation.adjust import SMALLEST_EXTRA_PX2, inverse_covariance

@@ -64,7 +64,8 @@ def median_or_none(radius_m: Array) -> float | None:
     return median if np.isfinite(median) else None
 
 
-def _rms_or_none(ratio: Array) -> float | None:
+def _error_ratio(cells: Cells) -> float | None:
+    ratio = cells[ERROR_RATIO]
     return float(np.sqrt(np.nanmean(np.square(ratio)))) if np.isfinite(ratio).any() else None
 
 
@@ -90,7 +91,7 @@ SUMMARY_QUANTITIES = (
         for bound in SHARES_M
     ),
     *(_cells_quantity(name, "", _mean(name), "mean over the places") for name in ("p_ok", "p_ambiguous", "p_refused")),
-    _cells_quantity(ERROR_RATIO, "", lambda cells: _rms_or_none(cells[ERROR_RATIO]),
+    _cells_quantity(ERROR_RATIO, "", _error_ratio,
               "errors of the draws over the stated ones, root mean square over the places: near 1 where the stated "
               "ones are right; null: no draw has a position", schema="positive", before=None),
 )  # fmt: skip

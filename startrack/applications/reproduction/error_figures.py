@@ -18,13 +18,7 @@ from startrack.applications.reproduction.methods import (
     error_statistics,
     format_errors,
 )
-from startrack.applications.reproduction.simulator import (
-    ASPECT_RATIO,
-    DIAMETER_M,
-    MAGNITUDE,
-    THESIS,
-    star_count,
-)
+from startrack.applications.reproduction.simulator import ASPECT_RATIO, DIAMETER_M, MAGNITUDE, THESIS, star_count
 from startrack.output import Column
 
 if TYPE_CHECKING:

@@ -14,12 +14,7 @@ from startrack.applications.reproduction.methods import (
     error_statistics,
     format_errors,
 )
-from startrack.applications.reproduction.simulator import (
-    MAGNITUDE,
-    THESIS,
-    Mistakes,
-    star_count,
-)
+from startrack.applications.reproduction.simulator import MAGNITUDE, THESIS, Mistakes, star_count
 from startrack.output import Column
 
 DEEP_MAGNITUDE, DEEP_MISTAKES = 8.0, Mistakes(missed=0.10, false=0.01)

@@ -1,7 +1,7 @@
 """Many exposures: tracks of a camera at rest or on a drive; odometry from text and ROS bags."""
 
 from startrack.applications.tracking.observed_frame import FrameStore, ObservedFrame, observe_frame
-from startrack.applications.tracking.odometry import Odometry, read_odometry
+from startrack.applications.tracking.odometry import Odometry, OdometryFile, read_odometry
 from startrack.applications.tracking.picture import draw_track
 from startrack.applications.tracking.quantities import FRAME_QUANTITIES, TRACK, frame_records
 from startrack.applications.tracking.session import TrackSession, follow_images
@@ -19,8 +19,8 @@ from startrack.applications.tracking.write import track_page, track_record, writ
 from startrack.exposure import read_bag_exposures
 
 __all__ = [
-    "FRAME_QUANTITIES", "ODOMETRY_FLOOR_M", "ODOMETRY_SIGMA", "TRACK", "CrestHeights", "FrameStore", "ObservedFrame",
-    "Odometry", "Track", "TrackErrors", "TrackFrame", "TrackSession", "Trajectory", "draw_track", "estimate_track",
-    "follow_images", "frame_records", "observe_frame", "read_bag_exposures", "read_odometry", "track_page",
-    "track_record", "write_track",
+    "FRAME_QUANTITIES", "ODOMETRY_FLOOR_M", "ODOMETRY_SIGMA", "TRACK", "CrestHeights", "FrameStore",
+    "ObservedFrame", "Odometry", "OdometryFile", "Track", "TrackErrors", "TrackFrame", "TrackSession", "Trajectory",
+    "draw_track", "estimate_track", "follow_images", "frame_records", "observe_frame", "read_bag_exposures",
+    "read_odometry", "track_page", "track_record", "write_track",
 ]  # fmt: skip

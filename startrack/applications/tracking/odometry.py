@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -121,6 +123,44 @@ def read_odometry(path: FilePath, topic: str | None = None, *, growing: bool = F
     if topic is not None:
         _refuse(f"{printable(path)}: is read as text and has no topic {topic}; bags end in {', '.join(BAG_SUFFIXES)}")
     return _odometry_of_text(path, growing)
+
+
+class OdometryFile:
+    """A file of odometry that is read again where it has changed."""
+
+    def __init__(self, path: str, topic: str | None, is_followed: bool) -> None:
+        """Of a `path`, and of a bag the `topic`; `is_followed`: its last line may be incomplete."""
+        self.path, self.topic, self._is_growing = path, topic, is_followed
+        self._has_ended = False
+        self._read: tuple[object, Odometry] | None = None  # with the stamp of the file
+
+    @property
+    def has_changed(self) -> bool:
+        """Whether the file is another one than was read."""
+        return self._read is None or self._read[0] != self._stamp()
+
+    def read(self) -> Odometry:
+        """The odometry as it is now. Raises BadInput as `read_odometry`."""
+        stamp = self._stamp()
+        if self._read is None or self._read[0] != stamp:
+            read = partial(read_odometry, self.path, self.topic)
+            try:
+                self._read = stamp, read(growing=self._is_growing)
+            except BadInput:
+                if not self._has_ended:
+                    raise
+                self._read = stamp, read(growing=True)  # without the last line
+        return self._read[1]
+
+    def end(self) -> None:
+        """The file grows no more: its last line counts too, if it can be read."""
+        self._has_ended, self._is_growing, self._read = True, False, None
+
+    def _stamp(self) -> object:
+        with suppress(OSError):
+            found = Path(self.path).stat()
+            return found.st_size, found.st_mtime_ns
+        return None
 
 
 def _odometry_of_text(path: FilePath, growing: bool) -> Odometry:

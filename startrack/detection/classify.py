@@ -46,8 +46,9 @@ def refit_saturated(fitted: Fitted, sigma: float) -> tuple[Fitted, Array]:
     fits, width = fitted.fits, np.full(len(fitted.fits.flux), sigma)
     clipped = np.flatnonzero(are_saturated(fitted.stamps) & (fits.chi2 > POOR_CHI2_PER_DOF * fits.dof))
     for wider in WIDTH_FACTORS if len(clipped) else ():
-        stamps = fitted.stamps.take(clipped)
-        again = fit_points(stamps, fits.xy_px[clipped], wider * sigma, fitted.source_noise, 0.0, FIT_ROUNDS_AGAIN)
+        again = fit_points(
+            fitted.stamps, clipped, fits.xy_px[clipped], wider * sigma, fitted.source_noise, 0.0, FIT_ROUNDS_AGAIN
+        )
         better = np.flatnonzero(again.chi2 < fits.chi2[clipped])
         fits = fits.with_rows(clipped[better], again.take(better))
         width[clipped[better]] = wider * sigma

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,13 +15,12 @@ from startrack.detection.fit import (
     fit_points,
     measure_source_noise,
 )
-from startrack.detection.frame import RESIDUAL_FRACTION, Frame, Pixels, SourceNoise, cut_stamps, radius_for
+from startrack.detection.frame import Frame, Pixels, SourceNoise, cut_stamps, radius_for
 from startrack.detection.peaks import MAX_STAMP_PIXELS, Peaks
 from startrack.psf import pixel_profile_single
 
 CROWDED_ROUNDS = 3  # of subtracting neighbours and fitting again
 NEIGHBOUR_SIGMA = 0.1  # of a pixel's noise: a neighbour's signal above this is subtracted
-NEIGHBOUR_ERROR = np.float32(RESIDUAL_FRACTION)  # relative error of that signal: fits, and the PSF's wings
 
 
 @dataclass(frozen=True)
@@ -40,17 +39,19 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = 
     radius, centres = radius_for(sigma), peaks.centres
     data, variance = frame.cut_light(centres, radius)
     stamps = Stamps(data, variance, frame.usable_pixels(centres, radius), centres, peaks.surround)
+    every, refined = np.arange(len(centres)), 0 if known is None else len(known.flux)
     last = np.zeros_like(data)  # neighbours' signal subtracted in the last fit
-    refined = 0 if known is None else len(known.flux)
     if known is not None and frame.found is not None:
         last = cut_stamps(frame.found, centres, radius)
         last[:refined] -= source_signal(known.xy_px - centres[:refined], known.flux, sigma, radius)
         last[np.square(last).max(axis=(1, 2)) <= NEIGHBOUR_SIGMA**2 * variance[:, radius, radius]] = 0.0
-    cleaned = _subtract_neighbours(stamps, last)
     fits = PointFits.concatenate(*(
-        fit_points(cleaned.take(which), peaks.start_xy_px[which], sigma, frame.source_noise, peaks.own_part, rounds)
-        for which, rounds in ((slice(0, refined), FIT_ROUNDS_AGAIN), (slice(refined, None), FIT_ROUNDS))
-        if len(centres[which])
+        fit_points(
+            stamps, which, peaks.start_xy_px[which], sigma, frame.source_noise, peaks.own_part, rounds,
+            None if known is None else last[which],
+        )
+        for which, rounds in ((every[:refined], FIT_ROUNDS_AGAIN), (every[refined:], FIT_ROUNDS))
+        if len(which)
     ))  # fmt: skip
     pairs = cKDTree(centres).query_pairs(1.5 * radius + 3.0 * sigma, output_type="ndarray")  # stamps that overlap
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
@@ -60,27 +61,22 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = 
     source_noise = measure_source_noise(stamps, fits, alone, sigma, frame.source_noise)
 
     def fit_again(which: Ints, signal: Pixels) -> PointFits:
-        part = _subtract_neighbours(stamps.take(which), signal)
-        again = fit_points(part, fits.xy_px[which], sigma, source_noise, peaks.own_part, FIT_ROUNDS_AGAIN)
+        again = fit_points(
+            stamps, which, fits.xy_px[which], sigma, source_noise, peaks.own_part, FIT_ROUNDS_AGAIN, signal
+        )
         return fits.with_rows(which, again)
 
     bright = _find_reweighted(fits, sigma, variance, frame.source_noise, source_noise)
     if len(bright):
         fits = fit_again(bright, last[bright])
     for _ in range(CROWDED_ROUNDS):
-        crowded, signal = _sum_neighbour_signal(stamps, fits, star, other, sigma)
-        changed = (np.square(signal - last[crowded]) > NEIGHBOUR_SIGMA**2 * variance[crowded]).any(axis=(1, 2))
-        crowded, signal = crowded[changed], signal[changed]
+        counts = _are_relevant(stamps, fits, star, other, sigma)
+        crowded, signal = _changed_signal(stamps, fits, star[counts], other[counts], sigma, last)
         if not len(crowded):
             break
         last[crowded] = signal
         fits = fit_again(crowded, signal)
     return Fitted(stamps, fits, source_noise)
-
-
-def _subtract_neighbours(stamps: Stamps, signal: Pixels) -> Stamps:
-    """The stamps with the neighbours' signal subtracted; its error is added to the variance."""
-    return replace(stamps, data=stamps.data - signal, variance=stamps.variance + np.square(NEIGHBOUR_ERROR * signal))
 
 
 def _find_reweighted(fits: PointFits, sigma: float, variance: Pixels, was: SourceNoise, now: SourceNoise) -> Ints:
@@ -91,28 +87,21 @@ def _find_reweighted(fits: PointFits, sigma: float, variance: Pixels, was: Sourc
     return np.flatnonzero(np.abs(after - before) > 0.1 * before)
 
 
-def _sum_neighbour_signal(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> tuple[Ints, Pixels]:
-    """The candidates (k,) whose stamps contain relevant signal of neighbours, and that signal (k, s, s)."""
-    side = s.data.shape[1]
-    radius = side // 2
-    counts = _are_relevant(s, fits, star, other, sigma)
-    star, other = star[counts], other[counts]
-    crowded, signal = [np.zeros(0, dtype=np.int64)], [np.zeros((0, side, side), dtype=np.float32)]
-    firsts = np.flatnonzero(np.diff(star, prepend=-1))
-    pairs_at_a_time = max(1, MAX_STAMP_PIXELS // (side * side))
-    while len(firsts):
-        # Whole stars at a time, at least one: all pairs up to the first of a later star.
-        end = np.searchsorted(firsts, firsts[0] + pairs_at_a_time)
-        last = firsts[end] if end < len(firsts) else len(star)
-        here = slice(firsts[0], last)
-        each = source_signal(fits.xy_px[other[here]] - s.centres[star[here]], fits.flux[other[here]], sigma, radius)
-        sums = np.add.reduceat(each, firsts[:end] - firsts[0], axis=0)
-        who = star[firsts[:end]]
-        matters = (np.square(sums) > NEIGHBOUR_SIGMA**2 * s.variance[who]).any(axis=(1, 2))
-        crowded.append(who[matters])
-        signal.append(sums[matters])
-        firsts = firsts[end:]
-    return np.concatenate(crowded), np.concatenate(signal)
+def _changed_signal(
+    s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float, last: Pixels
+) -> tuple[Ints, Pixels]:
+    """The candidates (k,) whose stamps hold other neighbours' light than `last` (n, s, s), and that light (k, s, s).
+
+    `star` and `other` (m,) are pairs of a candidate and a neighbour, sorted by the first.
+    """
+    from startrack.detection.fit_kernel import sum_neighbours
+
+    crowded = star[np.flatnonzero(np.diff(star, prepend=-1))]
+    signal = np.empty((len(crowded), *last.shape[1:]), dtype=np.float32)
+    offset_px = fits.xy_px[other] - s.centres[star]
+    changed = np.zeros(len(crowded), dtype=np.bool_)
+    sum_neighbours(star, offset_px, fits.flux[other], sigma, s.variance, NEIGHBOUR_SIGMA, last, signal, changed)
+    return crowded[changed], signal[changed]
 
 
 def _are_relevant(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> Array:

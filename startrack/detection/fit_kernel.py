@@ -19,23 +19,27 @@ ERF_SCALE, A1, A2, A3, A4, A5 = float(ERF_T), *(float(a) for a in ERF_COEFFICIEN
 
 @njit(cache=True, nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
 def fit_stamps(
-    data, variance, usable, start_px, sigma_px, per_unit, model_error, rounds, surround, xy_px, values, covariance
-) -> None:
-    """Fit one point source to each stamp (n, s, s) and fill the outputs.
+    data, variance, usable, signal, signal_error, which, start_px, sigma_px, per_unit, model_error, rounds, surround,
+    xy_px, values, covariance,
+) -> None:  # fmt: skip
+    """Fit one point source to each of the stamps `which` (m,) of (n, s, s), and fill the outputs.
 
-    `usable` (n, s, s) may have no rows: all pixels then are. `start_px` (n, 2) are offsets from the middle pixel,
-    `per_unit` and `model_error` the noise of the source's own light, `surround` (n,) the level of its surroundings.
-    Outputs: offsets `xy_px` (n, 2); `covariance` (n, 4, 4) of x, y, flux, level; `values` (n, 8): flux, level, chi^2,
-    chi^2 of a single pixel, usable pixels, and the sums over pixels of the matched filter times the light above the
-    surroundings, times the profile, and times the profile with the own photons' noise.
+    `usable` (n, s, s) may have no rows: all pixels then are. `signal` (m, s, s), the neighbours' light with the
+    relative error `signal_error`, is subtracted; it may have no rows either. `start_px` (m, 2) are offsets from the
+    middle pixel, `per_unit` and `model_error` the noise of the source's own light, `surround` (m,) the level of its
+    surroundings. Outputs: offsets `xy_px` (m, 2); `covariance` (m, 4, 4) of x, y, flux, level; `values` (m, 8): flux,
+    level, chi^2, chi^2 of a single pixel, usable pixels, and the sums over pixels of the matched filter times the light
+    above the surroundings, times the profile, and times the profile with the own photons' noise.
     """
-    n, side = data.shape[0], data.shape[1]
+    side = data.shape[1]
     radius = side // 2
     profile, slope, centre = np.zeros((2, side)), np.zeros((2, side)), np.zeros(2)
-    weight, miss = np.zeros((side, side)), np.zeros((side, side))
+    # Pixel by pixel: light, variance, 1 where usable; profile of the source and its slopes in x and y.
+    pixels, shapes = np.zeros((3, side * side)), np.zeros((3, side * side))
     size = covariance.shape[1]  # 4
     normal, right, delta = np.zeros((size, size)), np.zeros(size), np.zeros(size)
-    for i in range(n):
+    for i in range(len(which)):
+        _read_stamp(data, variance, usable, signal, signal_error, which[i], i, pixels)
         for axis in range(2):
             centre[axis] = min(max(start_px[i, axis], -radius), radius)
         flux, level = 0.0, 0.0
@@ -43,20 +47,12 @@ def fit_stamps(
             if step != 1:  # the first step leaves the position as it is
                 for axis in range(2):
                     _profile(profile, slope, axis, centre[axis], sigma_px, radius)
-            shine = max(flux, 0.0)
-            for r in range(side):
-                for c in range(side):
-                    shape = profile[1, r] * profile[0, c]
-                    light = shine * shape
-                    noise = variance[i, r, c] + light * (per_unit + model_error * model_error * light)
-                    weight[r, c] = 1.0 / noise
-                    miss[r, c] = data[i, r, c] - flux * shape - level
-            if len(usable) > 0:
                 for r in range(side):
                     for c in range(side):
-                        if not usable[i, r, c]:
-                            weight[r, c] = 0.0
-            _normal_equations(weight, miss, flux, profile, slope, normal, right)
+                        shapes[0, r * side + c] = profile[1, r] * profile[0, c]
+                        shapes[1, r * side + c] = profile[1, r] * slope[0, c]
+                        shapes[2, r * side + c] = slope[1, r] * profile[0, c]
+            _normal_equations(pixels, shapes, flux, level, per_unit, model_error, normal, right)
             if step == 0:  # flux and level first: without a flux the position has no gradient
                 a, b, d = normal[2, 2], normal[2, 3], normal[3, 3]
                 determinant = max(a * d - b * b, 1e-300)
@@ -80,7 +76,23 @@ def fit_stamps(
                 level += delta[3]
         xy_px[i, 0], xy_px[i, 1] = centre[0], centre[1]
         values[i, 0], values[i, 1] = flux, level
-        _judge(data, variance, usable, i, weight, miss, profile, flux, per_unit, surround, values)
+        _judge(pixels, shapes[0], flux, level, per_unit, model_error, surround[i], values[i])
+
+
+@njit(inline="always")
+def _read_stamp(data, variance, usable, signal, signal_error, k, i, pixels) -> None:
+    """Fill pixels (3, s^2): light, variance and usability of stamp k without the neighbours' signal i."""
+    side = data.shape[1]
+    for r in range(side):
+        for c in range(side):
+            at = r * side + c
+            pixels[0, at], pixels[1, at], pixels[2, at] = data[k, r, c], variance[k, r, c], 1.0
+            if len(signal):
+                error = signal_error * signal[i, r, c]
+                pixels[0, at] -= signal[i, r, c]
+                pixels[1, at] += error * error
+            if len(usable) and not usable[k, r, c]:
+                pixels[2, at] = 0.0
 
 
 @njit(inline="always")
@@ -100,39 +112,32 @@ def _profile(profile, slope, axis, offset, sigma_px, radius) -> None:
 
 
 @njit(inline="always")
-def _normal_equations(weight, miss, flux, profile, slope, normal, right) -> None:
-    """Normal matrix (4, 4), symmetric, and right side (4,) for x, y, flux, level: sums over x, then over y."""
-    side = profile.shape[1]
+def _normal_equations(pixels, shapes, flux, level, per_unit, model_error, normal, right) -> None:
+    """Normal matrix (4, 4), symmetric, and right side (4,) for x, y, flux, level."""
+    light, variance, use = pixels[0], pixels[1], pixels[2]
+    shape, by_x, by_y = shapes[0], shapes[1], shapes[2]
+    shine, error = max(flux, 0.0), model_error * model_error
     xx = yy = xy = xf = yf = xl = yl = ff = fl = ll = bx = by = bf = bl = 0.0
-    for r in range(side):
-        w = wp = wd = wpp = wpd = wdd = m = mp = md = 0.0
-        for c in range(side):
-            v, p, d = weight[r, c], profile[0, c], slope[0, c]
-            e = v * miss[r, c]
-            w += v
-            wp += v * p
-            wd += v * d
-            wpp += v * p * p
-            wpd += v * p * d
-            wdd += v * d * d
-            m += e
-            mp += e * p
-            md += e * d
-        p, d = profile[1, r], slope[1, r]
-        xx += p * p * wdd
-        yy += d * d * wpp
-        xy += p * d * wpd
-        xf += p * p * wpd
-        yf += p * d * wpp
-        xl += p * wd
-        yl += d * wp
-        ff += p * p * wpp
-        fl += p * wp
-        ll += w
-        bx += p * md
-        by += d * mp
-        bf += p * mp
-        bl += m
+    for k in range(len(light)):
+        f, x, y = shape[k], by_x[k], by_y[k]
+        own = shine * f
+        weight = use[k] / (variance[k] + own * (per_unit + error * own))
+        miss = light[k] - flux * f - level
+        wf, wx, wy = weight * f, weight * x, weight * y
+        xx += wx * x
+        yy += wy * y
+        xy += wx * y
+        xf += wx * f
+        yf += wy * f
+        xl += wx
+        yl += wy
+        ff += wf * f
+        fl += wf
+        ll += weight
+        bx += wx * miss
+        by += wy * miss
+        bf += wf * miss
+        bl += weight * miss
     normal[0, 0], normal[1, 1] = flux * flux * xx + POSITION_PRIOR, flux * flux * yy + POSITION_PRIOR
     normal[2, 2], normal[3, 3] = ff + FLUX_PRIOR, ll + FLUX_PRIOR
     normal[1, 0], normal[2, 0], normal[2, 1] = flux * flux * xy, flux * xf, flux * yf
@@ -175,35 +180,62 @@ def _solve(factor, x) -> None:
 
 
 @njit(inline="always")
-def _judge(data, variance, usable, i, weight, miss, profile, flux, per_unit, surround, values) -> None:
-    """Fill values[i, 2:] for the fitted source: how well it fits, how well a single pixel does, and filter sums."""
-    side = profile.shape[1]
-    middle = side // 2
-    hot_r, hot_c = middle - 1, middle - 1
-    for r in range(middle - 1, middle + 2):
-        for c in range(middle - 1, middle + 2):
-            if data[i, r, c] > data[i, hot_r, hot_c]:
-                hot_r, hot_c = r, c
-    shine = max(flux, 0.0)
+def _judge(pixels, shape, flux, level, per_unit, model_error, surround, values) -> None:
+    """Fill values[2:] for the fitted source: how well it fits, how well a single pixel does, and filter sums."""
+    light, variance, use = pixels[0], pixels[1], pixels[2]
+    side = int(math.sqrt(len(light)) + 0.5)
+    hot = len(light) // 2 - side - 1  # the brightest pixel of the middle nine
+    for r in range(-1, 2):
+        for c in range(-1, 2):
+            k = len(light) // 2 + r * side + c
+            hot = k if light[k] > light[hot] else hot
+    shine, error = max(flux, 0.0), model_error * model_error
     chi2 = count = above = norm = own = total = light_sum = 0.0
-    for r in range(side):
-        for c in range(side):
-            chi2 += weight[r, c] * miss[r, c] * miss[r, c]
-            if len(usable) > 0 and not usable[i, r, c]:
-                continue
-            count += 1.0
-            plain, shape = 1.0 / variance[i, r, c], profile[1, r] * profile[0, c]
-            above += plain * shape * (data[i, r, c] - surround[i])
-            norm += plain * shape * shape
-            own += plain * shape * shape / (1.0 + per_unit * shine * shape * plain)
-            if r != hot_r or c != hot_c:
-                total += plain
-                light_sum += plain * data[i, r, c]
-    mean = light_sum / max(total, 1e-300)
-    chi2_pixel = 0.0
-    for r in range(side):
-        for c in range(side):
-            if (r != hot_r or c != hot_c) and (len(usable) == 0 or usable[i, r, c]):
-                chi2_pixel += (data[i, r, c] - mean) ** 2 / variance[i, r, c]
-    values[i, 2], values[i, 3], values[i, 4] = chi2, chi2_pixel, count
-    values[i, 5], values[i, 6], values[i, 7] = above, norm, own
+    for k in range(len(light)):
+        plain, glow = use[k] / variance[k], shine * shape[k]
+        miss = light[k] - flux * shape[k] - level
+        filtered = plain * shape[k]
+        chi2 += use[k] * miss * miss / (variance[k] + glow * (per_unit + error * glow))
+        count += use[k]
+        above += filtered * (light[k] - surround)
+        norm += filtered * shape[k]
+        own += filtered * shape[k] / (1.0 + per_unit * glow * plain)
+    use[hot] = 0.0
+    for k in range(len(light)):
+        total += use[k] / variance[k]
+        light_sum += use[k] / variance[k] * light[k]
+    mean, chi2_pixel = light_sum / max(total, 1e-300), 0.0
+    for k in range(len(light)):
+        chi2_pixel += use[k] * (light[k] - mean) ** 2 / variance[k]
+    values[2], values[3], values[4] = chi2, chi2_pixel, count
+    values[5], values[6], values[7] = above, norm, own
+
+
+@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
+def sum_neighbours(star, offset_px, flux, sigma_px, variance, limit_sigma, last, signal, changed) -> None:
+    """Fill signal (k, s, s) with the light of sources in the stamps of the k different stars among `star` (m,).
+
+    The sources are `offset_px` (m, 2) from the middle of the stamp of `star`, which is sorted. `changed` (k,): whether
+    the light and its difference from `last` (n, s, s) exceed `limit_sigma` of a pixel's noise.
+    """
+    side = last.shape[1]
+    profile, slope = np.zeros((2, side)), np.zeros((2, side))
+    k = -1
+    for i in range(len(star)):
+        if i == 0 or star[i] != star[i - 1]:
+            k += 1
+            signal[k] = 0.0
+        for axis in range(2):
+            _profile(profile, slope, axis, offset_px[i, axis], sigma_px, side // 2)
+        for r in range(side):
+            for c in range(side):
+                signal[k, r, c] += max(flux[i], 0.0) * profile[1, r] * profile[0, c]
+        if i + 1 < len(star) and star[i + 1] == star[i]:
+            continue
+        matters = differs = False
+        for r in range(side):
+            for c in range(side):
+                limit = limit_sigma * limit_sigma * variance[star[i], r, c]
+                matters |= signal[k, r, c] ** 2 > limit
+                differs |= (signal[k, r, c] - last[star[i], r, c]) ** 2 > limit
+        changed[k] = matters and differs

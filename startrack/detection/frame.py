@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from startrack.camera import Camera
 from startrack.core.smooth_image import Image, SmoothImage
 from startrack.core.types import Bools, Exposure, Ints
+from startrack.detection.background import COARSE_PX
 from startrack.detection.residual_kernel import cut_light, fill_residuals
 from startrack.psf import stamp_radius
 
@@ -19,6 +20,7 @@ Pixels = NDArray[np.floating[Any]]  # stamps, in either precision
 SATURATED_FRACTION = 0.98
 MIN_BINNED_SIGMA_PX = 1.8  # PSF width from which the frame is binned
 RESIDUAL_FRACTION = 0.1  # of a known star's signal: error of its subtraction
+STRIP_PIXELS = 2**17
 NOTHING = np.zeros((0, 0), dtype=np.float32)
 MODEL_ERROR = 0.03  # of a star's signal: difference between real PSFs and the Gaussian
 
@@ -78,19 +80,26 @@ def electrons(exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray
     recorded_adu, correction = exposure.recorded_adu, exposure.correction
     sensor = None if camera is None else camera.sensor
     highest = SATURATED_FRACTION * (ceiling if sensor is None else min(ceiling, sensor.saturation_adu))
-    is_dark = recorded_adu.max() < highest
-    saturated = np.zeros(recorded_adu.shape, dtype=np.bool_) if is_dark else recorded_adu >= highest
-    if sensor is None:
-        return pixels_adu, saturated
-    if sensor.gain_e_per_adu == 1.0 and sensor.bias_adu == 0.0:
-        return pixels_adu, saturated
-    image = pixels_adu * np.float32(sensor.gain_e_per_adu)
-    bias_e = np.float32(sensor.bias_adu * sensor.gain_e_per_adu)
-    if correction is not None and correction.scales_black and correction.sensitivity_1 is not None:
-        image -= bias_e / correction.sensitivity_1
-    else:
-        image -= bias_e
+    gain, bias_e, image = np.float32(1.0), np.zeros((1, 1), dtype=np.float32), pixels_adu
+    if sensor is not None and (sensor.gain_e_per_adu != 1.0 or sensor.bias_adu != 0.0):
+        gain, image = np.float32(sensor.gain_e_per_adu), np.empty_like(pixels_adu)
+        bias_e += np.float32(sensor.bias_adu * sensor.gain_e_per_adu)
+        if correction is not None and correction.scales_black and correction.sensitivity_1 is not None:
+            bias_e = bias_e / correction.sensitivity_1
+    saturated = np.zeros(recorded_adu.shape, dtype=np.bool_)
+    for top in range(0, len(image), rows_at_a_time(image.shape)):
+        rows = slice(top, top + rows_at_a_time(image.shape))
+        if not recorded_adu[rows].max() < highest:  # seldom: memory that nobody writes to costs no time
+            np.greater_equal(recorded_adu[rows], highest, out=saturated[rows])
+        if image is not pixels_adu:
+            np.multiply(pixels_adu[rows], gain, out=image[rows])
+            image[rows] -= bias_e if len(bias_e) == 1 else bias_e[rows]
     return image, saturated
+
+
+def rows_at_a_time(shape: tuple[int, ...]) -> int:
+    """Rows of an image (H, W) that stay in the processor's cache: whole squares of COARSE_PX."""
+    return COARSE_PX * max(1, STRIP_PIXELS // (COARSE_PX * shape[1]))
 
 
 def cut_stamps(image: NDArray[Any], centres: Ints, radius: int) -> NDArray[Any]:

@@ -12,12 +12,10 @@ from startrack.core.kernels import njit
 from startrack.core.smooth_image import Image, SmoothImage
 from startrack.core.types import Array, Ints
 from startrack.detection.background import COARSE_PX, clipped_means, coarse_width, smooth_level
-from startrack.detection.frame import Frame, radius_for
+from startrack.detection.frame import Frame, radius_for, rows_at_a_time
 from startrack.psf import filter_kernel
 
-STRIP_PIXELS = 2**17  # that are looked at together
 NO_PIXELS = np.zeros((0, 0), dtype=np.bool_)
-RUN_PX = 32  # without a peak, that are passed over together
 MAX_STAMP_PIXELS = 2_500_000  # of all candidates together: bounds time and memory, for any content of the frame
 MAX_BLOBS = 1000  # saturated; the largest
 MAX_DEAD_GROUPED_PX = 20_000  # pixels up to which they are grouped without looking at the whole mask
@@ -87,18 +85,13 @@ def bright_pixels(frame: Frame, lowest: float, most: int) -> Ints:
 def _level_of_surroundings(frame: Frame, width: int) -> SmoothImage:
     """Level of the background that block medians miss, in units of the noise: the mean over boxes of a width [px]."""
     means = np.empty([-(-length // COARSE_PX) for length in frame.shape], dtype=np.float32)
-    rows = _rows_at_a_time(frame)
+    rows = rows_at_a_time(frame.shape)
     residuals = np.empty((rows, frame.shape[1]), dtype=np.float32)
     for top in range(0, frame.shape[0], rows):
         strip = residuals[: frame.shape[0] - top]
         frame.fill_residuals(strip, top)
         clipped_means(strip, means[top // COARSE_PX : -(-(top + rows) // COARSE_PX)])
     return smooth_level(means, width, frame.shape)
-
-
-def _rows_at_a_time(frame: Frame) -> int:
-    """Rows of the frame that stay in the processor's cache: whole squares of COARSE_PX."""
-    return COARSE_PX * max(1, STRIP_PIXELS // (COARSE_PX * frame.shape[1]))
 
 
 def _peaks_above(
@@ -110,51 +103,44 @@ def _peaks_above(
     Those that need light from beyond the border are left out.
     """
     margin = 1 + (0 if kernel is None else len(kernel) // 2)
-    (height, width), rows = frame.shape, _rows_at_a_time(frame)
+    (height, width), rows = frame.shape, rows_at_a_time(frame.shape)
     residuals, filtered = np.empty((2, rows + 2 * margin, width), dtype=np.float32)
-    peaks = np.empty((rows * width, 5), dtype=np.float32)
     dead = NO_PIXELS if frame.dead is None else frame.dead
-    found = [peaks[:0]]
+    found = [np.zeros((0, 5))]
     for first in range(0, height - 2 * margin, rows):
         strip = residuals[: height - first]
         frame.fill_residuals(strip, first, level)
         if kernel is not None:
             cv2.sepFilter2D(strip, -1, kernel, kernel, dst=filtered[: len(strip)])
             strip = filtered[: len(strip)]
-        found.append(peaks[: _collect_peaks(strip, np.float32(lowest), margin, dead, first, peaks)].copy())
-    column, row, top, x, y = np.concatenate(found).astype(np.float64).T
+        above = np.flatnonzero(strip[margin:-margin] > np.float32(lowest)) + margin * width
+        peaks = np.empty((len(above), 5))
+        found.append(peaks[: _collect_peaks(strip, above, margin, dead, first, peaks)])
+    column, row, top, x, y = np.concatenate(found).T
     return np.stack([column, row], axis=1).astype(np.int64), top, np.stack([x, y], axis=1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _collect_peaks(image, lowest, margin, dead, first, peaks):  # type: ignore[no-untyped-def]
-    """Fill peaks (n, 5) with column, row, height and offsets of the local maxima `margin` inside; return their number.
+def _collect_peaks(image, above, margin, dead, first, peaks):  # type: ignore[no-untyped-def]
+    """Fill peaks (n, 5) with column, row, height and offsets of the local maxima; return their number.
 
-    The rows of the image are the frame's from `first` on. Runs of pixels below `lowest` are passed over as one.
+    They are looked for among the pixels `above` (n,), counted row by row, at least `margin` inside. The rows of the
+    image are the frame's from `first` on.
     """
     count, width = 0, image.shape[1]
-    for i in range(margin, image.shape[0] - margin):
-        line = image[i]
-        for start in range(margin, width - margin, RUN_PX):
-            end = min(start + RUN_PX, width - margin)
-            above = np.int32(0)
-            for j in range(start, end):
-                above |= np.int32(line[j] > lowest)
-            if above == 0:
-                continue
-            for j in range(start, end):
-                value = line[j]
-                if not value > lowest or (len(dead) and dead[first + i, j]):
-                    continue
-                highest = True
-                for k in range(i - 1, i + 2):
-                    for m in range(j - 1, j + 2):
-                        highest = highest and value >= image[k, m]
-                if highest:
-                    peaks[count, 0], peaks[count, 1], peaks[count, 2] = j, first + i, value
-                    peaks[count, 3] = _top(line[j - 1], value, line[j + 1])
-                    peaks[count, 4] = _top(image[i - 1, j], value, image[i + 1, j])
-                    count += 1
+    for k in range(len(above)):
+        i, j = above[k] // width, above[k] % width
+        if j < margin or j >= width - margin or (len(dead) and dead[first + i, j]):
+            continue
+        value, highest = image[i, j], True
+        for m in range(i - 1, i + 2):
+            for n in range(j - 1, j + 2):
+                highest = highest and value >= image[m, n]
+        if highest:
+            peaks[count, 0], peaks[count, 1], peaks[count, 2] = j, first + i, value
+            peaks[count, 3] = _top(image[i, j - 1], value, image[i, j + 1])
+            peaks[count, 4] = _top(image[i - 1, j], value, image[i + 1, j])
+            count += 1
     return count
 
 

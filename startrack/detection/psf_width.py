@@ -114,7 +114,8 @@ def guess_psf_width(prepare: Callable[[float], Frame], sigma: float) -> float:
             break
         data, variance = frame.cut_light(centres, radius)
         stamps = Stamps(data, variance, frame.usable_pixels(centres, radius), centres, np.zeros(len(centres)))
-        fits = fit_points(stamps, centres.astype(np.float64), sigma, frame.source_noise, 0.0, FIT_ROUNDS_AGAIN)
+        every, start = np.arange(len(centres)), centres.astype(np.float64)
+        fits = fit_points(stamps, every, start, sigma, frame.source_noise, 0.0, FIT_ROUNDS_AGAIN)
         measured = measure_psf_width(frame, centres, fits, sigma)
         if measured is None:
             break

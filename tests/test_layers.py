@@ -220,8 +220,8 @@ def test_heavy_modules_are_imported_where_they_are_used():
 LOADED = "import sys, json; print(json.dumps(sorted({name.split('.')[0] for name in sys.modules})))"
 
 
-def loaded_after(code: str) -> set[str]:
-    run = subprocess.run([sys.executable, "-c", f"{code}\n{LOADED}"], capture_output=True, text=True, check=True)
+def loaded_after(code: str, names: str = LOADED) -> set[str]:
+    run = subprocess.run([sys.executable, "-c", f"{code}\n{names}"], capture_output=True, text=True, check=True)
     return set(json.loads(run.stdout.splitlines()[-1]))
 
 
@@ -236,3 +236,13 @@ def test_the_library_is_imported_without_the_slow_ones():
     """The pipeline computes with numpy, scipy and cv2; ephemerides, FITS, plots and progress bars can wait."""
     loaded = loaded_after("import startrack.chain.pipeline, startrack.output")
     assert loaded & (set(HEAVY) - {"cv2", "scipy"}) == set()
+
+
+def test_an_image_is_located_without_what_takes_long_to_load(tmp_path):
+    """All files of a result are written without astropy, and with those parts of scipy that no other part needs."""
+    image = Path(__file__).parent.parent / "sample_images" / "near-wall.png"
+    code = f"from startrack.cli.main import main\nmain(['locate', {str(image)!r}, '-q', '-D', {str(tmp_path)!r}])"
+    loaded = loaded_after(code, "import sys, json; print(json.dumps(sorted(sys.modules)))")
+    assert (tmp_path / "near-wall.corr").is_file()
+    assert loaded & (set(HEAVY) - {"cv2", "scipy", "PIL", "spiceypy"}) == set()
+    assert loaded & {"scipy.optimize", "scipy.ndimage", "scipy.interpolate", "scipy.stats", "urllib.request"} == set()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,18 @@ def read_back(camera: Camera, R_cam_icrs: np.ndarray) -> WCS:
         warnings.filterwarnings("ignore", message="The WCS transformation has more axes")  # no pixels in a .wcs file
         header = fits.Header.fromstring(header_block(wcs_cards(camera, R_cam_icrs)).decode("ascii"))
         return WCS(header)
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.name)
+def test_the_header_is_written_as_astropy_writes_it(camera: Camera) -> None:
+    cards = wcs_cards(camera, Rotation.random(random_state=7).as_matrix())
+    header = fits.Header()
+    for key, value in cards.items():
+        if key.startswith("COMMENT"):
+            header.add_comment(value)
+        else:
+            header[key] = value
+    assert header_block(cards) == header.tostring().encode("ascii")
 
 
 def whole_field(camera: Camera) -> np.ndarray:
@@ -77,6 +90,11 @@ def test_identify_writes_world_coordinates_on_which_catalogue_stars_fall(tmp_pat
     corr = Table.read(tmp_path / "startrack-out/near-wall.corr")
     assert len(corr) > 1000
     x, y = wcs.all_world2pix(corr["index_ra"], corr["index_dec"], 1)
+    with fits.open(tmp_path / "startrack-out/near-wall.corr") as units:
+        again = BytesIO()
+        columns = [fits.Column(c.name, c.format, c.unit, array=units[1].data[c.name]) for c in units[1].columns]
+        fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns(columns, name="CORR")]).writeto(again)
+    assert (tmp_path / "startrack-out/near-wall.corr").read_bytes() == again.getvalue()
     off = np.hypot(x - corr["index_x"], y - corr["index_y"])
     assert off.max() < 0.1  # aberration over the whole sky: the fitted rotation removes its mean
     error = np.hypot(x - corr["field_x"], y - corr["field_y"])

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import math
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 
@@ -25,6 +27,7 @@ from startrack.core.types import Exposure, PositionPrior
 from startrack.exposure import split_bag_path
 from startrack.identification import WIDE_FIELD_RAD
 
+NEEDED_LATER = ("scipy.special", "scipy.spatial", "spiceypy", "PIL.ImageDraw")  # in this order; pictures need the last
 Solve = Callable[[Exposure, Camera | None], chain.Outcome]
 
 
@@ -68,6 +71,8 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve) -> int:
     """
     if args.image_topic is not None and not any(split_bag_path(path) for path in args.images):
         args.usage_error("--image-topic is for ROS bags, and none is given")
+    needed = NEEDED_LATER[:-1] if args.no_plots else NEEDED_LATER
+    Thread(target=lambda: [importlib.import_module(name) for name in needed]).start()
     codes, first = set(), {"format": f"startrack.{kind.removesuffix('s')}/1"}
     for path, stem in zip(args.images, result_stems(args.images), strict=True):
         name = Path(path).name

@@ -1,7 +1,9 @@
-"""Statistics that several packages need: a robust estimate of spread, and weights of log-likelihoods."""
+"""Numbers from functions and samples: a robust estimate of spread, weights of log-likelihoods, a root."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -31,3 +33,35 @@ def relative_weights(log_weights: Array, axis: int | None = None) -> Array:
 def shares(log_weights: Array) -> Array:
     """Exponentials (n,) of `log_weights` (n,), scaled so that their sum is 1."""
     return np.asarray(np.exp(log_weights - np.logaddexp.reduce(log_weights)))
+
+
+def root_between(function: Callable[[float], float], before: float, now: float, tolerance: float) -> float:
+    """A root of a `function` that changes its sign between `before` and `now`, to a `tolerance`.
+
+    Brent 1973, Algorithms for Minimization without Derivatives, chapter 4, step by step as scipy.optimize.brentq, which
+    takes 0.1 s to load.
+    """
+    f_before, f_now = function(before), function(now)
+    other = f_other = last_step = step = 0.0
+    while True:
+        if f_before != 0.0 and (f_before < 0.0) != (f_now < 0.0):
+            other, f_other, last_step, step = before, f_before, now - before, now - before
+        if abs(f_other) < abs(f_now):
+            before, now, other = now, other, now
+            f_before, f_now, f_other = f_now, f_other, f_now
+        least, half = 0.5 * (tolerance + 4.0 * np.finfo(float).eps * abs(now)), 0.5 * (other - now)
+        if f_now == 0.0 or abs(half) < least:
+            return now
+        tried = math.inf
+        if abs(last_step) > least and abs(f_now) < abs(f_before):
+            slope = (f_now - f_before) / (now - before)
+            if before == other:
+                tried = -f_now * (now - before) / (f_now - f_before)
+            elif f_other != f_before:
+                far = (f_other - f_now) / (other - now)
+                tried = -f_now * (f_other * far - f_before * slope) / (far * slope * (f_other - f_before))
+        is_useful = 2.0 * abs(tried) < min(abs(last_step), 3.0 * abs(half) - least)
+        last_step, step = (step, tried) if is_useful else (half, half)
+        before, f_before = now, f_now
+        now += step if abs(step) > least else math.copysign(least, half)
+        f_now = function(now)

@@ -14,6 +14,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import numpy as np
 
 from startrack.camera import Camera, lens_jacobian, with_update
+from startrack.core.statistics import root_between
 from startrack.core.types import Array, NotIdentified
 from startrack.estimation.normal_equations import NormalEquations, Observations, Terms
 from startrack.frames import R_from_rotvec
@@ -23,6 +24,7 @@ STAR_OUTLIER_CHI2 = 16.0  # 4 sigma in each axis: rejects one good star in 3000
 HUBER_SIGMAS = 2.5  # residual beyond which the influence of an observation is constant
 MIN_ATTITUDE_STARS = 3
 SMALLEST_EXTRA_PX2, LARGEST_EXTRA_PX2 = 1e-6, 1e8
+ROOT_TOLERANCE = 1e-6  # of the logarithm of the variance that is added
 FIRST_DAMPING = 1e-6
 SMALLEST_DAMPING, MAX_DAMPING = FIRST_DAMPING**2, 1.0 / FIRST_DAMPING
 SMALLEST_RISE_RAD = 0.2  # angle up to which the radius of a valid lens must increase
@@ -260,8 +262,6 @@ def extra_variance_px2(
     with the degrees of freedom, for residuals without outliers. `parameters`: number of fitted parameters, which
     are subtracted from the degrees of freedom of the residuals (n, 2).
     """
-    from scipy.optimize import brentq
-
     n = len(residual_px)
     axes_px2, axes = np.linalg.eigh(covariance_px2)
     squared = np.square(np.einsum("nij,ni->nj", axes, residual_px)).T
@@ -282,4 +282,4 @@ def extra_variance_px2(
         return SMALLEST_EXTRA_PX2
     while excess(high) > 0.0 and high < np.log(LARGEST_EXTRA_PX2):
         low, high = high, high + np.log(4.0)
-    return float(np.exp(brentq(excess, low, high, xtol=1e-6))) if excess(high) < 0.0 else float(np.exp(high))
+    return float(np.exp(root_between(excess, low, high, ROOT_TOLERANCE))) if excess(high) < 0.0 else float(np.exp(high))

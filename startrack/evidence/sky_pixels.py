@@ -121,15 +121,17 @@ def _clear_disks(mask, xy_px, radius_px):
     A small disk whose middle the mask lacks hardly reaches into the band: it is left out.
     """
     height, width = mask.shape
-    touching = radius_px > BAND_PX / 2
+    touching = np.empty(len(xy_px), np.bool_)
     for k in range(len(xy_px)):
         x, y = xy_px[k, 0], xy_px[k, 1]
-        touching[k] |= 0 <= x < width and 0 <= y < height and mask[y, x]
-    for k in np.flatnonzero(touching):
+        touching[k] = radius_px[k] > BAND_PX / 2 or (0 <= x < width and 0 <= y < height and mask[y, x])
+    for k in range(len(xy_px)):
         x, y, r = xy_px[k, 0], xy_px[k, 1], radius_px[k]
+        if not touching[k]:
+            continue
         for row in range(max(y - r, 0), min(y + r + 1, height)):
             for column in range(max(x - r, 0), min(x + r + 1, width)):
-                if (column - x) ** 2 + (row - y) ** 2 <= r * r:
+                if (column - x) * (column - x) + (row - y) * (row - y) <= r * r:
                     mask[row, column] = False
 
 
@@ -239,9 +241,15 @@ def _spread(sums: Array) -> Array:
 
 
 def _smooth(values: Array, sectors: float) -> Array:
-    from scipy.ndimage import gaussian_filter1d
-
-    return np.asarray(gaussian_filter1d(values, sectors, axis=-1, mode="wrap"))
+    """Gaussian means of `values` (..., SECTORS) round the circle, with a standard deviation of `sectors`."""
+    n, reach = values.shape[-1], int(4.0 * sectors + 0.5)
+    weights = np.exp(-0.5 / (sectors * sectors) * np.arange(-reach, reach + 1) ** 2)
+    weights /= weights.sum()
+    around = values[..., np.arange(-reach, n + reach) % n]
+    smooth = values * weights[reach]
+    for k in range(reach):
+        smooth += (around[..., k : k + n] + around[..., 2 * reach - k : 2 * reach - k + n]) * weights[k]
+    return np.asarray(smooth)
 
 
 @njit(cache=True, nogil=True)

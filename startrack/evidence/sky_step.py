@@ -56,8 +56,8 @@ class Skyline:
         return cls(terrain.horizon_rad(np.asarray(position_m)[None, :], azimuth))
 
     def __call__(self, azimuth_rad: Array) -> Array:
-        found = np.empty(np.shape(azimuth_rad))
-        _interpolate_circle(np.ascontiguousarray(self.elevation_rad), np.ravel(azimuth_rad), found.reshape(-1))
+        found = np.array(azimuth_rad, dtype=np.float64, order="C")
+        _interpolate_circle(np.ascontiguousarray(self.elevation_rad), found.reshape(-1))
         return found
 
     def raised(self, by_rad: Array) -> Skyline:
@@ -219,11 +219,11 @@ def _px_per_rad(camera: Camera, angle_rad: Array) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _interpolate_circle(values, azimuth, found):  # type: ignore[no-untyped-def]
-    """Fill found (n,) with values (m,), given at even steps from azimuth 0 on, at the azimuths (n,) [rad]."""
+def _interpolate_circle(values, found):  # type: ignore[no-untyped-def]
+    """Replace the azimuths (n,) [rad] in `found` by values (m,), given at even steps from azimuth 0 on."""
     m = len(values)
     for k in range(len(found)):
-        at = azimuth[k] * (m / (2 * np.pi))
+        at = found[k] * (m / (2 * np.pi))
         if at < 0.0 or at >= m:
             at %= m
         low = min(int(at), m - 1)

@@ -22,6 +22,7 @@ from startrack.exposure.bag import (
 from startrack.exposure.correction import combine_masks, mask_of, read_dark, read_flat, read_mask, touch_masked
 from startrack.exposure.decoding import are_fractions
 from startrack.exposure.facts import NO_TIME, Facts, check_time_sigma_s, with_facts
+from startrack.exposure.fits import BLOCK_BYTES
 from startrack.exposure.png import insert_png_chunks, png_chunks
 from startrack.exposure.read import exposure_of, read_exposure
 from startrack.exposure.sidecar import (
@@ -37,9 +38,9 @@ from startrack.exposure.sidecar import (
 from startrack.exposure.write import write_exposure, write_sidecar
 
 __all__ = [
-    "BAG_SUFFIXES", "IMAGE_KEYS", "NO_TIME", "ODOMETRY_TYPES", "PACKING_SUFFIXES", "PICTURE_SUFFIXES", "RAW_SUFFIXES",
-    "SIDECAR", "BagImage", "Facts", "Sidecar", "are_fractions", "check_time_sigma_s", "choose_bag_image",
-    "combine_masks", "exposure_of", "insert_png_chunks",
+    "BAG_SUFFIXES", "BLOCK_BYTES", "IMAGE_KEYS", "NO_TIME", "ODOMETRY_TYPES", "PACKING_SUFFIXES", "PICTURE_SUFFIXES",
+    "RAW_SUFFIXES", "SIDECAR", "BagImage", "Facts", "Sidecar", "are_fractions", "check_time_sigma_s",
+    "choose_bag_image", "combine_masks", "exposure_of", "insert_png_chunks",
     "is_bag", "list_bag_images", "mask_of", "png_chunks", "read_bag_exposures", "read_bag_image", "read_dark",
     "read_exposure", "read_flat", "read_mask", "read_messages", "sidecar_of", "split_bag_path", "stem", "touch_masked",
     "with_facts", "write_exposure", "write_sidecar",

@@ -42,9 +42,12 @@ def _pass(likelihood, heights, cells, rough):
 
     The sums over exp(-|x - x'| / rough) are two recursions, up and down.
     """
-    n, whole = len(heights), cells.sum()
-    fall, norm, found = np.empty(n), _spread(cells, heights, rough), 0.0
-    a = cells / whole
+    n, whole, found = len(heights), 0.0, 0.0
+    for i in range(n):
+        whole += cells[i]
+    a, fall, norm = np.empty(n), np.empty(n), _spread(cells, heights, rough)
+    for i in range(n):
+        a[i] = cells[i] / whole
     for s in range(len(likelihood)):
         if s > 0:
             for i in range(n):

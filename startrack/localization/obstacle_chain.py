@@ -210,16 +210,33 @@ def transitions(moves: Moves = MOVES) -> Array:
 def _smooth(e, T):
     """Posterior (SECTORS, STATES) by two rounds forward and backward: the second has forgotten where it began."""
     sectors, states = e.shape
-    f, post, a, c = np.zeros((sectors, states)), np.zeros((sectors, states)), np.ones(states), np.ones(states)
+    f, post, a, b = np.zeros((sectors, states)), np.zeros((sectors, states)), np.zeros(states), np.zeros(states)
     for step in range(2 * sectors):
-        a = (a @ T) * e[step % sectors]
-        a /= a.sum()
-        f[step % sectors] = a
+        s, total = step % sectors, 0.0
+        for j in range(states):
+            moved = 1.0 if step == 0 else 0.0
+            for i in range(states):
+                moved += a[i] * T[i, j]
+            f[s, j] = moved * e[s, j]
+            total += f[s, j]
+        for j in range(states):
+            f[s, j] /= total
+            a[j] = f[s, j]
+    for j in range(states):
+        a[j] = 1.0
     for step in range(2 * sectors):
-        s = sectors - 1 - step % sectors
-        post[s] = f[s] * c / (f[s] * c).sum()
-        c = T @ (c * e[s])
-        c /= c.sum()
+        s, total, whole = sectors - 1 - step % sectors, 0.0, 0.0
+        for j in range(states):
+            post[s, j], b[j] = f[s, j] * a[j], a[j] * e[s, j]
+            total += post[s, j]
+        for i in range(states):
+            post[s, i] /= total
+            a[i] = 0.0
+            for j in range(states):
+                a[i] += T[i, j] * b[j]
+            whole += a[i]
+        for i in range(states):
+            a[i] /= whole
     return post
 
 

@@ -215,10 +215,12 @@ def integral_to(profiles, s, height):
 @njit(cache=True, nogil=True)
 def _average_over_map(profiles, sigma, bins):
     """The cells with exp F averaged over a normal error of the map's skyline (SECTORS,); far off it stays as it is."""
-    weights = np.empty(len(bins) - 1)
+    weights, whole = np.empty(len(bins) - 1), 0.0
     for q in range(len(weights)):
         weights[q] = 0.5 * (erf(bins[q + 1] / sqrt(2.0)) - erf(bins[q] / sqrt(2.0)))
-    weights /= weights.sum()
+        whole += weights[q]
+    for q in range(len(weights)):
+        weights[q] /= whole
     sectors, room = len(sigma), len(profiles.x)
     low, high, step = np.zeros(sectors), np.zeros(sectors), np.zeros(sectors)
     for s in range(sectors):

@@ -6,9 +6,10 @@ Coordinates are longitude and latitude in degrees: WGS 84 on the Earth, planetoc
 
 from __future__ import annotations
 
+import html
 import json
+from functools import partial
 from typing import TYPE_CHECKING, Any
-from xml.sax.saxutils import escape
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from startrack.output.record import result_dict
 if TYPE_CHECKING:
     from startrack.chain import Located
     from startrack.core.types import Array
+
+escape = partial(html.escape, quote=False)
 
 GEO_FORMATS = ("geojson", "kml")
 CIRCLE_POINTS = 72

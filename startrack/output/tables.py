@@ -34,7 +34,7 @@ def ecsv_text(columns: Sequence[Column]) -> str:
     for one in columns:
         unit, description = f"unit: {one.unit}, " if one.unit else "", one.description.replace("'", "''")
         head.append(f"# - {{name: '{one.name}', {unit}datatype: {one.datatype}, description: '{description}'}}")
-        texts = format_values(one.form, one.values.tolist() if isinstance(one.values, np.ndarray) else one.values)
+        texts = format_values(one.form, one.values)
         if one.datatype == "string":  # quoted where a text holds a comma or a quote
             texts = [f'"{text.replace(QUOTE, 2 * QUOTE)}"' if "," in text or QUOTE in text else text for text in texts]
         fields.append(texts)
@@ -54,7 +54,14 @@ def quantity_columns(quantities: Iterable[Quantity], values: Mapping[str, Iterab
 
 def format_values(form: str, values: Iterable[Any]) -> list[str]:
     """The `values` as texts in the %-format `form`; empty for None and nan."""
-    return ["" if value is None or value != value else form % value for value in values]
+    if not isinstance(values, np.ndarray):
+        return ["" if value is None or value != value else form % value for value in values]
+    absent = np.flatnonzero(values != values)
+    texts = "\n".join([form] * len(values)) % tuple(values.tolist())  # in one piece: in two thirds of the time
+    found = texts.split("\n") if len(values) else []
+    for k in absent:
+        found[k] = ""
+    return found
 
 
 def star_table_text(value: Inputs) -> str:

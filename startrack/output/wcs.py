@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -18,10 +17,18 @@ from startrack import __version__
 from startrack.camera import Camera, Decentring
 from startrack.chain import Measured, Oriented
 from startrack.core.types import Array
+from startrack.exposure import BLOCK_BYTES
 from startrack.frames import Site, aberrate, format_utc, observer_velocity_m_s, wahba
 
 Card = bool | int | float | str
 SIP_ORDER = 4
+EMPTY_UNIT: dict[str, Card] = {"SIMPLE": True, "BITPIX": 8, "NAXIS": 0, "EXTEND": True}
+COMMENTS = {  # of the cards of a table
+    "SIMPLE": "conforms to FITS standard", "XTENSION": "binary table extension", "BITPIX": "array data type",
+    "NAXIS": "number of array dimensions", "NAXIS1": "length of dimension 1", "NAXIS2": "length of dimension 2",
+    "PCOUNT": "number of group parameters", "GCOUNT": "number of groups", "TFIELDS": "number of table fields",
+    "EXTNAME": "extension name",
+}  # fmt: skip
 FIELD_POINTS = 40  # points across the frame at which the field is sampled
 
 
@@ -50,8 +57,11 @@ def wcs_cards(camera: Camera, R_cam_icrs: Array, value: Oriented | None = None) 
     focal = np.array(camera.handed_focal_px)
     cd = np.degrees(np.stack([east, north]) @ R_cam_icrs[:2].T / focal)  # from px to degrees east and north
     sip = "-SIP" if camera.decentring else ""
-    cards: dict[str, Card] = {"SIMPLE": True, "BITPIX": 8, "NAXIS": 0, "EXTEND": True}
-    cards |= {"WCSAXES": 2, "CTYPE1": f"RA---{projection.code}{sip}", "CTYPE2": f"DEC--{projection.code}{sip}"}
+    cards = EMPTY_UNIT | {
+        "WCSAXES": 2,
+        "CTYPE1": f"RA---{projection.code}{sip}",
+        "CTYPE2": f"DEC--{projection.code}{sip}",
+    }
     cards |= {"CUNIT1": "deg", "CUNIT2": "deg", "RADESYS": "ICRS", "LONPOLE": 180.0}
     cards |= {"CRVAL1": float(np.degrees(ra) % 360.0), "CRVAL2": float(np.degrees(dec))}
     cards |= {f"CRPIX{i + 1}": float(_axis_px(camera)[i]) + 1.0 for i in range(2)}
@@ -74,8 +84,6 @@ def matches_bytes(value: Oriented) -> bytes:
     Columns as astrometry.net's: field_x, field_y, field_ra, field_dec, index_x, index_y, index_ra, index_dec, and
     index_id, FLUX, MAG.
     """
-    from astropy.io import fits
-
     camera, R = value.camera, _R_cam_catalog(value)
     found, stars = value.identification, value.stars.take(value.identification.star)
     velocity = _velocity_m_s(value)
@@ -91,29 +99,50 @@ def matches_bytes(value: Oriented) -> bytes:
         ("index_id", "", np.asarray(stars.catalog_id)), ("FLUX", "", value.detections.flux_e[found.detection]),
         ("MAG", "mag", stars.v_mag),
     ]  # fmt: skip
-    made = [
-        fits.Column(
-            name=key, unit=unit or None, array=values,
-            format=f"{max(values.dtype.itemsize // 4, 1)}A" if values.dtype.kind == "U" else "D",
-        )
-        for key, unit, values in columns
-    ]  # fmt: skip
-    file = BytesIO()
-    fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns(made, name="CORR")]).writeto(file)
-    return file.getvalue()
+    return header_block(EMPTY_UNIT, COMMENTS) + _table_unit("CORR", columns)
 
 
-def header_block(cards: Mapping[str, Card]) -> bytes:
-    """A FITS header with the `cards`; keys that begin with COMMENT are its comments."""
-    from astropy.io.fits import Header
+def _table_unit(name: str, columns: list[tuple[str, str, NDArray[Any]]]) -> bytes:
+    """A binary table of FITS with the `columns`: key, unit, and values (n,), which are numbers or texts."""
+    stored = [np.asarray(values, dtype="S" if values.dtype.kind == "U" else ">f8") for *_, values in columns]
+    rows = np.rec.fromarrays(stored)
+    cards: dict[str, Card] = {"XTENSION": "BINTABLE", "BITPIX": 8, "NAXIS": 2}
+    cards |= {"NAXIS1": rows.itemsize, "NAXIS2": len(rows), "PCOUNT": 0, "GCOUNT": 1, "TFIELDS": len(columns)}
+    for k, ((key, unit, _), values) in enumerate(zip(columns, stored, strict=True), start=1):
+        cards |= {f"TTYPE{k}": key, f"TFORM{k}": "D" if values.dtype.kind == "f" else f"{values.itemsize}A"}
+        cards |= {f"TUNIT{k}": unit} if unit else {}
+    return header_block(cards | {"EXTNAME": name}, COMMENTS) + _whole_blocks(rows.tobytes(), b"\0")
 
-    header = Header()
+
+def header_block(cards: Mapping[str, Card], comments: Mapping[str, str] | None = None) -> bytes:
+    """A FITS header with the `cards` and the `comments` on them; cards whose keys begin with COMMENT are comments.
+
+    FITS Standard 4.0, section 4. astropy writes the same, but takes 0.3 s to load.
+    """
+    lines = []
     for key, value in cards.items():
         if key.startswith("COMMENT"):  # COMMENT1, COMMENT2, ...: keys of a mapping are unique
-            header.add_comment(value)
+            lines.append(f"COMMENT {value}")
         else:
-            header[key] = value
-    return bytes(header.tostring().encode("ascii"))
+            comment = f" / {comments[key]}" if comments and key in comments else ""
+            lines.append(f"{key:8}= {_card_value(value)}{comment}")
+    return _whole_blocks("".join(f"{line:80}" for line in [*lines, "END"]).encode("ascii"), b" ")
+
+
+def _card_value(value: Card) -> str:
+    """The text of a card's `value` in its first 20 columns, or more where it is a longer text."""
+    if isinstance(value, str):
+        return f"'{value:8}'".ljust(20)
+    if isinstance(value, bool):
+        return f"{'T' if value else 'F':>20}"
+    digits, *exponent = str(value).split("e")
+    end = "E" + exponent[0] if exponent else ""
+    return f"{digits[: 20 - len(end)] + end:>20}"
+
+
+def _whole_blocks(content: bytes, filler: bytes) -> bytes:
+    """The `content` continued by the `filler` to a whole number of FITS blocks."""
+    return content + filler * (-len(content) % BLOCK_BYTES)
 
 
 def _velocity_m_s(value: Oriented) -> Array | None:

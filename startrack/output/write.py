@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 from startrack.chain import Located, Measured, Oriented, Outcome, last_value
 from startrack.core.errors import BadInput
 from startrack.core.files import make_folder, write_atomically
+from startrack.core.types import MeasuredSkyline
 from startrack.output.geo import GEO_FORMATS, geo_text
 from startrack.output.picture.annotate import annotated_png
 from startrack.output.picture.canvas import png_bytes
@@ -98,18 +100,24 @@ def write_results(
 
 
 def _write_companions(outcome: Outcome, path: Path, *, plots: bool) -> None:
+    """Write tables, WCS and pictures beside each other: pictures are drawn and packed while tables are written."""
     value = last_value(outcome)
-    if isinstance(value, Measured) or (isinstance(value, Oriented) and value.terrain is None):
-        write_star_table(companion(path, ".stars.ecsv"), value)
-        write_wcs(companion(path, ".wcs"), companion(path, ".corr"), value)
-    if isinstance(value, Located) and value.skyline is not None:
-        table = skyline_table_text(value.skyline).encode("utf-8")
-        write_atomically(companion(path, SKYLINE_TABLE), table, overwrite=True)
-        if plots:
-            panorama = png_bytes(located_picture(value, value.skyline))
-            write_atomically(companion(path, SKYLINE_PICTURE), panorama, overwrite=True)
-    if plots:
-        write_annotated(companion(path, ANNOTATED), outcome)
+    with ThreadPoolExecutor() as pool:
+        files = [pool.submit(write_annotated, companion(path, ANNOTATED), outcome)] if plots else []
+        if isinstance(value, Located) and value.skyline is not None:
+            table = skyline_table_text(value.skyline).encode("utf-8")
+            write_atomically(companion(path, SKYLINE_TABLE), table, overwrite=True)
+            if plots:
+                files.append(pool.submit(_write_panorama, companion(path, SKYLINE_PICTURE), value, value.skyline))
+        if isinstance(value, Measured) or (isinstance(value, Oriented) and value.terrain is None):
+            write_star_table(companion(path, ".stars.ecsv"), value)
+            write_wcs(companion(path, ".wcs"), companion(path, ".corr"), value)
+    for file in files:
+        file.result()
+
+
+def _write_panorama(path: Path, value: Located, skyline: MeasuredSkyline) -> None:
+    write_atomically(path, png_bytes(located_picture(value, skyline)), overwrite=True)
 
 
 def write_geo(record: Path, outcome: Outcome, kinds: Sequence[str]) -> None:

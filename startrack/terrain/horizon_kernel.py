@@ -62,7 +62,7 @@ def height_at(heights, posts, m, column, row):
     return top + down * (bottom - top)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def surface(grid, posts, heights, moon, east, north, guess):
     """Height in enu of the ground at (east, north); the guess where no map reaches."""
     level2 = east * east + north * north

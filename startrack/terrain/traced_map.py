@@ -192,7 +192,7 @@ class TracedMap(Terrain):
 
     def ground_m(self, points_m: Array) -> Array:
         """Height of the ground in enu (...) [m]."""
-        points = np.ascontiguousarray(points_m, dtype=np.float64)
+        points = np.array(points_m, dtype=np.float64, order="C")
         up = np.empty(points.shape[:-1])
         surfaces(self.ground, points.reshape(-1, 2), up.reshape(-1))
         return up
@@ -218,8 +218,8 @@ def flatten_rays(points_m: Array, azimuths_rad: Array) -> tuple[tuple[int, ...],
 
 
 def _flatten(a: Any, shape: tuple[int, ...]) -> Array:
-    """The values of `a`, broadcast to the shape, in one contiguous array."""
-    return np.ascontiguousarray(np.broadcast_to(np.asarray(a, dtype=np.float64), shape))
+    """The values of `a`, broadcast to the shape, in one contiguous array of their own: kernels have one layout."""
+    return np.array(np.broadcast_to(np.asarray(a, dtype=np.float64), shape), order="C")
 
 
 def _run_in_threads(function: Any, fixed: tuple[Any, ...], arrays: tuple[Array, ...]) -> None:

@@ -118,12 +118,14 @@ def _background_and_light(value: Inputs, size: tuple[int, int], inside: Bools) -
     smooth = cv2.medianBlur(levels, STAR_PX).astype(np.float32) * np.float32(step) + np.float32(low)
     light = image - smooth
     noise = max(robust_sigma(light[::SAMPLE, ::SAMPLE][known], 0.0) if known.any() else 0.0, 1e-6)
-    light = np.arcsinh(np.maximum(light * np.float32(1 / noise) - np.float32(CALM_SNR), 0) / np.float32(KNEE_SNR))
-    light = np.minimum(light / np.float32(np.arcsinh(GLARE_SNR / KNEE_SNR)), 1)
+    light = np.maximum(light * np.float32(1 / noise) - np.float32(CALM_SNR), 0)
+    lit = np.flatnonzero(light)
+    bent = np.arcsinh(light.flat[lit] / np.float32(KNEE_SNR)) / np.float32(np.arcsinh(GLARE_SNR / KNEE_SNR))
+    light.flat[lit] = np.power(np.minimum(bent, 1), np.float32(0.75))
     dark, bright = np.percentile(smooth[::SAMPLE, ::SAMPLE][known] if known.any() else smooth, [2, 98])
     # A background that is flatter than the noise shall look flat.
     sky = (smooth - np.float32(dark)) / np.float32(max(bright - dark, CALM_SNR * noise))
-    return np.clip(sky, 0, 1), np.power(light, np.float32(0.75))
+    return np.clip(sky, 0, 1), light
 
 
 def remove_hot_pixels(pixels_adu: Image, psf_sigma_px: float) -> Image:
@@ -131,12 +133,15 @@ def remove_hot_pixels(pixels_adu: Image, psf_sigma_px: float) -> Image:
     if psf_sigma_px < MIN_PSF_PX:
         return pixels_adu
     middle = np.asarray(cv2.medianBlur(pixels_adu, 3), dtype=np.float32)
-    noise = robust_sigma((pixels_adu - middle)[::SAMPLE, ::SAMPLE], 0.0)
+    noise = robust_sigma(pixels_adu[::SAMPLE, ::SAMPLE] - middle[::SAMPLE, ::SAMPLE], 0.0)
     # Seen from the darkest pixel about: within a wide star the median is the star's own light.
     darkest = cv2.erode(pixels_adu, np.ones((5, 5), np.uint8))
-    excess, beside = pixels_adu - darkest, cv2.dilate(pixels_adu, NEIGHBOURS) - darkest
-    lone = (excess > SPIKE_SIGMAS * max(noise, 1e-6)) & (beside < SPIKE_NEIGHBOUR * excess)
-    return np.asarray(np.where(lone, middle, pixels_adu), dtype=np.float32)
+    excess, beside = cv2.subtract(pixels_adu, darkest), cv2.dilate(pixels_adu, NEIGHBOURS)
+    bright = np.flatnonzero(excess > SPIKE_SIGMAS * max(noise, 1e-6))
+    lone = bright[beside.flat[bright] - darkest.flat[bright] < SPIKE_NEIGHBOUR * excess.flat[bright]]
+    cleaned = pixels_adu.copy()
+    cleaned.flat[lone] = middle.flat[lone]
+    return cleaned
 
 
 def _distance_to_edge_px(camera: Camera, size: tuple[int, int]) -> Image:

@@ -146,12 +146,13 @@ def _draw_detections(canvas: Canvas, view: View, value: Detected) -> None:
         identified[value.identification.detection] = True
     shown = np.flatnonzero(identified | _other_sources(value))
     strength = np.log(np.maximum(found.snr, FAINTEST_SNR) / FAINTEST_SNR) / np.log(BRIGHTEST_SNR / FAINTEST_SNR)
+    places = view.canvas_px(found.xy_px).tolist()
     # The bright ones last, on top; the faint ones dim, so that a thousand of them do not drown the stars.
     for k in shown[::-1]:
         bright = min(float(strength[k]), 1.0)
         colour = Ink.IDENTIFIED if identified[k] else Ink.DETECTION
         colour = mix_colours(colour, Ink.SKY_DARK, 0.6 * (1.0 - bright))
-        canvas.circle(view.canvas_px(found.xy_px[k]), 4.5 + 5.5 * bright, colour)
+        canvas.circle(places[k], 4.5 + 5.5 * bright, colour)
 
 
 def _hidden_stars(value: Inputs) -> tuple[Ints, Array]:

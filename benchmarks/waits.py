@@ -1,0 +1,167 @@
+"""What a person waits for: this code and that of another commit in turn, in one run; the median of each.
+
+    python benchmarks/waits.py [--against COMMIT] [--runs N] [--only WORD ...]
+
+One function a row. A process gets the code by PYTHONPATH; the other commit's is a git worktree. Seconds are wall time,
+in brackets CPU time. Ratios count, on free cores: a machine at work stretches both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import atexit
+import os
+import re
+import resource
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache, partial
+from importlib import metadata
+from pathlib import Path
+
+from _results import table, write_section
+
+ROOT = Path(__file__).parent.parent
+SAMPLE = ROOT / "sample_images/near-wall.png"
+BASELINE = "374b11e"
+Seconds = tuple[float, float]  # wall and CPU
+
+
+@dataclass(frozen=True)
+class Row:
+    """A wait: `measure` takes the folder of a code and gives its cost; `runs`: how often, None for as asked."""
+
+    name: str
+    wanted: str
+    measure: Callable[[Path], Seconds | float]
+    runs: int | None = None
+
+
+def main() -> None:
+    """Measure the rows; write the section of RESULTS.md."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--against", default=BASELINE, metavar="COMMIT")
+    parser.add_argument("--runs", type=int, default=9)
+    parser.add_argument("--only", nargs="+", default=[""], metavar="WORD", help="rows with one of these words")
+    args = parser.parse_args()
+    rows = []
+    with worktree(args.against) as before:
+        for row in (row for row in ROWS if any(word in row.name for word in args.only)):
+            rows.append(cells(row, before, row.runs or args.runs))
+            print(*rows[-1], sep="  ", flush=True)
+    columns = ["what", args.against, "this", "this / that", "wanted"]
+    command = f"python benchmarks/waits.py --against {args.against} --runs {args.runs}"
+    write_section("Waits", command, ("numpy", "numba"), table(columns, rows))
+
+
+def cells(row: Row, before: Path, runs: int) -> list[str]:
+    """The cells of a row from `runs` pairs: the code in the folder `before`, then this one."""
+    pairs = [(row.measure(before), row.measure(ROOT)) for _ in range(runs)]
+    old, new = (middle([pair[k] for pair in pairs]) for k in range(2))
+    return [row.name, shown(old), shown(new), f"{first(new) / first(old):.2f}", row.wanted]
+
+
+def middle(costs: list[Seconds | float]) -> Seconds | float:
+    """The median of costs, or of each of their two parts."""
+    if isinstance(costs[0], tuple):
+        return tuple(statistics.median(part) for part in zip(*costs, strict=True))
+    return statistics.median(costs)
+
+
+def first(cost: Seconds | float) -> float:
+    return cost[0] if isinstance(cost, tuple) else cost
+
+
+def shown(cost: Seconds | float) -> str:
+    return f"{cost[0]:.2f} s ({cost[1]:.2f})" if isinstance(cost, tuple) else f"{cost:.0f} MB"
+
+
+@contextmanager
+def worktree(commit: str) -> Iterator[Path]:
+    """A folder with the files of a commit, for the block."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "code"
+        subprocess.run(["git", "-C", ROOT, "worktree", "add", "-q", "--detach", path, commit], check=True)
+        try:
+            yield path
+        finally:
+            subprocess.run(["git", "-C", ROOT, "worktree", "remove", "--force", path], check=True)
+
+
+def process(code: Path, *words: str, **variables: str) -> Seconds:
+    """Wall and CPU time of `startrack` with the arguments `words`, by the code in a folder."""
+    inherited = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
+    with tempfile.TemporaryDirectory() as folder:
+        command, before = [sys.executable, "-m", "startrack", *words, "-D", folder], cpu_s()
+        start = time.perf_counter()
+        subprocess.run(command, cwd=folder, env=inherited | {"PYTHONPATH": str(code)} | variables, check=True)
+        return time.perf_counter() - start, cpu_s() - before
+
+
+def cpu_s() -> float:
+    """User and system time [s] of the processes that have ended."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
+
+
+@cache
+def warm_up(code: Path, image: Path) -> None:
+    """Have the code compile what it uses for an image, and compute the tables of its terrain."""
+    process(code, "locate", str(image), "-q")
+
+
+def located(code: Path, *flags: str) -> Seconds:
+    """The whole command, warm."""
+    warm_up(code, SAMPLE)
+    return process(code, "locate", str(SAMPLE), "-q", *flags)
+
+
+def first_use(code: Path, image: Callable[[], Path]) -> Seconds:
+    """The whole command with nothing compiled; tables of the terrain are there."""
+    warm_up(code, image())
+    with tempfile.TemporaryDirectory() as folder:
+        return process(code, "locate", str(image()), "-q", NUMBA_CACHE_DIR=folder)
+
+
+@cache
+def height_map_frame() -> Path:
+    """A frame of the floor of Shackleton, rendered once."""
+    folder = Path(tempfile.mkdtemp())
+    atexit.register(shutil.rmtree, folder)
+    command = [sys.executable, "-m", "startrack", "render", "-t", "shackleton", "--seed", "3", "-D", str(folder)]
+    subprocess.run(command, cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True, capture_output=True)
+    return next(folder.glob("*.png"))
+
+
+def core_mb(code: Path) -> float:
+    """Files of the packages that the core requires, with theirs, as they are installed here [MB]."""
+    project = tomllib.loads((code / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    found, coming = {}, list(project["dependencies"])
+    while coming:
+        name = re.split(r"[^\w.-]", coming.pop())[0].lower()
+        if name not in found:
+            package = metadata.distribution(name)
+            files = [Path(str(file.locate())) for file in package.files or []]
+            found[name] = sum(file.stat().st_size for file in files if file.is_file())
+            coming += [one for one in package.requires or [] if "extra ==" not in one and "_version <" not in one]
+    return sum(found.values()) / 1e6
+
+
+ROWS = (
+    Row("`locate near-wall.png`, whole process, all files", "<= 1.5 s", located),
+    Row("`locate near-wall.png --no-plots`, whole process", "<= 1.0 s", lambda code: located(code, "--no-plots")),
+    Row("first use, cylinder: compilation", "<= 10 s", partial(first_use, image=lambda: SAMPLE), runs=3),
+    Row("first use, height map: compilation", "<= 20 s", partial(first_use, image=height_map_frame), runs=3),
+    Row("packages of the core", "<= 760 MB", core_mb, runs=1),
+)
+
+if __name__ == "__main__":
+    main()

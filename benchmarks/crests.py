@@ -22,7 +22,7 @@ from _map_draws import draw_ground
 from _results import table, write_section
 from drives import POST_SIGMA_M, RADIUS_M, RAISED_SIGMA_RAD, SLOPE_RAD, mean_error_and_nees
 
-from startrack.applications.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
+from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.types import Array
 from startrack.estimation.observations import Observations, Steps
 from startrack.estimation.trajectory import smooth

@@ -24,7 +24,7 @@ from _results import table, write_section
 
 from startrack.applications.tracking.contradictions import smooth_robustly
 from startrack.applications.tracking.filtered_positions import filter_positions, positions_at_rest
-from startrack.applications.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
+from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.types import Array
 from startrack.estimation.observations import FrameEstimate, Observations, Steps
 from startrack.estimation.trajectory import smooth

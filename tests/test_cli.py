@@ -519,7 +519,7 @@ def test_the_flag_of_the_evidence_has_the_sources_of_the_settings():
 
 
 def test_the_flags_of_the_odometry_have_the_defaults_of_the_track():
-    from startrack.applications.tracking import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
     from startrack.cli.flags import ODOMETRY
+    from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 
     assert [one.options["default"] for one in ODOMETRY] == [ODOMETRY_SIGMA, ODOMETRY_FLOOR_M]

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from startrack.cli.flag_types import FIELD_TOLERANCE_1, fields_of_view_rad
+from startrack.cli.flag_types import fields_of_view_rad
 from startrack.cli.main import main
+from startrack.core import FIELD_TOLERANCE_1
 
 LOWELL = str(Path(__file__).parents[1] / "sample_images/lowell-2018-08-06.fits.bz2")  # 180 degrees
 

@@ -13,6 +13,7 @@ from startrack.applications.calibration import Calibration
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
 from startrack.chain import Image, Time
+from startrack.core import SKY_V_MAG_ARCSEC2
 from startrack.core.errors import BadInput
 from startrack.core.files import file_stem
 from startrack.core.types import Exposure, MeasuredSkyline
@@ -148,7 +149,7 @@ def predict(
     positions_m: ArrayLike | None = None,
     spacing_m: float | None = None,
     exposure: float | Quantity | None = None,
-    sky_v_mag_arcsec2: float = 22.0,
+    sky_v_mag_arcsec2: float = SKY_V_MAG_ARCSEC2,
     draws: int = 10,
     seed: int = 0,
     localizer: str = "posterior",

@@ -13,6 +13,7 @@ from startrack.applications.tracking import Odometry, Track
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
 from startrack.chain import Image, Outcome, Refused, Settings, Time, stars_at
+from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.errors import BAD_INPUT_REASONS, BadInput
 from startrack.core.types import Exposure
 from startrack.terrain import Terrain
@@ -65,8 +66,8 @@ def track(
     camera: str | Camera | None = None,
     terrain: str | Terrain | None = None,
     odometry: str | Odometry | None = None,
-    odometry_sigma: float = tracking.ODOMETRY_SIGMA,
-    odometry_floor_m: float = tracking.ODOMETRY_FLOOR_M,
+    odometry_sigma: float = ODOMETRY_SIGMA,
+    odometry_floor_m: float = ODOMETRY_FLOOR_M,
     at_rest: bool = False,
     settings: Settings | None = None,
 ) -> Track:

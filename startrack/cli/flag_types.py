@@ -7,13 +7,12 @@ import math
 from collections.abc import Callable
 from typing import TypeVar
 
-from startrack.core import MAX_COUNT, MAX_EXPOSURE_S
+from startrack.core import FIELD_TOLERANCE_1, MAX_COUNT, MAX_EXPOSURE_S
 from startrack.core.declaration import LARGEST, SHOWN_CHARS
 
 T = TypeVar("T")
 SCHEMES = ("", "tcp", "tls", "ucx", "ws", "wss")  # of Dask's addresses
 MAX_MAGNITUDE = 100.0
-FIELD_TOLERANCE_1 = 0.1  # as startrack.identification.unknown_lens has it; written here so that help is quick
 
 
 def number(text: str) -> float:

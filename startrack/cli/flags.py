@@ -10,6 +10,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from startrack.cli.flag_types import amount, position_prior, positive_count, seconds, time_sigma_s
+from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 
 if TYPE_CHECKING:
     from startrack.core.declaration import Key
@@ -180,9 +181,9 @@ NEAR = flag(
 )
 METHOD = (LOCALIZER, EVIDENCE, NEAR)
 
-ODOMETRY = (  # the defaults are those of startrack.applications.tracking; written here so that help is quick
-    flag("--odometry-sigma F", "error of a move on each horizontal axis, relative", amount, default=0.02),
-    flag("--odometry-floor M", "the same, beside that in quadrature", amount, default=0.05),
+ODOMETRY = (
+    flag("--odometry-sigma F", "error of a move on each horizontal axis, relative", amount, default=ODOMETRY_SIGMA),
+    flag("--odometry-floor M", "the same, beside that in quadrature", amount, default=ODOMETRY_FLOOR_M),
 )
 
 DIR = flag("-D --dir OUT", "folder of the results", default="startrack-out")

@@ -14,6 +14,7 @@ from typing import Any
 from startrack import rendering
 from startrack.camera import load_camera
 from startrack.cli.console import progress
+from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.files import check_output, write_atomically
 from startrack.core.types import TIME_SIGMA_S
 from startrack.exposure import with_facts, write_exposure, write_sidecar
@@ -153,8 +154,6 @@ def _line(summary: dict[str, Any]) -> str:
 
 def _write_trajectories(args: argparse.Namespace, series: Series, poses: Sequence[Pose]) -> None:
     """Write the true `poses` of the series and, of a drive, its odometry, as TUM text with the stated times."""
-    from startrack.applications.tracking import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
-
     offset = timedelta(seconds=args.clock_offset)  # odometry and images have one clock
     times_s = [(pose.time_utc - offset).timestamp() for pose in poses]
 

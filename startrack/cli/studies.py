@@ -16,11 +16,11 @@ from typing import Any
 from startrack.applications import prediction, reproduction
 from startrack.applications.prediction import Conditions
 from startrack.applications.reproduction import ARTEFACTS, Artefact
-from startrack.applications.tracking import ODOMETRY_FLOOR_M
 from startrack.chain import input_hashes
 from startrack.cli.console import progress
 from startrack.cli.flags import check_cluster, check_extra, check_localizer
 from startrack.cli.images import absolute_reference, compile_kernels, prepare
+from startrack.core import ODOMETRY_FLOOR_M
 from startrack.core.compilation import announce_compilation, is_compiled
 from startrack.core.errors import EXIT_STOPPED
 from startrack.core.files import make_folder
@@ -40,30 +40,31 @@ def predict(args: argparse.Namespace) -> int:
     cameras = [absolute_reference(one) for one in (args.camera, args.compare) if one is not None]
     hashes = input_hashes(os.path.join(args.dir, "predict.json"), cameras, conditions.terrain)
     inputs = tuple(sorted({(Path(path).name, sha256) for path, sha256 in hashes.items()}))  # of the files of flags
-    report = prediction.Report.begin(conditions, inputs, _places(args, conditions))
+    plan = prediction.Plan.of(conditions, inputs, _places(args, conditions))
     out = make_folder(args.dir)
-    report.check_folder(out, overwrite=args.overwrite)
-    prepare(report.terrain, args)
+    plan.check_folder(out, overwrite=args.overwrite)
+    prepare(plan.terrain, args)
     if args.cluster is None and not is_compiled():
-        compile_kernels(report.terrain)
+        compile_kernels(plan.terrain)
     start, bar, depth = time.perf_counter(), partial(progress, shown=not args.quiet), None
     jobs = args.jobs or count_cores()
     try:
         with prediction.draw_store(out, draws=args.draws, jobs=jobs, progress=bar, cluster=args.cluster) as store:
             if args.cluster is not None:
                 store.connect()
-            predictions = prediction.Predictions(report.points.places, store, inputs, args.overwrite)
+            predictions = prediction.Predictions(plan.points.places, store, inputs, args.overwrite)
             if args.depth:
                 conditions, depth = predictions.depth(conditions, args.target_radius95)
             first = predictions.cells(conditions, "predict")
             others = {other: predictions.cells(other, "compare") for other in _variants(args, conditions, cameras)}
-            report = report.finish(conditions, first, others, depth)
     except RunStopped as cause:
         print(f"startrack predict: {cause}; the same command goes on", file=sys.stderr)
         return EXIT_STOPPED
+    odometry = None
     if args.odometry_sigma is not None:
         floor_m = ODOMETRY_FLOOR_M if args.odometry_floor is None else args.odometry_floor
-        report = report.with_odometry(prediction.OdometryErrors(args.odometry_sigma, floor_m))
+        odometry = prediction.OdometryErrors(args.odometry_sigma, floor_m)
+    report = prediction.Report.of(replace(plan, conditions=conditions), first, others, depth, odometry)
     files = prediction.write_report(report, out, plots=not args.no_plots)
     if args.json:
         print(json.dumps(report.record))

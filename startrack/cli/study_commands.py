@@ -5,6 +5,7 @@ from __future__ import annotations
 from startrack.cli import flag_types as types
 from startrack.cli import flags
 from startrack.cli.flags import Command, Either, flag, function_at
+from startrack.core import SKY_V_MAG_ARCSEC2
 
 # The keys of startrack.applications.reproduction.ARTEFACTS, whose import would load numpy.
 ARTEFACT_NAMES = (
@@ -64,7 +65,7 @@ COMMANDS = (
                     "seconds; default: a V 6 star on the axis reaches 5 sigma, which takes fisheye-2048 0.40 s",
                     types.seconds,
                 ),
-                flag("--sky-mag V", "diffuse sky per arcsec^2", types.magnitude, default=22.0),
+                flag("--sky-mag V", "diffuse sky per arcsec^2", types.magnitude, default=SKY_V_MAG_ARCSEC2),
                 flag("--sky-gradient F", "its slope to the horizon", types.number, default=0.0),
                 flag("--sky-gradient-azimuth DEG", "where it rises to", types.number, default=0.0),
                 flag("--wall-reflectance F", "of the sky's light", types.amount, default=0.04),
@@ -106,7 +107,7 @@ COMMANDS = (
                 flag("-t --terrain FILE", "terrain file, or a shipped name", required=True),
                 flag("-c --camera FILE", "camera file, or a shipped name", required=True),
                 flag("--time UTC", "middle of the exposures; START/END: evenly spaced between", required=True),
-                flag("--sky MAG", "diffuse sky per arcsec^2", types.magnitude, default=22.0),
+                flag("--sky MAG", "diffuse sky per arcsec^2", types.magnitude, default=SKY_V_MAG_ARCSEC2),
             ),
             "method": (
                 flag("--spacing M", "between the places (a tenth of the area)", types.positive_number),

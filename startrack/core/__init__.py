@@ -4,3 +4,6 @@ MAX_EXPOSURE_S = 1e6  # of an image
 MAX_COUNT = 1_000_000  # of frames, cells or draws: more is a wrong unit
 REPORTED_IMAGES = 30  # on a page, with their pictures
 STAR_COUNT_SLOPE = 1.08  # natural logarithm of the stars per magnitude, V 6 to 10: 2.9 times as many
+FIELD_TOLERANCE_1 = 0.1  # of a field of view that is given approximately
+ODOMETRY_SIGMA, ODOMETRY_FLOOR_M = 0.02, 0.05  # of a move, relative to its length, and beside that
+SKY_V_MAG_ARCSEC2 = 22.0  # diffuse light of a dark sky

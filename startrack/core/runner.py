@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 CONNECT_S = 10.0
-CLOSE_S = 5.0  # for idle processes to end by themselves
+CLOSE_S = CONNECT_S / 2  # for idle processes to end by themselves
 TASK_LIMIT_S = 900.0  # without any result: far above the slowest image, reached only by a blocked process
 TASKS_PER_PROCESS = 2  # submitted at a time: one in progress and the next; twice as many far away, on a cluster
 DIED = "the process that worked on it died (out of memory?) or stood still, alone as it did beside others"

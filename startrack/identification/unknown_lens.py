@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera, with_covariance
+from startrack.core import FIELD_TOLERANCE_1
 from startrack.core.types import Array, Centroids, Identification, NotIdentified, Stars
 from startrack.estimation.adjust import HUBER_WITH_CUT, Scheme, State, adjust
 from startrack.estimation.false_alarm import probability
@@ -67,8 +68,8 @@ class UnknownLensSolution:
 
 
 def identify_unknown_lens(
-    centroids: Centroids, size_px: tuple[int, int], fov_rad: float, stars: Stars, *, tolerance: float = 0.1,
-    background: NDArray[Any] | None = None,
+    centroids: Centroids, size_px: tuple[int, int], fov_rad: float, stars: Stars, *,
+    tolerance: float = FIELD_TOLERANCE_1, background: NDArray[Any] | None = None,
 ) -> UnknownLensSolution:  # fmt: skip
     """Lens, attitude and matches of `centroids` in a frame of `size_px` (W, H), its field of view known to `tolerance`.
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.catalog import bodies
+from startrack.core import SKY_V_MAG_ARCSEC2
 from startrack.core.types import Array, BadInput, Stars, Value, rotation, vector
 from startrack.frames import R_body_enu_from_heading_pitch_roll, R_enu_icrs, Site, observer_velocity_m_s, sky_rotvec_rad
 from startrack.rendering.compose import draw_hot_pixels
@@ -61,7 +62,7 @@ class Series:
     roll_rad: float | None = None
     max_tilt_rad: float = float(np.radians(5.0))  # of random tilts: uniform over the cap of this radius
     exposure_s: float | None = None  # None: a V 6 star on the axis reaches 5 sigma
-    sky_v_mag_arcsec2: float | None = 22.0
+    sky_v_mag_arcsec2: float | None = SKY_V_MAG_ARCSEC2
     sky_gradient: float = 0.0
     sky_gradient_azimuth_rad: float = 0.0
     wall_reflectance: float = 0.04

@@ -10,11 +10,11 @@ import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,13 +40,12 @@ COLUMNS = [
 ]
 
 
-@dataclass
-class Rows:
+class Rows(NamedTuple):
     """Rows of all images of a folder, and the number of results that have none."""
 
-    rows: list[Record] = field(default_factory=list)
-    omitted: int = 0  # stored results of other settings or contents, or of an attempt that failed
-    superseded: int = 0  # images refused now because of an input, whose earlier solution is kept beside the tables
+    rows: list[Record]
+    omitted: int  # stored results of other settings or contents, or of an attempt that failed
+    superseded: int  # images refused now because of an input, whose earlier solution is kept beside the tables
 
 
 def table_values(record: Record) -> Record:
@@ -58,18 +57,18 @@ def table_rows(tasks: Iterable[Task], now: Mapping[str, Record], out: str | os.P
     """Rows of the whole folder's `tasks`; `now` has the records of this run by the images' names as text.
 
     `out` is the folder of the results."""
-    found = Rows()
+    rows, omitted, superseded = list[Record](), 0, 0
     for task in tasks:
         name = text_of_name(task.name)
         record = now.get(name) or results.valid_stored_record(task)
         if record is None:
-            found.omitted += os.path.exists(task.result)
+            omitted += os.path.exists(task.result)
             continue
-        superseded = name in now and not is_solved(record) and is_solved(stored_record(task.result))
-        found.superseded += superseded
+        is_superseded = name in now and not is_solved(record) and is_solved(stored_record(task.result))
+        superseded += is_superseded
         result = text_of_name(Path(os.path.relpath(task.result, out)).as_posix())
-        found.rows.append({**table_values(record), "image": name, RESULT: None if superseded else result})
-    return found
+        rows.append({**table_values(record), "image": name, RESULT: None if is_superseded else result})
+    return Rows(rows, omitted, superseded)
 
 
 def write_tables(out: Path, records: Sequence[Record], settings: dict[str, Any]) -> list[Path]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -58,48 +58,19 @@ class OdometryErrors:
 
 
 @dataclass(frozen=True, eq=False)
-class Report:
-    """A prediction at the points, with its record."""
+class Plan:
+    """What is predicted: the `points` under the `conditions`, on the `terrain` that these name."""
 
     conditions: Conditions
     terrain: Terrain
     points: AreaCells | PathPoints
-    inputs: tuple[tuple[str, str], ...]
-    cells: Cells = field(default_factory=dict)
-    variants: list[dict[str, Any]] = field(default_factory=list)
-    depth: dict[str, Any] | None = None
-    odometry: OdometryErrors | None = None
+    inputs: tuple[tuple[str, str], ...]  # of the record: names and SHA-256 of files
 
     @classmethod
-    def begin(
-        cls, conditions: Conditions, inputs: tuple[tuple[str, str], ...], points: AreaCells | PathPoints
-    ) -> Report:
-        """The report on `points` under `conditions` before the draws; the record lists the `inputs`.
-
-        Raises BadInput for files that cannot be used.
-        """
+    def of(cls, conditions: Conditions, inputs: tuple[tuple[str, str], ...], points: AreaCells | PathPoints) -> Plan:
+        """The plan with its terrain. Raises BadInput for files that cannot be used."""
         predictor_of(conditions).exposure_s  # noqa: B018 - a camera without a sensor is refused before anything is drawn
         return cls(conditions, load_terrain(conditions.terrain), points, inputs)
-
-    def finish(
-        self, conditions: Conditions, cells: Cells, others: Mapping[Conditions, Cells], depth: dict[str, Any] | None
-    ) -> Report:
-        """The report with the predictions: `cells` of the `conditions`, and `others` to compare with.
-
-        `depth` is the record of the search for a depth, if there was one.
-        """
-        variants = []
-        for other, found in others.items():
-            known = predictor_of(other)
-            light = {"exposure_s": known.exposure_s, "limiting_v_mag": known.limiting_v_mag}
-            variants.append({"camera": known.camera.name, **light, "summary": summarize_cells(found)})
-        return replace(self, conditions=conditions, cells=cells, variants=variants, depth=depth)
-
-    def with_odometry(self, odometry: OdometryErrors) -> Report:
-        """The report of a path with odometry between its images."""
-        points_m = self.points.position_m
-        cells = add_odometry(points_m, self.cells, sigma_1=odometry.sigma_1, floor_m=odometry.floor_m)
-        return replace(self, cells=cells, odometry=odometry)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -122,18 +93,6 @@ class Report:
             "localizer": self.conditions.localizer,
         }
 
-    @property
-    def record(self) -> dict[str, Any]:
-        """The content of predict.json."""
-        more: dict[str, Any] = {"variants": self.variants} if self.variants else {}
-        if self.depth is not None:
-            more["depth"] = self.depth
-        if self.odometry is not None:
-            medians = {f"median_{name}": median_or_none(self.cells[name]) for name in (FILTERED, SMOOTHED)}
-            more["odometry"] = {"sigma": self.odometry.sigma_1, "floor_m": self.odometry.floor_m, **medians}
-        provenance = {"version": __version__, "inputs": dict(self.inputs)}
-        return {**self.settings, "summary": summarize_cells(self.cells), **more, "provenance": provenance}
-
     def check_folder(self, out: Path, *, overwrite: bool) -> None:
         """Raise BadOutput if `out` holds a prediction of other places, cameras or times and not `overwrite`."""
         try:
@@ -146,13 +105,51 @@ class Report:
             what = f"{out} holds another prediction ({', '.join(differs)} differ)"
             raise BadOutput("bad_image", f"{what}: choose another -D, or replace it with -O")
 
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """A prediction: the quantities of the points of a `plan`, and what it is compared with."""
+
+    plan: Plan
+    cells: Cells
+    variants: list[dict[str, Any]]  # records of other conditions
+    depth: dict[str, Any] | None  # record of the search for a depth, if there was one
+    odometry: OdometryErrors | None  # between the images along a path
+
+    @classmethod
+    def of(
+        cls, plan: Plan, cells: Cells, others: Mapping[Conditions, Cells], depth: dict[str, Any] | None,
+        odometry: OdometryErrors | None,
+    ) -> Report:  # fmt: skip
+        """The report with the predictions: `cells` of the `plan`, and `others` to compare with."""
+        variants = []
+        for other, found in others.items():
+            known = predictor_of(other)
+            light = {"exposure_s": known.exposure_s, "limiting_v_mag": known.limiting_v_mag}
+            variants.append({"camera": known.camera.name, **light, "summary": summarize_cells(found)})
+        if odometry is not None:
+            cells = add_odometry(plan.points.position_m, cells, sigma_1=odometry.sigma_1, floor_m=odometry.floor_m)
+        return cls(plan, cells, variants, depth, odometry)
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The content of predict.json."""
+        more: dict[str, Any] = {"variants": self.variants} if self.variants else {}
+        if self.depth is not None:
+            more["depth"] = self.depth
+        if self.odometry is not None:
+            medians = {f"median_{name}": median_or_none(self.cells[name]) for name in (FILTERED, SMOOTHED)}
+            more["odometry"] = {"sigma": self.odometry.sigma_1, "floor_m": self.odometry.floor_m, **medians}
+        provenance = {"version": __version__, "inputs": dict(self.plan.inputs)}
+        return {**self.plan.settings, "summary": summarize_cells(self.cells), **more, "provenance": provenance}
+
     def lines(self) -> list[str]:
         """The summary in words."""
-        found, what = summarize_cells(self.cells), "area" if self.points.kind == "area" else "path"
+        found, what = summarize_cells(self.cells), "area" if self.plan.points.kind == "area" else "path"
         radius = _median_error_text(found["median_radius95_m"])
         shares = ", ".join(f"{100 * found[f'share_below_{bound}_m']:.0f} % below {bound} m" for bound in SHARES_M)
         lines = [
-            f"{self.terrain.name}: {len(self.points.position_m)} places, {radius}; of the {what} {shares}",
+            f"{self.plan.terrain.name}: {len(self.plan.points.position_m)} places, {radius}; of the {what} {shares}",
             f"draws: {100 * found['p_ok']:.1f} % located, {100 * found['p_ambiguous']:.1f} % ambiguous, "
             f"{100 * found['p_refused']:.1f} % refused",
         ]
@@ -185,7 +182,7 @@ def write_report(report: Report, out: Path, *, plots: bool) -> list[Path]:
 
     Files of an earlier prediction that this one does not make are removed.
     """
-    points, made = report.points, dict[str, bytes]()
+    points, made = report.plan.points, dict[str, bytes]()
     if isinstance(points, AreaCells):  # the quantities as bands, in the projection of the terrain's map
         bands = {one.key: points.band(report.cells[one.key]) for one in CELL_QUANTITIES}
         write_bands(out / MAP, points.frame, bands)
@@ -195,7 +192,7 @@ def write_report(report: Report, out: Path, *, plots: bool) -> list[Path]:
     if report.variants:
         made[COMPARISON_TABLE] = _comparison_table(report.variants).encode()
         if plots:
-            title = f"Cameras and exposures at the same places: {report.terrain.name}"
+            title = f"Cameras and exposures at the same places: {report.plan.terrain.name}"
             made[COMPARISON_PICTURE] = png_bytes(comparison_picture(report.variants, title))
     made[RECORD_FILE] = (json.dumps(report.record, indent=1) + "\n").encode()
     for name, data in made.items():
@@ -208,12 +205,12 @@ def write_report(report: Report, out: Path, *, plots: bool) -> list[Path]:
 
 def _table(report: Report) -> str:
     """One row a place; with the distance along the path, if there is one."""
-    points, site, (east_m, north_m) = report.points, report.terrain.site, report.points.position_m.T
+    points, site, (east_m, north_m) = report.plan.points, report.plan.terrain.site, report.plan.points.position_m.T
     values = {**report.cells, "east_m": east_m, "north_m": north_m}
     if isinstance(points, PathPoints):
         values["distance_m"] = points.distance_m
     if site is not None:
-        up_m = np.asarray(report.terrain.ground_m(points.position_m)) + report.terrain.camera_height_m
+        up_m = np.asarray(report.plan.terrain.ground_m(points.position_m)) + report.plan.terrain.camera_height_m
         values |= zip(
             ("latitude_deg", "longitude_deg"), np.degrees(latlon_from_enu(site, east_m, north_m, up_m)), strict=True
         )
@@ -233,16 +230,16 @@ def _comparison_table(variants: list[dict[str, Any]]) -> str:
 
 
 def _picture(report: Report) -> Any:
-    points, cells = report.points, report.cells
+    points, cells = report.plan.points, report.cells
     radius = np.where(np.isnan(cells["radius95_m"]), np.inf, cells["radius95_m"])
-    title = f"How well one image of the stars gives the position: {report.terrain.name}"
-    s = report.settings
+    title = f"How well one image of the stars gives the position: {report.plan.terrain.name}"
+    s = report.plan.settings
     times = s["first_time_utc"][:16].replace("T", " ")
     if s["last_time_utc"] != s["first_time_utc"]:
         times += f" to {s['last_time_utc'][:16].replace('T', ' ')}"
     draws = f"{s['draws']} draws every {s['spacing_m']:.4g} m"
     caption = [f"camera {s['camera']}, {s['exposure_s']:.3g} s, {times} UTC, {draws}"]
     if isinstance(points, AreaCells):
-        return prediction_picture(report.terrain, points.site, points.raster(radius), title, caption)
+        return prediction_picture(report.plan.terrain, points.site, points.raster(radius), title, caption)
     curves = {words: cells[name] for name, words in PATH_CURVES.items() if name in cells}
     return path_picture(points.distance_m, radius, cells["p_ok"], title, caption, curves)

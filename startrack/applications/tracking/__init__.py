@@ -5,21 +5,13 @@ from startrack.applications.tracking.odometry import Odometry, OdometryFile, rea
 from startrack.applications.tracking.picture import draw_track
 from startrack.applications.tracking.quantities import FRAME_QUANTITIES, TRACK, frame_records
 from startrack.applications.tracking.session import TrackSession, follow_images
-from startrack.applications.tracking.track import (
-    ODOMETRY_FLOOR_M,
-    ODOMETRY_SIGMA,
-    CrestHeights,
-    Track,
-    TrackFrame,
-    Trajectory,
-    estimate_track,
-)
+from startrack.applications.tracking.track import CrestHeights, Track, TrackFrame, Trajectory, estimate_track
 from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.applications.tracking.write import track_page, track_record, write_track
 from startrack.exposure import read_bag_exposures
 
 __all__ = [
-    "FRAME_QUANTITIES", "ODOMETRY_FLOOR_M", "ODOMETRY_SIGMA", "TRACK", "CrestHeights", "FrameStore",
+    "FRAME_QUANTITIES", "TRACK", "CrestHeights", "FrameStore",
     "ObservedFrame", "Odometry", "OdometryFile", "Track", "TrackErrors", "TrackFrame", "TrackSession", "Trajectory",
     "draw_track", "estimate_track", "follow_images", "frame_records", "observe_frame", "read_bag_exposures",
     "read_odometry", "track_page", "track_record", "write_track",

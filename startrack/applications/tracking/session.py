@@ -21,17 +21,11 @@ from startrack.applications.tracking.observed_frame import (
     observe_frame,
 )
 from startrack.applications.tracking.odometry import SPAN_TOLERANCE_S, Odometry
-from startrack.applications.tracking.track import (
-    ODOMETRY_FLOOR_M,
-    ODOMETRY_SIGMA,
-    Track,
-    estimate_track,
-    odometry_steps,
-    track_of_newest,
-)
+from startrack.applications.tracking.track import Track, estimate_track, odometry_steps, track_of_newest
 from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.catalog import load_catalog
 from startrack.chain import Settings, input_hashes, job_sha256, load_camera_input, locate, terrain_input
+from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.errors import BadInput
 from startrack.exposure import NO_TIME
 

@@ -14,6 +14,7 @@ from startrack.applications.tracking.filtered_positions import OnlineTrack, filt
 from startrack.applications.tracking.observed_frame import ImageFix, ObservedFrame
 from startrack.applications.tracking.odometry import Odometry, odometry_steps
 from startrack.applications.tracking.track_errors import BIAS, CLOCK, DEPTH, TrackErrors
+from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.types import Array, BadInput, Bools, ClockError, Ints
 from startrack.estimation.observations import UNKNOWN_M
 from startrack.estimation.trajectory import Smoothed, radius_holding
@@ -21,7 +22,6 @@ from startrack.frames import quat_xyzw_from_R
 from startrack.localization import camera_at
 from startrack.terrain import Terrain
 
-ODOMETRY_SIGMA, ODOMETRY_FLOOR_M = 0.02, 0.05  # of a move, relative to its length, and beside that
 UNKNOWN_SIGMA_M = 1e-3 * UNKNOWN_M  # a position with a larger error is not known
 
 

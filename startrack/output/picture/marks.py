@@ -13,7 +13,7 @@ from startrack.chain import Detected, Identified, Inputs, Located, Measured, Ori
 from startrack.core.types import Array, Bools, Ints
 from startrack.frames import azel_from_rays, heading_pitch_roll_from_R_body_enu, rays_from_azel
 from startrack.output.picture.axes import known_runs
-from startrack.output.picture.backdrop import AZIMUTHS_RAD, View, horizon_at_fix
+from startrack.output.picture.backdrop import AZIMUTHS_RAD, KNEE_SNR, View, horizon_at_fix
 from startrack.output.picture.canvas import LARGE_PX, TEXT_PX, TITLE_PX, Canvas, Ink, box_around, mix_colours
 from startrack.output.tables import names_of, status_of
 from startrack.output.values import R_body_enu
@@ -24,7 +24,8 @@ COMPASS = {0: "N", 90: "E", 180: "S", 270: "W"}
 TICK_RAD = np.radians([0.0, 2.2, 5.0])  # foot and top of a tick of the compass and the middle of its letter
 MAX_CROSSES = 150  # of hidden stars, the brightest: more would hide the picture
 MAX_NAMES = 20  # of stars, and half as many of hidden ones
-FAINTEST_SNR, BRIGHTEST_SNR = 5.0, 300.0
+FAINTEST_SNR = KNEE_SNR  # with the smallest mark
+BRIGHTEST_SNR = 300.0  # with the largest one
 
 
 def overlay_of(value: Inputs) -> dict[str, Any]:

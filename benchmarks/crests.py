@@ -22,9 +22,8 @@ from _map_draws import draw_ground
 from _results import table, write_section
 from drives import POST_SIGMA_M, RADIUS_M, RAISED_SIGMA_RAD, SLOPE_RAD, mean_error_and_nees
 
-from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.types import Array
-from startrack.estimation.observations import Observations, Steps
+from startrack.estimation.observations import USUAL_ODOMETRY, Observations, Steps
 from startrack.estimation.trajectory import smooth
 from startrack.terrain import HeightMap, load_terrain
 
@@ -90,7 +89,7 @@ def beside(course: Course, side_m: float) -> Course:
 def measured_moves(position_m: Array, rng: np.random.Generator) -> Steps:
     """Moves with the errors that they state."""
     moves = np.diff(position_m, axis=0)
-    sigma = np.hypot(ODOMETRY_SIGMA * np.linalg.norm(moves, axis=1), ODOMETRY_FLOOR_M)
+    sigma = USUAL_ODOMETRY.sigma_m(moves)
     return Steps(moves + sigma[:, None] * rng.normal(size=moves.shape), sigma)
 
 

@@ -12,6 +12,7 @@ from jsonschema import Draft202012Validator
 from startrack.applications.prediction import PREDICTION
 from startrack.applications.prediction.run import add_odometry, ellipse_m2
 from startrack.cli.main import main
+from startrack.estimation.observations import OdometryErrors
 
 POSITION_M = np.array([[0.0, 0.0], [300.0, 0.0], [300.0, 400.0], [700.0, 400.0], [700.0, 900.0]])
 SIGMA_1, FLOOR_M = 0.02, 3.0
@@ -55,7 +56,7 @@ def test_ellipses_are_turned_from_north_to_east():
 def test_radii_are_those_of_least_squares():
     """The second place has no position; the moves alone lead there."""
     cells = cells_of([8.0, np.nan, 15.0, 5.0, 20.0], [6.0, np.nan, 4.0, 5.0, 10.0], [20.0, np.nan, 110.0, 0.0, 70.0])
-    found = add_odometry(POSITION_M, cells, sigma_1=SIGMA_1, floor_m=FLOOR_M)
+    found = add_odometry(POSITION_M, cells, OdometryErrors(SIGMA_1, FLOOR_M))
     covariances = [None if np.isnan(one).any() else one for one in ellipse_m2(cells)]
     for k, covariance in enumerate(normal_equations(covariances, 5)):
         assert share_within(covariance, found["radius95_smoothed_m"][k]) == pytest.approx(0.95, abs=0.003)
@@ -66,10 +67,10 @@ def test_radii_are_those_of_least_squares():
 
 def test_before_the_first_position_only_later_images_help():
     cells = cells_of([np.nan, 6.0, 6.0, 6.0, 6.0], [np.nan, 6.0, 6.0, 6.0, 6.0], [np.nan, 0.0, 0.0, 0.0, 0.0])
-    found = add_odometry(POSITION_M, cells, sigma_1=SIGMA_1, floor_m=FLOOR_M)
+    found = add_odometry(POSITION_M, cells, OdometryErrors(SIGMA_1, FLOOR_M))
     assert np.isnan(found["radius95_filtered_m"]).tolist() == [True, False, False, False, False]
     assert np.isfinite(found["radius95_smoothed_m"]).all()
-    nowhere = add_odometry(POSITION_M, cells_of(*np.full((3, 5), np.nan)), sigma_1=SIGMA_1, floor_m=FLOOR_M)
+    nowhere = add_odometry(POSITION_M, cells_of(*np.full((3, 5), np.nan)), OdometryErrors(SIGMA_1, FLOOR_M))
     assert np.isnan(nowhere["radius95_filtered_m"]).all()
     assert np.isnan(nowhere["radius95_smoothed_m"]).all()
 

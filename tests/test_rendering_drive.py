@@ -8,6 +8,7 @@ from render_helpers import CRATER, FISHEYE
 
 from startrack.applications.tracking import Odometry
 from startrack.core.errors import BadInput
+from startrack.estimation.observations import OdometryErrors
 from startrack.frames import R_body_enu_from_heading_pitch_roll, heading_pitch_roll_from_R_body_enu, parse_utc
 from startrack.rendering import Drive, Series, draw_odometry, read_drive
 
@@ -71,7 +72,9 @@ def test_increments_of_the_odometry_have_independent_errors_of_the_stated_size(s
     R_body_enu = np.array([R_body_enu_from_heading_pitch_roll(h, *rng.normal(0, 0.05, 2)) for h in heading])
     step = step_m * np.column_stack([np.sin(heading), np.cos(heading), np.zeros(n)])
     position_enu_m = np.cumsum(step, axis=0) + np.array([300.0, -4000.0, 1.5])
-    position_m, R_odom_body = draw_odometry(position_enu_m, R_body_enu, sigma_1=sigma_1, floor_m=floor_m, rng=rng)
+    position_m, R_odom_body = draw_odometry(
+        position_enu_m, R_body_enu, errors=OdometryErrors(sigma_1, floor_m), rng=rng
+    )
     np.testing.assert_allclose(position_m[0], 0, atol=1e-12)
     R_odom_enu = R_odom_body @ R_body_enu
     np.testing.assert_allclose(R_odom_enu, np.broadcast_to(R_odom_enu[0], R_odom_enu.shape), atol=1e-12)
@@ -92,17 +95,17 @@ def test_increments_of_the_odometry_have_independent_errors_of_the_stated_size(s
 def test_without_errors_the_odometry_gives_the_true_increments_in_the_body_frame():
     drive = series(drive=EAST_THEN_NORTH)
     poses = [drive.pose(k) for k in range(6)]
-    position_m, R_odom_body = drive.odometry(poses, sigma_1=0.0, floor_m=0.0)
+    position_m, R_odom_body = drive.odometry(poses, OdometryErrors(0.0, 0.0))
     from scipy.spatial.transform import Rotation
 
     times = np.arange(6) * 60.0
     odometry = Odometry(time_s=times, position_m=position_m, quat_xyzw=Rotation.from_matrix(R_odom_body).as_quat())
     true = [now.R_body_enu @ (then.position_enu_m - now.position_enu_m) for now, then in pairwise(poses)]
     np.testing.assert_allclose(odometry.increments_body_m(times), true, atol=1e-9)
-    again, _ = drive.odometry(poses, sigma_1=0.02, floor_m=0.05)
-    once_more, _ = drive.odometry(poses[:3], sigma_1=0.02, floor_m=0.05)
+    again, _ = drive.odometry(poses, OdometryErrors(0.02, 0.05))
+    once_more, _ = drive.odometry(poses[:3], OdometryErrors(0.02, 0.05))
     np.testing.assert_array_equal(again[:3], once_more)
-    assert not np.allclose(again, series(drive=EAST_THEN_NORTH, seed=5).odometry(poses, sigma_1=0.02, floor_m=0.05)[0])
+    assert not np.allclose(again, series(drive=EAST_THEN_NORTH, seed=5).odometry(poses, OdometryErrors(0.02, 0.05))[0])
 
 
 def test_waypoints_are_read_by_the_names_of_their_columns(tmp_path):

@@ -12,6 +12,7 @@ from tracking_helpers import HEIGHT_SIGMA_M, shifted, simulate_drive
 from startrack.applications.tracking import ObservedFrame, Odometry, Track, TrackErrors, estimate_track
 from startrack.applications.tracking.odometry import odometry_steps
 from startrack.core.errors import BadInput
+from startrack.estimation.observations import OdometryErrors
 from startrack.frames import R_body_enu_from_heading_pitch_roll, quat_xyzw_from_R
 from startrack.localization.shared_errors import SharedErrors
 from startrack.terrain import HeightMap, ShapeError, load_terrain
@@ -65,7 +66,7 @@ def test_moves_are_turned_by_the_stars_attitude_also_over_refused_frames():
     frames = observed(drive.estimates, R)
     for k in (4, 5, 6):
         frames[k] = refused(frames[k])
-    steps = odometry_steps(frames, odometry_of(drive.position_m, R), 0.02, 0.05)
+    steps = odometry_steps(frames, odometry_of(drive.position_m, R), OdometryErrors(0.02, 0.05))
     moves = np.diff(drive.position_m, axis=0)
     np.testing.assert_allclose(steps.move_m, moves, atol=1e-6)
     np.testing.assert_allclose(steps.sigma_m, np.hypot(0.02 * np.linalg.norm(moves, axis=1), 0.05), rtol=1e-6)
@@ -76,7 +77,7 @@ def test_moves_before_the_first_attitude_are_not_known():
     drive, R = simulate_drive(rng, FRAMES), attitudes(rng)
     frames = observed(drive.estimates, R)
     frames[0] = refused(frames[0])
-    steps = odometry_steps(frames, odometry_of(drive.position_m, R), 0.02, 0.05)
+    steps = odometry_steps(frames, odometry_of(drive.position_m, R), OdometryErrors(0.02, 0.05))
     assert np.isinf(steps.sigma_m[0])
     assert np.isfinite(steps.sigma_m[1:]).all()
 

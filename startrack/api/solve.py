@@ -16,6 +16,7 @@ from startrack.chain import Image, Outcome, Refused, Settings, Time, stars_at
 from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.errors import BAD_INPUT_REASONS, BadInput
 from startrack.core.types import Exposure
+from startrack.estimation.observations import OdometryErrors
 from startrack.terrain import Terrain
 
 if TYPE_CHECKING:
@@ -93,8 +94,8 @@ def track(
     """
     settings = chain.settings_input(settings) or Settings()
     session = tracking.TrackSession(
-        settings=settings, stated_camera=camera, stated_terrain=terrain, odometry_sigma=odometry_sigma,
-        odometry_floor_m=odometry_floor_m,
+        settings=settings, stated_camera=camera, stated_terrain=terrain,
+        odometry_errors=OdometryErrors(odometry_sigma, odometry_floor_m),
     )  # fmt: skip
     for image in images:
         session.add_exposure(chain.exposure_input(image, None))

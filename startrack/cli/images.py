@@ -21,6 +21,7 @@ from startrack.core.compilation import announce_compilation
 from startrack.core.errors import BadInput
 from startrack.core.files import is_path
 from startrack.core.types import Evidence, Exposure, NotLocated
+from startrack.estimation.observations import OdometryErrors
 from startrack.frames import Site, parse_utc
 from startrack.terrain import TERRAIN_KEYS, Terrain, load_terrain
 
@@ -42,6 +43,12 @@ def read(path: str, args: argparse.Namespace) -> Exposure:
     if bag is None:
         return images.read_exposure(path, **flag_facts(args))
     return images.read_bag_image(images.choose_bag_image(*bag, args.image_topic), **flag_facts(args))
+
+
+def odometry_errors(args: argparse.Namespace) -> OdometryErrors:
+    """The errors of odometry that flags state, the usual ones where they do not."""
+    flags = {"sigma_1": args.odometry_sigma, "floor_m": args.odometry_floor}
+    return OdometryErrors(**{name: value for name, value in flags.items() if value is not None})
 
 
 def flag_facts(args: argparse.Namespace) -> dict[str, Any]:

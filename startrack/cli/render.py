@@ -14,7 +14,7 @@ from typing import Any
 from startrack import rendering
 from startrack.camera import load_camera
 from startrack.cli.console import progress
-from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
+from startrack.cli.images import odometry_errors
 from startrack.core.files import check_output, write_atomically
 from startrack.core.types import TIME_SIGMA_S
 from startrack.exposure import with_facts, write_exposure, write_sidecar
@@ -163,7 +163,6 @@ def _write_trajectories(args: argparse.Namespace, series: Series, poses: Sequenc
 
     write(TRUTH, TRUTH_HEAD, [pose.position_enu_m for pose in poses], [pose.R_body_enu.T for pose in poses])
     if series.drive is not None:
-        sigma_1 = ODOMETRY_SIGMA if args.odometry_sigma is None else args.odometry_sigma
-        floor_m = ODOMETRY_FLOOR_M if args.odometry_floor is None else args.odometry_floor
-        head = ODOMETRY_HEAD.format(sigma=sigma_1, floor=floor_m)
-        write(ODOMETRY, head, *series.odometry(poses, sigma_1=sigma_1, floor_m=floor_m))
+        errors = odometry_errors(args)
+        head = ODOMETRY_HEAD.format(sigma=errors.sigma_1, floor=errors.floor_m)
+        write(ODOMETRY, head, *series.odometry(poses, errors))

@@ -19,8 +19,7 @@ from startrack.applications.reproduction import ARTEFACTS, Artefact
 from startrack.chain import input_hashes
 from startrack.cli.console import progress
 from startrack.cli.flags import check_cluster, check_extra, check_localizer
-from startrack.cli.images import absolute_reference, compile_kernels, prepare
-from startrack.core import ODOMETRY_FLOOR_M
+from startrack.cli.images import absolute_reference, compile_kernels, odometry_errors, prepare
 from startrack.core.compilation import announce_compilation, is_compiled
 from startrack.core.errors import EXIT_STOPPED
 from startrack.core.files import make_folder
@@ -60,10 +59,7 @@ def predict(args: argparse.Namespace) -> int:
     except RunStopped as cause:
         print(f"startrack predict: {cause}; the same command goes on", file=sys.stderr)
         return EXIT_STOPPED
-    odometry = None
-    if args.odometry_sigma is not None:
-        floor_m = ODOMETRY_FLOOR_M if args.odometry_floor is None else args.odometry_floor
-        odometry = prediction.OdometryErrors(args.odometry_sigma, floor_m)
+    odometry = None if args.odometry_sigma is None else odometry_errors(args)
     report = prediction.Report.of(replace(plan, conditions=conditions), first, others, depth, odometry)
     files = prediction.write_report(report, out, plots=not args.no_plots)
     if args.json:

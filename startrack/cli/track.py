@@ -18,7 +18,7 @@ from startrack.applications.batch import images_under
 from startrack.applications.tracking import FrameStore, ObservedFrame, Odometry, OdometryFile, Track, TrackSession
 from startrack.chain import Settings
 from startrack.cli.console import progress, worst_code
-from startrack.cli.images import flag_facts, prepare_reference
+from startrack.cli.images import flag_facts, odometry_errors, prepare_reference
 from startrack.core.errors import EXIT_BAD_INPUT, EXIT_REFUSED, EXIT_STOPPED, BadInput, BadOutput, exit_code_of
 from startrack.core.files import make_folder, printable
 from startrack.core.types import Exposure
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
         )
     session = TrackSession(
         store=FrameStore(out / STORE), settings=Settings(evidence_sources=args.evidence), facts=flag_facts(args),
-        odometry_sigma=args.odometry_sigma, odometry_floor_m=args.odometry_floor,
+        odometry_errors=odometry_errors(args),
     )  # fmt: skip
     track = TrackRun(args, session)
     (track.follow if args.follow else track.take_all)()

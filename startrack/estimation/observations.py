@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.types import Array, Ints
 
 if TYPE_CHECKING:
@@ -37,6 +38,21 @@ class FrameEstimate:
     def parameters(self) -> int:
         """2 + k."""
         return len(self.mean)
+
+
+@dataclass(frozen=True)
+class OdometryErrors:
+    """Errors of moves, independent on each horizontal axis; by default those of a usual rover's odometry."""
+
+    sigma_1: float = ODOMETRY_SIGMA  # standard deviation, relative to the length of a move
+    floor_m: float = ODOMETRY_FLOOR_M  # beside that, in quadrature
+
+    def sigma_m(self, move_m: Array) -> Array:
+        """Standard deviation (...) [m] of moves (..., 2), or (..., 3), on each axis."""
+        return np.hypot(self.sigma_1 * np.linalg.norm(move_m, axis=-1), self.floor_m)
+
+
+USUAL_ODOMETRY = OdometryErrors()
 
 
 @dataclass(frozen=True, eq=False)

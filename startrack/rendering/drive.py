@@ -11,6 +11,7 @@ import numpy as np
 from startrack.core import MAX_COUNT
 from startrack.core.files import FilePath, printable, read_text
 from startrack.core.types import Array, BadInput, Value, array
+from startrack.estimation.observations import OdometryErrors
 
 PATH_COLUMNS = ("east_m", "north_m")
 STEP_ROUNDING_1 = 1e-9  # relative, of a number of steps: a path of whole steps has a frame at its end
@@ -97,21 +98,20 @@ def read_drive(path: FilePath, speed_m_s: float) -> Drive:
 
 
 def draw_odometry(
-    position_enu_m: Array, R_body_enu: Array, *, sigma_1: float, floor_m: float, rng: np.random.Generator
+    position_enu_m: Array, R_body_enu: Array, *, errors: OdometryErrors, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Odometry of true poses: positions (n, 3) [m] and rotations R_odom_body (n, 3, 3).
 
-    The poses are `position_enu_m` (n, 3) and `R_body_enu` (n, 3, 3); `rng` draws the errors.
+    The poses are `position_enu_m` (n, 3) and `R_body_enu` (n, 3, 3); `rng` draws the `errors` of the increments.
 
     The frame `odom` begins at the first pose; it is level, and its heading is drawn. The error of each increment is
-    independent and normal on each horizontal axis, with the variance (sigma_1 length)^2 + floor_m^2; the errors of
-    the increments add up along the drive. Heights and attitudes are exact.
+    independent and normal on each horizontal axis; the errors of the increments add up along the drive. Heights and
+    attitudes are exact.
     """
     from startrack.frames import R_from_rotvec
 
     R_odom_enu = R_from_rotvec([0.0, 0.0, rng.uniform(0, 2 * np.pi)])
     increments_m = np.diff(position_enu_m, axis=0)
-    sigma_m = np.hypot(sigma_1 * np.linalg.norm(increments_m, axis=1), floor_m)
-    increments_m[:, :2] += sigma_m[:, None] * rng.standard_normal((len(increments_m), 2))
+    increments_m[:, :2] += errors.sigma_m(increments_m)[:, None] * rng.standard_normal((len(increments_m), 2))
     position_m = np.concatenate([np.zeros((1, 3)), np.cumsum(increments_m, axis=0)])
     return position_m @ R_odom_enu.T, R_odom_enu @ np.swapaxes(R_body_enu, -1, -2)

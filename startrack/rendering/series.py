@@ -15,6 +15,7 @@ from startrack.camera import Camera
 from startrack.catalog import bodies
 from startrack.core import SKY_V_MAG_ARCSEC2
 from startrack.core.types import Array, BadInput, Stars, Value, rotation, vector
+from startrack.estimation.observations import OdometryErrors
 from startrack.frames import R_body_enu_from_heading_pitch_roll, R_enu_icrs, Site, observer_velocity_m_s, sky_rotvec_rad
 from startrack.rendering.compose import draw_hot_pixels
 from startrack.rendering.drive import Drive, draw_odometry
@@ -147,15 +148,15 @@ class Series:
         """Time and pose of exposure `number`. Raises BadInput (bad_terrain: no camera can stand there; no_time)."""
         return self._pose_and_rng(number)[0]
 
-    def odometry(self, poses: Sequence[Pose], *, sigma_1: float, floor_m: float) -> tuple[Array, Array]:
-        """Odometry of the first exposures of the series, whose true poses are `poses`.
+    def odometry(self, poses: Sequence[Pose], errors: OdometryErrors) -> tuple[Array, Array]:
+        """Odometry with `errors` of the first exposures of the series, whose true poses are `poses`.
 
-        `sigma_1` and `floor_m` are its errors; see `draw_odometry`.
+        See `draw_odometry`.
         """
         position_enu_m = np.array([pose.position_enu_m for pose in poses])
         R_body_enu = np.array([pose.R_body_enu for pose in poses])
         rng = np.random.default_rng([self.seed, Stream.ODOMETRY])
-        return draw_odometry(position_enu_m, R_body_enu, sigma_1=sigma_1, floor_m=floor_m, rng=rng)
+        return draw_odometry(position_enu_m, R_body_enu, errors=errors, rng=rng)
 
     def _pose_and_rng(self, number: int) -> tuple[Pose, np.random.Generator]:
         """The pose of exposure `number`, and the generator in the state after the pose was drawn."""

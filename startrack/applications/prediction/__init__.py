@@ -3,7 +3,7 @@
 from startrack.applications.prediction.draws import Conditions, Place, Predictor, Status, draw_store, times_between
 from startrack.applications.prediction.places import area_cells, default_spacing_m, path_points
 from startrack.applications.prediction.quantities import CELL_QUANTITIES, PATH_QUANTITIES, PREDICTION, summarize_cells
-from startrack.applications.prediction.report import OdometryErrors, Plan, Report, write_report
+from startrack.applications.prediction.report import Plan, Report, write_report
 from startrack.applications.prediction.run import (
     Prediction,
     Predictions,
@@ -13,7 +13,7 @@ from startrack.applications.prediction.run import (
 )
 
 __all__ = [
-    "CELL_QUANTITIES", "PATH_QUANTITIES", "PREDICTION", "Conditions", "OdometryErrors", "Place", "Plan", "Prediction",
+    "CELL_QUANTITIES", "PATH_QUANTITIES", "PREDICTION", "Conditions", "Place", "Plan", "Prediction",
     "Predictions", "Predictor", "Report", "Status", "area_cells", "cells_of_draws", "default_spacing_m", "draw_store",
     "path_points", "predict_positions", "share_within", "summarize_cells", "times_between", "write_report",
 ]  # fmt: skip

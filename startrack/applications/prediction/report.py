@@ -29,6 +29,7 @@ from startrack.applications.prediction.quantities import (
 from startrack.applications.prediction.run import add_odometry
 from startrack.core.errors import BadOutput, length_text
 from startrack.core.files import write_atomically
+from startrack.estimation.observations import OdometryErrors
 from startrack.frames import format_utc, latlon_from_enu
 from startrack.output import (
     Column,
@@ -47,14 +48,6 @@ PREDICTION_FILES = {MAP, CELL_TABLE, RECORD_FILE, MAP_PICTURE, COMPARISON_TABLE,
 NO_RADIUS = "no position at half of the places"
 PATH_CURVES = {FILTERED: "images so far, and odometry", SMOOTHED: "all images, and odometry"}
 SETTINGS = ("kind", "terrain", "camera", "first_time_utc", "last_time_utc", "spacing_m", "places")  # of one prediction
-
-
-@dataclass(frozen=True)
-class OdometryErrors:
-    """Errors of moves on each horizontal axis."""
-
-    sigma_1: float  # relative to the length of a move
-    floor_m: float  # beside that, in quadrature
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +121,7 @@ class Report:
             light = {"exposure_s": known.exposure_s, "limiting_v_mag": known.limiting_v_mag}
             variants.append({"camera": known.camera.name, **light, "summary": summarize_cells(found)})
         if odometry is not None:
-            cells = add_odometry(plan.points.position_m, cells, sigma_1=odometry.sigma_1, floor_m=odometry.floor_m)
+            cells = add_odometry(plan.points.position_m, cells, odometry)
         return cls(plan, cells, variants, depth, odometry)
 
     @property

@@ -31,7 +31,7 @@ from startrack.applications.prediction.quantities import (
 from startrack.camera import Camera, load_camera
 from startrack.core.chunk_store import Chunk, ChunkStore
 from startrack.core.types import Array, Bools
-from startrack.estimation.observations import FrameEstimate, Observations, Steps
+from startrack.estimation.observations import FrameEstimate, Observations, OdometryErrors, Steps
 from startrack.estimation.trajectory import TrackFilter, radius_holding, smooth
 from startrack.rendering import exposure_for_snr
 from startrack.terrain import Terrain
@@ -76,11 +76,11 @@ def share_within(cells: Cells, radius95_m: float) -> float:
     return float(np.mean(cells["radius95_m"] <= radius95_m))
 
 
-def add_odometry(position_m: Array, cells: Cells, *, sigma_1: float, floor_m: float) -> Cells:
+def add_odometry(position_m: Array, cells: Cells, errors: OdometryErrors) -> Cells:
     """The `cells` at points (k, 2) along a path with the 95 % radii by the images and odometry together.
 
-    Each point has one image with its predicted ellipse; of those without a radius the odometry alone counts. Moves err
-    on each axis by `sigma_1` of their length and, in quadrature, by `floor_m`. Radii are NaN where nothing is known.
+    Each point has one image with its predicted ellipse; of those without a radius the odometry alone counts. Moves have
+    these `errors`. Radii are NaN where nothing is known.
     """
     known = np.isfinite(cells["radius95_m"])
     alone = FrameEstimate(
@@ -92,7 +92,7 @@ def add_odometry(position_m: Array, cells: Cells, *, sigma_1: float, floor_m: fl
         for covariance, is_known in zip(ellipse_m2(cells), known, strict=True)
     ]
     move_m = np.diff(position_m, axis=0)
-    steps = Steps(move_m, np.hypot(sigma_1 * np.linalg.norm(move_m, axis=1), floor_m))
+    steps = Steps(move_m, errors.sigma_m(move_m))
     filtered = smoothed = np.full((len(known), 2, 2), np.inf)
     if known.any():
         state, filtered = TrackFilter(0, 0.0), filtered.copy()

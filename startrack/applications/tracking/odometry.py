@@ -15,7 +15,7 @@ import numpy as np
 from startrack.core.errors import BadInput
 from startrack.core.files import MAX_CAUSE_CHARS, FilePath, printable, read_text
 from startrack.core.types import Array, Value, array
-from startrack.estimation.observations import Steps
+from startrack.estimation.observations import OdometryErrors, Steps
 from startrack.exposure import BAG_SUFFIXES, ODOMETRY_TYPES, is_bag, read_messages
 from startrack.frames import format_utc
 
@@ -82,7 +82,7 @@ class Odometry(Value):
         return np.asarray(attitude.inv().apply(np.diff(position_m, axis=0)))
 
 
-def odometry_steps(frames: Sequence[ObservedFrame], odometry: Odometry | None, sigma_1: float, floor_m: float) -> Steps:
+def odometry_steps(frames: Sequence[ObservedFrame], odometry: Odometry | None, errors: OdometryErrors) -> Steps:
     """Moves between frames in enu, turned by the attitude that the stars show.
 
     Frames without an attitude of their own take the last one before them, and the odometry's turns since. Moves before
@@ -103,7 +103,7 @@ def odometry_steps(frames: Sequence[ObservedFrame], odometry: Odometry | None, s
         ends = [odometry.increments_body_m(time_s[[anchor, end]])[0] for end in at[1:]]
         move_body = ends[-1] - (ends[-2] if len(ends) > 1 else 0.0)
         move[k] = (R.T @ move_body)[:2]
-        sigma[k] = np.hypot(sigma_1 * np.linalg.norm(move_body), floor_m)
+        sigma[k] = errors.sigma_m(move_body)
     return Steps(move, sigma)
 
 

@@ -25,8 +25,8 @@ from startrack.applications.tracking.track import Track, estimate_track, odometr
 from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.catalog import load_catalog
 from startrack.chain import Settings, input_hashes, job_sha256, load_camera_input, locate, terrain_input
-from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.errors import BadInput
+from startrack.estimation.observations import USUAL_ODOMETRY, OdometryErrors
 from startrack.exposure import NO_TIME
 
 if TYPE_CHECKING:
@@ -52,8 +52,7 @@ class TrackSession:
     facts: dict[str, Any] = field(default_factory=dict)  # from flags, by the parameters of `read_exposure`
     stated_camera: str | Camera | None = None  # of all images; None: that which each names
     stated_terrain: str | Terrain | None = None  # the same
-    odometry_sigma: float = ODOMETRY_SIGMA  # of a move on each horizontal axis, relative to its length
-    odometry_floor_m: float = ODOMETRY_FLOOR_M  # beside that
+    odometry_errors: OdometryErrors = USUAL_ODOMETRY
     frames: list[ObservedFrame] = field(default_factory=list)  # in the order of time
     terrain: Terrain | None = None
     camera: Camera | None = None
@@ -103,8 +102,7 @@ class TrackSession:
             reason = "insufficient_geometry" if refused is None else refused.reason
             raise BadInput(reason, f"none of {len(frames)} images has a single position")
         return estimate_track(
-            frames, self.terrain, self.shared, odometry=odometry, odometry_sigma=self.odometry_sigma,
-            odometry_floor_m=self.odometry_floor_m, at_rest=at_rest,
+            frames, self.terrain, self.shared, odometry=odometry, odometry_errors=self.odometry_errors, at_rest=at_rest,
         )  # fmt: skip
 
     def odometry_positions_m(self, track: Track, odometry: Odometry | None) -> Array:
@@ -143,7 +141,7 @@ class TrackSession:
             yield track_of_newest(self.frames[k], self._online, self.terrain)
 
     def _steps(self, frames: Sequence[ObservedFrame], odometry: Odometry | None) -> Steps:
-        return odometry_steps(frames, odometry, self.odometry_sigma, self.odometry_floor_m)
+        return odometry_steps(frames, odometry, self.odometry_errors)
 
     def _load_references(self, exposure: Exposure) -> tuple[Camera, Terrain, TrackErrors]:
         """Camera, terrain and shared errors of the track: those of its first image. Raises BadInput for another's."""

@@ -14,9 +14,8 @@ from startrack.applications.tracking.filtered_positions import OnlineTrack, filt
 from startrack.applications.tracking.observed_frame import ImageFix, ObservedFrame
 from startrack.applications.tracking.odometry import Odometry, odometry_steps
 from startrack.applications.tracking.track_errors import BIAS, CLOCK, DEPTH, TrackErrors
-from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.types import Array, BadInput, Bools, ClockError, Ints
-from startrack.estimation.observations import UNKNOWN_M
+from startrack.estimation.observations import UNKNOWN_M, USUAL_ODOMETRY, OdometryErrors
 from startrack.estimation.trajectory import Smoothed, radius_holding
 from startrack.frames import quat_xyzw_from_R
 from startrack.localization import camera_at
@@ -94,8 +93,7 @@ def estimate_track(
     shared: TrackErrors,
     *,
     odometry: Odometry | None = None,
-    odometry_sigma: float = ODOMETRY_SIGMA,
-    odometry_floor_m: float = ODOMETRY_FLOOR_M,
+    odometry_errors: OdometryErrors = USUAL_ODOMETRY,
     at_rest: bool = False,
 ) -> Track:
     """The track of frames in the order of time.
@@ -105,8 +103,7 @@ def estimate_track(
         terrain: on which all were located.
         shared: the errors that the frames share.
         odometry: moves between the frames; None: not known.
-        odometry_sigma: standard deviation of a move on each horizontal axis, relative to its length.
-        odometry_floor_m: the same, beside that.
+        odometry_errors: of these moves.
         at_rest: the camera did not move: all exposures have one position.
 
     Raises BadInput: no_time for frames that are not in the order of time, bad_odometry for odometry that does not cover
@@ -120,7 +117,7 @@ def estimate_track(
         robust, position_m, covariance_m2 = positions_at_rest(frames, terrain, shared)
         first, second = [*np.flatnonzero(robust.mode >= 0).tolist(), n][:2]
     else:
-        steps = odometry_steps(frames, odometry, odometry_sigma, odometry_floor_m)
+        steps = odometry_steps(frames, odometry, odometry_errors)
         robust = smooth_robustly(modes, steps, terrain.height_sigma_m)
         position_m, covariance_m2 = filter_positions(modes, steps, len(shared), terrain.height_sigma_m)
         first = next(k for k, of in enumerate(modes) if len(of) == 1)

@@ -50,3 +50,11 @@ def normal_cdf(x):  # type: ignore[no-untyped-def]
     at = (min(max(x, -REACH), REACH) + REACH) * (CDF_STEPS / (2 * REACH))
     i = min(int(at), CDF_STEPS - 1)
     return TABLE[i] + (at - i) * (TABLE[i + 1] - TABLE[i])
+
+
+@njit(inline="always")
+def rows_beside(y, side, count):  # type: ignore[no-untyped-def]
+    """Indices of the rows, of `count`, of a SmoothImage on either side of row y, and the part of the second one."""
+    at = min(max((y + 0.5) / side - 0.5, 0.0), count - 1.0)
+    low = int(at)
+    return low, min(low + 1, count - 1), np.float32(at - low)

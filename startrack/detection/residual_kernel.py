@@ -5,17 +5,9 @@ from __future__ import annotations
 # mypy: disable-error-code="no-untyped-def"
 import numpy as np
 
-from startrack.core.kernels import REORDERED_SUMS, njit
+from startrack.core.kernels import REORDERED_SUMS, njit, rows_beside
 from startrack.core.smooth_image import Image, SmoothImage
 from startrack.core.types import Ints
-
-
-@njit(inline="always")
-def _rows_beside(y, side, count):
-    """Indices of the rows of a SmoothImage on either side of the image's row y, and the part of the second one."""
-    at = min(max((y + 0.5) / side - 0.5, 0.0), count - 1.0)
-    low = int(at)
-    return low, min(low + 1, count - 1), np.float32(at - low)
 
 
 @njit(cache=True, nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
@@ -28,7 +20,7 @@ def fill_residuals(image, background, noise, side, found, per_unit, found_error,
     one = np.float32(1.0)
     for i in range(out.shape[0]):
         y = first + i
-        low, high, part = _rows_beside(y, side, len(background))
+        low, high, part = rows_beside(y, side, len(background))
         rest = one - part
         line, light = out[i], image[y]
         below_b, above_b, below_n, above_n = background[low], background[high], noise[low], noise[high]
@@ -43,7 +35,7 @@ def fill_residuals(image, background, noise, side, found, per_unit, found_error,
                 sigma = below_n[x] * rest + above_n[x] * part
                 line[x] = (light[x] - (below_b[x] * rest + above_b[x] * part)) / sigma
         if len(level):
-            low, high, part = _rows_beside(y, level_side, len(level))
+            low, high, part = rows_beside(y, level_side, len(level))
             rest, below_b, above_b = one - part, level[low], level[high]
             for x in range(len(line)):
                 line[x] -= below_b[x] * rest + above_b[x] * part
@@ -56,7 +48,7 @@ def _fill_stamps(image, background, noise, side, centres, light, variance):
     for k in range(len(centres)):
         left, top = centres[k, 0] - width // 2, centres[k, 1] - width // 2
         for i in range(width):
-            low, high, part = _rows_beside(top + i, side, len(background))
+            low, high, part = rows_beside(top + i, side, len(background))
             rest = np.float32(1.0) - part
             for j in range(width):
                 x = left + j

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.core.kernels import REORDERED_SUMS, njit
+from startrack.core.kernels import REORDERED_SUMS, njit, rows_beside
 from startrack.core.types import Array, Bools, Detections, Ints
 from startrack.psf import pixel_profile_table, stamp_radius
 
-ZERO = np.float32(0.0)  # literals would be of double precision
+ZERO, ONE = np.float32(0.0), np.float32(1.0)  # literals would be of double precision
 LEAST = np.finfo(np.float32).tiny  # of a divisor
 SURE_SIGMAS = 5.0  # from here on chance is excluded: two in a million
 OUTLIER_VARIANCES = np.float32(SURE_SIGMAS**2)
@@ -64,11 +64,12 @@ def measure(detections: Detections, sources: Sources) -> Photometry:
     order, first, columns = order_by_cell(sources.xy_px, d.image_e.shape, reach_px)
     table = neighbour_profiles(sigma_px)
     measured, usable = np.empty((len(order), 4)), np.empty(len(order), dtype=np.bool_)
-    pictures = [np.ascontiguousarray(a).view() for a in (d.image_e, d.background_e, d.noise_e, d.dead)]
+    pictures = [np.ascontiguousarray(a).view() for a in (d.image_e, d.background.rows, d.noise.rows, d.dead)]
     for picture in pictures:  # contiguous and read-only: another layout or flag would compile the loop again
         picture.flags.writeable = False
     measure_sources(  # type: ignore[call-arg]
-        *pictures, sources.xy_px[order], sources.flux_e[order], sources.fraction_sigma[order], sources.visible[order],
+        *pictures, d.background.side, d.noise.side, sources.xy_px[order], sources.flux_e[order],
+        sources.fraction_sigma[order], sources.visible[order],
         first, columns, reach_px, reach_px, radius, table, measured, usable,
     )  # fmt: skip
     given = np.argsort(order)
@@ -98,14 +99,14 @@ def order_by_cell(xy_px: Array, shape: tuple[int, ...], side_px: float) -> tuple
 
 @njit(cache=True, nogil=True, fastmath=REORDERED_SUMS)
 def measure_sources(
-    image, background, noise, dead, xy_px, flux_e, fraction_sigma, visible, first, columns,
+    image, background, noise, dead, background_side, noise_side, xy_px, flux_e, fraction_sigma, visible, first, columns,
     reach_px, side_px, radius, profiles, measured, usable,
 ) -> None:  # fmt: skip
     """Fill `measured` (n, 4) and `usable` (n,) for sources (n) ordered by cells, their stamps inside the frame.
 
-    The columns are flux, variance, own shot noise and neighbours' variance, as `Photometry` explains them. `profiles`
-    (steps + 1, 2 k + 1) are pixel profiles at offsets from -1/2 to 1/2. Neighbours lie within `reach_px`, at most
-    `side_px`, the side of the cells; `first` is each cell's first source.
+    The columns are flux, variance, own shot noise and neighbours' variance, as `Photometry` explains them. `background`
+    and `noise` are rows of a SmoothImage. `profiles` (steps + 1, 2 k + 1) are pixel profiles at offsets from -1/2 to
+    1/2. Neighbours lie within `reach_px`, at most `side_px`, the side of cells; `first` is each cell's first source.
     """
     n = len(xy_px)
     k = profiles.shape[1] // 2
@@ -125,8 +126,8 @@ def measure_sources(
             x, y = k + left - centre[j, 0], k + top - centre[j, 1]
             _add_light(light, side, np.float32(flux_e[j] * visible[j]), across, down, j, x, y)
         _load_stamp(
-            image, background, noise, dead, across, down, i, left, top, radius, k, light, profile, data, variance,
-            weight,
+            image, background, noise, dead, background_side, noise_side, across, down, i, left, top, radius, k, light,
+            profile, data, variance, weight,
         )  # fmt: skip
         flux, middle, strength, masked = _fit_masking(profile, light, data, variance, weight)
         seen = ZERO  # part of the star's light in pixels that have a weight
@@ -187,8 +188,9 @@ def profiles_of(xy_px, profiles):
 
 @njit(inline="always")
 def _load_stamp(
-    image, background, noise, dead, across, down, i, left, top, radius, k, light, profile, data, variance, weight
-) -> None:
+    image, background, noise, dead, background_side, noise_side, across, down, i, left, top, radius, k, light,
+    profile, data, variance, weight,
+) -> None:  # fmt: skip
     """Source i: its profile, the pixels without background and neighbours, their variances, and their weights.
 
     The weight is 1 / variance, and 0 in unusable pixels.
@@ -197,12 +199,16 @@ def _load_stamp(
     source, x0, c0 = np.uint64(i), np.uint64(left), np.uint64(k - radius)
     for r in range(side):
         p0, y, height = np.uint64(r * side), np.uint64(top + r), down[i, k - radius + r]
+        b_low, b_high, b_part = rows_beside(top + r, background_side, len(background))
+        n_low, n_high, n_part = rows_beside(top + r, noise_side, len(noise))
         for c in range(np.uint64(side)):
             p, x = p0 + c, x0 + c
             profile[p] = height * across[source, c0 + c]
-            data[p] = image[y, x] - background[y, x] - light[p]
-            variance[p] = noise[y, x] * noise[y, x]
-            weight[p] = ZERO if dead[y, x] else np.float32(1.0) / variance[p]
+            level = background[b_low, x] * (ONE - b_part) + background[b_high, x] * b_part
+            sigma = noise[n_low, x] * (ONE - n_part) + noise[n_high, x] * n_part
+            data[p] = image[y, x] - level - light[p]
+            variance[p] = sigma * sigma
+            weight[p] = ZERO if dead[y, x] else ONE / variance[p]
 
 
 @njit(inline="always")

@@ -16,7 +16,7 @@ from startrack.localization.importance_sampling import FEW, Gaussian, WeightedPo
 from startrack.localization.skyline_model import SkylineModel
 
 HIDDEN_COPIES = 6  # of each point, with values of the errors that the rows do not show
-DOUBTFUL_NATS = 5.0  # by which a map beats a free skyline, below which other times are tried too
+DOUBTFUL_NATS = 8.0  # by which a map beats a free skyline, right ones by 11 to 16; below, other times are tried too
 WIDER, LINEAR_PART = 2.0, 0.01  # variance of the first points, in that of the plain and of the linear solution
 GROSS_ROUNDS = (120, 160, 200, 300, 400, 500)  # points; FEW effective ones end them
 

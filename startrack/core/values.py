@@ -51,23 +51,27 @@ class Value:
 
     def __post_init__(self) -> None:
         lengths: dict[str, int] = {}
-        for f in fields(self):  # type: ignore[arg-type]
-            if "shape" not in f.metadata:
-                continue
-            want, given = f.metadata["shape"], getattr(self, f.name)
-            default = f.metadata.get("default")
+        for name, want, dtype, default, may_be_nan in self._arrays():
+            given = getattr(self, name)
             if default is not None and np.ndim(given) == 0:
                 given = np.full([lengths.get(w, w) for w in want], default if given is None else given)
-            a = given if _is_locked(given, f.metadata["dtype"]) else np.array(given, dtype=f.metadata["dtype"])
+            a = given if _is_locked(given, dtype) else np.array(given, dtype=dtype)
             if a.ndim != len(want):
-                raise ValueError(f"{type(self).__name__}.{f.name}: {a.ndim} dimensions, expected {want}")
+                raise ValueError(f"{type(self).__name__}.{name}: {a.ndim} dimensions, expected {want}")
             for n, w in zip(a.shape, want, strict=True):
                 if n != (lengths.setdefault(w, n) if isinstance(w, str) else w):
-                    raise ValueError(f"{type(self).__name__}.{f.name}: shape {a.shape}, expected {want} {lengths}")
-            if a.dtype.kind == "f" and not f.metadata.get("may_be_nan") and np.isnan(a).any():
-                raise ValueError(f"{type(self).__name__}.{f.name} holds NaN")
+                    raise ValueError(f"{type(self).__name__}.{name}: shape {a.shape}, expected {want} {lengths}")
+            if a.dtype.kind == "f" and not may_be_nan and np.isnan(a).any():
+                raise ValueError(f"{type(self).__name__}.{name} holds NaN")
             a.flags.writeable = False
-            object.__setattr__(self, f.name, a)
+            object.__setattr__(self, name, a)
+
+    @classmethod
+    @cache
+    def _arrays(cls) -> list[tuple[Any, ...]]:
+        """Name, shape, type, default and whether NaN is allowed of each field declared with `array`."""
+        declared = [(f.name, f.metadata) for f in fields(cls) if "shape" in f.metadata]  # type: ignore[arg-type]
+        return [(name, m["shape"], m["dtype"], m["default"], m["may_be_nan"]) for name, m in declared]
 
 
 class Rows(Value):
@@ -99,4 +103,4 @@ class Rows(Value):
     @cache
     def _columns(cls) -> list[str]:
         """Names of the array fields of the common length."""
-        return [f.name for f in fields(cls) if f.metadata.get("shape", ())[:1] == ("n",)]  # type: ignore[arg-type]
+        return [name for name, shape, *_ in cls._arrays() if shape[:1] == ("n",)]

@@ -44,6 +44,7 @@ class PointFits(Rows):
         values = {name: values.copy() for name, values in vars(self).items()}
         for name, value in values.items():
             value[which] = getattr(others, name)
+            value.flags.writeable = False  # locked values need no copy
         return PointFits(**values)
 
 

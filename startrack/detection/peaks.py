@@ -18,7 +18,6 @@ from startrack.psf import filter_kernel
 NO_PIXELS = np.zeros((0, 0), dtype=np.bool_)
 MAX_STAMP_PIXELS = 2_500_000  # of all candidates together: bounds time and memory, for any content of the frame
 MAX_BLOBS = 1000  # saturated; the largest
-MAX_DEAD_GROUPED_PX = 20_000  # pixels up to which they are grouped without looking at the whole mask
 OWN_RESIDUE_SIGMAS = 1.5
 ONE_PIXEL_FRACTION = 0.15  # of a peak's light beside it; a star of 0.45 px has 0.18
 
@@ -159,12 +158,7 @@ def _saturated_blobs(dead: NDArray[np.bool_] | None, margin: int) -> Array:
     row, column = np.divmod(np.flatnonzero(dead), width)
     if not len(row):
         return np.zeros((0, 2))
-    if len(row) > MAX_DEAD_GROUPED_PX:  # large areas: the whole mask
-        count, labels, _, _ = cv2.connectedComponentsWithStats(dead.astype(np.uint8))
-        label = labels[row, column].astype(np.int64) - 1
-        count -= 1
-    else:
-        count, label = _group_touching(row, column)
+    count, label = _group_touching(row, column)
     area = np.bincount(label, minlength=count)
     middle = np.stack([np.bincount(label, q, count) / np.maximum(area, 1) for q in (column, row)], axis=1)
     inside = (middle >= margin).all(axis=1) & (middle[:, 0] < width - margin) & (middle[:, 1] < height - margin)
@@ -174,13 +168,16 @@ def _saturated_blobs(dead: NDArray[np.bool_] | None, margin: int) -> Array:
 
 
 def _group_touching(row: Ints, column: Ints) -> tuple[int, Ints]:
-    """Number of groups of touching pixels (corners count) among a few, and the group (n,) of each pixel."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
+    """Number of groups of touching pixels (corners count), and the group (n,) of each pixel."""
+    i, j = _without_gaps(row), _without_gaps(column)
+    mask = np.zeros((i.max() + 1, j.max() + 1), dtype=np.uint8)
+    mask[i, j] = 1
+    count, labels = cv2.connectedComponents(mask)
+    return count - 1, labels[i, j].astype(np.int64) - 1
 
-    pixels = np.stack([row, column], axis=1)
-    i, j = cKDTree(pixels).query_pairs(1.5, output_type="ndarray").T
-    graph = coo_matrix((np.ones(len(i), dtype=np.int8), (i, j)), shape=(len(pixels), len(pixels)))
-    count, label = connected_components(graph, directed=False)
-    return int(count), label.astype(np.int64)
+
+def _without_gaps(at: Ints) -> Ints:
+    """Indices (n,) in the same order, of which only neighbours differ by one, and none by much more."""
+    kept = np.bincount(at, minlength=at.max() + 2) > 0
+    kept[1:] |= kept[:-1].copy()
+    return np.asarray(np.cumsum(kept)[at] - 1)

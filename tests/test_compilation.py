@@ -52,7 +52,7 @@ def test_compiling_is_announced_once_and_loading_is_not(tmp_path):
     script = tmp_path / "first_use.py"
     script.write_text(FIRST_USE)
     assert run_script(script, tmp_path / "cache").splitlines() == [
-        "compiling what this command uses first: about 20 s, for height maps a minute; kept on disk"
+        "compiling what this command uses first: about 10 s, for height maps 20 s; kept on disk"
     ]
     assert run_script(script, tmp_path / "cache") == ""
 

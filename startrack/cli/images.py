@@ -6,9 +6,11 @@ import argparse
 import logging
 import math
 import os
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -17,9 +19,10 @@ from startrack import exposure as images
 from startrack.camera import Camera, load_camera
 from startrack.cli.console import progress
 from startrack.cli.flags import checked_flag
-from startrack.core.compilation import announce_compilation
+from startrack.core.compilation import announce_compilation, is_compiled
 from startrack.core.errors import BadInput
 from startrack.core.files import is_path
+from startrack.core.runner import count_cores
 from startrack.core.types import Evidence, Exposure, NotLocated
 from startrack.estimation.observations import OdometryErrors
 from startrack.frames import Site, parse_utc
@@ -34,6 +37,7 @@ LOADERS: dict[str, Callable[[str], object]] = {  # of the files among these fact
     "flat": images.read_flat,
 }  # fmt: skip
 RAYS = 360  # of the fix that compiles the kernels: one a degree above the skyline and one below
+COMPILE = f"import sys, {__name__} as images; images.compile_kernels(images.load_terrain(sys.argv[1]))"
 OFFSET_RAD = 0.01  # of these rays from the skyline
 
 
@@ -146,6 +150,18 @@ def compile_kernels(terrain: Terrain) -> None:
     )
     with suppress(NotLocated):  # the kernels are compiled in any case
         ExactPosterior()(evidence, terrain)
+
+
+@cache
+def compile_beside(reference: str) -> subprocess.Popen[bytes] | None:
+    """The process that compiles the kernels of a fix on the terrain at `reference`, beside this one; None if compiled.
+
+    It halves the wait at the first use: numba compiles on one core.
+    """
+    if is_compiled() or count_cores() == 1:
+        return None
+    nothing = subprocess.DEVNULL
+    return subprocess.Popen([sys.executable, "-c", COMPILE, reference], stdin=nothing, stdout=nothing, stderr=nothing)
 
 
 @contextmanager

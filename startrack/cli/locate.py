@@ -19,7 +19,7 @@ from startrack.camera import Camera, load_camera
 from startrack.catalog import load_catalog
 from startrack.cli.console import Outcome, print_outcome, refusal_record, worst_code
 from startrack.cli.flags import check_localizer
-from startrack.cli.images import check_fov, prepare_reference, read
+from startrack.cli.images import check_fov, compile_beside, prepare_reference, read
 from startrack.cli.report import write_page_of_images
 from startrack.core.errors import INTERNAL_ERROR, BadInput, BadOutput
 from startrack.core.files import make_folder
@@ -109,7 +109,9 @@ def _solve_image(args: argparse.Namespace, path: str, out: Path, solve: Solve) -
     output.prepare_folder(out, exposure.sha256, overwrite=args.overwrite, remedy=remedy)
     read_s = time.perf_counter() - start
     if is_located and exposure.time_utc is not None and exposure.camera is not None:
-        prepare_reference(exposure.terrain, args)
+        terrain = prepare_reference(exposure.terrain, args)
+        if terrain is not None and exposure.terrain is not None:
+            compile_beside(exposure.terrain)
     start = time.perf_counter()
     result = chain.add_timing(solve(exposure, camera), read=1e3 * read_s)
     more = {"explain": output.explain(result)} if is_located and args.explain else {}

@@ -83,9 +83,7 @@ def announce_compilation() -> None:
     class Announcement(event.Listener):  # type: ignore[misc]
         def on_start(self, event: Any) -> None:
             if event.data["dispatcher"].py_func.__module__.startswith("startrack.") and ANNOUNCEMENT_TURN.take():
-                LOG.warning(
-                    "compiling what this command uses first: about 20 s, for height maps a minute; kept on disk"
-                )
+                LOG.warning("compiling what this command uses first: about 10 s, for height maps 20 s; kept on disk")
 
         def on_end(self, event: Any) -> None:
             """Nothing to do."""

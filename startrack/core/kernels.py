@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from math import erfc, sqrt
 from typing import Any
 
@@ -14,12 +15,20 @@ choose_cache_folder()
 discard_stale_kernels()
 
 import numba  # noqa: E402 - it reads where its cache lies when it loads
+from llvmlite.binding import add_symbol  # noqa: E402
 from numba.core.caching import FunctionCache  # noqa: E402
-from numba.core.runtime import rtsys  # noqa: E402
+from numba.core.runtime._nrt_python import c_helpers  # noqa: E402
 
 REORDERED_SUMS = {"reassoc", "contract", "nsz"}  # as `fastmath`: lets the compiler sum several pixels at a time
 REACH, CDF_STEPS = 8.0, 4096  # of `normal_cdf`: standard deviations on either side, and steps of the table
 TABLE = np.array([0.5 * erfc(-x / sqrt(2.0)) for x in np.linspace(-REACH, REACH, CDF_STEPS + 1)])
+
+
+@cache
+def add_runtime_symbols() -> None:
+    """Tell LLVM where the functions of numba's runtime are, which compiled kernels call."""
+    for name, address in c_helpers.items():
+        add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
 
 
 class KernelCache(FunctionCache):  # type: ignore[misc]
@@ -27,7 +36,7 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The compiled kernel for arguments of types `sig` in a `target_context`; None where there is none yet."""
-        rtsys.initialize(target_context)
+        add_runtime_symbols()
         with self._guard_against_spurious_io_errors():
             return self._load_overload(sig, target_context)
 

@@ -153,7 +153,8 @@ def chain_log_likelihoods(profiles, levels, moves, shifts, cut, closing, found):
                 for p in range(points):
                     clear[p] *= clear_emissions[s, p]
                 if step % 4 == 3:
-                    total[:] = clear
+                    for p in range(points):  # numba takes 1.5 s to compile total[:] = clear
+                        total[p] = clear[p]
                     for j in range(1, STATES):
                         for p in range(points):
                             total[p] += risen[j, p]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from startrack.core.statistics import error_ellipse
 from startrack.output import Rows
 
 if TYPE_CHECKING:
@@ -86,10 +87,8 @@ class Position(Shown):
         covariance_m2 = self.covariance.to_value(u.m**2)
         if not np.isfinite(covariance_m2).all():
             return Ellipse(np.inf * u.m, np.inf * u.m, Angle(0.0, u.deg))
-        squares, axes = np.linalg.eigh(covariance_m2)
-        minor, major = np.sqrt(np.maximum(squares, 0.0)) * u.m
-        azimuth_rad = np.arctan2(axes[0, 1], axes[1, 1]) % np.pi
-        return Ellipse(major, minor, Angle(np.degrees(azimuth_rad), u.deg))
+        major_m, minor_m, azimuth_rad = error_ellipse(covariance_m2)
+        return Ellipse(major_m * u.m, minor_m * u.m, Angle(np.degrees(azimuth_rad), u.deg))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -65,3 +65,13 @@ def root_between(function: Callable[[float], float], before: float, now: float, 
         before, f_before = now, f_now
         now += step if abs(step) > least else math.copysign(least, half)
         f_now = function(now)
+
+
+def error_ellipse(covariance: Array) -> tuple[Array, Array, Array]:
+    """Larger and smaller semi-axis (...) of one sigma, and azimuth (...) of the larger [rad, from 0 to pi].
+
+    `covariance` (..., 2, 2) is that of east and north.
+    """
+    squares, axes = np.linalg.eigh(covariance)
+    minor, major = np.moveaxis(np.sqrt(np.maximum(squares, 0.0)), -1, 0)
+    return major, minor, np.arctan2(axes[..., 0, 1], axes[..., 1, 1]) % np.pi

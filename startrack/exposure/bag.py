@@ -41,11 +41,6 @@ class Message(NamedTuple):
     content: Any  # fields as in the message's definition
     raw: bytes  # as stored
 
-    @property
-    def stamp_s(self) -> float:
-        """The header's time [Unix s]."""
-        return self.stamp_ns / 1e9
-
 
 class StoredMessage(NamedTuple):
     """Where one message of a topic is in its bag."""

@@ -9,6 +9,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from startrack.chain import Located, Measured, Oriented
+from startrack.core.statistics import error_ellipse
 from startrack.core.types import Array, Fix
 from startrack.frames import R_from_rotvec, heading_pitch_roll_from_R_body_enu, latlon_from_enu
 
@@ -124,9 +125,8 @@ def ellipse(at: At) -> tuple[float, float, float] | None:
     covariance = at("position.covariance_m2")
     if covariance is None:
         return None
-    squares, axes = np.linalg.eigh(np.asarray(covariance, dtype=float))
-    minor, major = np.sqrt(np.maximum(squares, 0.0))
-    return float(major), float(minor), float(np.degrees(np.arctan2(axes[0, 1], axes[1, 1]) % np.pi))
+    major_m, minor_m, azimuth_rad = error_ellipse(np.asarray(covariance, dtype=float))
+    return float(major_m), float(minor_m), float(np.degrees(azimuth_rad))
 
 
 def finite_or_none(value: Any) -> Any:

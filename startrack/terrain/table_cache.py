@@ -123,14 +123,11 @@ def _single_builder(path: Path, name: str) -> Iterator[None]:
 
     Where files cannot be locked (a read-only folder, some network disks) no process waits, and each makes its own.
     """
-
-    def announce() -> None:
-        LOG.info("horizons of %s: another process works them out, waiting for it", name)
-
+    text = f"horizons of {name}: another process works them out, waiting for it"
     with ExitStack() as stack:
         with suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
-            stack.enter_context(hold_lock(path, on_wait=announce))
+            stack.enter_context(hold_lock(path, on_wait=lambda: LOG.info(text)))
         yield
 
 

@@ -36,11 +36,6 @@ def elevations_rad() -> Array:
     return np.asarray(np.arange(LOWEST_RAD, (np.pi + GRID_STEP_RAD) / 2, GRID_STEP_RAD))
 
 
-def column_azimuths_rad() -> Array:
-    """Azimuths (AZIMUTH_COLUMNS,) of the columns' middles; four lie evenly about each degree."""
-    return np.asarray((np.arange(AZIMUTH_COLUMNS) + 0.5 - COLUMNS_PER_AZIMUTH / 2) * (2 * np.pi / AZIMUTH_COLUMNS))
-
-
 def column_of(azimuth_rad: Array) -> Ints:
     """The column (n,) that each azimuth (n,) lies in."""
     column = np.floor(azimuth_rad * (AZIMUTH_COLUMNS / (2 * np.pi)) + COLUMNS_PER_AZIMUTH / 2)
@@ -87,8 +82,10 @@ def sample_columns(
         cv2.circle(disks, (i, j), round(radius), 1, -1)
     shape = len(elevation), AZIMUTH_COLUMNS
     total, spread, points = np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=bool)
+    # Of the columns' middles: four lie evenly about each degree.
+    middles = (np.arange(AZIMUTH_COLUMNS) + 0.5 - COLUMNS_PER_AZIMUTH / 2) * (2 * np.pi / AZIMUTH_COLUMNS)
     for k in range(COLUMN_SAMPLES):
-        azimuth = column_azimuths_rad() + ((k + 0.5) / COLUMN_SAMPLES - 0.5) * 2 * np.pi / AZIMUTH_COLUMNS
+        azimuth = middles + ((k + 0.5) / COLUMN_SAMPLES - 0.5) * 2 * np.pi / AZIMUTH_COLUMNS
         xy, inside = camera.project(rays_from_azel(azimuth[None, :], elevation[:, None]) @ R_cam_enu.T)
         x, y = (np.ascontiguousarray(xy[..., axis], dtype=np.float32) for axis in (0, 1))
         hidden = ~inside | (cv2.remap(lost, x, y, cv2.INTER_NEAREST) > 0)

@@ -30,6 +30,7 @@ from startrack.applications.prediction.quantities import (
 )
 from startrack.camera import Camera, load_camera
 from startrack.core.chunk_store import Chunk, ChunkStore
+from startrack.core.statistics import error_ellipse
 from startrack.core.types import Array, Bools
 from startrack.estimation.observations import FrameEstimate, Observations, OdometryErrors, Steps
 from startrack.estimation.trajectory import TrackFilter, radius_holding, smooth
@@ -64,11 +65,8 @@ def _ellipses(covariance_m2: Array, located: Bools) -> tuple[Array, Array, Array
     total = np.where(located[:, :, None, None], covariance_m2, 0.0).sum(axis=1)
     major, minor, azimuth = np.full((3, len(count)), np.nan)
     known = count > 0
-    squares, axes = np.linalg.eigh(total[known] / count[known, None, None])
-    minor[known], major[known] = np.sqrt(np.maximum(squares, 0.0)).T
-    east, north = axes[:, :, 1].T
-    azimuth[known] = np.degrees(np.arctan2(east, north)) % 180.0
-    return major, minor, azimuth
+    major[known], minor[known], azimuth[known] = error_ellipse(total[known] / count[known, None, None])
+    return major, minor, np.degrees(azimuth)
 
 
 def share_within(cells: Cells, radius95_m: float) -> float:

@@ -195,7 +195,7 @@ def _odometry_of_bag(path: FilePath, topic: str | None) -> Odometry:
         body, pose = message.content, message.content.pose.pose
         at, q = pose.position, pose.orientation
         frames.add((body.header.frame_id, body.child_frame_id))
-        rows.append([message.stamp_s, at.x, at.y, at.z, q.x, q.y, q.z, q.w])
+        rows.append([message.stamp_ns / 1e9, at.x, at.y, at.z, q.x, q.y, q.z, q.w])
     if len(frames) > 1:
         named = "; ".join(f"{child!r} in {frame!r}" for frame, child in sorted(frames))
         _refuse(f"{printable(path)}: the topic has poses of several frames: {named}")

@@ -71,10 +71,11 @@ def write_track(
     written.
     """
     record = track_record(track, odometry)
+    columns = {q.key: [one[q.key] for one in record["frames"]] for q in FRAME_QUANTITIES}
     made: dict[str, bytes] = {
         "track.tum": tum_text(track, track.smoothed).encode(),
         "track.filtered.tum": tum_text(track, track.filtered).encode(),
-        "track.ecsv": frames_table(record["frames"]).encode(),
+        "track.ecsv": ecsv_text(quantity_columns(FRAME_QUANTITIES, columns)).encode(),
         "track.geojson": track_geojson(track, record["frames"]).encode(),
         "track.crests.ecsv": crests_table(track).encode(),
         **(pictures or {}),
@@ -93,12 +94,6 @@ def tum_text(track: Track, trajectory: Trajectory) -> str:
             R_enu_body = R_from_quat_xyzw(frame.quat_xyzw_body_enu).T
             lines.append(tum_line(frame.time_utc.astimezone(UTC).timestamp(), position_m, R_enu_body))
     return "".join(lines)
-
-
-def frames_table(records: Sequence[dict[str, Any]]) -> str:
-    """track.ecsv: a row for each of the frames' `records`."""
-    values = {q.key: [record[q.key] for record in records] for q in FRAME_QUANTITIES}
-    return ecsv_text(quantity_columns(FRAME_QUANTITIES, values))
 
 
 def crests_table(track: Track) -> str:

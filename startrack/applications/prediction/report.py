@@ -61,7 +61,7 @@ class Plan:
 
     @classmethod
     def of(cls, conditions: Conditions, inputs: tuple[tuple[str, str], ...], points: AreaCells | PathPoints) -> Plan:
-        """The plan with its terrain. Raises BadInput for files that cannot be used."""
+        """The plan of `points` under `conditions`; its record lists `inputs`. Raises BadInput for unusable files."""
         predictor_of(conditions).exposure_s  # noqa: B018 - a camera without a sensor is refused before anything is drawn
         return cls(conditions, load_terrain(conditions.terrain), points, inputs)
 
@@ -114,7 +114,10 @@ class Report:
         cls, plan: Plan, cells: Cells, others: Mapping[Conditions, Cells], depth: dict[str, Any] | None,
         odometry: OdometryErrors | None,
     ) -> Report:  # fmt: skip
-        """The report with the predictions: `cells` of the `plan`, and `others` to compare with."""
+        """The report with the predictions: `cells` of the `plan`, and `others` to compare with.
+
+        `depth` and `odometry` are as of the report; the cells get those along the path with odometry here.
+        """
         variants = []
         for other, found in others.items():
             known = predictor_of(other)

@@ -49,12 +49,15 @@ def _fill_stamps(image, background, noise, side, centres, light, variance):
         left, top = centres[k, 0] - width // 2, centres[k, 1] - width // 2
         for i in range(width):
             low, high, part = rows_beside(top + i, side, len(background))
-            rest = np.float32(1.0) - part
+            rest, columns = np.float32(1.0) - part, slice(left, left + width)
+            below_b, above_b, below_n, above_n = (
+                background[low, columns], background[high, columns], noise[low, columns], noise[high, columns]
+            )  # fmt: skip
+            pixels, own, spread = image[top + i, columns], light[k, i], variance[k, i]
             for j in range(width):
-                x = left + j
-                sigma = noise[low, x] * rest + noise[high, x] * part
-                light[k, i, j] = image[top + i, x] - (background[low, x] * rest + background[high, x] * part)
-                variance[k, i, j] = sigma * sigma
+                sigma = below_n[j] * rest + above_n[j] * part
+                own[j] = pixels[j] - (below_b[j] * rest + above_b[j] * part)
+                spread[j] = sigma * sigma
 
 
 def cut_light(

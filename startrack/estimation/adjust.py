@@ -263,9 +263,12 @@ def extra_variance_px2(
     are subtracted from the degrees of freedom of the residuals (n, 2).
     """
     n = len(residual_px)
-    axes_px2, axes = np.linalg.eigh(covariance_px2)
-    squared = np.square(np.einsum("nij,ni->nj", axes, residual_px)).T
-    axes_px2 = np.ascontiguousarray(axes_px2.T)
+    # Along the axes of each covariance.
+    (x, y), xx, yy, xy = residual_px.T, covariance_px2[:, 0, 0], covariance_px2[:, 1, 1], covariance_px2[:, 0, 1]
+    half, turn = np.hypot(0.5 * (xx - yy), xy), 0.5 * np.arctan2(2.0 * xy, xx - yy)
+    c, s = np.cos(turn), np.sin(turn)
+    squared = np.square(np.stack([c * x + s * y, c * y - s * x]))
+    axes_px2 = 0.5 * (xx + yy) + np.stack([half, -half])
     middle_two = (n - 1) // 2, n // 2
     expected = max(2.0 * n - parameters, 1.0) if by_sum else CHI2_2DOF_MEDIAN * max(1.0 - 0.5 * parameters / n, 0.1)
 

@@ -215,7 +215,7 @@ def integral_to(profiles, s, height):
 @njit(cache=True, nogil=True)
 def _average_over_map(profiles, sigma, bins):
     """The cells with exp F averaged over a normal error of the map's skyline (SECTORS,); far off it stays as it is."""
-    weights, whole = np.empty(len(bins) - 1), 0.0
+    weights, whole, cells = np.empty(len(bins) - 1), 0.0, np.zeros(len(bins), dtype=np.int64)
     for q in range(len(weights)):
         weights[q] = 0.5 * (erf(bins[q + 1] / sqrt(2.0)) - erf(bins[q] / sqrt(2.0)))
         whole += weights[q]
@@ -244,11 +244,12 @@ def _average_over_map(profiles, sigma, bins):
             n += 1
             k += 1
         count = int((high[s] - low[s]) / step[s])
-        before = _mean_over(profiles, s, low[s], sigma[s], bins, weights)
+        cells[:] = profiles.first[s]
+        before = _mean_over(profiles, s, low[s], sigma[s], bins, weights, cells)
         for i in range(count):
             at = low[s] + i * step[s]
-            after = _mean_over(profiles, s, at + step[s], sigma[s], bins, weights)
-            middle = _mean_over(profiles, s, at + 0.5 * step[s], sigma[s], bins, weights)
+            middle = _mean_over(profiles, s, at + 0.5 * step[s], sigma[s], bins, weights, cells)
+            after = _mean_over(profiles, s, at + step[s], sigma[s], bins, weights, cells)
             rise = abs(after - before)
             x[n], left[n], right[n], bend[n] = at, before, after, 4.0 * (middle - 0.5 * (before + after))
             if min(before, after) <= middle <= max(before, after):  # the parabola has no peak either
@@ -269,11 +270,21 @@ def _average_over_map(profiles, sigma, bins):
 
 
 @njit(cache=True, nogil=True)
-def _mean_over(profiles, s, height, sigma, bins, weights):
-    """Logarithm of the mean of exp F over a normal error about a height."""
-    total, before = 0.0, integral_to(profiles, s, height + bins[0] * sigma)
-    for q in range(len(weights)):
-        after = integral_to(profiles, s, height + bins[q + 1] * sigma)
-        total += weights[q] * (after - before) / ((bins[q + 1] - bins[q]) * sigma)
+def _mean_over(profiles, s, height, sigma, bins, weights, cells):
+    """Logarithm of the mean of exp F over a normal error about a height.
+
+    `cells` (bins,) hold the ends of the bins about a lower height, from which on they are searched.
+    """
+    x, integral, free, last = profiles.x, profiles.integral, profiles.free[s], profiles.first[s + 1] - 1
+    total, before = 0.0, 0.0
+    for q in range(len(bins)):
+        at, k = height + bins[q] * sigma, cells[q]
+        while k < last - 1 and x[k + 1] <= at:
+            k += 1
+        cells[q] = k
+        after = integral[k] + (min(at, HIGH_RAD) - x[k]) / (x[k + 1] - x[k]) * (integral[k + 1] - integral[k])
+        after += max(at - HIGH_RAD, 0.0) * exp(-free)
+        if q > 0:
+            total += weights[q - 1] * (after - before) / ((bins[q] - bins[q - 1]) * sigma)
         before = after
-    return np.log(max(total, LEAST_MEAN)) + profiles.free[s]
+    return np.log(max(total, LEAST_MEAN)) + free

@@ -15,7 +15,7 @@ from startrack.localization.importance_sampling import moments
 from startrack.localization.integrity import assess_integrity
 from startrack.localization.search import Explored
 from startrack.localization.summary import camera_at, link_points, require_inside
-from startrack.localization.wrong_files import require_files
+from startrack.localization.wrong_files import require_files, require_map_in_view
 from startrack.terrain import Terrain
 
 AMBIGUOUS_MASS = 0.01
@@ -97,7 +97,7 @@ def label_modes(points_m: Array, share: Array) -> Ints:
 def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, dropped_probability: float) -> Fix:
     """The fix by sampled hypotheses, the heaviest first, in a terrain, after a search.
 
-    A first look is not compared with other explanations, and has no protection level.
+    A first look is not compared with other explanations of what it shows, and has no protection level.
     Raises NotLocated: outside_search_area, insufficient_geometry, inconsistent_evidence.
     """
     whole = Posterior(found, terrain)
@@ -111,6 +111,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
     clear = best.model.states(parameters)[:, 0]
     if not ambiguous and radius95 > USELESS_FRACTION * terrain.search_radius_m:
         raise NotLocated(_useless_text(whole))
+    require_map_in_view(best.model, clear)
     integrity = None
     if not best.model.seen.rows.is_first_look:
         require_files(found, parameters, clear)

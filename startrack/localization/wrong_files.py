@@ -10,11 +10,26 @@ from startrack.core.types import Array, Blocked, NotLocated
 from startrack.localization.free_skyline import free_log_likelihood
 from startrack.localization.hypothesis import GROSS_ROUNDS, Hypothesis, sample_gross_error
 from startrack.localization.shared_errors import SharedErrors
+from startrack.localization.skyline_model import SkylineModel
 
 WRONG_FACT_NATS = 3.0  # by which a gross error of a stated fact must explain the rows better: 1 of 100 clean skies
 MOST_BLOCKED = 0.5  # of the skyline that the rows show: where more is on no map, another place may explain them as well
 WIDE_SHAPE = 0.4  # relative range of a wrong map's steepness: a free skyline is compared with a map of any of them
 FEW_ROUNDS = GROSS_ROUNDS[:1]  # points by which facts are screened: of 34 frames refused with GROSS_ROUNDS it leaves 32
+
+
+def require_map_in_view(model: SkylineModel, clear: Array) -> None:
+    """Raises NotLocated (inconsistent_evidence) where most of the skyline of a `model` is on no map.
+
+    `clear` (SECTORS,) is the probability that the map's skyline shows.
+    """
+    hidden = Blocked(1.0 - clear).whole
+    if np.average(hidden, weights=model.seen.moments.information) > MOST_BLOCKED:
+        raise NotLocated(
+            f"something on no map hides {360.0 * hidden.mean():.0f} degrees of the skyline, or terrain, time or "
+            "camera file are wrong",
+            reason="inconsistent_evidence",
+        )
 
 
 def require_files(found: Sequence[Hypothesis], parameters: Array, clear: Array) -> None:
@@ -26,12 +41,6 @@ def require_files(found: Sequence[Hypothesis], parameters: Array, clear: Array) 
         clear: (SECTORS,) probability that the map's skyline shows.
     """
     wrong, model = Blocked(1.0 - clear), found[0].model
-    if np.average(wrong.whole, weights=model.seen.moments.information) > MOST_BLOCKED:
-        raise NotLocated(
-            f"something on no map hides {360.0 * wrong.whole.mean():.0f} degrees of the skyline, or terrain, time or "
-            "camera file are wrong",
-            reason="inconsistent_evidence",
-        )
     better = free_log_likelihood(model.seen.profiles, model.shift_of(parameters)) - _log_map(found[0], parameters)
     if better > 0.0:
         where = f", most at azimuths {wrong.text}" if wrong else ""

@@ -5,7 +5,13 @@
 Needs the extra `bench`; programs that are not installed are left out. Single-threaded.
 """
 
+# ruff: noqa: E402 - the numbers of threads must be set before the libraries are imported
 from __future__ import annotations
+
+import os
+
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[variable] = "1"
 
 import argparse
 import time

@@ -244,7 +244,7 @@ def test_names_of_the_command_are_those_that_can_be_made():
     assert tuple(ARTEFACTS) == ARTEFACT_NAMES
     assert FULL.skies * FULL.per_sky == FULL.one_sky == 100_000  # as in the thesis
     assert QUICK.per_sky < FULL.per_sky
-    fewer = FULL.limit_ours(700)
+    fewer = FULL.limit_our_positions(700)
     assert (fewer.per_sky, fewer.one_sky) == (FULL.per_sky, FULL.one_sky)
     assert (fewer.ours_per_sky, fewer.bound_per_sky, fewer.deep_per_sky, fewer.ours_one_sky) == (700, 700, 500, 7000)
 

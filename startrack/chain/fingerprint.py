@@ -51,11 +51,11 @@ def job_sha256(image: str, image_sha256: str, facts: dict[str, Any], *others: ob
     flags = {**facts, **files}
     extras = [has_deep_catalog(), path.suffix.lower() in RAW_SUFFIXES and find_spec("rawpy") is not None]
     whole = [__version__, flags, *others, extras, image_sha256, sidecar and sha256_of(sidecar)]
-    whole += _correction_sha256(path, facts)
+    whole += _correction_hashes(path, facts)
     return hashlib.sha256(json.dumps(whole, default=str).encode()).hexdigest()
 
 
-def _correction_sha256(image: Path, facts: dict[str, Any]) -> list[str]:
+def _correction_hashes(image: Path, facts: dict[str, Any]) -> list[str]:
     """Key and SHA-256 of the dark frame and the flat field of an `image`, by flags, else by its sidecar."""
     try:
         sidecar = Sidecar.read(image)

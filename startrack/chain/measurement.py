@@ -21,11 +21,11 @@ from startrack.evidence import (
     filtered_noise_e,
     flux_scale,
     height_above_px,
-    measure_noise,
     measure_response,
     measure_sky_step,
     reliable_azimuths,
     subtract_sky_step,
+    with_noise_of_blocks,
 )  # fmt: skip
 from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
 from startrack.localization import DEFAULT_LOCALIZER, Localizer, clock_at, clock_matters, require_localizer
@@ -53,7 +53,7 @@ def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -
         oriented = add_gaia_stars(oriented, site)
     R, response = R_enu_icrs(site, when), None
     if oriented.damage is not None:
-        oriented = replace(oriented, detections=measure_noise(oriented.detections))
+        oriented = replace(oriented, detections=with_noise_of_blocks(oriented.detections))
     light = _photometry(oriented, terrain, R, settings.evidence, oriented.detections)
     if oriented.catalog_name != shown.catalog_name and not _shows_deep_stars(light, oriented.stars):
         warnings = (*shown.exposure.warnings, NO_DEEP_STARS.format(oriented.catalog_name))

@@ -75,7 +75,10 @@ def _find_images(args: argparse.Namespace) -> tuple[Sequence[Image], Sequence[Im
 def _locate_images(
     found: Sequence[Image], whole: Sequence[Image], out: Path, facts: dict[str, Any], args: argparse.Namespace
 ) -> int:
-    """Locate the images `found` and write the tables of the `whole` folder; the exit code."""
+    """Locate the images `found` and write the tables of the `whole` folder or bag; the exit code.
+
+    A usage error where `out` holds a batch of other images. Raises BadInput, BadOutput.
+    """
     if not args.overwrite and batch.belongs_to_other_images(out, whole):
         args.usage_error(
             f"{out} holds a batch of other images than {args.folder} has now: choose another -D, or replace its "

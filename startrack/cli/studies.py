@@ -131,7 +131,7 @@ def reproduce(args: argparse.Namespace) -> int:
     out, size = make_folder(args.dir), reproduction.FULL if args.full else reproduction.QUICK
     announce_compilation()
     if args.ours is not None:
-        size = size.limit_ours(args.ours)
+        size = size.limit_our_positions(args.ours)
     with reproduction.fix_store(out, jobs=args.jobs or count_cores(), progress=progress, cluster=args.cluster) as store:
         if args.cluster is not None:
             store.connect()

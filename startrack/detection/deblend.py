@@ -115,7 +115,10 @@ def _are_relevant(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: fl
 
 
 def source_signal(offset_px: Array, flux: Array, sigma: float | Array, radius: int) -> Pixels:
-    """Signal (n, s, s) of sources of these fluxes (n,) at offsets (n, 2) from the middle of their stamps."""
+    """Signal (n, s, s) of sources of these fluxes (n,) at offsets (n, 2) [px] from the middle of their stamps.
+
+    s is 2 `radius` + 1, `sigma` [px] that of the PSF; negative fluxes count as 0.
+    """
     px, _ = pixel_profile_single(offset_px[:, 0], sigma, radius)
     py, _ = pixel_profile_single(offset_px[:, 1], sigma, radius)
     py *= np.maximum(flux, 0.0)[:, None].astype(np.float32)
@@ -123,7 +126,7 @@ def source_signal(offset_px: Array, flux: Array, sigma: float | Array, radius: i
 
 
 def paint_sources(fits: PointFits, sigma: float, shape: tuple[int, int]) -> Pixels:
-    """Image (H, W) of the fitted sources, to 5 sigma."""
+    """Image (H, W) of the fitted sources, out to 5 `sigma` [px] of the PSF, in the unit of their fluxes."""
     radius = int(np.ceil(5.0 * sigma))
     side = 2 * radius + 1
     image = np.zeros((shape[0] + 2 * side, shape[1] + 2 * side), dtype=np.float32)

@@ -74,9 +74,10 @@ def log_p_value_bound(distance_px: Array, gate_px: float, predicted: int, densit
 
 
 def expected_false_alarms(tried: int, matched: Ints | int, rays: int, each: float) -> Array:
-    """Expected number of the `tried` hypotheses at which chance makes `matched` of the rays coincide with stars.
+    """Expected number of the `tried` hypotheses at which chance makes `matched` or more rays coincide with stars.
 
-    Here the trials are the `rays` of the detections, without the three of the pattern.
+    `matched` (k,) and the trials are without the three of the pattern, `rays` of all detections with them. `each` is
+    the probability that one ray coincides.
     """
     return tried * binomial_tail(matched, rays - PATTERN_MATCHES, each)
 

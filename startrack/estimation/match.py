@@ -65,15 +65,16 @@ def match_nearest(tree: Any, px: Array, gate_px: float) -> tuple[Ints, Ints, Arr
     return detection[star].astype(np.int64), star, distance[star]
 
 
-def match_mutual(xy_px: Array, px: Array, gate_px: float) -> tuple[Ints, Ints]:
-    """(detection, star) that are each other's nearest within the gate, sorted by star.
+def match_mutual(xy_px: Array, star_px: Array, gate_px: float) -> tuple[Ints, Ints]:
+    """Indices (k,), (k,) of detections `xy_px` (n, 2) and stars `star_px` (m, 2), each other's nearest within the gate.
 
+    Sorted by star.
     Stricter than `match_nearest`: a detection whose nearest star belongs to another detection stays unmatched.
     """
     from scipy.spatial import cKDTree
 
-    distance, detection = cKDTree(xy_px).query(px, distance_upper_bound=gate_px)
-    _, back = cKDTree(px).query(xy_px, distance_upper_bound=gate_px)
+    distance, detection = cKDTree(xy_px).query(star_px, distance_upper_bound=gate_px)
+    _, back = cKDTree(star_px).query(xy_px, distance_upper_bound=gate_px)
     star = np.flatnonzero(np.isfinite(distance))
     star = star[back[detection[star]] == star]
     return detection[star].astype(np.int64), star

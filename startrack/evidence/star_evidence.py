@@ -206,8 +206,11 @@ class DamagedResponse:
         )  # fmt: skip
 
 
-def measure_noise(detections: Detections) -> Detections:
-    """The `detections` with a noise of the pixels that holds for clipped values too: their spread in blocks."""
+def with_noise_of_blocks(detections: Detections) -> Detections:
+    """The `detections` with noise (H, W) [e] that holds for clipped values too: the spread in blocks.
+
+    The largest values of each block are left out.
+    """
     image, side = detections.image_e - detections.background_e, NOISE_BLOCK_PX
     height, width = image.shape
     padded = np.pad(image, ((0, -height % side), (0, -width % side)), mode="reflect")

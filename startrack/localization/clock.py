@@ -80,7 +80,7 @@ class Track:
         Raises NotLocated (outside_search_area, insufficient_geometry).
         """
         found: list[tuple[float, float, Array]] = []
-        for later_s, position_m in self._seeds():
+        for later_s, position_m in self._likely_times():
             if all(abs(later_s - other_s) > 0.5 * self.step_s for other_s, _, _ in found):
                 found.append(self._settle_time(later_s, position_m))
         later, share, position = zip(*found, strict=True)
@@ -98,8 +98,11 @@ class Track:
         """Between two times."""
         return float(TIME_STEP_RAD / np.linalg.norm(self.clock.turn_rad_s))
 
-    def _seeds(self) -> list[tuple[float, Array]]:
-        """Likely times [s later], the best first, each with a position (2,)."""
+    def _likely_times(self) -> list[tuple[float, Array]]:
+        """Likely times [s later], the best first, each with a position (2,) [m, enu].
+
+        Raises NotLocated (insufficient_geometry, outside_search_area).
+        """
         low, high = self.limits_s
         times = np.linspace(low, high, 2 * int(np.ceil(0.5 * (high - low) / self.step_s)) + 1)
         if len(times) > MOST_SCANNED:

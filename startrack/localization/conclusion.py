@@ -123,7 +123,8 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
         modes=modes, ambiguous=ambiguous, dropped_probability=dropped_probability, search=explored.search,
         horizon_error_rad=_mean_error(best, "bias_rad"), clock=_clock(whole), blocked=blocked if blocked else None,
         integrity=integrity, unstated=_unstated_facts(whole), raised_rad=best.model.rise_rad(parameters),
-        at_time_m=parameters[:2], shown=_shown_errors(best), samples=_support(whole, explored, dropped_probability),
+        at_time_m=parameters[:2], shown=_shown_errors(best),
+        samples=_restart_points(whole, explored, dropped_probability),
     )  # fmt: skip
 
 
@@ -223,8 +224,11 @@ def _shown_errors(best: Hypothesis) -> tuple[ShownError, ...]:
     )
 
 
-def _support(whole: Posterior, explored: Explored, dropped_probability: float) -> Explored:
-    """Where a later search of the same image begins: points of the posterior without errors of the clock."""
+def _restart_points(whole: Posterior, explored: Explored, dropped_probability: float) -> Explored:
+    """The SUPPORT likeliest points (n, 2) [m, enu] of the best hypothesis, where a later search of the image begins.
+
+    They are those before the error of the clock moves them.
+    """
     one = whole.best
     order = np.argsort(-one.found.log_weight)[:SUPPORT]
     points, log = one.found.points[order, :2], one.found.log_weight[order]

@@ -199,7 +199,7 @@ def _skyline(measured: Measured) -> Array:
 
 
 def _doubtful_facts(measured: Measured) -> Iterator[str]:
-    """The facts of which one is wrong, where they contradict the image."""
+    """A line of text for each fact that may be wrong where they contradict the image, with what would mend it."""
     sigma = f"stated to {duration(measured.clock.sigma_s)}"
     if measured.clock.gross_probability > 0.0:
         sigma = "nobody states its error"

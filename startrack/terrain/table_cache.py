@@ -146,7 +146,8 @@ def build_table(ground: TracedMap, progress: Progress | None = None) -> HorizonT
     cells = np.flatnonzero(np.hypot(*centres.T) < square.reach_m + 1.42 * square.half_m)
     done = 0
 
-    def trace(part: Ints) -> int:
+    def trace_cells(part: Ints) -> int:
+        """Trace cells (k,) and write their fields to `values`; how many they are."""
         found = np.empty((len(part), AZIMUTH_BINS, FIELDS))
         fill_cells(packed, centres[part], square.half_m, height_m, sines, cosines, half_turn, found)
         values[part] = quantize_fields(found)
@@ -154,7 +155,7 @@ def build_table(ground: TracedMap, progress: Progress | None = None) -> HorizonT
 
     pool = ThreadPoolExecutor(count_cores())
     try:
-        for count in pool.map(trace, np.array_split(cells, max(1, len(cells) // 64))):
+        for count in pool.map(trace_cells, np.array_split(cells, max(1, len(cells) // 64))):
             done += count
             if progress is not None:
                 progress(done, len(cells))

@@ -129,7 +129,10 @@ def _parquet(records: Sequence[Record]) -> bytes:
 
 
 def _trajectories(records: Sequence[Record]) -> dict[str, list[str]]:
-    """File name to poses (body to enu, TUM) in the order of time: one file a terrain, whose origin is that of enu."""
+    """File name to TUM lines (Unix seconds; m; body to enu) of the solved images with a time, in its order.
+
+    One file a terrain, whose origin is that of enu.
+    """
     poses: dict[tuple[str, ...], list[str]] = {}
     for record in records:
         if record["status"] == "ok" and record["provenance"]["time_utc"] is not None:

@@ -46,7 +46,7 @@ class Size:
     sweep_per_sky: int
     traverses: int
 
-    def limit_ours(self, most: int) -> Size:
+    def limit_our_positions(self, most: int) -> Size:
         """This size with our method on at most `most` positions per starfield, ten times as many in figure 3.10."""
         per_sky = {name: min(getattr(self, name), most) for name in ("ours_per_sky", "bound_per_sky", "deep_per_sky")}
         return replace(self, **per_sky, ours_one_sky=min(self.ours_one_sky, 10 * most))

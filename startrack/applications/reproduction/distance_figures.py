@@ -54,7 +54,7 @@ def fig3_7(context: Context) -> Artefact:
 
 
 def fig3_9(context: Context) -> Artefact:
-    """Distance between changes against the crater's aspect ratio."""
+    """Figure 3.9: distance [m] between changes of the visible stars, against the crater's diameter over its depth."""
     curves = np.array([_gaps(context, MAGNITUDE, ratio) for ratio in ASPECT_RATIOS])
     ten, widest = (_gaps(context, MAGNITUDE, ratio).mean(axis=0) for ratio in (ASPECT_RATIO, 50.0))
     detail = (

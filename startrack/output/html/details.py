@@ -114,7 +114,8 @@ def sectors_of(stars: MeasuredStars, horizon: Horizon) -> dict[str, Any] | None:
         chosen = near & side & (stars.status == status)
         return [int(number) for number in np.bincount(sector[chosen], minlength=PAGE_SECTORS)]
 
-    def total(chosen: Bools) -> list[float]:
+    def sum_evidence(chosen: Bools) -> list[float]:
+        """Sums of |evidence| [nats] of the `chosen` (n,) near stars, one a sector (PAGE_SECTORS,)."""
         chosen = near & chosen
         weights = np.abs(stars.llr[chosen])
         return round_values(np.bincount(sector[chosen], weights=weights, minlength=PAGE_SECTORS))
@@ -125,8 +126,8 @@ def sectors_of(stars: MeasuredStars, horizon: Horizon) -> dict[str, Any] | None:
         "contradicted_nats": CONTRADICTED_NATS,
         "above": {status: count(above, status) for status in ("seen", "hidden")},
         "below": {status: count(~above, status) for status in ("seen", "hidden")},
-        "supports": total(agrees),
-        "opposes": total(~agrees),
+        "supports": sum_evidence(agrees),
+        "opposes": sum_evidence(~agrees),
         "nats": round_values(_nats_by_sector(stars.azimuth_rad[sure], above_rad[sure], stars.llr[sure])),
     }
 

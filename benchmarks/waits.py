@@ -139,7 +139,8 @@ def height_map_frame() -> Path:
     """A frame of the floor of Shackleton, rendered once."""
     folder = Path(tempfile.mkdtemp())
     atexit.register(shutil.rmtree, folder)
-    command = [sys.executable, "-m", "startrack", "render", "-t", "shackleton", "--seed", "3", "-D", str(folder)]
+    at = ("--east", "1500", "--north", "-2500", "-D", str(folder))
+    command = [sys.executable, "-m", "startrack", "render", "-t", "shackleton", "--seed", "3", *at]
     subprocess.run(command, cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True, capture_output=True)
     return next(folder.glob("*.png"))
 

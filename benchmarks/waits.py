@@ -1,15 +1,16 @@
-"""What a person waits for: this code and that of another commit in turn, in one run; the median of each.
+"""What a person waits for: this code, that of another commit and peers in turn, in one run; the median of each.
 
     python benchmarks/waits.py [--against COMMIT] [--runs N] [--only WORD ...]
 
 One function a row. A process gets the code by PYTHONPATH; the other commit's is a git worktree. Seconds are wall time,
-in brackets CPU time. Ratios count, on free cores: a machine at work stretches both.
+in brackets CPU time; milliseconds are CPU time. Ratios count, on free cores: a machine at work stretches both.
 """
 
 from __future__ import annotations
 
 import argparse
 import atexit
+import math
 import os
 import re
 import resource
@@ -33,16 +34,22 @@ ROOT = Path(__file__).parent.parent
 SAMPLE = ROOT / "sample_images/near-wall.png"
 BASELINE = "374b11e"
 REFUSED = 3  # the exit code
-Seconds = tuple[float, float]  # wall and CPU
+PEERS = ("sep", "tetra3rs", "ruststartracker")
+Cost = tuple[float, ...]  # one number, or wall and CPU time
 
 
 @dataclass(frozen=True)
 class Row:
-    """A wait: `measure` takes the folder of a code and gives its cost; `runs`: how often, None for as asked."""
+    """A wait: `measure` takes the folder of a code and gives its cost in `unit`, NaN where that code cannot do it.
+
+    `peer` gives the cost of another program on the same input; `runs`: how often, None for as asked.
+    """
 
     name: str
     wanted: str
-    measure: Callable[[Path], Seconds | float]
+    measure: Callable[[Path], Cost]
+    unit: str = "s"
+    peer: Callable[[], Cost] | None = None
     runs: int | None = None
 
 
@@ -51,38 +58,41 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--against", default=BASELINE, metavar="COMMIT")
     parser.add_argument("--runs", type=int, default=9)
-    parser.add_argument("--only", nargs="+", default=[""], metavar="WORD", help="rows with one of these words")
+    parser.add_argument(
+        "--only", nargs="+", default=[""], metavar="WORD", help="rows with one of these words; not stored"
+    )
     args = parser.parse_args()
     rows = []
     with worktree(args.against) as before:
         for row in (row for row in ROWS if any(word in row.name for word in args.only)):
             rows.append(cells(row, before, row.runs or args.runs))
             print(*rows[-1], sep="  ", flush=True)
-    columns = ["what", args.against, "this", "this / that", "wanted"]
-    command = f"python benchmarks/waits.py --against {args.against} --runs {args.runs}"
-    write_section("Waits", command, ("numpy", "numba"), table(columns, rows))
+    if args.only == [""]:
+        columns = ["what", args.against, "this", "this / that", "peer", "this / peer", "wanted"]
+        command = f"python benchmarks/waits.py --against {args.against} --runs {args.runs}"
+        write_section("Waits", command, ("numpy", "numba", *PEERS), table(columns, rows))
 
 
 def cells(row: Row, before: Path, runs: int) -> list[str]:
-    """The cells of a row from `runs` pairs: the code in the folder `before`, then this one."""
-    pairs = [(row.measure(before), row.measure(ROOT)) for _ in range(runs)]
-    old, new = (middle([pair[k] for pair in pairs]) for k in range(2))
-    return [row.name, shown(old), shown(new), f"{first(new) / first(old):.2f}", row.wanted]
+    """The cells of a row from `runs` rounds: the code in the folder `before`, this one, the peer."""
+    sides = (lambda: row.measure(before), lambda: row.measure(ROOT), row.peer or (lambda: (math.nan,)))
+    rounds = [[side() for side in sides] for _ in range(runs)]
+    old, new, peer = (
+        tuple(statistics.median(part) for part in zip(*costs, strict=True)) for costs in zip(*rounds, strict=True)
+    )
+    to_old, to_peer = (shown(new[0] / other[0], ".2f") for other in (old, peer))
+    before_cell, cell, peer_cell = (in_unit(cost, row.unit) for cost in (old, new, peer))
+    return [row.name, before_cell, cell, to_old, peer_cell, to_peer, row.wanted]
 
 
-def middle(costs: list[Seconds | float]) -> Seconds | float:
-    """The median of costs, or of each of their two parts."""
-    if isinstance(costs[0], tuple):
-        return tuple(statistics.median(part) for part in zip(*costs, strict=True))
-    return statistics.median(costs)
+def in_unit(cost: Cost, unit: str) -> str:
+    """A cost with its unit, CPU time in brackets; "-" where there is none."""
+    number, *cpu = (shown(part, {"s": ".2f", "ms": ".3g"}.get(unit, ".0f")) for part in cost)
+    return "-" if number == "-" else f"{number} {unit}" + "".join(f" ({part})" for part in cpu)
 
 
-def first(cost: Seconds | float) -> float:
-    return cost[0] if isinstance(cost, tuple) else cost
-
-
-def shown(cost: Seconds | float) -> str:
-    return f"{cost[0]:.2f} s ({cost[1]:.2f})" if isinstance(cost, tuple) else f"{cost:.0f} MB"
+def shown(number: float, digits: str) -> str:
+    return "-" if math.isnan(number) else format(number, digits)
 
 
 @contextmanager
@@ -97,7 +107,7 @@ def worktree(commit: str) -> Iterator[Path]:
             subprocess.run(["git", "-C", ROOT, "worktree", "remove", "--force", path], check=True)
 
 
-def process(code: Path, *words: str, **variables: str) -> Seconds:
+def process(code: Path, *words: str, **variables: str) -> Cost:
     """Wall and CPU time of `startrack` with the arguments `words`, by the code in a folder."""
     inherited = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     with tempfile.TemporaryDirectory() as folder:
@@ -107,6 +117,14 @@ def process(code: Path, *words: str, **variables: str) -> Seconds:
         if done.returncode not in (0, REFUSED):
             done.check_returncode()
         return time.perf_counter() - start, cpu_s() - before
+
+
+def in_process(name: str, code: Path = ROOT) -> Cost:
+    """What the function `name` of `_waited.py` prints last, in a process with the code in a folder; NaN if it fails."""
+    command = [sys.executable, ROOT / "benchmarks/_waited.py", name]
+    variables = os.environ | {"PYTHONPATH": str(code), "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(command, env=variables, check=False, capture_output=True, text=True)
+    return (float(done.stdout.split()[-1]) if done.returncode == 0 else math.nan,)
 
 
 def cpu_s() -> float:
@@ -121,13 +139,13 @@ def warm_up(code: Path, image: Path, *flags: str) -> None:
     process(code, "locate", str(image), "-q", *flags)
 
 
-def located(code: Path, *flags: str, image: Callable[[], Path] = lambda: SAMPLE) -> Seconds:
+def located(code: Path, *flags: str, image: Callable[[], Path] = lambda: SAMPLE) -> Cost:
     """The whole command, warm."""
     warm_up(code, image(), *flags)
     return process(code, "locate", str(image()), "-q", *flags)
 
 
-def first_use(code: Path, image: Callable[[], Path]) -> Seconds:
+def first_use(code: Path, image: Callable[[], Path]) -> Cost:
     """The whole command with nothing compiled; tables of the terrain are there."""
     warm_up(code, image())
     with tempfile.TemporaryDirectory() as folder:
@@ -145,12 +163,12 @@ def height_map_frame() -> Path:
     return next(folder.glob("*.png"))
 
 
-def on_floor(code: Path, *flags: str) -> Seconds:
+def on_floor(code: Path, *flags: str) -> Cost:
     """The whole command without pictures for a frame of the floor of Shackleton, warm."""
     return located(code, "--no-plots", *flags, image=height_map_frame)
 
 
-def core_mb(code: Path) -> float:
+def core_mb(code: Path) -> Cost:
     """Files of the packages that the core requires, with theirs, as they are installed here [MB]."""
     project = tomllib.loads((code / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     found, coming = dict[str, int](), list(project["dependencies"])
@@ -164,7 +182,7 @@ def core_mb(code: Path) -> float:
             files = [Path(str(file.locate())) for file in package.files or []]
             found[name] = sum(file.stat().st_size for file in files if file.is_file())
             coming += [one for one in package.requires or [] if "extra ==" not in one]
-    return sum(found.values()) / 1e6
+    return (sum(found.values()) / 1e6,)
 
 
 ROWS = (
@@ -175,9 +193,12 @@ ROWS = (
         "the same, with a clock right to an hour", "<= 3 s", lambda code: on_floor(code, "--time-sigma", "3600"), runs=3
     ),
     Row("the same on Faustini's map, until refused", "<= 8 s", lambda code: on_floor(code, "-t", "faustini"), runs=3),
+    Row(
+        "read to fix; sep", "<= 1 peer", partial(in_process, "read_to_fix"), "ms", partial(in_process, "sep_winpos"), 3
+    ),
     Row("first use, cylinder: compilation", "<= 10 s", partial(first_use, image=lambda: SAMPLE), runs=1),
     Row("first use, height map: compilation", "<= 20 s", partial(first_use, image=height_map_frame), runs=1),
-    Row("packages of the core", "<= 760 MB", core_mb, runs=1),
+    Row("packages of the core", "<= 760 MB", core_mb, "MB", runs=1),
 )
 
 if __name__ == "__main__":

@@ -113,5 +113,5 @@ def test_texts_with_commas_quotes_and_letters_from_afar(tmp_path):
     assert table["number"].filled(-1).tolist() == [1, -1, 3, -1, 5]
     assert table["yes"].tolist() == [True, False, True, True, False]
     assert table["text"].description == "it's a text"
-    with pytest.raises(ValueError, match="shorter"):
+    with pytest.raises(ValueError, match="different lengths"):
         ecsv_text([*columns, Column("short", [1.0])])

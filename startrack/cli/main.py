@@ -18,6 +18,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: a second thread waits for work, 0.2 s a start
+
 from startrack import __version__
 from startrack.cli.console import discard_stdout, print_advice
 from startrack.cli.flags import Command

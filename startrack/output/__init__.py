@@ -49,7 +49,6 @@ from startrack.output.record import (
 from startrack.output.schema import SCHEMAS
 from startrack.output.tables import (
     ecsv_text,
-    format_values,
     quantity_columns,
     skyline_table_text,
     skyline_texts_deg,
@@ -77,7 +76,7 @@ __all__ = [
     "SKYLINE_FILES", "TEXT_PX", "TITLE_PX", "Axes", "Box", "Canvas", "Colour", "Column", "Found", "Ink", "Kind",
     "Legend", "Map", "Quantity", "R_body_enu", "Rows", "Schema", "annotate", "boresight_rad", "box_around",
     "comparison_picture", "detection_dict", "draw_overview", "ecsv_text", "ellipse_m", "explain", "feature",
-    "file_schema", "fill_frame", "format_values", "geojson_text", "ground_map", "horizon_picture",
+    "file_schema", "fill_frame", "geojson_text", "ground_map", "horizon_picture",
     "identification_dict", "json_text", "lens_text", "list_schema", "markdown_table", "mix_colours", "nice_step",
     "object_schema", "or_null", "page_text", "path_picture", "png_bytes", "prediction_picture", "prepare_folder",
     "quantity_columns", "record_from", "record_of", "refusal_line", "refused_dict", "relief_picture",

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from startrack.catalog import star_names
 from startrack.chain import Inputs, Measured, Oriented
+from startrack.core.table_text import column_lines, join_columns
 from startrack.core.types import Array, Ints, MeasuredSkyline
 from startrack.evidence import SEEN_LLR
 from startrack.output.quantity import Column, Quantity
@@ -24,22 +25,29 @@ if TYPE_CHECKING:
 
 STAR_STATUSES = ("seen", "hidden", "uncertain", "unusable")
 FAINTER_THAN_FAINTEST_MATCH_MAG = 0.5
-QUOTE = '"'
 LEAST_HALF_RAD, MOST_HALF_RAD = np.radians(0.02), np.radians(5.0)
 
 
 def ecsv_text(columns: Sequence[Column]) -> str:
-    """The table as ECSV. All columns have the same length; texts must be free of line breaks."""
-    head, fields = ["# %ECSV 1.0", "# ---", "# delimiter: ','", "# datatype:"], []
+    """The table as ECSV. Texts must be free of line breaks. Raises ValueError for columns of different lengths."""
+    head, bodies, lengths = ["# %ECSV 1.0", "# ---", "# delimiter: ','", "# datatype:"], [], set()
     for one in columns:
         unit, description = f"unit: {one.unit}, " if one.unit else "", one.description.replace("'", "''")
         head.append(f"# - {{name: '{one.name}', {unit}datatype: {one.datatype}, description: '{description}'}}")
-        texts = format_values(one.form, one.values)
-        if one.datatype == "string":  # quoted where a text holds a comma or a quote
-            texts = [f'"{text.replace(QUOTE, 2 * QUOTE)}"' if "," in text or QUOTE in text else text for text in texts]
-        fields.append(texts)
+        lines = column_lines(one.form, one.values)
+        if one.datatype == "string" and (b"," in lines or b'"' in lines):
+            lines = b"\n".join([_quoted(line) for line in lines.split(b"\n")])
+        bodies.append(lines)
+        lengths.add(lines.count(b"\n"))
+    if len(lengths) > 1:
+        raise ValueError(f"columns of different lengths: {sorted(lengths)}")
     head += ["# schema: astropy-2.0", ",".join(column.name for column in columns)]
-    return "\n".join([*head, *map(",".join, zip(*fields, strict=True))]) + "\n"
+    return "\n".join([*head, join_columns(bodies).decode()])
+
+
+def _quoted(text: bytes) -> bytes:
+    """A text in quotes if it holds a comma or a quote."""
+    return b'"%b"' % text.replace(b'"', b'""') if b"," in text or b'"' in text else text
 
 
 def quantity_columns(quantities: Iterable[Quantity], values: Mapping[str, Iterable[Any]]) -> list[Column]:
@@ -50,18 +58,6 @@ def quantity_columns(quantities: Iterable[Quantity], values: Mapping[str, Iterab
         for one in quantity.table_columns
         if one.name in values
     ]
-
-
-def format_values(form: str, values: Iterable[Any]) -> list[str]:
-    """The `values` as texts in the %-format `form`; empty for None and nan."""
-    if not isinstance(values, np.ndarray):
-        return ["" if value is None or value != value else form % value for value in values]
-    absent = np.flatnonzero(values != values)
-    texts = "\n".join([form] * len(values)) % tuple(values.tolist())  # in one piece: in two thirds of the time
-    found = texts.split("\n") if len(values) else []
-    for k in absent:
-        found[k] = ""
-    return found
 
 
 def star_table_text(value: Inputs) -> str:
@@ -159,4 +155,5 @@ def skyline_texts_deg(skyline: MeasuredSkyline) -> tuple[list[str], list[str], l
         np.where(skyline.known, np.degrees(values), np.nan) for values in (skyline.elevation_rad, skyline.sigma_rad)
     )
     azimuth = [f"{value:g}" for value in np.round(np.degrees(skyline.azimuth_rad), 6)]
-    return azimuth, format_values("%.4f", elevation.tolist()), format_values("%.4f", sigma.tolist())
+    elevations, sigmas = (column_lines("%.4f", values).decode().split("\n")[:-1] for values in (elevation, sigma))
+    return azimuth, elevations, sigmas

@@ -118,14 +118,14 @@ class Camera:
         by_ray = _polar_by_ray(slope * z, ratio, slope * s, ux, uy)
         if self.decentring:  # d (s, t): as for rho, with rho = a
             ratio = np.divide(angle, s, out=np.ones_like(s), where=off_axis)
-            gradient = self.decentring.gradient(np.stack([angle * ux, angle * uy], axis=-1))
-            by_ray = by_ray + gradient @ _polar_by_ray(z, ratio, s, ux, uy)
-        zero = np.zeros_like(x)
-        by_rotation = np.stack(
-            [np.stack([zero, z, -y], axis=-1), np.stack([-z, zero, x], axis=-1), np.stack([y, -x, zero], axis=-1)],
-            axis=-2,
-        )
-        return (by_ray @ by_rotation) * np.array(self.handed_focal_px)[:, None]
+            gradient = np.moveaxis(self.decentring.gradient(np.stack([angle * ux, angle * uy], axis=-1)), -1, 0)
+            of_angles = _polar_by_ray(z, ratio, s, ux, uy)
+            by_ray = by_ray + sum(np.moveaxis(gradient[k], -1, 0)[:, None] * of_angles[k] for k in (0, 1))
+        by_rotation = np.empty_like(by_ray)  # by_ray x ray
+        for row, by_one, focal_px in zip(by_rotation, by_ray, self.handed_focal_px, strict=True):
+            dx, dy, dz = focal_px * by_one
+            row[0], row[1], row[2] = dz * y - dy * z, dx * z - dz * x, dy * x - dx * y
+        return np.moveaxis(by_rotation, (0, 1), (-2, -1))
 
     def pixel_solid_angle_sr(self, angle_rad: Array) -> Array:
         """Solid angle [sr] of one pixel at the angles a = `angle_rad` off the axis, any shape.
@@ -150,14 +150,12 @@ class Camera:
 
 
 def _polar_by_ray(along: Array, across: Array, down: Array, ux: Array, uy: Array) -> Array:
-    """d (r u) / d ray (..., 2, 3), u = (ux, uy) the direction off the axis: across u it changes by `across`."""
-    return np.stack(
-        [
-            np.stack([along * ux * ux + across * uy * uy, (along - across) * ux * uy, -down * ux], axis=-1),
-            np.stack([(along - across) * ux * uy, along * uy * uy + across * ux * ux, -down * uy], axis=-1),
-        ],
-        axis=-2,
-    )
+    """d (r u) / d ray (2, 3, ...), u = (ux, uy) the direction off the axis: across u it changes by `across`."""
+    mixed = (along - across) * ux * uy
+    return np.array([
+        [along * ux * ux + across * uy * uy, mixed, -down * ux],
+        [mixed, along * uy * uy + across * ux * ux, -down * uy],
+    ])  # fmt: skip
 
 
 def lens_jacobian(camera: Camera, rays_cam: Array, order: tuple[str, ...]) -> Array:
@@ -167,28 +165,30 @@ def lens_jacobian(camera: Camera, rays_cam: Array, order: tuple[str, ...]) -> Ar
     decentring [px per px, or px per 1]. Raises ValueError for a name that the lens does not have.
     """
     rays_cam = np.asarray(rays_cam, dtype=np.float64)
-    x, y, z = rays_cam[..., 0], rays_cam[..., 1], rays_cam[..., 2]
-    off_axis = np.hypot(x, y)
-    angle = np.arctan2(off_axis, z)
-    u = np.stack([np.divide(c, off_axis, out=np.zeros_like(c), where=off_axis > 0) for c in (x, y)], axis=-1)
-    st = angle[..., None] * u
-    uv = camera.lens.rho(angle)[..., None] * u + camera.decentring.shift(st)  # image point [focal lengths]
-    handed_px = np.array(camera.handed_focal_px)
-    sign = np.array([-1.0 if camera.mirrored else 1.0, 1.0])
-    x_only, y_only = np.array([1.0, 0.0]), np.array([0.0, 1.0])
-
-    def column(name: str) -> Array:
-        if name == "f":
-            return uv * sign * [1.0, camera.focal_px[1] / camera.focal_px[0]]
-        if name in ("fx", "fy"):
-            return uv * sign * (x_only if name == "fx" else y_only)
-        if name in ("cx", "cy"):
-            return np.broadcast_to(x_only if name == "cx" else y_only, uv.shape)
+    off_axis = np.hypot(rays_cam[..., 0], rays_cam[..., 1])
+    angle = np.arctan2(off_axis, rays_cam[..., 2])
+    per_off_axis = np.divide(1.0, off_axis, out=np.zeros_like(off_axis), where=off_axis > 0)
+    u = rays_cam[..., 0] * per_off_axis, rays_cam[..., 1] * per_off_axis
+    st = np.stack([angle * u[0], angle * u[1]], axis=-1)
+    rho, shift = camera.lens.rho(angle), camera.decentring.shift(st)
+    uv = rho * u[0] + shift[..., 0], rho * u[1] + shift[..., 1]  # image point [focal lengths]
+    handed_px, sign, (fx, fy) = camera.handed_focal_px, -1.0 if camera.mirrored else 1.0, camera.focal_px
+    by_name = {
+        "f": (sign * uv[0], fy / fx * uv[1]), "fx": (sign * uv[0], 0.0), "fy": (0.0, uv[1]), "cx": (1.0, 0.0),
+        "cy": (0.0, 1.0),
+    }  # fmt: skip
+    jacobian = np.empty((len(order), 2, *angle.shape))
+    for column, name in zip(jacobian, order, strict=True):
+        if name in by_name:
+            column[0], column[1] = by_name[name]
+            continue
         if name in ("p1", "p2"):
-            return handed_px * Decentring(float(name == "p1"), float(name == "p2")).shift(st)
-        return handed_px * camera.lens.derivative(name, angle)[..., None] * u
-
-    return np.stack([column(name) for name in order], axis=-1)
+            du, dv = np.moveaxis(Decentring(float(name == "p1"), float(name == "p2")).shift(st), -1, 0)
+        else:
+            radial = camera.lens.derivative(name, angle)
+            du, dv = radial * u[0], radial * u[1]
+        column[0], column[1] = handed_px[0] * du, handed_px[1] * dv
+    return np.moveaxis(jacobian, (0, 1), (-1, -2))
 
 
 def cap_grid(angle_rad: float, points: int = CAP_POINTS) -> Array:

@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -44,6 +44,15 @@ Result = TypeVar("Result")
 def count_cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def map_in_threads(work: Callable[..., Result], *tasks: Iterable[Any]) -> Iterator[Result]:
+    """The results of `work` for the `tasks`, as of `map`, by a thread a core; the first exception is raised.
+
+    For work on arrays, which numpy, OpenCV and the compiled kernels do beside other threads.
+    """
+    with ThreadPoolExecutor(count_cores()) as pool:
+        yield from pool.map(work, *tasks)
 
 
 class RunStopped(Exception):

@@ -241,10 +241,8 @@ def inverse_covariance(covariance_px2: Array, extra_px2: float) -> Array:
     """Inverses (n, 2, 2) of the covariances (n, 2, 2) with a variance per axis added."""
     xx, yy, xy = covariance_px2[:, 0, 0] + extra_px2, covariance_px2[:, 1, 1] + extra_px2, covariance_px2[:, 0, 1]
     by_determinant = 1.0 / (xx * yy - xy * xy)
-    inverse = np.empty((len(xx), 2, 2))
-    inverse[:, 0, 0], inverse[:, 1, 1] = yy * by_determinant, xx * by_determinant
-    inverse[:, 0, 1] = inverse[:, 1, 0] = -xy * by_determinant
-    return inverse
+    mixed = -xy * by_determinant
+    return np.array([[yy * by_determinant, mixed], [mixed, xx * by_determinant]]).transpose(2, 0, 1)
 
 
 def chi_square(residual_px: Array, inverse: Array) -> Array:

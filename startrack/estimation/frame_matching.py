@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from datetime import datetime
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.catalog import Sky, StarCatalog, sky_at
+from startrack.core.runner import map_in_threads
 from startrack.core.types import Array, BadInput, Bools, Centroids, Exposure, Ints
 from startrack.estimation.false_alarm import CELLS_ACROSS
 from startrack.estimation.match import DEPTH_BELOW_THRESHOLD_MAG, instrumental_mag, is_isolated, match_by_brightness
@@ -132,6 +133,17 @@ def match_frame(frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: flo
         significant_matched=int(np.count_nonzero(significant[detection])),
         bright=BrightStars(bright, px[bright], np.isin(bright, star)),
     )
+
+
+def match_frames(
+    frames: Sequence[Frame], camera: Camera, R_cam_icrs: Array, within_rad: float, gate_px: float
+) -> tuple[FrameMatches, ...]:
+    """`match_frame` for each of the `frames` with its attitude of `R_cam_icrs` (frames, 3, 3)."""
+
+    def match(frame: Frame, R: Array) -> FrameMatches:
+        return match_frame(frame, camera, R, within_rad, gate_px)
+
+    return tuple(map_in_threads(match, frames, R_cam_icrs))
 
 
 def predict_pixels(

@@ -8,7 +8,7 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.core.types import Array, Ints, NotIdentified
-from startrack.estimation.frame_matching import Frame, FrameMatches, match_frame
+from startrack.estimation.frame_matching import Frame, FrameMatches, match_frame, match_frames
 from startrack.estimation.lens_fit import MIN_LENS_STARS, WIDEST_GAP_RAD, LensFit, fit_lens
 from startrack.estimation.normal_equations import Observations, observations
 from startrack.frames import off_axis_rad
@@ -78,9 +78,7 @@ def fit_frames(frames: tuple[Frame, ...], camera: Camera, R_cam_icrs: Array) -> 
         first = k < len(gates_px)
         gate_px = gates_px[k] if first else gate_px
         within = camera.calibrated_angle_rad + RING_RAD
-        matches = tuple(
-            match_frame(frame, camera, R, within, gate_px) for frame, R in zip(frames, R_cam_icrs, strict=True)
-        )
+        matches = match_frames(frames, camera, R_cam_icrs, within, gate_px)
         points = _points(frames, [(matched.detection, matched.star) for matched in matches])
         fit = _fit_points(points, camera, R_cam_icrs, _coefficients(within) if first else None)
         camera, R_cam_icrs = fit.camera, fit.R_cam_icrs

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import repeat
 
 import numpy as np
 
 from startrack.camera import Camera, Decentring, Lens, default_lens, lens_kinds
+from startrack.core.runner import map_in_threads
 from startrack.core.types import Array, Ints
 from startrack.estimation.adjust import SQUARES, CameraState, Scheme, Solution, adjust
 from startrack.estimation.normal_equations import Observations
@@ -136,11 +138,12 @@ def best_model(
         ]
     else:
         models = [LensModel(lens=default_lens(), size=default_lens().fit_size(coefficients))]
-    fitted = [fit(model, state) for model in models]
+    fitted = list(map_in_threads(fit, models, repeat(state)))
     chosen = _choose_longest(fitted, outermost)
     for _ in range(0 if square else 2):
-        wider = replace(chosen.model, aspect=True), replace(chosen.model, decentred=True)
-        more = [fit(model, chosen.solution.state) for model in wider if model != chosen.model]
+        base = chosen.model
+        wider = [one for one in (replace(base, aspect=True), replace(base, decentred=True)) if one != base]
+        more = list(map_in_threads(fit, wider, repeat(chosen.solution.state)))
         fitted += more
         better = min(more, key=lambda f: f.score.held_out_chi2, default=chosen)
         if better.score.held_out_chi2 > chosen.score.held_out_chi2 - EXTENSION_CHI2:

@@ -90,8 +90,9 @@ def match_by_brightness(
     (m,) and `detection_mag` (d,) are on one scale. Stars fainter than `limit_mag` are not matched. A saturated
     detection may be fainter than its star by any amount.
     """
+    star = star[star_mag[star] < limit_mag]
     distance, nearest = tree.query(px[star], distance_upper_bound=gate_px)
-    hit = np.isfinite(distance) & (star_mag[star] < limit_mag)
+    hit = np.isfinite(distance)
     star, detection, distance = star[hit], nearest[hit], distance[hit]
     fainter = star_mag[star] - detection_mag[detection]
     agree = np.abs(fainter) < np.hypot(tolerance_mag, 2.0 * star_sigma_mag[star])
@@ -110,14 +111,13 @@ def is_isolated(
     """
     from scipy.spatial import cKDTree
 
+    alone = np.ones(len(star), dtype=bool)
     if not len(star):
-        return np.zeros(0, dtype=bool)
-    near = cKDTree(px[seen]).query_ball_point(at_px, radius_px)
-    limit = mag[star] + blend_mag
-    return np.array([
-        not any(seen[j] != own and mag[seen[j]] < faintest for j in others)
-        for others, own, faintest in zip(near, star, limit, strict=True)
-    ])  # fmt: skip
+        return alone
+    near = cKDTree(at_px).sparse_distance_matrix(cKDTree(px[seen]), radius_px, output_type="ndarray")
+    at, other = near["i"], seen[near["j"]]
+    alone[at[(other != star[at]) & (mag[other] < mag[star[at]] + blend_mag)]] = False
+    return alone
 
 
 @dataclass(frozen=True)

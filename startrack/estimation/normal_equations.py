@@ -160,7 +160,7 @@ class Terms:
 
     def take(self, which: Ints) -> Terms:
         """The terms of the observations with these ascending indices."""
-        return Terms(self.lens[which], self.pose[which], self.image[which], self.images)
+        return Terms(self.lens.T[..., which].T, self.pose.T[..., which].T, self.image[which], self.images)
 
     def shift_px(self, lens: Array, poses: Array) -> Array:
         """Linear shift (n, 2) of the predicted pixels by steps of the lens parameters (m,) and poses (images, q)."""
@@ -170,14 +170,14 @@ class Terms:
         """Sums over the observations with weights (n, 2, 2) and residuals (n, 2), measured minus predicted."""
         m = self.lens.shape[2]
         q = m + self.pose.shape[2]
-        full = np.concatenate([self.lens, self.pose, residual_px[:, :, None]], axis=2)
-        x, y = full[:, 0], full[:, 1]
-        wx = weight[:, 0, :1] * x + weight[:, 0, 1:] * y
-        wy = weight[:, 1, :1] * x + weight[:, 1, 1:] * y
         ends = np.searchsorted(self.image, np.arange(self.images + 1))
         total = np.zeros((self.images, q + 1, q + 1))
         for i, (a, b) in enumerate(pairwise(ends.tolist())):  # one matrix product each is much faster than einsum
-            total[i] = x[a:b].T @ wx[a:b] + y[a:b].T @ wy[a:b]
+            full = np.concatenate([self.lens.T[..., a:b], self.pose.T[..., a:b], residual_px.T[None, :, a:b]])
+            (xx, xy), (yx, yy) = weight[a:b].transpose(1, 2, 0)
+            x, y = full[:, 0], full[:, 1]
+            weighted = np.stack([xx * x + xy * y, yx * x + yy * y], axis=1)
+            total[i] = full.reshape(q + 1, -1) @ weighted.reshape(q + 1, -1).T
         return NormalEquations(
             lens=total[:, :m, :m].sum(axis=0),
             lens_pose=total[:, :m, m:q],

@@ -22,8 +22,11 @@ def rays_from_azel(azimuth_rad: ArrayLike, elevation_rad: ArrayLike) -> Array:
 
     The azimuth is counted from north through east.
     """
-    a, e = np.broadcast_arrays(np.asarray(azimuth_rad, dtype=float), np.asarray(elevation_rad, dtype=float))
-    return np.stack([np.sin(a) * np.cos(e), np.cos(a) * np.cos(e), np.sin(e)], axis=-1)
+    a, e = np.asarray(azimuth_rad, dtype=float), np.asarray(elevation_rad, dtype=float)
+    rays = np.empty((*np.broadcast_shapes(a.shape, e.shape), 3))
+    level = np.cos(e)
+    rays[..., 0], rays[..., 1], rays[..., 2] = np.sin(a) * level, np.cos(a) * level, np.sin(e)
+    return rays
 
 
 def length_xy(x: Array, y: Array) -> Array:

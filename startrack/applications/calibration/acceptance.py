@@ -12,7 +12,7 @@ from startrack.camera import Camera, cap_grid
 from startrack.catalog import MOST_BELOW_PART, StarCatalog, is_below_horizon, sky_at
 from startrack.core.types import Array, Bools, Ints
 from startrack.estimation.false_alarm import log_p_value_poisson
-from startrack.estimation.frame_matching import Frame, FrameMatches, match_frame
+from startrack.estimation.frame_matching import Frame, FrameMatches, match_frames
 from startrack.estimation.joint_fit import JointFit
 from startrack.estimation.normal_equations import Observations
 from startrack.frames import R_from_rotvec, Site
@@ -130,13 +130,10 @@ def _log_p_value(found: int, by_chance: Iterable[int]) -> float:
     return log_p_value_poisson(found, max(float(np.mean(list(by_chance))), MIN_CHANCE_MATCHES))
 
 
-def _rotated_matches(joint: JointFit, frames: Sequence[Frame], rotation_rad: float) -> list[FrameMatches]:
+def _rotated_matches(joint: JointFit, frames: Sequence[Frame], rotation_rad: float) -> tuple[FrameMatches, ...]:
     """The matches of `frames` with the lens and the attitudes of a `joint` fit, these rotated by an angle."""
     camera, rotation = joint.fit.camera, R_from_rotvec(np.array([0.0, 0.3 * rotation_rad, rotation_rad]))
-    return [
-        match_frame(frame, camera, rotation @ R, camera.calibrated_angle_rad, joint.gate_px)
-        for frame, R in zip(frames, joint.fit.R_cam_icrs, strict=True)
-    ]
+    return match_frames(frames, camera, rotation @ joint.fit.R_cam_icrs, camera.calibrated_angle_rad, joint.gate_px)
 
 
 def _mirrored_residual_px(joint: JointFit) -> float:

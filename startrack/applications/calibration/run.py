@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from startrack.applications.calibration.shared_errors import widen_covariance
 from startrack.applications.calibration.static_parts import find_obstructions, remove_static_sources
 from startrack.camera import Camera
 from startrack.catalog import StarCatalog
+from startrack.core.runner import map_in_threads
 from startrack.core.types import Array, BadInput, Bools, Exposure, Identification, NoSolution, NotIdentified
 from startrack.detection import Detector
 from startrack.estimation.frame_matching import Frame, frame_of, require_body, require_time
@@ -140,8 +142,7 @@ def load_frame(exposure: Exposure, catalog: StarCatalog, site: Site | None, came
 
 
 def _frames(run: _Run, exposures: Sequence[Exposure]) -> list[Frame]:
-    frames: list[Frame] = []
-    for exposure in exposures:
+    def load(exposure: Exposure) -> Frame | NoSolution:
         wanted = (run.start or exposures[0]).size_px
         if exposure.size_px != wanted:
             raise BadInput(
@@ -149,32 +150,36 @@ def _frames(run: _Run, exposures: Sequence[Exposure]) -> list[Frame]:
                 f"{exposure.name} is {exposure.size_px[0]} x {exposure.size_px[1]} px, not {wanted[0]} x {wanted[1]}: "
                 "one camera has one size",
             )
-        run.progress(f"detecting stars in {exposure.name}")
         try:
-            frames.append(load_frame(exposure, run.catalog, run.site, camera=run.start))
+            return load_frame(exposure, run.catalog, run.site, camera=run.start)
         except NoSolution as cause:
-            run.refuse(exposure.name, cause)
+            return cause
+
+    frames: list[Frame] = []
+    for exposure, found in zip(exposures, map_in_threads(load, exposures), strict=True):
+        run.progress(f"detecting stars in {exposure.name}")
+        if isinstance(found, NoSolution):
+            run.refuse(exposure.name, found)
+        else:
+            frames.append(found)
     if not frames:
         raise NotIdentified(run.refused[0].message if run.refused else "no image was given", reason="no_stars")
     return frames
 
 
 def _identify_all(run: _Run, frames: list[Frame]) -> None:
-    """Identify the stars of every frame; failures are tried again with the lens of the others."""
+    """Identify the stars of every frame: the lens of the first that can be is the start for all others."""
     waiting: list[tuple[Frame, NoSolution]] = []
-    for frame in frames:
+    coming = iter(frames)
+    for frame in coming:
         try:
-            _identify(run, frame)
+            run.identified.append(_identify_first(run, frame))
+            break
         except NoSolution as cause:
             waiting.append((frame, cause))
-    for frame, refusal in waiting:
-        try:
-            if not run.identified:
-                raise refusal
-            _identify(run, frame)
-        except NoSolution as cause:
-            run.refuse(frame.exposure.name, cause)
     if not run.identified:
+        for frame, refusal in waiting:
+            run.refuse(frame.exposure.name, refusal)
         raise NotIdentified(
             f"the stars of no image could be identified ({run.refused[0].message}). Take pictures of the clear, dark "
             "night sky, in focus, with the camera still and at least a hundred stars in view"
@@ -182,25 +187,34 @@ def _identify_all(run: _Run, frames: list[Frame]) -> None:
             reason=run.refused[0].reason,
         )
 
-
-def _identify(run: _Run, frame: Frame) -> None:
-    """With the lens of earlier frames, else the approximate one, else without a lens."""
-    run.progress(f"identifying the stars of {frame.exposure.name}")
-    camera, found = run.lead.camera if run.identified else run.start, None
-    if camera is not None:
+    def identify(frame: Frame) -> _IdentifiedFrame | NoSolution:
         try:
+            camera, found = identify_with_camera(run.identified[0].camera, frame)
+        except NoSolution as cause:
+            return cause
+        return _IdentifiedFrame(frame, camera, found.R_cam_icrs, found)
+
+    others = [*coming, *(frame for frame, _ in waiting)]
+    for frame, outcome in zip(others, map_in_threads(identify, others), strict=True):
+        run.progress(f"identifying the stars of {frame.exposure.name}")
+        if isinstance(outcome, NoSolution):
+            run.refuse(frame.exposure.name, outcome)
+        else:
+            run.identified.append(outcome)
+
+
+def _identify_first(run: _Run, frame: Frame) -> _IdentifiedFrame:
+    """With the approximate lens, else without one; then the lens is grown outwards."""
+    run.progress(f"identifying the stars of {frame.exposure.name}")
+    camera, found = run.start, None
+    if camera is not None:
+        with suppress(NotIdentified):
             camera, found = identify_with_camera(camera, frame)
-        except NotIdentified:
-            if run.identified:
-                raise
     if camera is None or found is None:  # an approximate camera with another kind of lens still gives the field of view
         solution = identify_unknown_lens(frame.sources, frame.exposure.size_px, run.fov_rad, frame.sky.stars)
         camera, found = solution.camera, solution.identification
-    R = found.R_cam_icrs
-    if not run.identified:
-        run.progress(f"growing the lens outwards in {frame.exposure.name}")
-        camera, R = grow_from_matches(frame, camera, R, found.star, found.detection)
-    run.identified.append(_IdentifiedFrame(frame, camera, R, found))
+    camera, R = grow_from_matches(frame, camera, found.R_cam_icrs, found.star, found.detection)
+    return _IdentifiedFrame(frame, camera, R, found)
 
 
 def _field_rad(camera: Camera | None, fov_rad: float | None) -> float:

@@ -14,6 +14,8 @@ import numpy as np
 from startrack.applications.calibration.acceptance import IMAGE_RINGS
 from startrack.applications.calibration.static_parts import find_hot_pixels, turn_rad
 from startrack.camera import Camera
+from startrack.core.runner import map_in_threads
+from startrack.core.smooth_image import Image
 from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Exposure
 from startrack.estimation.joint_fit import JointFit
@@ -132,33 +134,36 @@ def fit_photon_transfer(pairs: list[tuple[Exposure, Exposure]]) -> PhotonTransfe
     """
     if not pairs:
         return None
-    blocks = [_block_statistics(a.recorded_adu.astype(np.float64), b.recorded_adu.astype(np.float64)) for a, b in pairs]
-    level, variance = np.concatenate(blocks, axis=1)
+    level, variance = np.concatenate(list(map_in_threads(_block_statistics, pairs)), axis=1)
     good = variance > 0
     return _fit_line(level[good], variance[good]) if good.sum() >= MIN_BLOCKS else None
 
 
-def _block_statistics(a: Array, b: Array) -> tuple[Array, Array]:
-    """Median level (n,) of one frame [ADU] and variance (n,) of one pixel [ADU^2], block by block.
+def _block_statistics(pair: tuple[Exposure, Exposure]) -> Array:
+    """Median level of a frame of the `pair` [ADU] and variance of a pixel [ADU^2] (2, n), block by block."""
+    a, b = (exposure.recorded_adu for exposure in pair)
+    tops = range(0, a.shape[0] // TRANSFER_BLOCK_PX * TRANSFER_BLOCK_PX, TRANSFER_BLOCK_PX)
+    return np.concatenate([_row_statistics(*(one[top : top + TRANSFER_BLOCK_PX] for one in (a, b))) for top in tops], 1)
+
+
+def _row_statistics(a: Image, b: Image) -> Array:
+    """The same of a row of blocks; a row at a time stays in the processor's cache.
 
     The variance is that of differences between neighbouring pixels in the difference of the frames, which the slope of
     the sky and the sensitivities of the pixels do not affect; clipping excludes the stars.
     """
-    side = TRANSFER_BLOCK_PX
-    height, width = (n // side * side for n in a.shape)
-
-    def split_blocks(image: Array) -> Array:
-        rows = image[:height, :width].reshape(height // side, side, width // side, side)
-        return rows.transpose(0, 2, 1, 3).reshape(-1, side, side)
-
-    step = np.diff(split_blocks(a - b), axis=2).reshape(-1, side * (side - 1))
+    side = len(a)
+    one, other = (
+        rows[:, : rows.shape[1] // side * side].astype(np.float64).reshape(side, -1, side).swapaxes(0, 1)
+        for rows in (a, b)
+    )
+    step = np.diff(one - other, axis=2).reshape(-1, side * (side - 1))
     step -= np.median(step, axis=1, keepdims=True)
-    variance = np.square(robust_sigma(step, 0.0, axis=1))
+    variance, squared = np.square(robust_sigma(step, 0.0, axis=1)), np.square(step)
     for _ in range(CLIP_ROUNDS):  # clipped to the core of the distribution, without stars
-        core = np.square(step) < CORE_SIGMA**2 * variance[:, None]
-        variance = np.sum(np.square(step) * core, axis=1) / np.maximum(core.sum(axis=1), 1) / CORE_VARIANCE_1
-    level = 0.5 * np.median(split_blocks(a) + split_blocks(b), axis=(1, 2))
-    return level, variance / 4.0
+        core = squared < CORE_SIGMA**2 * variance[:, None]
+        variance = np.sum(squared * core, axis=1) / np.maximum(core.sum(axis=1), 1) / CORE_VARIANCE_1
+    return np.stack([0.5 * np.median(one + other, axis=(1, 2)), variance / 4.0])
 
 
 def _fit_line(level: Array, variance: Array) -> PhotonTransfer | None:
@@ -187,19 +192,21 @@ def _measure_widths(joint: JointFit) -> tuple[Array, Array, Array]:
     PSF sigma [px] before integration over the pixel, angle off the axis [rad], and the flux with the star's own width
     over the flux of the detector.
     """
-    parts = [np.zeros((3, 0))]
-    for i, (frame, matched) in enumerate(zip(joint.frames, joint.matches, strict=True)):
-        found = frame.sources
+
+    def measure(i: int) -> Array:
+        frame, matched, found = joint.frames[i], joint.matches[i], joint.frames[i].sources
         used = matched.detection[joint.fit.used[joint.points.image == i]]
         used = used[(found.snr[used] > MIN_WIDTH_SNR) & ~found.saturated[used]][:MAX_WIDTHS]
         radius = stamp_radius(1.6 * found.psf_sigma_px) + 2
         px = found.xy_px[used]
         whole = np.all((px > radius + 1) & (px < np.array(frame.exposure.size_px) - radius - 2), axis=1)
-        if whole.any():
-            width_px, flux = _fit_widths(np.asarray(frame.exposure.pixels_adu), px[whole], radius)
-            angle = joint.fit.camera.angle_rad(px[whole])
-            parts.append(np.stack([width_px, angle, flux / found.flux_e[used[whole]]]))
-    sigma_px, angle, ratio = np.concatenate(parts, axis=1)
+        if not whole.any():
+            return np.zeros((3, 0))
+        width_px, flux = _fit_widths(np.asarray(frame.exposure.pixels_adu), px[whole], radius)
+        angle = joint.fit.camera.angle_rad(px[whole])
+        return np.stack([width_px, angle, flux / found.flux_e[used[whole]]])
+
+    sigma_px, angle, ratio = np.concatenate(list(map_in_threads(measure, range(len(joint.frames)))), axis=1)
     return sigma_px, angle, ratio
 
 

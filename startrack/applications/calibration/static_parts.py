@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import partial, reduce
 
 import numpy as np
 
+from startrack.core.runner import map_in_threads
 from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Bools, Ints
-from startrack.estimation.frame_matching import Frame, match_frame
+from startrack.estimation.frame_matching import Frame, match_frames
 from startrack.estimation.joint_fit import JointFit
 from startrack.exposure import combine_masks
 
@@ -44,14 +45,16 @@ def remove_static_sources(frames: tuple[Frame, ...], R_cam_icrs: Array) -> tuple
     """
     from scipy.spatial import cKDTree
 
-    trees, moving = [cKDTree(frame.sources.xy_px) for frame in frames], []
-    for frame, R in zip(frames, R_cam_icrs, strict=True):
+    trees = [cKDTree(frame.sources.xy_px) for frame in frames]
+
+    def moving(frame: Frame, R: Array) -> Frame:
         static = np.zeros(len(frame.sources), dtype=bool)
         for tree, other in zip(trees, R_cam_icrs, strict=True):
             if has_turned(R, other, frame.exposure.size_px):
                 static |= np.isfinite(tree.query(frame.sources.xy_px, distance_upper_bound=SAME_PX)[0])
-        moving.append(replace(frame, sources=frame.sources.take(~static)))
-    return tuple(moving)
+        return replace(frame, sources=frame.sources.take(~static))
+
+    return tuple(map_in_threads(moving, frames, R_cam_icrs))
 
 
 def find_hot_pixels(joint: JointFit) -> Array | None:
@@ -60,7 +63,7 @@ def find_hot_pixels(joint: JointFit) -> Array | None:
     others = [i for i in range(1, len(joint.frames)) if has_turned(R[0], R[i], size_px)]
     if not others:
         return None
-    least = reduce(np.minimum, (_excess_sigmas(joint, i) for i in (0, *others)))
+    least = reduce(np.minimum, map_in_threads(partial(_excess_sigmas, joint), [0, *others]))
     y, x = np.nonzero(least > HOT_SIGMA)
     order = np.argsort(-least[y, x], kind="stable")[:MAX_HOT_PIXELS]
     return np.stack([x[order], y[order]], axis=1).astype(np.float64)
@@ -100,8 +103,8 @@ def find_obstructions(joint: JointFit, frames: Sequence[Frame]) -> Bools | None:
     """
     camera = joint.fit.camera
     parts = [(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0))]
-    for frame, R in zip(frames, joint.fit.R_cam_icrs, strict=True):
-        matched = match_frame(frame, camera, R, camera.calibrated_angle_rad, joint.gate_px)
+    matches = match_frames(frames, camera, joint.fit.R_cam_icrs, camera.calibrated_angle_rad, joint.gate_px)
+    for frame, matched in zip(frames, matches, strict=True):
         rate = matched.expected_found / max(matched.expected, 1)
         if rate < MIN_RATE_1:
             continue

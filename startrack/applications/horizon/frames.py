@@ -19,6 +19,7 @@ from startrack.catalog import (
 )
 from startrack.chain import Oriented, Refused, identify, identify_blind
 from startrack.core.errors import BadInput, Reason
+from startrack.core.runner import map_in_threads
 from startrack.core.types import Array, Body, Detections, Exposure, Ints
 from startrack.estimation.frame_matching import frame_of, require_body, require_time
 from startrack.estimation.joint_fit import JointFit, fit_frames
@@ -70,22 +71,30 @@ def orient_frames(
         raise BadInput("no_calibration", "no camera is known: give a camera file (-c) or the field of view (--fov)")
     identified: list[Oriented] = []
     left_out: list[LeftOut] = []
-    for exposure in exposures:
+
+    def orient(exposure: Exposure) -> Oriented | Refused:
         require_time(exposure)
         require_body(exposure, site)
         known = identified[0].camera if identified else camera
-        outcome = (
-            identify(exposure, known, catalog, site=site)
-            if known is not None
-            else identify_blind(exposure, fov_rad or 0.0, catalog)
-        )
-        if isinstance(outcome, Refused):
-            if outcome.reason.exit_code == Reason.BAD_IMAGE.exit_code:
-                raise BadInput(outcome.reason, f"{exposure.name}: {outcome.message}")
-            left_out.append(LeftOut(name=exposure.name, reason=outcome.reason, message=outcome.message))
-        else:
+        if known is None:
+            return identify_blind(exposure, fov_rad or 0.0, catalog)
+        return identify(exposure, known, catalog, site=site)
+
+    def take(exposure: Exposure, outcome: Oriented | Refused) -> None:
+        if isinstance(outcome, Oriented):
             _require_above_horizon(outcome, site)
             identified.append(outcome)
+        elif outcome.reason.exit_code == Reason.BAD_IMAGE.exit_code:
+            raise BadInput(outcome.reason, f"{exposure.name}: {outcome.message}")
+        else:
+            left_out.append(LeftOut(name=exposure.name, reason=outcome.reason, message=outcome.message))
+
+    others = list(exposures)
+    while others and not identified:  # the lens of the first one identified serves for all others
+        exposure = others.pop(0)
+        take(exposure, orient(exposure))
+    for exposure, outcome in zip(others, map_in_threads(orient, others), strict=True):
+        take(exposure, outcome)
     if not identified:
         return (), tuple(left_out)
     frames = tuple(frame_of(one.exposure, one.detections, catalog, site) for one in identified)
@@ -96,8 +105,8 @@ def orient_frames(
     if camera is None and fov_rad is not None and fov_rad >= WIDE_FIELD_RAD:
         edge = 0.5 * fov_rad
     camera = replace(fitted, max_angle_rad=float(min(edge, fitted.lens.max_invertible_rad)))
-    found = tuple(_sky_frame(k, one, joint, camera, catalog, site) for k, one in enumerate(identified))
-    return found, tuple(left_out)
+    found = (_sky_frame(k, one, joint, camera, catalog, site) for k, one in enumerate(identified))
+    return tuple(found), tuple(left_out)
 
 
 def _require_above_horizon(one: Oriented, site: Site) -> None:

@@ -11,16 +11,17 @@ from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, COLUMNS_PER_
 from startrack.applications.horizon.frames import LeftOut, SkyFrame, orient_frames
 from startrack.applications.horizon.posterior import (
     WEAKEST_CONTRAST,
+    add_step_log_likelihood,
     column_log_prior,
     combine_columns,
     star_log_likelihood,
-    step_log_likelihood,
 )
 from startrack.applications.horizon.skylight import Steps, find_steps
 from startrack.applications.horizon.starlight import StarLight, measure_stars
 from startrack.camera import Camera
 from startrack.catalog import StarCatalog, apparent_elevation_rad
 from startrack.core.errors import NoSolution
+from startrack.core.runner import map_in_threads
 from startrack.core.types import Array, Bools, Exposure, MeasuredSkyline
 from startrack.frames import Site, off_axis_rad, rays_from_azel
 
@@ -72,13 +73,10 @@ def measure_frames(frames: tuple[SkyFrame, ...], left_out: tuple[LeftOut, ...], 
     if not frames:
         first = left_out[0]
         raise NoSolution(f"{first.name}: {first.message}", reason=first.reason)
-    stars = [measure_stars(frame) for frame in frames]
-    steps = [find_steps(frame, light) for frame, light in zip(frames, stars, strict=True)]
+    stars, steps, evidence = zip(*map_in_threads(_measure_frame, frames), strict=True)
     total = column_log_prior()
-    for light, by_width in zip(stars, steps, strict=True):
-        total = total + star_log_likelihood(light.rays, light.missing)
-        for found, (_, weight) in zip(by_width, WIDTHS, strict=True):
-            total += step_log_likelihood(found, weight)
+    for log_likelihood in evidence:
+        total += log_likelihood
     # The columns' posterior as bins of one degree; the errors that the frames share are added once.
     mean, sigma = combine_columns(total)
     azimuth = np.radians(np.arange(SKYLINE_AZIMUTHS, dtype=np.float64) * (360.0 / SKYLINE_AZIMUTHS))
@@ -100,6 +98,15 @@ def measure_frames(frames: tuple[SkyFrame, ...], left_out: tuple[LeftOut, ...], 
         source=np.where(known, source, ""),
     )
     return SkylineResult(skyline, frames, left_out)
+
+
+def _measure_frame(frame: SkyFrame) -> tuple[StarLight, list[Steps], Array]:
+    """Stars and steps of light of a frame, and the log-likelihood (AZIMUTH_COLUMNS, n) of the skyline by them."""
+    light = measure_stars(frame)
+    by_width, total = find_steps(frame, light), star_log_likelihood(light.rays, light.missing)
+    for found, (_, weight) in zip(by_width, WIDTHS, strict=True):
+        add_step_log_likelihood(total, found, weight)
+    return light, by_width, total
 
 
 def _gap_depth(steps: Sequence[list[Steps]], elevation_rad: Array) -> Array:

@@ -6,13 +6,13 @@ distribution, sometimes a wide one (a tree), and sometimes it jumps anywhere (a 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, GRID_STEP_RAD, LOWEST_RAD, column_of, elevations_rad
 from startrack.applications.horizon.skylight import MIN_SIGNIFICANCE, Steps
+from startrack.core.runner import map_in_threads
 from startrack.core.types import Array, Evidence
+from startrack.estimation.column_chain import add_steps, pass_messages
 
 CHANGES_RAD = np.radians(np.array([0.02, 0.12, 0.8]))  # Laplace scales of the change between columns: hill, wood, tree
 CHANGE_WEIGHTS = (0.55, 0.25, 0.18)
@@ -78,10 +78,8 @@ def limit_llr(llr: Array, missing: Array, spurious: float) -> Array:
     return np.asarray(np.log(((1 - missing) * seen + missing * unseen) / (spurious * seen + (1 - spurious) * unseen)))
 
 
-def step_log_likelihood(steps: Steps, temper: float) -> Array:
-    """Log-likelihood (AZIMUTH_COLUMNS, n), times `temper`, of an image's steps of light at each elevation."""
-    elevation = elevations_rad()
-    total = np.zeros((AZIMUTH_COLUMNS, len(elevation)))
+def add_step_log_likelihood(total: Array, steps: Steps, temper: float) -> None:
+    """Add that of an image's steps of light, times `temper`, to the log-likelihood `total` (AZIMUTH_COLUMNS, n)."""
     noise = NOISE_PER_RAD * np.exp(-0.5 * (np.square(steps.significance) - MIN_SIGNIFICANCE**2))
     contrast = np.abs(steps.contrast)
     in_sky = noise + SKY_PER_RAD * np.exp(-contrast / SKY_CONTRAST) + RARE_PER_RAD
@@ -90,43 +88,17 @@ def step_log_likelihood(steps: Steps, temper: float) -> Array:
     weight = np.where(steps.contrast > 0, brighter, 1 - brighter)
     weight = SHOWN_PROBABILITY * weight * np.minimum(contrast / WEAKEST_CONTRAST, 1.0) ** 2 / in_ground
     passed = 0.5 * np.log(in_sky / in_ground)
-    for c in np.unique(steps.column):
-        mixture = np.full(len(elevation), 1 - SHOWN_PROBABILITY)
-        for k in np.flatnonzero(steps.column == c):
-            e, s = steps.elevation_rad[k], steps.sigma_rad[k]
-            mixture += weight[k] * np.exp(-0.5 * np.square((elevation - e) / s)) / (s * np.sqrt(2 * np.pi))
-            total[c] += passed[k] * (elevation < e - 2 * s)
-        total[c] += np.log(mixture)
-    return temper * total
+    order = np.argsort(steps.column, kind="stable")
+    rows = (one[order] for one in (steps.column, steps.elevation_rad, steps.sigma_rad, weight, passed))
+    add_steps(total, temper, LOWEST_RAD, GRID_STEP_RAD, *rows, 1 - SHOWN_PROBABILITY)
 
 
 def combine_columns(log_likelihood: Array) -> tuple[Array, Array]:
     """Means and standard deviations [rad] of each column by the chain with log-likelihoods (AZIMUTH_COLUMNS, n)."""
-    from scipy.fft import irfft, next_fast_len, rfft
-
-    columns, n = log_likelihood.shape
     likelihood = np.exp(log_likelihood - log_likelihood.max(axis=1, keepdims=True))
     likelihood = likelihood / likelihood.mean(axis=1, keepdims=True) + OUTLIER_PROBABILITY
-    size = next_fast_len(2 * n)
-    distance = GRID_STEP_RAD * np.minimum(np.arange(size), size - np.arange(size))
-    shapes = np.exp(-distance / CHANGES_RAD[:, None])
-    kernel = rfft(np.sum(np.array(CHANGE_WEIGHTS)[:, None] * shapes / shapes.sum(axis=1, keepdims=True), axis=0))
-
-    def predict(message: Array) -> Array:
-        spread = np.maximum(irfft(rfft(message, size) * kernel, size)[:n], 0.0)
-        return (1 - JUMP_WEIGHT) * spread / spread.sum() + JUMP_WEIGHT / n
-
-    def run(order: Sequence[int]) -> Array:
-        found = np.empty((columns, n))
-        message = np.full(n, 1.0 / n)
-        for _ in range(2):  # the second round starts where the first one ended: the compass is a circle
-            for c in order:
-                found[c] = message
-                after = message * likelihood[c]
-                message = predict(after / after.sum())
-        return found
-
-    ahead, behind = run(range(columns)), run(range(columns - 1, -1, -1))
+    change = np.exp(-GRID_STEP_RAD / CHANGES_RAD), np.array(CHANGE_WEIGHTS), JUMP_WEIGHT
+    ahead, behind = map_in_threads(lambda forward: pass_messages(likelihood, forward, *change), (True, False))
     posterior = ahead * behind * likelihood
     posterior /= posterior.sum(axis=1, keepdims=True)
     elevation = elevations_rad()

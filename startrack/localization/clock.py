@@ -11,7 +11,16 @@ from startrack.core.types import Array, Clock, Evidence, NotLocated
 from startrack.frames import R_from_rotvec, Site, sky_rotvec_rad, turn_azel
 from startrack.localization.horizon_bias import LinearSolution, at_likeliest_bias
 from startrack.localization.likelihood import PositionLikelihood
-from startrack.localization.search import BEAMS, Explored, Guess, beam_search, choose_apart, local_posterior
+from startrack.localization.search import (
+    BEAMS,
+    SCORED,
+    Explored,
+    Guess,
+    choose_apart,
+    last_boxes,
+    local_posterior,
+    refine_boxes,
+)
 from startrack.localization.shared_errors import is_noticeable
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain
@@ -23,6 +32,7 @@ WRONG_SIGMA_S = 21_600.0  # of one whose stated error is wrong: a local time, a 
 TIME_STEP_RAD = np.radians(0.26)  # of the turn between two times at which a position is searched
 MOST_SCANNED = 250  # of these times: 65 degrees of turn, five days on the Moon
 TRACKED_NATS = 30.0  # less than the best: a time is not looked at more closely
+BOXES_APART = 4.0  # halves of boxes between the positions that neighbouring times see of one solution
 TIME_ROUNDS = 6  # in which the rows are turned to the time that they show, at most
 LINEAR_TURN_RAD = np.radians(0.05)  # of the sky: up to it the skyline of a map changes linearly with the time
 GROSS_REACH_SIGMAS = 3.0  # of a gross error of the clock, to the last time that is tried
@@ -67,6 +77,22 @@ def clock_matters(clock: Clock | None, terrain: Terrain) -> bool:
 
 
 @dataclass(frozen=True)
+class Scan:
+    """A time [s later] and the boxes that fit best there: log-likelihood and position (2,) of the best centre."""
+
+    later_s: float
+    fit: float
+    position_m: Array
+    centres_m: Array  # (n, 2), the best average first
+    half_m: float
+
+    def leads_to(self, other: Scan, step_s: float) -> bool:
+        """Whether the next time, of those `step_s` apart, fits better at nearly the same position."""
+        is_next = 0 < abs(self.later_s - other.later_s) < 1.5 * step_s and self.fit < other.fit
+        return is_next and float(np.abs(self.position_m - other.position_m).max()) <= BOXES_APART * self.half_m
+
+
+@dataclass(frozen=True)
 class Track:
     """Times that the clock of rows allows on a terrain."""
 
@@ -81,8 +107,9 @@ class Track:
         """
         found: list[tuple[float, float, Array]] = []
         for later_s, position_m in self._likely_times():
-            if all(abs(later_s - other_s) > 0.5 * self.step_s for other_s, _, _ in found):
-                found.append(self._settle_time(later_s, position_m))
+            settled = self._settle_time(later_s, position_m, [time_s for time_s, _, _ in found])
+            if settled is not None:
+                found.append(settled)
         later, share, position = zip(*found, strict=True)
         return np.array(later), np.array(share), np.array(position)
 
@@ -110,21 +137,38 @@ class Track:
                 f"a clock that is right to {duration(self.clock.sigma_s)} leaves too many times to search on this "
                 "terrain: find the time more exactly (--time-sigma states its error)"
             )
-        found = []
-        for later_s in times:
-            likelihood = self._likelihood(later_s)
-            guess = beam_search(likelihood, BEAMS[0])
-            if len(guess.points_m):
-                found.append((guess.best + self._log_offset(later_s, likelihood), later_s, guess.points_m[0]))
-        if not found:
+        scanned = [one for one in map(self._scan, times) if one.fit > -np.inf]
+        if not scanned:
             raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
+        found = []
+        for one in scanned:
+            if not any(one.leads_to(other, self.step_s) for other in scanned):
+                likelihood = self._likelihood(one.later_s)
+                guess = refine_boxes(likelihood, one.centres_m, one.half_m)
+                found.append((guess.best + self._log_offset(one.later_s, likelihood), one.later_s, guess.points_m[0]))
         found.sort(key=lambda one: -one[0])
         return [(later_s, position) for fit, later_s, position in found if fit > found[0][0] - TRACKED_NATS]
 
-    def _settle_time(self, later_s: float, position_m: Array) -> tuple[float, float, Array]:
-        """The time that the rows show about a time [s later], the logarithm of its share, and the best position."""
+    def _scan(self, later_s: float) -> Scan:
+        """The best boxes at a time [s later]."""
+        likelihood = self._likelihood(later_s)
+        centres, half = last_boxes(likelihood, *BEAMS[0])
+        points = centres[:SCORED][np.asarray(self.terrain.allowed(centres[:SCORED]))]
+        scores = likelihood.exact_scores(points) if len(points) else np.zeros(0)
+        fit = float(scores.max(initial=-np.inf)) + self._log_offset(later_s, likelihood)
+        return Scan(later_s, fit, points[np.argmax(scores)] if len(points) else np.zeros(2), centres, half)
+
+    def _settle_time(
+        self, later_s: float, position_m: Array, found_s: list[float]
+    ) -> tuple[float, float, Array] | None:
+        """The time that the rows show about a time [s later], the logarithm of its share, and the best position.
+
+        None on the way to one of the times `found_s`.
+        """
         low, high = self.limits_s
         for _ in range(TIME_ROUNDS):
+            if any(abs(later_s - time_s) < 0.5 * self.step_s for time_s in found_s):
+                return None
             solution = LinearSolution.near(turn_evidence(self.evidence, later_s), self.terrain, position_m)
             later_s = min(max(later_s + solution.later_s, low), high)
             position_m = solution.position_m

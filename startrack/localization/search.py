@@ -87,10 +87,10 @@ def beam_search(likelihood: PositionLikelihood, beam: tuple[int, bool]) -> Guess
 
     The guess decides nothing: without a good one the proof takes longer.
     """
-    return refine_boxes(likelihood, *_last_boxes(likelihood, *beam))
+    return refine_boxes(likelihood, *last_boxes(likelihood, *beam))
 
 
-def _last_boxes(likelihood: PositionLikelihood, width: int, traced: bool) -> tuple[Array, float]:
+def last_boxes(likelihood: PositionLikelihood, width: int, traced: bool) -> tuple[Array, float]:
     """Centres (n, 2) of the last boxes, the best average first, and half their side [m]."""
     terrain, (east_m, north_m, half) = likelihood.terrain, likelihood.terrain.searched
     centres = np.array([[east_m, north_m]])

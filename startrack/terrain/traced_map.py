@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Self
@@ -229,7 +230,18 @@ def _run_in_threads(function: Any, fixed: tuple[Any, ...], arrays: tuple[Array, 
         function(*fixed, *arrays)
         return
     ends = np.linspace(0, n, cores + 1).astype(int)
-    with ThreadPoolExecutor(cores) as pool:
-        parts = [[a[i:j] for a in arrays] for i, j in pairwise(ends)]
-        for future in [pool.submit(function, *fixed, *part) for part in parts]:
-            future.result()
+    own, *others = [[a[i:j] for a in arrays] for i, j in pairwise(ends)]
+    running = [_thread_pool().submit(function, *fixed, *part) for part in others]
+    function(*fixed, *own)
+    for future in running:
+        future.result()
+
+
+@cache
+def _thread_pool() -> ThreadPoolExecutor:
+    """Threads beside the calling one, kept: each start takes as long as a thousand rays."""
+    return ThreadPoolExecutor(MAX_THREADS)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_thread_pool.cache_clear)  # threads are not copied

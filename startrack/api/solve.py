@@ -12,7 +12,7 @@ from startrack.applications import tracking
 from startrack.applications.tracking import Odometry, Track
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
-from startrack.chain import Image, Outcome, Refused, Settings, Time, stars_at
+from startrack.chain import Image, NearAttitude, Outcome, Refused, Settings, Time, stars_at
 from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.errors import BAD_INPUT_REASONS, BadInput
 from startrack.core.types import Exposure
@@ -112,6 +112,7 @@ def identify(
     size_px: tuple[int, int] | None = None,
     flux: ArrayLike | None = None,
     sigma_px: ArrayLike | None = None,
+    near_attitude: ArrayLike | None = None,
 ) -> Solution | IdentifiedCentroids:
     """Stars and attitude of an image, or of a list of centroids. Neither terrain nor time is needed.
 
@@ -125,6 +126,8 @@ def identify(
         size_px: of centroids: width and height of the frame; needed with `fov`, and given with nothing else.
         flux: of centroids: (n,) in any linear unit. None: they are sorted, brightest first.
         sigma_px: of centroids: error per axis, one number or (n,). None: 0.3 px.
+        near_attitude: with a camera, a rough attitude R_cam_icrs (3, 3), some degrees off at most: the stars are sought
+            there first, and everywhere if they are not there.
 
     Returns:
         Of an image a Solution, whose `result.camera` is the camera used or found. Of centroids `IdentifiedCentroids`:
@@ -132,12 +135,15 @@ def identify(
 
     Raises:
         ValueError: both `camera` and `fov` are given, or of centroids neither; arrays of a wrong shape or type; of an
-            image `size_px`, `flux` or `sigma_px`; `size_px` with `camera`.
+            image `size_px`, `flux` or `sigma_px`; `size_px` with `camera`; `near_attitude` that is no rotation.
         BadInput: as `locate`.
         NotIdentified: the centroids are not identified.
     """
     if fov is not None and camera is not None:
         raise ValueError("camera= and fov= exclude each other: with fov= the lens is found, with camera= it is known")
+    if fov is not None and near_attitude is not None:
+        raise ValueError("near_attitude= needs camera=: with fov= the lens is not known")
+    near = None if near_attitude is None else NearAttitude.of(near_attitude)
     of_list = {"size_px": size_px, "flux": flux, "sigma_px": sigma_px}
     given = [f"{name}=" for name, value in of_list.items() if value is not None]
     if given and isinstance(image, str | os.PathLike | Exposure):
@@ -152,12 +158,14 @@ def identify(
             xy_px, camera=None if camera is None else chain.load_camera_input(camera),
             fov_rad=None if fov is None else chain.field_of_view_rad(fov), size_px=size_px, flux=flux,
             sigma_px=sigma_px, stars=stars_at(load_catalog(), chain.time_input(time), None),
+            near_R_cam_icrs=None if near is None else near.R_cam_icrs_at(None, None),
         )  # fmt: skip
     exposure = chain.exposure_input(image, time)
     if fov is not None:
         outcome = chain.identify_blind(exposure, chain.field_of_view_rad(fov), load_catalog())
     else:
-        outcome = chain.identify(exposure, chain.camera_input(camera, exposure), load_catalog())
+        settings = Settings(near_attitude=near)
+        outcome = chain.identify(exposure, chain.camera_input(camera, exposure), load_catalog(), settings)
     return _solution(outcome, "identification")
 
 

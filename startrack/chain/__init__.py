@@ -16,6 +16,7 @@ from startrack.chain.inputs import (
     time_input,
 )
 from startrack.chain.measurement import CERTAIN_PROBABILITY, COMPLETE_V_MAG, locate_rays
+from startrack.chain.near_attitude import NearAttitude, read_near_attitude
 from startrack.chain.orientation import stars_at
 from startrack.chain.pipeline import add_timing, detect, identify, identify_blind, locate, locate_exposure
 from startrack.chain.sky_refinement import EDGE_SIGMA_PX
@@ -36,10 +37,10 @@ from startrack.chain.stages import (
 )
 
 __all__ = [
-    "CERTAIN_PROBABILITY", "COMPLETE_V_MAG", "EDGE_SIGMA_PX", "MISSING", "STAGES", "Detected", "Identified",
-    "Image", "Inputs", "Located", "Measured", "Oriented", "Outcome", "Refused", "Settings", "StarFix", "StarRays",
-    "Time", "add_timing", "angle_rad", "are_unchanged", "camera_input", "content_sha256", "detect", "duration_s",
-    "exposure_input", "field_of_view_rad", "identify", "identify_blind", "input_hashes", "is_list_of_centroids",
-    "job_sha256", "last_value", "load_camera_input", "locate", "locate_exposure", "locate_rays", "settings_input",
-    "stars_at", "terrain_input", "time_input",
+    "CERTAIN_PROBABILITY", "COMPLETE_V_MAG", "EDGE_SIGMA_PX", "MISSING", "STAGES", "Detected", "Identified", "Image",
+    "Inputs", "Located", "Measured", "NearAttitude", "Oriented", "Outcome", "Refused", "Settings", "StarFix",
+    "StarRays", "Time", "add_timing", "angle_rad", "are_unchanged", "camera_input", "content_sha256", "detect",
+    "duration_s", "exposure_input", "field_of_view_rad", "identify", "identify_blind", "input_hashes",
+    "is_list_of_centroids", "job_sha256", "last_value", "load_camera_input", "locate", "locate_exposure", "locate_rays",
+    "read_near_attitude", "settings_input", "stars_at", "terrain_input", "time_input",
 ]  # fmt: skip

@@ -9,14 +9,14 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.catalog import StarCatalog, bodies
-from startrack.chain.stages import Detected, Identified, Inputs, Oriented, extend
+from startrack.chain.stages import Detected, Identified, Inputs, Oriented, Settings, extend
 from startrack.core.compilation import announce_compilation
 from startrack.core.types import Array, BadInput, Exposure, NotIdentified, Stars, TooFewStars
 from startrack.detection import Detector
 from startrack.estimation.attitude import AttitudeFit, solve_attitude
 from startrack.exposure import NO_TIME, are_fractions
 from startrack.frames import Site, observer_velocity_m_s
-from startrack.identification import Identifier, check_single_field
+from startrack.identification import check_single_field
 from startrack.terrain import Terrain
 
 LEAST_SHIFT_PX, MOST_SHIFT_PX = 0.1, 8.0  # of the image's centre; a larger one is another camera
@@ -68,21 +68,23 @@ def detect_sources(inputs: Inputs, camera: Camera | None, detector: Detector) ->
 
 
 def identify_stars(
-    detected: Detected, camera: Camera, catalog: StarCatalog, identifier: Identifier, site: Site | None
+    detected: Detected, camera: Camera, catalog: StarCatalog, settings: Settings, site: Site | None
 ) -> Identified:
-    """Which of the point sources `detected` is which star of the `catalog`, found by the `identifier`.
+    """Which of the point sources `detected` is which star of the `catalog`.
 
-    `site` (None: not known) is where the `camera` stands. Raises NotIdentified, TooFewStars.
+    It is found by the identifier of the `settings`, first near their rough attitude. `site` (None: not known) is where
+    the `camera` stands. Raises NotIdentified, TooFewStars.
     """
-    when = detected.exposure.time_utc
+    when, near = detected.exposure.time_utc, settings.near_attitude
     stars = stars_at(catalog, when, site)
+    near_R_cam_icrs = None if near is None else near.R_cam_icrs_at(when, site)
     return extend(
         detected,
         Identified,
         camera=camera,
         stars=stars,
         bodies=tuple(bodies(site, when)) if site is not None and when is not None else (),
-        identification=identifier(detected.detections, camera, stars),
+        identification=settings.identifier(detected.detections, camera, stars, near_R_cam_icrs),
     )
 
 

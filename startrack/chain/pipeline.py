@@ -54,7 +54,7 @@ def locate(
 
     def stages() -> Located:
         check_inputs(run.reached)
-        oriented = _orient(run, camera, settings, identify_stars, camera, catalog, settings.identifier, terrain.site)
+        oriented = _orient(run, camera, settings, identify_stars, camera, catalog, settings, terrain.site)
         run.time_stage("attitude", check_one_attitude, oriented)
         measured = run.run_stage("evidence", measure_evidence, oriented, terrain, settings)
         first = replace(measured.evidence(), is_first_look=settings.evidence_sources != "stars")
@@ -119,7 +119,7 @@ def identify(
 
     def stages() -> Oriented:
         check_inputs(run.reached)
-        return _orient(run, camera, settings, identify_stars, camera, catalog, settings.identifier, site)
+        return _orient(run, camera, settings, identify_stars, camera, catalog, settings, site)
 
     return run.outcome(stages)
 

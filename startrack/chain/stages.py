@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, Self, TypeAlias, TypeVar, cast
 import numpy as np
 
 from startrack.camera import Camera
+from startrack.chain.near_attitude import NearAttitude
 from startrack.core.errors import Reason
 from startrack.core.types import (
     Array,
@@ -61,6 +62,7 @@ class Settings:
     localizer: Localizer = field(default_factory=lambda: require_localizer(DEFAULT_LOCALIZER))
     evidence_sources: str = "both"  # "stars", "sky" (the light of the sky at the skyline) or "both"
     near: PositionPrior | None = None  # of the position; None: anywhere in the search area of the terrain
+    near_attitude: NearAttitude | None = None  # tried first; it saves time and changes no answer
     deep_stars: bool = True  # use Gaia's stars too, where they are installed and the frame is deeper than Hipparcos
 
     def __post_init__(self) -> None:

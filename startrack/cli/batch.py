@@ -19,7 +19,7 @@ from startrack.applications import batch
 from startrack.applications.batch import Image, ImageDone, Task
 from startrack.cli.console import discard_stdout, progress
 from startrack.cli.flags import check_cluster, check_localizer
-from startrack.cli.images import absolute_facts, compile_kernels, prepare_reference
+from startrack.cli.images import absolute_facts, compile_kernels, near_attitude_of, prepare_reference
 from startrack.cli.report import write_page_of
 from startrack.core import errors
 from startrack.core.compilation import is_compiled
@@ -114,12 +114,12 @@ def _locate_images(
 
 
 def _tasks(found: Sequence[Image], out: Path, facts: dict[str, Any], args: argparse.Namespace) -> list[Task]:
-    here = Path(os.path.abspath(out))
+    here, near_attitude = Path(os.path.abspath(out)), near_attitude_of(args)
     return [
         Task(
             name=image.name, path=os.path.abspath(image.path), result=str(batch.record_path(here, image)), facts=facts,
             plots=not args.no_plots, overwrite=args.overwrite, localizer=args.localizer,
-            evidence=args.evidence, near=args.near, bag_image=image.bag_image,
+            evidence=args.evidence, near=args.near, near_attitude=near_attitude, bag_image=image.bag_image,
         )
         for image in found
     ]  # fmt: skip
@@ -229,7 +229,9 @@ def _write_tables(args: argparse.Namespace, out: Path, tasks: Sequence[Task], re
         for key, value in tasks[0].facts.items()
     }
     method = {"localizer": args.localizer, "evidence": args.evidence}
-    near = {} if args.near is None else {"near": list(args.near)}
+    near: dict[str, Any] = {} if args.near is None else {"near": list(args.near)}
+    if args.near_attitude is not None:
+        near["near_attitude"] = Path(args.near_attitude).name
     rows = batch.table_rows(tasks, {record["image"]: record for record in records}, os.path.abspath(out))
     batch.write_tables(out, rows.rows, {**of_flags, **method, **near, "plots": not args.no_plots})
     lacking = {

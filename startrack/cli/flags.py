@@ -179,7 +179,12 @@ NEAR = flag(
     "is refused",
     position_prior,
 )
-METHOD = (LOCALIZER, EVIDENCE, NEAR)
+NEAR_ATTITUDE = flag(
+    "--near-attitude FILE",
+    "a result of startrack whose attitude is a rough one, some degrees off at most: the stars are sought there first, "
+    "and everywhere if they are not there",
+)
+METHOD = (LOCALIZER, EVIDENCE, NEAR, NEAR_ATTITUDE)
 
 ODOMETRY = (
     flag("--odometry-sigma F", "error of a move on each horizontal axis, relative", amount, default=ODOMETRY_SIGMA),

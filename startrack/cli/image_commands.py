@@ -55,6 +55,7 @@ COMMANDS = (
                     lambda text: fields_of_view_rad(text, NARROWEST_DEG, WIDEST_DEG),
                 ),
             ),
+            "method": (flags.NEAR_ATTITUDE,),
             **SHARED,
         },
         example="startrack identify sky.png --fov 60",

@@ -17,6 +17,7 @@ import numpy as np
 
 from startrack import exposure as images
 from startrack.camera import Camera, load_camera
+from startrack.chain import NearAttitude, read_near_attitude
 from startrack.cli.console import progress
 from startrack.cli.flags import checked_flag
 from startrack.core.compilation import announce_compilation, is_compiled
@@ -80,6 +81,11 @@ def check_fov(args: argparse.Namespace) -> None:
     """A usage error for a field of view beside a camera."""
     if args.fov is not None and args.camera is not None:
         args.usage_error("--fov is for an unknown lens, -c for a known one: give one of them")
+
+
+def near_attitude_of(args: argparse.Namespace) -> NearAttitude | None:
+    """The rough attitude of --near-attitude; None without it. Raises BadInput (bad_image)."""
+    return None if args.near_attitude is None else read_near_attitude(args.near_attitude)
 
 
 def check_one_time(args: argparse.Namespace) -> None:

@@ -19,7 +19,7 @@ from startrack.camera import Camera, load_camera
 from startrack.catalog import load_catalog
 from startrack.cli.console import Outcome, print_outcome, refusal_record, worst_code
 from startrack.cli.flags import check_localizer
-from startrack.cli.images import check_fov, compile_beside, prepare_reference, read
+from startrack.cli.images import check_fov, compile_beside, near_attitude_of, prepare_reference, read
 from startrack.cli.report import write_page_of_images
 from startrack.core.errors import INTERNAL_ERROR, BadInput, BadOutput
 from startrack.core.files import make_folder
@@ -40,7 +40,9 @@ def locate(args: argparse.Namespace) -> int:
         )
     check_localizer(args)
     near = None if args.near is None else PositionPrior(*args.near)
-    settings = chain.Settings(localizer=args.localizer, evidence_sources=args.evidence, near=near)
+    settings = chain.Settings(
+        localizer=args.localizer, evidence_sources=args.evidence, near=near, near_attitude=near_attitude_of(args)
+    )
     code = _run_images(args, "fix", lambda exposure, _: chain.locate_exposure(exposure, settings))
     if args.report:
         write_page_of_images(args.dir, args.images)
@@ -50,11 +52,14 @@ def locate(args: argparse.Namespace) -> int:
 def identify(args: argparse.Namespace) -> int:
     """Identify every image; the exit code of the worst."""
     check_fov(args)
+    if args.fov is not None and args.near_attitude is not None:
+        args.usage_error("--near-attitude needs a camera file: with --fov the lens is not known")
+    settings = chain.Settings(near_attitude=near_attitude_of(args))
 
     def solve(exposure: Exposure, camera: Camera | None) -> chain.Outcome:
         if camera is None:
             return chain.identify_blind(exposure, args.fov, load_catalog())
-        return chain.identify(exposure, camera, load_catalog())
+        return chain.identify(exposure, camera, load_catalog(), settings)
 
     return _run_images(args, "identification", solve)
 

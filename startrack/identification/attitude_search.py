@@ -1,11 +1,11 @@
-"""Attitudes: triangles of detections that match the catalogue's, tested against bright stars, refined with all stars.
+"""Attitudes: triangles of detections that match the catalogue's, tested against bright stars.
 
 All arrays are small and the number of numpy calls is kept low: a typical search ends with its first triangles.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -13,18 +13,11 @@ from itertools import pairwise
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.core.types import Array, Bools, Centroids, Ints
-from startrack.estimation.adjust import CHI2_2DOF_MEDIAN, SMALLEST_EXTRA_PX2, STAR_OUTLIER_CHI2
+from startrack.core.types import Array, Centroids, Ints
 from startrack.estimation.false_alarm import PATTERN_MATCHES, expected_false_alarms
-from startrack.estimation.match import (
-    BRIGHTER_MAG,
-    CandidatePairs,
-    PhotometricScale,
-    brightness_agreement,
-    upper_median,
-)
 from startrack.frames import wahba
 from startrack.identification.index import CatalogPatterns, Neighbours, PixelScale
+from startrack.identification.near_attitude import agreeing_pairs
 from startrack.identification.triangles import PatternIndex, sides_of_few, triangles
 
 PREFIXES = (0, 7, 10, 14, 20, 28)  # number of brightest detections that form triangles, round by round
@@ -44,8 +37,10 @@ GATE_PX = 6.0  # from a predicted star, in which detections are matched
 FIRST_GATE_PX = GATE_PX / 2
 INLIER_PX = 1.5  # largest distance of a detection on its star
 ONE_SOURCE_SIGMAS = 3.0  # of the PSF: radius within which stars share one detection
-MATCH_ROUNDS = 4  # of matching and rotating; one suffices if the bright stars determine the attitude
-SETTLED_PX = 0.15
+SETTLING_ROUNDS = 10  # two or three suffice
+# Of a rough attitude that is the right one: 0.8 of rendered frames, 0.45 of coarse pixels. One that is a degree off
+# fits the stars about one axis.
+LEAST_PART = 0.3
 MAX_DRIFT_PX = 0.7  # change of the attitude up to which the neighbours remain valid
 
 
@@ -84,6 +79,7 @@ class AttitudeHypothesis:
     detection: Ints  # (k,)
     star: Ints  # (k,)
     near: Neighbours | None  # all stars near the detections, where they were looked up
+    part: float  # of the pairs of a bright detection and a star near it that coincide
 
 
 class AttitudeSearch:
@@ -117,6 +113,24 @@ class AttitudeSearch:
                     yield from self._attitudes_from_triangles(index, first, fresh, end, tolerance)
         yield from self._attitudes_from_pairs(tolerance)
         yield from self._attitudes_from_short_triangles(rough_px * self.scale.axis_rad_per_px)
+
+    def hypotheses_near(self, near_R_cam_icrs: Array, tolerance_px: float) -> Iterator[AttitudeHypothesis]:
+        """A rough attitude itself, then the one at which the most bright detections beside stars agree.
+
+        Only those that are unlikely by chance.
+        """
+        tolerance = tolerance_px * self.scale.axis_rad_per_px
+        self.tried += 1
+        for itself in self._test_attitudes([near_R_cam_icrs], 0, 2.0 * tolerance):
+            if itself.part > LEAST_PART:
+                yield itself
+        detection, star, tried = agreeing_pairs(
+            self.rays_cam, near_R_cam_icrs, self.patterns, self.scale.diameter_rad, tolerance
+        )
+        self.tried += tried
+        if len(detection) >= PATTERN_MATCHES:
+            R = wahba(self.rays_cam[detection], self.patterns.stars.rays_icrs[star])
+            yield from self._test_attitudes([R], 0, 2.0 * tolerance)
 
     def _attitudes_from_triangles(
         self, index: PatternIndex, first: int, fresh: int, end: int, tolerance: float
@@ -158,19 +172,50 @@ class AttitudeSearch:
         """Attitudes that rotate rays icrs (m, 3, 3), of this handedness (m,), to cam (m, 3, 3), by bright stars."""
         self.tried += len(cam)
         same = np.linalg.det(cam) * handedness > 0
-        cam, icrs, rays_cam = cam[same], icrs[same], self.rays_cam
-        some, radius = rays_cam[: first + VERIFIED_DETECTIONS], 2.0 * tolerance
-        depth = int(DEPTH_FACTOR * 4 * np.pi / self.patterns.field_sr * len(some))
-        for R in self._supported_attitudes(
-            cam, icrs, some[max(first - WINDOW_RANKS, 0) : first + PRETESTED], radius, depth
-        ):
-            near = self.patterns.neighbours(some @ R, self.sources.neighbour_radius_rad, depth)
-            hit = near.chord < radius
-            hits = min(int(np.count_nonzero(hit)), len(some))
+        some = self.rays_cam[max(first - WINDOW_RANKS, 0) : first + PRETESTED]
+        supported = self._supported_attitudes(cam[same], icrs[same], some, 2.0 * tolerance, self._depth(first))
+        yield from self._test_attitudes(supported, first, 2.0 * tolerance)
+
+    def _depth(self, first: int) -> int:
+        """Number of the brightest stars that the detections up to some beyond the `first` may be."""
+        rays = len(self.rays_cam[: first + VERIFIED_DETECTIONS])
+        return int(DEPTH_FACTOR * 4 * np.pi / self.patterns.field_sr * rays)
+
+    def _test_attitudes(self, attitudes: Iterable[Array], first: int, radius: float) -> Iterator[AttitudeHypothesis]:
+        """The `attitudes` at which more detections hit a star within the `radius` than chance makes likely."""
+        rays = len(self.rays_cam[: first + VERIFIED_DETECTIONS])
+        for R in attitudes:
+            near = self._neighbours(R, first)
+            hits = min(int(np.count_nonzero(near.chord < radius)), rays)
             if hits < MIN_MATCHES:
                 continue
-            if self._false_alarms(hits - PATTERN_MATCHES, len(some), near.depth, radius) < PLAUSIBLE:
-                yield AttitudeHypothesis(R, near.ray[hit], near.star[hit], near if len(some) == len(rays_cam) else None)
+            if self._false_alarms(hits - PATTERN_MATCHES, rays, near.depth, radius) < PLAUSIBLE:
+                yield self._settle(R, near, first, radius)
+
+    def _neighbours(self, R: Array, first: int) -> Neighbours:
+        """The stars near the detections up to some beyond the `first`, at the attitude `R`."""
+        rays = self.rays_cam[: first + VERIFIED_DETECTIONS] @ R
+        return self.patterns.neighbours(rays, self.sources.neighbour_radius_rad, self._depth(first))
+
+    def _settle(self, R: Array, near: Neighbours, first: int, radius: float) -> AttitudeHypothesis:
+        """The attitude that is the best for the stars which it places within the `radius` of a detection.
+
+        It begins at `R`, with the stars `near` the detections there. Whatever attitude in its surroundings proposes it,
+        the result is the same.
+        """
+        cam, icrs, start = self.rays_cam[near.ray], self.patterns.stars.rays_icrs[near.star], R
+        hit = near.chord < radius
+        for _ in range(SETTLING_ROUNDS):
+            R, before = wahba(cam[hit], icrs[hit]), hit
+            if np.abs(start - R).max() > MAX_DRIFT_PX * self.scale.axis_rad_per_px:
+                near, start = self._neighbours(R, first), R
+                cam, icrs = self.rays_cam[near.ray], self.patterns.stars.rays_icrs[near.star]
+            off = cam - icrs @ R.T
+            hit = np.einsum("ni,ni->n", off, off) < radius**2
+            if np.array_equal(hit, before):
+                break
+        is_whole = len(self.rays_cam) <= first + VERIFIED_DETECTIONS
+        return AttitudeHypothesis(R, near.ray[hit], near.star[hit], near if is_whole else None, float(hit.mean()))
 
     def _supported_attitudes(self, cam: Array, icrs: Array, some: Array, radius: float, depth: int) -> Iterator[Array]:
         """R_cam_icrs of the closest match, which is nearly always right, then of matches that detections support."""
@@ -188,82 +233,3 @@ class AttitudeSearch:
     def _false_alarms(self, further: Ints | int, rays: int, depth: int, radius: float) -> Array:
         """Expected number of trials in which so many further rays hit one of the `depth` brightest stars by chance."""
         return expected_false_alarms(self.tried, further, rays, min(depth * radius**2 / 4, 1.0))
-
-
-@dataclass(frozen=True)
-class AttitudeMatch:
-    """An attitude with its matches."""
-
-    R_cam_icrs: Array
-    pairs: CandidatePairs
-    matched: Ints  # (m,) indices of pairs: mutually nearest, agreeing in brightness, within GATE_PX
-    named: Bools  # (m,) close enough to be identified
-    inlier: Bools  # (m,) as close as the stated centroid errors predict
-    variance_px2: Array  # (m,) per axis, the error common to all stars added
-    visible_v_mag: Array  # of the stars in the image circle that are bright enough to be detected
-
-
-def refine_attitude(sources: Sources, hypothesis: AttitudeHypothesis) -> AttitudeMatch | None:
-    """Match all stars by position and brightness, starting from the bright ones that coincide.
-
-    None where too few agree.
-    """
-    d, stars, scale = sources.centroids, sources.patterns.stars, sources.scale
-    R = wahba(sources.rays_cam[hypothesis.detection], stars.rays_icrs[hypothesis.star])
-    photometry = PhotometricScale.from_matches(
-        d.flux_e, d.saturated, stars.v_mag[hypothesis.star], hypothesis.detection
-    )
-    limit, complete = np.searchsorted(stars.v_mag, [photometry.limit_mag, photometry.complete_mag]).tolist()
-    near = hypothesis.near
-    drift_px = np.abs(hypothesis.R_cam_icrs - R).max() / scale.axis_rad_per_px
-    if near is None or near.depth < limit or drift_px > MAX_DRIFT_PX:
-        near = sources.patterns.neighbours(sources.rays_cam @ R, sources.neighbour_radius_rad, limit)
-    detection, star = near.ray, near.star
-    rays_icrs, v_mag = stars.rays_icrs[star], stars.v_mag[star]
-    v_sigma_mag = stars.v_sigma_mag[star] + d.brightness_sigma_mag
-    xy_px = d.xy_px[detection]
-    for _ in range(MATCH_ROUNDS):
-        px, inside = sources.camera.project(rays_icrs @ R.T)
-        off = px - xy_px
-        distance = np.sqrt(np.einsum("ni,ni->n", off, off))
-        distance[~inside | (distance > GATE_PX)] = np.inf
-        pairs = CandidatePairs(detection, star, distance, v_mag, v_sigma_mag, photometry)
-        matched = pairs.one_to_one_pairs
-        if len(matched) < MIN_MATCHES:
-            return None
-        agree, variance = _select_inliers(pairs, matched, sources.variance_px2)
-        used = matched[agree]
-        if len(used) < MIN_MATCHES:
-            return None
-        refined = wahba(sources.rays_cam[detection[used]] / variance[agree][:, None], rays_icrs[used])
-        if np.abs(refined - R).max() / scale.axis_rad_per_px < SETTLED_PX:
-            break
-        R = refined
-    visible = stars.rays_icrs[:complete] @ R[2] > np.cos(sources.camera.max_angle_rad)
-    squared, misfit = np.square(pairs.distance_px[matched]), pairs.brightness_misfit[matched]
-    inlier = squared < np.maximum(INLIER_PX**2, STAR_OUTLIER_CHI2 * sources.variance_px2[detection[matched]])
-    # Position and brightness may not both be at the edge of what is allowed.
-    named = inlier & agree & (squared / (STAR_OUTLIER_CHI2 * variance) + misfit * misfit < 1.0)
-    return AttitudeMatch(refined, pairs, matched, named, inlier, variance, stars.v_mag[:complete][visible])
-
-
-def _select_inliers(pairs: CandidatePairs, which: Ints, variance_px2: Array) -> tuple[Bools, Array]:
-    """Which of the pairs are no outliers, and their variance per axis [px^2], the common error added.
-
-    The common error is estimated as in `extra_variance_px2`, but in closed form: for one variance per star.
-    """
-    distance = pairs.distance_px[which]
-    stated = variance_px2[pairs.detection[which]]
-    first = distance < FIRST_GATE_PX
-    if not first.any():
-        return first, stated
-    squared = np.square(distance)
-    extra = upper_median(squared[first]) / CHI2_2DOF_MEDIAN - upper_median(stated[first])
-    variance = stated + max(extra, SMALLEST_EXTRA_PX2)
-    return first & (squared < STAR_OUTLIER_CHI2 * variance), variance
-
-
-def agreement_of(centroids: Centroids, v_mag: Array, measured_mag: Array, dimmed_mag: float = BRIGHTER_MAG) -> float:
-    """Fraction of random pairs that agree in brightness; 1 where the brightness is not known."""
-    known = np.isfinite(centroids.brightness_sigma_mag)
-    return brightness_agreement(v_mag, measured_mag, dimmed_mag) if known else 1.0

@@ -70,6 +70,7 @@ def identify_centroids(
     psf_sigma_px: float = 1.0,
     stars: Stars | None = None,
     identifier: Identifier | None = None,
+    near_R_cam_icrs: Array | None = None,
 ) -> IdentifiedCentroids:
     """Identify the stars in a list of centroids, with a camera or from a field of view alone.
 
@@ -85,6 +86,7 @@ def identify_centroids(
         psf_sigma_px: width of the stars; nearer stars than three times this share one centroid.
         stars: catalogue at the time of the exposure, brightest first; None: Hipparcos at J2000.0, without aberration.
         identifier: settings of the identification with a camera.
+        near_R_cam_icrs: a rough attitude (3, 3) of a `camera`, near which the stars are sought first.
 
     Raises:
         ValueError: neither a camera, nor a field of view with the frame's size, or both; or arrays of a wrong shape or
@@ -100,7 +102,7 @@ def identify_centroids(
         if fov_rad is not None or size_px is not None:
             raise ValueError("with camera= neither a field of view nor size_px= is given: the camera has its own")
         _require_in_frame(sources.xy_px, camera.size_px)
-        found = (identifier or Identifier())(sources, camera, stars)
+        found = (identifier or Identifier())(sources, camera, stars, near_R_cam_icrs)
     elif fov_rad is not None and size_px is not None:
         _require_in_frame(sources.xy_px, size_px)
         solution = identify_unknown_lens(sources, size_px, fov_rad, stars)

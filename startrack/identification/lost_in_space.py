@@ -1,13 +1,15 @@
-"""Identification with a camera file and no prior on the attitude: which detection is which catalogue star."""
+"""Identification with a camera file, with or without a rough attitude: which detection is which catalogue star."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.core.types import Centroids, Identification, NotIdentified, Stars
+from startrack.core.types import Array, Centroids, Identification, NotIdentified, Stars
 from startrack.estimation.false_alarm import (
     CAP_RADIUS_RAD,
     coincidence_probability,
@@ -17,17 +19,16 @@ from startrack.estimation.false_alarm import (
     probability,
 )
 from startrack.estimation.match import DIMMED_MAG, SIGNIFICANT_SNR, upper_median
+from startrack.identification.attitude_refinement import AttitudeMatch, agreement_of, refine_attitude
 from startrack.identification.attitude_search import (
     FIRST_GATE_PX,
     GATE_PX,
     INLIER_PX,
     MIN_MATCHES,
     ONE_SOURCE_SIGMAS,
-    AttitudeMatch,
+    AttitudeHypothesis,
     AttitudeSearch,
     Sources,
-    agreement_of,
-    refine_attitude,
 )
 from startrack.identification.index import patterns_of, pixel_scale_of
 
@@ -42,7 +43,7 @@ LOCAL_FRACTION = 0.1  # of the field's diameter: radius of the caps in which the
 
 @dataclass(frozen=True)
 class Identifier:
-    """Identification by triangles, accepted by its p-value: (Centroids, Camera, Stars) -> Identification.
+    """Identification by triangles, accepted by its p-value: (Centroids, Camera, Stars, attitude) -> Identification.
 
     An attitude is accepted if chance would give as many coincidences with a probability below `max_false_alarm`, all
     hypotheses tried included; otherwise NotIdentified is raised.
@@ -52,9 +53,12 @@ class Identifier:
     tolerances_px: tuple[float, float] = (0.7, 3.0)  # error of a ray: centroids alone; rough calibration included
     whole_field: bool = True  # refuse a camera that fits only a part of its field; a calibration may begin with one
 
-    def __call__(self, centroids: Centroids, camera: Camera, stars: Stars) -> Identification:
+    def __call__(
+        self, centroids: Centroids, camera: Camera, stars: Stars, near_R_cam_icrs: Array | None = None
+    ) -> Identification:
         """Match `centroids` of a `camera` with the `stars`, both sorted, brightest first.
 
+        A rough attitude `near_R_cam_icrs` (3, 3) is tried first; where it is wrong, the others follow.
         Raises NotIdentified; its reason is "mirrored" where only the mirror image of the frame can be identified.
         """
         scale = pixel_scale_of(camera)
@@ -68,14 +72,19 @@ class Identifier:
         search = AttitudeSearch(sources)
         tolerance_px, rough_px = self.tolerances_px
         tolerance_px = min(max(tolerance_px, TOLERANCE_SIGMAS * upper_median(sources.variance_px2) ** 0.5), rough_px)
-        found, refusal = self._find_accepted(search, tolerance_px, rough_px)
+        found = None
+        if near_R_cam_icrs is not None:
+            with suppress(_WrongCamera):  # or a wrong attitude
+                found, _ = self._find_accepted(search, search.hypotheses_near(near_R_cam_icrs, tolerance_px))
+        if found is None:
+            found, refusal = self._find_accepted(search, search.hypotheses(tolerance_px, rough_px))
         if found is not None:
             if is_whole:
                 return found
             outside = int(np.count_nonzero(np.delete(centroids.snr, inside) > SIGNIFICANT_SNR))
             return replace(found, detection=inside[found.detection], unexplained=found.unexplained + outside)
         mirror, lenient = AttitudeSearch(sources.mirror_image()), replace(self, whole_field=False)
-        if lenient._find_accepted(mirror, tolerance_px, rough_px)[0] is not None:
+        if lenient._find_accepted(mirror, mirror.hypotheses(tolerance_px, rough_px))[0] is not None:
             raise NotIdentified(
                 "the image is a mirror image, compared with the camera file: flip the image, or set mirrored = "
                 f"{str(not camera.mirrored).lower()} in the camera file",
@@ -89,11 +98,11 @@ class Identifier:
         )
 
     def _find_accepted(
-        self, search: AttitudeSearch, tolerance_px: float, rough_px: float
+        self, search: AttitudeSearch, hypotheses: Iterable[AttitudeHypothesis]
     ) -> tuple[Identification | None, str]:
         """The first hypothesis that is accepted, or why the last one was not."""
         refusal = "no triangle of detections matches one of the catalogue"
-        for refined, hypothesis in enumerate(search.hypotheses(tolerance_px, rough_px)):
+        for refined, hypothesis in enumerate(hypotheses):
             if refined == MAX_REFINED:
                 break
             match = refine_attitude(search.sources, hypothesis)

@@ -16,7 +16,8 @@ from startrack.estimation.false_alarm import (
     log_trials,
 )
 from startrack.estimation.match import CandidatePairs, PhotometricScale, match_nearest
-from startrack.identification.attitude_search import GATE_PX, INLIER_PX, agreement_of
+from startrack.identification.attitude_refinement import agreement_of
+from startrack.identification.attitude_search import GATE_PX, INLIER_PX
 from startrack.identification.hypotheses import SAME_VIEW_RAD, HypothesisSearch, Window
 from startrack.identification.lens_guesses import PINHOLE, guess_lenses
 from startrack.identification.region_growing import FEWEST, GATE_OVER_SIGMA, REGION_ROUNDS, PinholeView

@@ -24,7 +24,8 @@ from startrack.estimation.match import (
     is_isolated,
     match_by_brightness,
 )
-from startrack.identification.attitude_search import GATE_PX, INLIER_PX, ONE_SOURCE_SIGMAS, agreement_of
+from startrack.identification.attitude_refinement import agreement_of
+from startrack.identification.attitude_search import GATE_PX, INLIER_PX, ONE_SOURCE_SIGMAS
 from startrack.identification.region_growing import FEWEST, GATE_OVER_SIGMA, fit_camera, match_in_view, with_file_lens
 
 # Gate [px] and number of brightest detections; None: all, which match by brightness too.

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from startrack import __version__, chain, output
-from startrack.chain import Outcome, content_sha256
+from startrack.chain import NearAttitude, Outcome, content_sha256
 from startrack.core.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput
 from startrack.core.files import FULL_DISK
 from startrack.core.runner import Died, Runner, RunStopped
@@ -48,6 +48,7 @@ class Task:
     evidence: str = "both"  # of startrack.chain.stages.EVIDENCE_SOURCES
     bag_image: BagImage | None = None  # where `path` is BAG#NUMBER
     near: tuple[float, float, float] | None = None  # east, north, sigma [m] of a prior of the position
+    near_attitude: NearAttitude | None = None
 
 
 def locate_images(runner: Runner[Task, ImageDone], tasks: Sequence[Task]) -> Generator[ImageDone, None, None]:
@@ -108,8 +109,9 @@ def _valid_record(task: Task, key: str) -> dict[str, Any] | None:
 
 def _key(task: Task, sha256: str) -> str:
     return chain.job_sha256(
-        task.path, sha256, task.facts, task.plots, task.localizer, task.evidence, *(task.near or ())
-    )
+        task.path, sha256, task.facts, task.plots, task.localizer, task.evidence, *(task.near or ()),
+        *([] if task.near_attitude is None else [task.near_attitude]),
+    )  # fmt: skip
 
 
 def _locate_and_write(task: Task, sha256: str, key: str) -> dict[str, Any]:
@@ -164,7 +166,9 @@ def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str
     try:
         near = None if task.near is None else PositionPrior(*task.near)
         localizer = require_localizer(task.localizer)
-        settings = chain.Settings(localizer=localizer, evidence_sources=task.evidence, near=near)
+        settings = chain.Settings(
+            localizer=localizer, evidence_sources=task.evidence, near=near, near_attitude=task.near_attitude
+        )
         return chain.locate_exposure(exposure, settings), inputs
     except BadInput as cause:
         refused = chain.Refused(reason=cause.reason, message=str(cause), reached=chain.Inputs(exposure=exposure))

@@ -17,7 +17,7 @@ from startrack.catalog import (
     is_below_horizon,
     sky_at,
 )
-from startrack.chain import Oriented, Refused, identify, identify_blind
+from startrack.chain import NearAttitude, Oriented, Refused, Settings, identify, identify_blind
 from startrack.core.errors import BadInput, Reason
 from startrack.core.runner import map_in_threads
 from startrack.core.types import Array, Body, Detections, Exposure, Ints
@@ -75,10 +75,13 @@ def orient_frames(
     def orient(exposure: Exposure) -> Oriented | Refused:
         require_time(exposure)
         require_body(exposure, site)
-        known = identified[0].camera if identified else camera
-        if known is None:
+        if identified:
+            first = identified[0]
+            near = NearAttitude.of(first.attitude_fit.attitude.R_cam_icrs, first.exposure.time_utc)
+            return identify(exposure, first.camera, catalog, Settings(near_attitude=near), site)
+        if camera is None:
             return identify_blind(exposure, fov_rad or 0.0, catalog)
-        return identify(exposure, known, catalog, site=site)
+        return identify(exposure, camera, catalog, site=site)
 
     def take(exposure: Exposure, outcome: Oriented | Refused) -> None:
         if isinstance(outcome, Oriented):
@@ -90,7 +93,7 @@ def orient_frames(
             left_out.append(LeftOut(name=exposure.name, reason=outcome.reason, message=outcome.message))
 
     others = list(exposures)
-    while others and not identified:  # the lens of the first one identified serves for all others
+    while others and not identified:  # lens and attitude of the first one identified serve for all others
         exposure = others.pop(0)
         take(exposure, orient(exposure))
     for exposure, outcome in zip(others, map_in_threads(orient, others), strict=True):

@@ -6,7 +6,7 @@ import hashlib
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,10 +24,19 @@ from startrack.applications.tracking.odometry import SPAN_TOLERANCE_S, Odometry
 from startrack.applications.tracking.track import Track, estimate_track, odometry_steps, track_of_newest
 from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.catalog import load_catalog
-from startrack.chain import Settings, input_hashes, job_sha256, load_camera_input, locate, terrain_input
+from startrack.chain import (
+    NearAttitude,
+    Settings,
+    input_hashes,
+    job_sha256,
+    load_camera_input,
+    locate,
+    terrain_input,
+)
 from startrack.core.errors import BadInput
 from startrack.estimation.observations import USUAL_ODOMETRY, OdometryErrors
 from startrack.exposure import NO_TIME
+from startrack.frames import R_enu_icrs
 
 if TYPE_CHECKING:
     from startrack.camera import Camera
@@ -75,7 +84,8 @@ class TrackSession:
         key = "" if self.store is None or path is None else self._key(exposure, path, shared)
         frame = self.store.read(key) if self.store and key else None
         if frame is None:
-            outcome = locate(exposure, camera, terrain, load_catalog(), self.settings)
+            settings = replace(self.settings, near_attitude=self._near_attitude(camera, terrain, exposure.time_utc))
+            outcome = locate(exposure, camera, terrain, load_catalog(), settings)
             frame = observe_frame(outcome, replace(shared, gross=facts_of(outcome, shared)), terrain)
             if self.store and key:
                 self.store.write(key, frame)
@@ -142,6 +152,14 @@ class TrackSession:
 
     def _steps(self, frames: Sequence[ObservedFrame], odometry: Odometry | None) -> Steps:
         return odometry_steps(frames, odometry, self.odometry_errors)
+
+    def _near_attitude(self, camera: Camera, terrain: Terrain, when: datetime) -> NearAttitude | None:
+        """That of the frame next to the time `when`; None where there is none."""
+        known = [(frame.time_utc, frame.R_body_enu) for frame in self.frames if frame.R_body_enu is not None]
+        if not known or terrain.site is None:
+            return None
+        time_utc, R_body_enu = min(known, key=lambda one: abs(one[0] - when))
+        return NearAttitude.of(camera.R_body_cam.T @ R_body_enu @ R_enu_icrs(terrain.site, time_utc), time_utc)
 
     def _load_references(self, exposure: Exposure) -> tuple[Camera, Terrain, TrackErrors]:
         """Camera, terrain and shared errors of the track: those of its first image. Raises BadInput for another's."""

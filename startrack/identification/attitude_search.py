@@ -39,7 +39,7 @@ INLIER_PX = 1.5  # largest distance of a detection on its star
 ONE_SOURCE_SIGMAS = 3.0  # of the PSF: radius within which stars share one detection
 SETTLING_ROUNDS = 10  # two or three suffice
 # Of a rough attitude that is the right one: 0.8 of rendered frames, 0.45 of coarse pixels. One that is a degree off
-# fits the stars about one axis.
+# fits the stars about one axis only.
 LEAST_PART = 0.3
 MAX_DRIFT_PX = 0.7  # change of the attitude up to which the neighbours remain valid
 

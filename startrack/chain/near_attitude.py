@@ -30,7 +30,7 @@ class NearAttitude:
 
     @classmethod
     def of(cls, R_cam_icrs: ArrayLike, time_utc: datetime | None = None) -> Self:
-        """The rough attitude `R_cam_icrs` (3, 3) at a time. Raises ValueError for a matrix that is no rotation."""
+        """The rough attitude `R_cam_icrs` (3, 3) at `time_utc`. Raises ValueError for a matrix that is no rotation."""
         return cls(tuple(quat_xyzw_from_R(R_cam_icrs).tolist()), time_utc)
 
     def R_cam_icrs_at(self, when: datetime | None, site: Site | None) -> Array:
@@ -45,7 +45,7 @@ class NearAttitude:
 
 
 def read_near_attitude(path: FilePath) -> NearAttitude:
-    """The attitude in a result file, `NAME.fix.json` or `NAME.identification.json`. Raises BadInput (bad_image)."""
+    """The attitude in the NAME.fix.json or NAME.identification.json at `path`. Raises BadInput (bad_image)."""
     try:
         found = json.loads(read_text(path, REASON, max_bytes=MAX_BYTES))
     except (ValueError, RecursionError) as cause:

@@ -1,6 +1,7 @@
 """Bounds of the horizon over boxes, compiled with numba, by the rays of `horizon_kernel`.
 
-A ray from anywhere in a box passes near the middle line: the steepest slopes to the side bound the ground there.
+A ray from anywhere in a box passes near the middle line: the steepest slopes to the side bound the ground there. Over a
+block of cells as large as the band is wide the slopes are the same, and the line is straight on the map.
 """
 
 from __future__ import annotations
@@ -14,13 +15,17 @@ from startrack.terrain.ground_kernel import level_of, slope_range, steepness
 from startrack.terrain.horizon_kernel import (
     FAR_M,
     LOWEST_TAN,
+    NUDGE_M,
+    STRAIGHT_M,
     best_in_step,
     block_at,
     exit_of,
+    height_on_line,
     horizon,
     locate,
     map_cell,
     surface,
+    surface_place,
 )
 
 FINE_POSTS = 1.2  # posts: of narrower bands slopes are taken cell by cell
@@ -127,7 +132,9 @@ def bounds(
     steepest = -FAR_M  # along the ray, from the box's near side on
     begin = -reach if whole else start_m
     s = best_at if best_at > reach else 12.0 * reach + 1.0
-    level, known_z = 0, up
+    level, known_s, known_z, known = 0, -FAR_M, up, (-1, 0.0, 0.0)
+    d_column, d_row, to_column, to_row, right, left, ahead = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    straight_map, straight_to, straight_low, at_before = -1, -FAR_M, low, -1
     probing, running = True, True  # one step at the middle's own horizon gives a lower bound that lets much be skipped
     while running:
         e, n = east + s * sin_a, north + s * cos_a
@@ -147,11 +154,15 @@ def bounds(
             if probing:
                 probing, s, known_z = False, begin, up
         else:
-            step = post_m[m]
-            rise = max(low + along_rise, -1.0)
-            column2, row2 = map_cell(grid, m, e + step * sin_a, n + step * cos_a, line + rise * step)
-            d_column, d_row = (column2 - column) / step, (row2 - row) / step
-            least_level = level_of(levels, m, post_m, moon, width, e, n)
+            if s > straight_to or m != straight_map or low != straight_low:
+                step, rise = post_m[m], max(low + along_rise, -1.0)
+                column2, row2 = map_cell(grid, m, e + step * sin_a, n + step * cos_a, line + rise * step)
+                d_column, d_row = (column2 - column) / step, (row2 - row) / step
+                column2, row2 = map_cell(grid, m, e + step * cos_a, n - step * sin_a, line)
+                to_column, to_row = (column2 - column) / step, (row2 - row) / step
+                straight_map, straight_low, at_before = m, low, -1
+                straight_to = s + STRAIGHT_M
+            least_level = level_of(levels, m, post_m, moon, width * (1 + 3 * tan_turn), e, n)
             near = whole and s < 6.0 * reach and not probing
             level = least_level if near or probing else min(max(level, least_level), levels[m] - 1)
             descending, skipped = not (near or probing), False
@@ -165,81 +176,107 @@ def bounds(
                     descending = False
                 else:
                     level -= 1
-            slack, rise_aside, bend, stop = 0.0, 0.0, np.sqrt(e * e + n * n) / moon, s
             if not skipped:
-                at = block_at(blocks, m, least_level, column, row)
-                length = exit_of(column, row, d_column, d_row, 0)
-                stop = s + length
-                side_column, side_row = map_cell(grid, m, e + step * cos_a, n - step * sin_a, line)
-                to_column, to_row = (side_column - column) / step, (side_row - row) / step
-                right = steepness(slopes, at, slope_unit[m], to_column, to_row)
-                left = steepness(slopes, at, slope_unit[m], -to_column, -to_row)
-                to_side = max(right - side_rise, left + side_rise, 0.0)
-                steep = max(abs(right), abs(left))
+                at, bend = block_at(blocks, m, least_level, column, row), np.sqrt(e * e + n * n) / moon
+                if at != at_before:
+                    right = steepness(slopes, at, slope_unit[m], to_column, to_row)
+                    left = steepness(slopes, at, slope_unit[m], -to_column, -to_row)
+                    ahead = steepness(slopes, at, slope_unit[m], d_column, d_row)
+                    at_before = at
+                if known_s != s:
+                    known_z, known = surface_place(grid, posts, heights, moon, e, n, known_z)
+                whole_level = 0 if probing else least_level
+                span = exit_of(column, row, d_column, d_row, whole_level)
+                end_z, end = surface_place(grid, posts, heights, moon, e + span * sin_a, n + span * cos_a, known_z)
+                if whole_level > 0 and (end[0] != known[0] or end[0] < 0):
+                    whole_level, span = 0, exit_of(column, row, d_column, d_row, 0)
+                    end_z, end = surface_place(grid, posts, heights, moon, e + span * sin_a, n + span * cos_a, known_z)
+                run_column, run_row = (end[1] - known[1]) / span, (end[2] - known[2]) / span
                 floor += tilted * width
-                width += length * tan_turn
-                rise_aside = to_side + steep * (0.005 + 2 * bend) + (aside + width) / moon
-                slack = rise_aside * width
+                to_side, steep = max(right - side_rise, left + side_rise, 0.0), max(abs(right), abs(left))
+                rise_aside = to_side + steep * (0.005 + 2 * bend) + (aside + width + span * tan_turn) / moon
                 if near:
-                    along = steepness(slopes, at, slope_unit[m], d_column, d_row) - along_rise
-                    along += (abs(along + along_rise) * (0.01 + 2 * bend) + bend + width / moon) + steep * tan_turn
-                    steepest = max(steepest, along)
-                elif not probing:
-                    top_here = tops[block_at(blocks, m, 0, column, row)] + slack
-                    if floor + min(climb * length, 0.0) >= top_here:
-                        s, skipped = stop, True
-            if not skipped:
-                half_s = s + 0.5 * length
-                z0 = surface(grid, posts, heights, moon, e, n, known_z)
-                z2 = surface(grid, posts, heights, moon, east + stop * sin_a, north + stop * cos_a, z0)
-                z1 = surface(grid, posts, heights, moon, east + half_s * sin_a, north + half_s * cos_a, 0.5 * (z0 + z2))
-                next_z = z2
-                z0, z1, z2 = z0 - along_rise * s, z1 - along_rise * half_s, z2 - along_rise * stop
-                top, bottom, bottom_s, bottom_z = _step_bounds(
-                    s, half_s, stop, z0, z1, z2, slack, low_up, high_up, reach, cos_turn
-                )
-                parts, part_slack = 1, KINK_M * min(width, 1.0)
-                if tilt_to_crest and top >= low and width < FINE_POSTS * post_m[m]:
-                    parts = STEP_PARTS
-                    column0, row0 = map_cell(grid, m, e, n, moon + z0 + along_rise * s)
-                bend_k = (z0 - 2 * z1 + z2) * 2 / (length * length)
-                rise_k = (z2 - z0) / length - bend_k * length
-                for k in range(parts):
-                    s0, s1, s2 = s, half_s, stop
-                    y0, y1, y2 = z0, z1, z2
-                    part_rise = rise_aside
-                    if parts > 1:
-                        a0, a2 = length * k / parts, length * (k + 1) / parts
-                        a1 = 0.5 * (a0 + a2)
-                        least, most = slope_range(
-                            heights, posts, m, column0, row0, d_column, d_row, a0, a2, to_column, to_row, width
-                        )
-                        if least <= most:
-                            part_rise = max(most - side_rise, side_rise - least, 0.0)
-                            part_rise += max(abs(least), abs(most)) * (0.005 + 2 * bend) + (aside + width) / moon
-                            part_rise = min(part_rise, rise_aside)
-                        s0, s1, s2 = s + a0, s + a1, s + a2
-                        y0 = z0 + a0 * (rise_k + a0 * bend_k)
-                        y1 = z0 + a1 * (rise_k + a1 * bend_k)
-                        y2 = z0 + a2 * (rise_k + a2 * bend_k)
+                    along = abs(ahead) * (0.01 + 2 * bend) + bend + width / moon + steep * tan_turn
+                    steepest = max(steepest, ahead - along_rise + along)
+                begun, z_begun, is_known = 0.0, known_z, True
+                while begun < span:  # from grid line to grid line
+                    column, row = known[1] + begun * run_column, known[2] + begun * run_row
+                    done = begun + exit_of(column, row, run_column, run_row, 0)
+                    if whole_level == 0 or done + 2 * NUDGE_M > span:
+                        done = span
+                    length = done - begun
+                    width += length * tan_turn
+                    slack = rise_aside * width
+                    low_here = floor + climb * begun + min(climb * length, 0.0)
+                    is_open = near or probing or low_here < tops[block_at(blocks, m, 0, column, row)] + slack
+                    if is_open:
+                        if not is_known:
+                            z_begun = height_on_line(
+                                heights, posts, moon, known, run_column, run_row, e, n, sin_a, cos_a, begun
+                            )
+                        middle, z1, z2 = begun + 0.5 * length, 0.0, end_z
+                        if end[0] == known[0] and end[0] >= 0:
+                            z1 = height_on_line(
+                                heights, posts, moon, known, run_column, run_row, e, n, sin_a, cos_a, middle
+                            )
+                            if done < span:
+                                z2 = height_on_line(
+                                    heights, posts, moon, known, run_column, run_row, e, n, sin_a, cos_a, done
+                                )
+                        else:
+                            z1 = surface(grid, posts, heights, moon, e + middle * sin_a, n + middle * cos_a, z_begun)
+                        next_z = z2
+                        s0, s1, s2 = s + begun, s + middle, s + done
+                        z0, z1, z2 = z_begun - along_rise * s0, z1 - along_rise * s1, z2 - along_rise * s2
                         top, bottom, bottom_s, bottom_z = _step_bounds(
-                            s0, s1, s2, y0, y1, y2, part_rise * width + part_slack, low_up, high_up, reach, cos_turn
+                            s0, s1, s2, z0, z1, z2, slack, low_up, high_up, reach, cos_turn
                         )
-                    if bottom > low:
-                        low, low_s, low_z, low_rise = bottom, bottom_s, bottom_z, part_rise
-                    if near:
-                        top = min(top, steepest)
-                    if not probing and top >= low and s2 > -reach:
-                        first, last = min(first, s0), max(last, s2)
-                        high = max(high, top)
-                        most_rise = max(most_rise, part_rise)
-                        over = max(2 * y1 - y0 - y2, 0.0) / 8
-                        line_from = max(line_from, over + y0 - middle_tan * s0, over + y1 - middle_tan * s1)
-                        line_from = max(line_from, over + y2 - middle_tan * s2)
+                        parts, part_slack = 1, KINK_M * min(width, 1.0)
+                        if tilt_to_crest and top >= low and width < FINE_POSTS * post_m[m]:
+                            parts = STEP_PARTS
+                        bend_k = (z0 - 2 * z1 + z2) * 2 / (length * length)
+                        rise_k = (z2 - z0) / length - bend_k * length
+                        for k in range(parts):
+                            t0, t1, t2 = s0, s1, s2
+                            y0, y1, y2 = z0, z1, z2
+                            part_rise = rise_aside
+                            if parts > 1:
+                                a0, a2 = length * k / parts, length * (k + 1) / parts
+                                a1 = 0.5 * (a0 + a2)
+                                least, most = slope_range(
+                                    heights, posts, m, column, row, d_column, d_row, a0, a2, to_column, to_row, width
+                                )
+                                if least <= most:
+                                    part_rise = max(most - side_rise, side_rise - least, 0.0)
+                                    part_rise += (
+                                        max(abs(least), abs(most)) * (0.005 + 2 * bend) + (aside + width) / moon
+                                    )
+                                    part_rise = min(part_rise, rise_aside)
+                                t0, t1, t2 = s0 + a0, s0 + a1, s0 + a2
+                                y0 = z0 + a0 * (rise_k + a0 * bend_k)
+                                y1 = z0 + a1 * (rise_k + a1 * bend_k)
+                                y2 = z0 + a2 * (rise_k + a2 * bend_k)
+                                top, bottom, bottom_s, bottom_z = _step_bounds(
+                                    t0, t1, t2, y0, y1, y2, part_rise * width + part_slack, low_up, high_up, reach,
+                                    cos_turn,
+                                )  # fmt: skip
+                            if bottom > low:
+                                low, low_s, low_z, low_rise = bottom, bottom_s, bottom_z, part_rise
+                            if near:
+                                top = min(top, steepest)
+                            if not probing and top >= low and t2 > -reach:
+                                first, last = min(first, t0), max(last, t2)
+                                high = max(high, top)
+                                most_rise = max(most_rise, part_rise)
+                                over = max(2 * y1 - y0 - y2, 0.0) / 8
+                                line_from = max(line_from, over + y0 - middle_tan * t0, over + y1 - middle_tan * t1)
+                                line_from = max(line_from, over + y2 - middle_tan * t2)
+                        z_begun = next_z
+                    is_known, begun = is_open, done
                 if probing:
                     probing, s, known_z = False, begin, up
                 else:
-                    known_z, s = next_z, stop
+                    known_s, known_z, known, s = s + span, end_z, end, s + span
     # What the plane itself rises along a ray that is turned by up to `turn`.
     turned = abs(along_rise) * (1.0 - cos_turn) + tilted * np.sqrt(1.0 - cos_turn * cos_turn)
     found[0], found[1], found[2], found[3], found[4] = low, max(high, low), first, last, best_at

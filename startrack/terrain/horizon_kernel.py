@@ -21,6 +21,7 @@ FIXED_POINT_ROUNDS = 3
 SETTLED_M = 0.5  # between rounds, each of which leaves a few per cent of the last one's change
 FAR_M = 1e9
 FIRST_GUESS_M, LAST_GUESS_M, GUESS_RATIO = 300.0, 50_000.0, 1.12
+STRAIGHT_M = 150.0  # over which a ray crosses a map in one direction: it climbs 60 m at most and bends by a centimetre
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -63,10 +64,11 @@ def height_at(heights, posts, m, column, row):
 
 
 @njit(cache=True, nogil=True)
-def surface(grid, posts, heights, moon, east, north, guess):
-    """Height in enu of the ground at (east, north); the guess where no map reaches."""
+def surface_place(grid, posts, heights, moon, east, north, guess):
+    """As `surface`, and where on the maps that is: the map, -1 where none reaches, column and row."""
     level2 = east * east + north * north
     up, before, rounds = guess, guess + 1.0, 0
+    m, column, row = -1, 0.0, 0.0
     while rounds < FIXED_POINT_ROUNDS and abs(up - before) > SETTLED_M:
         rounds += 1
         before = up
@@ -74,7 +76,25 @@ def surface(grid, posts, heights, moon, east, north, guess):
         if m >= 0:
             r = MOON_RADIUS_M + height_at(heights, posts, m, column, row)
             up = np.sqrt(r * r - level2) - moon
-    return up
+    return up, (m, column, row)
+
+
+@njit(cache=True, nogil=True)
+def surface(grid, posts, heights, moon, east, north, guess):
+    """Height in enu of the ground at (east, north); the guess where no map reaches."""
+    return surface_place(grid, posts, heights, moon, east, north, guess)[0]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def height_on_line(heights, posts, moon, place, d_column, d_row, east, north, sin_a, cos_a, s):
+    """Height in enu of the ground at s along the ray from `place` (map, column, row), which is at (east, north).
+
+    The ray goes d_column, d_row per metre there.
+    """
+    e, n = east + s * sin_a, north + s * cos_a
+    column, row = place[1] + s * d_column, place[2] + s * d_row
+    r = MOON_RADIUS_M + height_at(heights, posts, place[0], column, row)
+    return np.sqrt(r * r - e * e - n * n) - moon
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -145,7 +165,8 @@ def horizon(ground, east, north, up, sin_a, cos_a, start_m, end_m, hint_m):
         z = surface(grid, posts, heights, moon, east + start_m * sin_a, north + start_m * cos_a, z)
         if z != before:
             tan, at = (z - up) / start_m, start_m
-    known_s, known_z = -1.0, up  # the last place where the ground's height was worked out
+    known_s, known_z, known = -1.0, up, (-1, 0.0, 0.0)  # the last place where the ground's height was worked out
+    d_column, d_row, straight_map, straight_to, straight_tan = 0.0, 0.0, -1, -1.0, tan
     running = True
     while running and s < end_m:
         e, n = east + s * sin_a, north + s * cos_a
@@ -159,10 +180,11 @@ def horizon(ground, east, north, up, sin_a, cos_a, start_m, end_m, hint_m):
         elif climb >= 0.0 and r - MOON_RADIUS_M >= highest:
             running = False
         else:
-            step = post_m[m]
-            rise = max(tan, -1.0)
-            column2, row2 = map_cell(grid, m, e + step * sin_a, n + step * cos_a, z + step * rise)
-            d_column, d_row = (column2 - column) / step, (row2 - row) / step
+            if s > straight_to or m != straight_map or tan != straight_tan:
+                step, rise = post_m[m], max(tan, -1.0)
+                column2, row2 = map_cell(grid, m, e + step * sin_a, n + step * cos_a, z + step * rise)
+                d_column, d_row = (column2 - column) / step, (row2 - row) / step
+                straight_map, straight_tan, straight_to = m, tan, s + STRAIGHT_M
             level = min(level, levels[m] - 1)
             descending = True
             length = 0.0
@@ -179,14 +201,17 @@ def horizon(ground, east, north, up, sin_a, cos_a, start_m, end_m, hint_m):
             if level < 0:
                 level = 0
                 stop = s + length
-                a = known_z
                 if known_s != s:
-                    a = surface(grid, posts, heights, moon, e, n, z - moon)
-                b = surface(grid, posts, heights, moon, east + stop * sin_a, north + stop * cos_a, a)
-                half = s + 0.5 * length
-                c = surface(grid, posts, heights, moon, east + half * sin_a, north + half * cos_a, 0.5 * (a + b))
-                tan, at = best_in_step(tan, at, s, stop, a - up, c - up, b - up)
-                known_s, known_z, s = stop, b, stop
+                    known_z, known = surface_place(grid, posts, heights, moon, e, n, z - moon)
+                half = 0.5 * length
+                b, there = surface_place(grid, posts, heights, moon, e + length * sin_a, n + length * cos_a, known_z)
+                if there[0] == known[0] and there[0] >= 0:
+                    run_column, run_row = (there[1] - known[1]) / length, (there[2] - known[2]) / length
+                    c = height_on_line(heights, posts, moon, known, run_column, run_row, e, n, sin_a, cos_a, half)
+                else:
+                    c = surface(grid, posts, heights, moon, e + half * sin_a, n + half * cos_a, 0.5 * (known_z + b))
+                tan, at = best_in_step(tan, at, s, stop, known_z - up, c - up, b - up)
+                known_s, known_z, known, s = stop, b, there, stop
     return tan, at, edge
 
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from startrack.terrain.traced_map import TracedMap
 
 LOG = logging.getLogger(__name__)
-VERSION = 3  # of the tracing and of the table's format
+VERSION = 4  # of the tracing and of the table's format
 UNKNOWN_FROM = 12  # points across the square at which the ends of the maps are looked up
 
 # Terrains that need the same table share one in memory, for as long as one of them lives.
@@ -108,7 +108,7 @@ def load_or_build_table(ground: TracedMap, progress: Progress | None = None) -> 
     with _single_builder(path_of_table(key).with_suffix(".lock"), ground.name):
         table = load_table(key, ground.square)
         if table is None:
-            LOG.info("horizons of %s: computed now, once; this takes a minute or two", ground.name)
+            LOG.info("horizons of %s: computed now, once; this takes up to a minute", ground.name)
             start = clock.perf_counter()
             table = build_table(ground, progress)
             is_kept, path = keep_table(key, table), path_of_table(key)

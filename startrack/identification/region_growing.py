@@ -11,21 +11,20 @@ from startrack.core.types import Array, Bools, Ints
 from startrack.estimation.adjust import Prior, Scheme, State, adjust, cauchy_loss
 from startrack.estimation.false_alarm import log_p_value_bound
 from startrack.estimation.match import match_mutual
-from startrack.estimation.normal_equations import Observations, Terms, observations_of_image
-from startrack.frames import R_from_rotvec
+from startrack.estimation.normal_equations import observations_of_image
+from startrack.estimation.pinhole_fit import HALF_WEIGHT_CHI2, fit_pinhole
 from startrack.identification.attitude_search import INLIER_PX
 from startrack.identification.lens_guesses import unknown_camera
 
 REGION_ROUNDS = 2  # of matching and fitting within a stage
 FEWEST = 5  # matches
 GATE_OVER_SIGMA = 4.0  # the gate over the sigma of the loss
-MATCH_LOSS = cauchy_loss(4.0)  # chi-square of a match whose weight is halved
+MATCH_LOSS = cauchy_loss(HALF_WEIGHT_CHI2)
 LENGTH_SIGMAS = {"f": 0.1, "cx": 0.06, "cy": 0.06}  # prior sigmas in focal lengths
 PRIOR_SIGMAS = {"shape": 0.5, "k1": 0.1, "k2": 0.1, "k3": 0.05, "k4": 0.02}  # of the family, of the polynomial
 STARS_PER_DETECTION = 1.5
 SAME_RADIUS_1 = 1e-12  # relative difference of the radii of lenses that are the same
 TANGENT = (1 / 3, 2 / 15, 17 / 315, 62 / 2835)  # series of tan a beyond a: to 1e-7 up to 20 degrees
-LONGEST_STEP = 0.1  # of a view: radians, logarithm of the focal length, distortion
 WHOLE_LENS = ("f", "shape", "cx", "cy")
 FIT = Scheme(loss=MATCH_LOSS, steps=4, settled_px=1e-3)
 
@@ -150,11 +149,7 @@ def with_file_lens(camera: Camera, size: int, widest_rad: float) -> Camera:
 
 @dataclass(frozen=True)
 class PinholeView:
-    """Attitude, focal length and one distortion term of a narrow field's frame (W, H), the axis in its centre.
-
-    A state for `startrack.estimation.adjust` with closed-form derivatives in the tangential plane, an order of
-    magnitude cheaper than those of a general lens.
-    """
+    """Attitude, focal length and one distortion term of a narrow field's frame (W, H), the axis in its centre."""
 
     R_cam_icrs: Array
     focal_px: float
@@ -166,16 +161,6 @@ class PinholeView:
     def centre_px(self) -> Array:
         """(2,)"""
         return 0.5 * (np.array(self.size_px) - 1.0)
-
-    @property
-    def rotations(self) -> Array:
-        """R_cam_icrs (1, 3, 3)."""
-        return self.R_cam_icrs[None]
-
-    @property
-    def is_valid(self) -> bool:
-        """Always: the focal length is fitted by its logarithm."""
-        return True
 
     def project(self, rays_icrs: Array) -> tuple[Array, Bools]:
         """Pixels (n, 2) of rays (n, 3) less than 90 degrees off the axis, and which lie in the frame."""
@@ -190,47 +175,10 @@ class PinholeView:
 
         `distorted`: whether the lens may differ from a pinhole.
         """
-        covariance = np.broadcast_to(sigma_px**2 * np.eye(2), (len(xy_px), 2, 2))
-        points = observations_of_image(xy_px, covariance, rays_icrs)
-        free = ("log_focal", "distortion") if distorted else ("log_focal",)
-        scheme = Scheme(loss=MATCH_LOSS, steps=steps, settled_px=0.0, damped=False)
-        found: PinholeView = adjust(self, points, free, scheme).state
-        return found
-
-    def rays_cam(self, points: Observations) -> Array:
-        """Positions (n, 2) [focal lengths] of the observations in the pinhole's image plane."""
-        cam = points.rays_icrs @ self.R_cam_icrs.T
-        return np.asarray(cam[:, :2] / cam[:, 2:])
-
-    def residual_px(self, points: Observations, plane: Array) -> Array:
-        """Measured minus predicted pixels (n, 2)."""
-        return points.xy_px - self._pixels(plane)
-
-    def terms(self, points: Observations, plane: Array, free: tuple[str, ...]) -> Terms:
-        """Derivatives by the logarithm of the focal length, the distortion, and rotations about the camera's axes.
-
-        The rotation's effect on the distortion itself is left out.
-        """
-        (u, v), (fx, fy) = plane.T, self._signed_focal_px
-        pose = np.empty((len(u), 2, 3))
-        pose[:, 0, 0], pose[:, 0, 1], pose[:, 0, 2] = -fx * u * v, fx * (1 + u * u), -fx * v
-        pose[:, 1, 0], pose[:, 1, 1], pose[:, 1, 2] = -fy * (1 + v * v), fy * u * v, fy * u
-        signed = plane * self._signed_focal_px
-        by_lens = np.empty((len(u), 2, len(free)))
-        by_lens[:, :, 0] = signed * self._radius_ratio(plane)[:, None]
-        if len(free) > 1:
-            by_lens[:, :, 1] = signed * _cube(plane)[:, None]
-        return Terms(by_lens, pose, points.image, 1)
-
-    def step(self, free: tuple[str, ...], lens: Array, poses: Array) -> PinholeView:
-        """The view after a step of the free parameters and of the attitude (1, 3) [rad]."""
-        lens, poses = np.clip(lens, -LONGEST_STEP, LONGEST_STEP), np.clip(poses, -LONGEST_STEP, LONGEST_STEP)
-        return replace(
-            self,
-            R_cam_icrs=R_from_rotvec(poses[0]) @ self.R_cam_icrs,
-            focal_px=float(self.focal_px * np.exp(lens[0])),
-            distortion=self.distortion + (float(lens[1]) if len(free) > 1 else 0.0),
-        )
+        R, lens = self.R_cam_icrs.copy(), np.array([self.focal_px, self.distortion])
+        mirror = -1.0 if self.mirrored else 1.0
+        fit_pinhole(xy_px, rays_icrs, self.centre_px, mirror, sigma_px, steps, distorted, R, lens)
+        return replace(self, R_cam_icrs=R, focal_px=float(lens[0]), distortion=float(lens[1]))
 
     def camera(self) -> Camera:
         """The camera, as wide as its frame."""

@@ -42,7 +42,9 @@ Result = TypeVar("Result")
 
 
 def count_cores() -> int:
-    """Cores that this process may use."""
+    """Cores that this process may use; one in a process of a pool, as the others do other tasks."""
+    if parent_process() is not None:
+        return 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -16,6 +16,7 @@ from startrack.terrain.protocol import ForwardingTerrain, HorizonPosts, Terrain
 from startrack.terrain.traced_map import TracedMap, flatten_rays
 
 TILT_ROUNDS = 2  # of the azimuth towards that of the turned skyline: each leaves a thousandth of the difference
+SETTLED_RAD = 1e-8  # of the azimuth: a change of 2 milliarcsec needs no further round
 WIDER_RAD = 0.1  # by which azimuths are widened to find the highest skyline that a tilt may turn into a direction
 
 
@@ -48,7 +49,11 @@ class DeformedMap(ForwardingTerrain):
 
     @cached_property
     def _raised(self) -> TracedMap:
-        return replace(self.whole, camera_height_m=self.camera_height_m) if self._raised_m else self.whole
+        if not self._raised_m:
+            return self.whole
+        raised = replace(self.whole, camera_height_m=self.camera_height_m)
+        raised.__dict__["ground"] = self.whole.ground  # the same
+        return raised
 
     def without_table(self) -> DeformedMap:
         """The same ground of the raised camera's map without its table; see `Terrain`."""
@@ -68,7 +73,10 @@ class DeformedMap(ForwardingTerrain):
         azimuths = np.broadcast_to(azimuths_rad, found.shape)
         own = np.array(azimuths)
         for _ in range(TILT_ROUNDS):
-            own += (azimuths - self._turn(own, found)[0] + np.pi) % (2 * np.pi) - np.pi
+            step = (azimuths - self._turn(own, found)[0] + np.pi) % (2 * np.pi) - np.pi
+            if np.abs(step).max(initial=0.0) < SETTLED_RAD:
+                break
+            own += step
             found = self._level_rad(self._raised.horizon_rad(points_m, own))
         return self._turn(own, found)[1]
 

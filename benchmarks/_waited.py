@@ -9,7 +9,9 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 SAMPLE = Path(__file__).parent.parent / "sample_images/near-wall.png"
 RUNS = 15
@@ -32,15 +34,79 @@ def sep_winpos() -> None:
     print_ms(lambda: find(image, 1.0))
 
 
-def print_ms(run: Callable[[], object]) -> None:
-    """The median CPU time of a call, after one that loads what it needs."""
-    run()
-    costs = []
-    for _ in range(RUNS):
-        start = time.process_time()
+def detection_per_mpx() -> None:
+    """The stars of a frame of 4 Mpx with 2000 stars, with a camera file; per Mpx."""
+    detect_frame("startrack")
+
+
+def sep_per_mpx() -> None:
+    """The same by sep: background, extraction, windowed centroids."""
+    detect_frame("sep_winpos")
+
+
+def detect_frame(finder: str) -> None:
+    """The frame's stars by a function of `_star_peers`."""
+    import _star_peers
+    import numpy as np
+    from _star_frames import star_frame
+
+    sigma_px = 1.2
+    frame = star_frame(sigma_px, 2000, (3.0, 300.0), rng=np.random.default_rng([1, 0]))
+    find = getattr(_star_peers, finder)
+    print_ms(lambda: find(frame.image, sigma_px), parts=frame.image.size / 1e6)
+
+
+def narrow_fields() -> None:
+    """Stars and attitude of narrow fields of which the width is known to 10 %; a frame."""
+    import stars_narrow
+
+    from startrack.detection import Detector
+
+    detector = Detector()
+    solve_narrow(lambda exposure: detector(exposure, None), lambda _: stars_narrow.solve_ours)
+
+
+def tetra3rs_narrow_fields() -> None:
+    """The same by tetra3rs with its thorough extraction."""
+    import stars_narrow
+
+    def solver(width_deg: float) -> Callable[[Any, Any, Any], object]:
+        base = stars_narrow.database([width_deg])
+        return lambda found, picture, _: stars_narrow.solve_tetra3rs(found, picture, base)
+
+    solve_narrow(stars_narrow.extract_thorough, solver)
+
+
+def solve_narrow(find: Callable[[Any], object], solver: Callable[[float], Callable[[Any, Any, Any], object]]) -> None:
+    """Frames of each width, found and solved by the function that `solver` gives for the width."""
+    from stars_narrow import WIDTHS_DEG, synthetic_pictures
+
+    from startrack.catalog import load_catalog
+
+    stars = load_catalog().at(None, None)
+
+    def solve_one(solve: Callable[[Any, Any, Any], object], picture: Any) -> object:
+        return solve(find(picture.exposure), picture, stars)
+
+    runs = []
+    for width in WIDTHS_DEG:
+        solve = solver(width)
+        runs += [partial(solve_one, solve, p) for p in synthetic_pictures(stars, width, 3)]
+    print_ms(*runs)
+
+
+def print_ms(*runs: Callable[[], object], parts: float = 1.0) -> None:
+    """The median CPU time of a part of each call, after one that loads what it needs; the mean over the calls."""
+    medians = []
+    for run in runs:
         run()
-        costs.append(time.process_time() - start)
-    print(1e3 * statistics.median(costs))
+        costs = []
+        for _ in range(RUNS):
+            start = time.process_time()
+            run()
+            costs.append(time.process_time() - start)
+        medians.append(statistics.median(costs))
+    print(1e3 * statistics.mean(medians) / parts)
 
 
 if __name__ == "__main__":

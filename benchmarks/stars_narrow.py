@@ -95,15 +95,12 @@ def main() -> None:
 
 def compare_programs(name: str, pictures: list[Picture], stars: Stars) -> list[list[str]]:
     """The rows of one set."""
-    widths = [p.fov_deg for p in pictures]
-    base = tetra3rs.SolverDatabase.generate_from_gaia(
-        max_fov_deg=1.15 * max(widths), min_fov_deg=0.85 * min(widths), epoch_proper_motion_year=2000.0
-    )
+    base = database([p.fov_deg for p in pictures])
     detector = Detector()
     programs: dict[str, tuple[Finder, Solver]] = {
-        "startrack": (lambda e: detector(e, None), lambda found, p: _solve_ours(found, p, stars)),
-        "tetra3rs, extract_centroids_fast": (_extract_quick, lambda found, p: _solve_tetra3rs(found, p, base)),
-        "tetra3rs, extract_centroids": (_extract_thorough, lambda found, p: _solve_tetra3rs(found, p, base)),
+        "startrack": (lambda e: detector(e, None), lambda found, p: solve_ours(found, p, stars)),
+        "tetra3rs, extract_centroids_fast": (extract_quick, lambda found, p: solve_tetra3rs(found, p, base)),
+        "tetra3rs, extract_centroids": (extract_thorough, lambda found, p: solve_tetra3rs(found, p, base)),
     }
     tallies = {program: _run(find, solve, pictures) for program, (find, solve) in programs.items()}
     ours = tallies["startrack"]
@@ -113,6 +110,13 @@ def compare_programs(name: str, pictures: list[Picture], stars: Stars) -> list[l
          f"{ours.total_ms() / t.total_ms():.1f}"]
         for program, t in tallies.items()
     ]  # fmt: skip
+
+
+def database(widths_deg: list[float]) -> tetra3rs.SolverDatabase:
+    """The database of tetra3rs for fields of these widths."""
+    return tetra3rs.SolverDatabase.generate_from_gaia(
+        max_fov_deg=1.15 * max(widths_deg), min_fov_deg=0.85 * min(widths_deg), epoch_proper_motion_year=2000.0
+    )
 
 
 def _run(find: Finder, solve: Solver, pictures: list[Picture]) -> Tally:
@@ -147,21 +151,21 @@ def _count_wrong(tally: Tally, other: Tally, pictures: list[Picture]) -> int:
     return wrong
 
 
-def _solve_ours(found: object, picture: Picture, stars: Stars) -> np.ndarray | None:
+def solve_ours(found: object, picture: Picture, stars: Stars) -> np.ndarray | None:
     size = picture.exposure.size_px
     answer = identify_unknown_lens(found, size, np.radians(picture.fov_deg), stars)  # type: ignore[arg-type]
     return np.asarray(answer.identification.R_cam_icrs[2])
 
 
-def _extract_quick(exposure: Exposure) -> object:
+def extract_quick(exposure: Exposure) -> object:
     return tetra3rs.extract_centroids_fast(np.ascontiguousarray(exposure.pixels_adu), threads=1)
 
 
-def _extract_thorough(exposure: Exposure) -> object:
+def extract_thorough(exposure: Exposure) -> object:
     return tetra3rs.extract_centroids(np.ascontiguousarray(exposure.pixels_adu), threads=1)
 
 
-def _solve_tetra3rs(found: object, picture: Picture, base: object) -> np.ndarray | None:
+def solve_tetra3rs(found: object, picture: Picture, base: object) -> np.ndarray | None:
     width, height = picture.exposure.size_px
     answer = base.solve_from_centroids(  # type: ignore[attr-defined]
         found.centroids, fov_estimate_deg=picture.fov_deg, fov_max_error_deg=0.1 * picture.fov_deg,  # type: ignore[attr-defined]

@@ -196,6 +196,22 @@ ROWS = (
     Row(
         "read to fix; sep", "<= 1 peer", partial(in_process, "read_to_fix"), "ms", partial(in_process, "sep_winpos"), 3
     ),
+    Row(
+        "detection per Mpx; sep",
+        "<= 8 ms",
+        partial(in_process, "detection_per_mpx"),
+        "ms",
+        partial(in_process, "sep_per_mpx"),
+        3,
+    ),
+    Row(
+        "narrow fields, detect and identify; tetra3rs, thorough",
+        "<= 2 peer",
+        partial(in_process, "narrow_fields"),
+        "ms",
+        partial(in_process, "tetra3rs_narrow_fields"),
+        3,
+    ),
     Row("first use, cylinder: compilation", "<= 10 s", partial(first_use, image=lambda: SAMPLE), runs=1),
     Row("first use, height map: compilation", "<= 20 s", partial(first_use, image=height_map_frame), runs=1),
     Row("packages of the core", "<= 760 MB", core_mb, "MB", runs=1),

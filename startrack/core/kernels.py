@@ -8,6 +8,7 @@ from math import erfc, sqrt
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from startrack.core.compilation import choose_cache_folder, discard_stale_kernels
 
@@ -81,6 +82,13 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         return kernel
 
     return decorate
+
+
+def read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """A contiguous array that cannot be written to, for kernels: another layout or flag would compile them again."""
+    view = np.ascontiguousarray(array).view()
+    view.flags.writeable = False
+    return view
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -8,7 +8,7 @@ from functools import cache
 import cv2
 import numpy as np
 
-from startrack.core.kernels import REORDERED_SUMS, njit
+from startrack.core.kernels import njit, read_only
 from startrack.core.smooth_image import Image, SmoothImage
 
 BAND_PIXELS = 2**18
@@ -17,7 +17,6 @@ WIDEST_PX = 1.4
 STEEP_FRACTION = 0.03  # of the blocks
 MIN_NOISE_STEPS = 1.0  # noise in units of the smallest step below which the pixels hold too few values for quantiles
 LOW_QUANTILE, HIGH_QUANTILE = 0.05, 0.65  # quantiles of the pixels between which the noise is measured
-COARSE_PX = BLOCK_PX // 4  # the local level is a mean over squares of this side
 CLIPPED_SIGMA = 2.5  # beyond, a value is no noise
 # From -1/2 to 1/2 evenly, in an order without a pattern: 101 is a prime, so that each number comes once.
 ORDER = np.arange(BLOCK_PX**2) * 101 % BLOCK_PX**2
@@ -63,45 +62,6 @@ def block_side(sigma_px: float) -> int:
     return BLOCK_PX * max(1, round(sigma_px / WIDEST_PX))
 
 
-def smooth_level(means: Image, width_px: int, shape: tuple[int, ...]) -> SmoothImage:
-    """Mean over a box of residuals (H, W), from their `clipped_means`: the background that block medians miss.
-
-    Boxes are made of whole squares of COARSE_PX, which costs a third of the time and no more than their coarseness.
-    """
-    side = coarse_width(width_px)
-    smooth = cv2.boxFilter(means, -1, (side, side), borderType=cv2.BORDER_REFLECT)
-    return SmoothImage.from_blocks(np.asarray(smooth, dtype=np.float32), COARSE_PX, shape)
-
-
-@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
-def clipped_means(values, means):  # type: ignore[no-untyped-def]
-    """Fill means (h, w) with those of squares of COARSE_PX of the values (H, W), at the borders of what there is.
-
-    Values beyond CLIPPED_SIGMA count as zero, not as the nearest value: stars are all on one side.
-    """
-    height, width = values.shape
-    zero, limit = np.float32(0.0), np.float32(CLIPPED_SIGMA)
-    column = np.empty(width, np.float32)
-    for i in range(means.shape[0]):
-        top, bottom = i * COARSE_PX, min((i + 1) * COARSE_PX, height)
-        column[:] = zero
-        for y in range(top, bottom):
-            for x in range(width):
-                value = values[y, x]
-                column[x] += value if abs(value) <= limit else zero
-        for j in range(means.shape[1]):
-            first, last = j * COARSE_PX, min((j + 1) * COARSE_PX, width)
-            total = zero
-            for x in range(first, last):
-                total += column[x]
-            means[i, j] = total / np.float32((bottom - top) * (last - first))
-
-
-def coarse_width(width_px: int) -> int:
-    """The odd number of COARSE_PX nearest to a width [px]."""
-    return 2 * int(round(width_px / COARSE_PX - 1) // 2) + 1 if width_px > COARSE_PX else 1
-
-
 def _measure_blocks(
     image: Image, side: int, quantum: float, measure: Callable[[Image], tuple[Image, ...]]
 ) -> list[Image]:
@@ -109,11 +69,15 @@ def _measure_blocks(
 
     A few rows of blocks at a time fit into the processor's cache.
     """
-    rows = side * max(1, BAND_PIXELS * (side // BLOCK_PX) ** 2 // (side * image.shape[1]))
-    bands = [
-        measure(np.sort(_blocks(image[top : top + rows], side, quantum), axis=1))
-        for top in range(0, image.shape[0], rows)
-    ]
+    rows, columns = (-(-length // side) for length in image.shape)
+    at_a_time = max(1, BAND_PIXELS // (columns * BLOCK_PX**2))
+    blocks, bands = np.empty((at_a_time, columns, BLOCK_PX, BLOCK_PX), dtype=np.float32), []
+    for first in range(0, rows, at_a_time):
+        band = blocks[: rows - first]
+        _fill_blocks(read_only(image), side, first, np.float32(quantum) * PART_STEPS, band)
+        ordered = band.reshape(-1, BLOCK_PX**2)
+        ordered.sort(axis=1)
+        bands.append(measure(ordered))
     return [np.concatenate(parts) for parts in zip(*bands, strict=True)]
 
 
@@ -122,38 +86,38 @@ def _median_and_spread(ordered: Image) -> tuple[Image, Image]:
     return np.float32(0.5) * (ordered[:, middle - 1] + ordered[:, middle]), ordered @ _scale_weights()
 
 
-def _blocks(image: Image, side: int, quantum: float) -> Image:
-    """(blocks, BLOCK_PX^2): the image cut into square blocks, its border reflected to fill the last ones.
+@njit(cache=True, nogil=True)
+def _fill_blocks(image, side, first, part_steps, blocks):  # type: ignore[no-untyped-def]
+    """Fill blocks (rows, columns, BLOCK_PX, BLOCK_PX) with those of an image, from the row of blocks `first` on.
 
-    Of larger blocks some pixels, spread evenly, are enough: squares of two by two, for colour filters' sake.
+    The border is reflected to fill the last blocks. Of larger blocks some pixels, spread evenly, are enough: squares of
+    two by two, for colour filters' sake.
 
     Medians of whole numbers are whole numbers, and a spread would be wrong by up to half a step in 8-bit images: the
     same pattern of part-steps, of mean zero, is added to every block; its variance must be subtracted.
     """
     height, width = image.shape
-    below, right = -height % side, -width % side
-    if below or right:
-        image = np.asarray(cv2.copyMakeBorder(image, 0, below, 0, right, cv2.BORDER_REFLECT_101), dtype=np.float32)
-    blocks = np.empty((image.shape[0] // side, image.shape[1] // side, BLOCK_PX, BLOCK_PX), dtype=np.float32)
-    _fill_blocks(np.ascontiguousarray(image), side, np.float32(quantum) * PART_STEPS, blocks)
-    return blocks.reshape(-1, BLOCK_PX**2)
-
-
-@njit(cache=True, nogil=True)
-def _fill_blocks(image, side, part_steps, blocks):  # type: ignore[no-untyped-def]
-    """Fill blocks (rows, columns, BLOCK_PX, BLOCK_PX) with squares of two by two of the image, and the part-steps."""
     apart = 2 * side // BLOCK_PX  # the squares
     for i in range(blocks.shape[0]):
         for r in range(BLOCK_PX):
-            line, steps = image[i * side + r // 2 * apart + r % 2], part_steps[r]
+            line, steps = image[_reflect((first + i) * side + r // 2 * apart + r % 2, height)], part_steps[r]
             for j in range(blocks.shape[1]):
-                block, part = blocks[i, j, r], line[j * side : (j + 1) * side]
-                if apart == 2:  # the whole block
+                block, left = blocks[i, j, r], j * side
+                if left + side > width or apart > 2:
+                    for c in range(BLOCK_PX):
+                        block[c] = line[_reflect(left + c // 2 * apart + c % 2, width)] + steps[c]
+                else:
+                    part = line[left : left + side]
                     for c in range(BLOCK_PX):
                         block[c] = part[c] + steps[c]
-                else:
-                    for c in range(BLOCK_PX):
-                        block[c] = part[c // 2 * apart + c % 2] + steps[c]
+
+
+@njit(inline="always")
+def _reflect(at, length):  # type: ignore[no-untyped-def]
+    """The pixel of `length` that stands for one at or beyond the end: a mirror image about the last one."""
+    period = max(2 * (length - 1), 1)
+    at %= period
+    return at if at < length else period - at
 
 
 @cache

@@ -9,13 +9,12 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from startrack.core.types import Array, Bools, Ints
 from startrack.detection.background import CLIPPED_SIGMA
-from startrack.detection.deblend import Fitted, source_signal
+from startrack.detection.deblend import Fitted
 from startrack.detection.fit import FIT_ROUNDS_AGAIN, PointFits, Stamps, fit_points
-from startrack.detection.frame import Frame, Pixels, SourceNoise
+from startrack.detection.frame import Frame
 from startrack.detection.psf_width import MIN_BRIGHT_SOURCES, WIDTH_SNR
 
 # Of stars of a width [px]; measured at USUAL_SKEWNESS: equal rates of false stars.
@@ -76,14 +75,14 @@ def select_stars(fitted: Fitted, width_px: Array, threshold: float) -> Ints:
     left = np.flatnonzero(stands_out & placed & (fits.chi2 < fits.chi2_pixel))
     if not len(left):
         return left
-    misfit, edge = _psf_and_edge_misfit(fitted.stamps.take(left), fits.take(left), width_px[left], fitted.source_noise)
+    misfit, edge = _psf_and_edge_misfit(fitted, left, width_px[left])
     unlike_an_edge = fits.chi2[left] < edge + EDGE_MARGIN
     bright = fits.flux[left] > WIDTH_SNR * np.sqrt(fits.covariance[left, 2, 2])
     alike = misfit[unlike_an_edge & bright]
     typical = float(np.median(alike)) if len(alike) >= MIN_BRIGHT_SOURCES else 0.0
     typical = ROUGH_PSF_SPREAD * typical if typical > ROUGH_PSF_MISFIT else 0.0  # 0: stars fit the Gaussian
     good_fit = fits.chi2[left] < BAD_FIT_CHI2_PER_DOF * fits.dof[left]
-    allowed = np.where(are_saturated(fitted.stamps.take(left)), max(typical, SATURATED_MISFIT), typical)
+    allowed = np.where(are_saturated(fitted.stamps)[left], max(typical, SATURATED_MISFIT), typical)
     return left[unlike_an_edge & (good_fit | (misfit < allowed))]
 
 
@@ -147,48 +146,35 @@ def noise_skewness(frame: Frame) -> float:
     return min(photons / max(noise, 1e-6) ** 3, LARGEST_SKEWNESS)
 
 
-def _psf_and_edge_misfit(s: Stamps, fits: PointFits, width_px: Array, own: SourceNoise) -> tuple[Array, Array]:
-    """Misfit of the sources (n) to the Gaussian PSF, and their chi^2 as straight edges or lines.
+def _psf_and_edge_misfit(fitted: Fitted, which: Ints, width_px: Array) -> tuple[Array, Array]:
+    """Misfit of the sources `which` (m,) to a PSF of `width_px` (m,), and their chi^2 as straight edges or lines.
 
     The misfit is the root of the squared residual beyond the noise over the squared signal: 0 for a perfect star, about
     0.6 for a single bright pixel.
+
+    Edges are stripes of any brightness in the best of eight directions: sources that vary in one direction only, such
+    as a skyline, the edge of the image circle, a bad column, a satellite's trail. The number of stripes is added to
+    chi^2 so that many stripes are not preferred to few.
     """
-    signal = source_signal(fits.xy_px - s.centres, fits.flux, width_px, s.data.shape[1] // 2)
-    noise = s.variance + np.float32(own.per_unit) * signal
-    excess = np.square(s.data - signal - fits.level[:, None, None].astype(np.float32)) - noise
-    weights = 1.0 / (noise + np.square(np.float32(own.model_error) * signal))
-    squared = np.square(signal)
-    if s.usable is not None:
-        excess, weights, squared = excess * s.usable, weights * s.usable, squared * s.usable
-    total = squared.sum(axis=(1, 2), dtype=np.float64)
-    misfit = np.sqrt(np.maximum(excess.sum(axis=(1, 2), dtype=np.float64), 0.0) / np.maximum(total, 1e-12))
-    return misfit, edge_chi2(s.data, weights)
+    from startrack.detection.shape_kernel import compare_shapes
 
-
-def edge_chi2(data: Pixels, weights: Pixels) -> Array:
-    """chi^2 (n,) of stamps (n, s, s) as straight stripes of any brightness, in the best of eight directions.
-
-    The model covers sources that vary in one direction only: a skyline, the edge of the image circle, a bad column, a
-    satellite's trail. The number of stripes is added to chi^2 so that many stripes are not preferred to few.
-    """
-    n, side = len(data), data.shape[1]
-    stripes, starts = _stripes(side)
-    counts = np.diff(starts, append=stripes.shape[1]).astype(np.float32)  # expected reduction of chi^2 by noise
-    w = weights.reshape(n, -1).astype(np.float32)
-    flat = data.reshape(n, -1).astype(np.float32)
-    moment = w * flat
-    total, signal = w @ stripes, moment @ stripes
-    explained = np.add.reduceat(signal * signal / np.maximum(total, 1e-30), starts, axis=1) - counts
-    return np.asarray(np.sum(moment * flat, axis=1) - explained.max(axis=1), dtype=np.float64)
+    s, fits, own = fitted.stamps, fitted.fits, fitted.source_noise
+    misfit, edge = np.empty((2, len(which)))
+    compare_shapes(
+        *s.pixels, which, fits.xy_px[which] - s.centres[which], fits.flux[which], fits.level[which], width_px,
+        own.per_unit, own.model_error, *_stripes(s.data.shape[1]), misfit, edge,
+    )  # fmt: skip
+    return misfit, edge
 
 
 @lru_cache(maxsize=16)
-def _stripes(side: int) -> tuple[NDArray[np.float32], Ints]:
-    """Membership (s^2, m), 0 or 1, of pixels in stripes one pixel wide, and each direction's first stripe."""
+def _stripes(side: int) -> tuple[Ints, Ints]:
+    """Number (s^2, d) of the stripe, one pixel wide, of each pixel of a stamp in d directions; the numbers' ends."""
     offset = np.arange(side) - side // 2
     x, y = np.tile(offset, side), np.repeat(offset, side)
-    masks = []
+    numbers, ends = [], [0]
     for turn in np.arange(EDGE_DIRECTIONS) * np.pi / EDGE_DIRECTIONS:
         _, number = np.unique(np.rint(x * np.cos(turn) + y * np.sin(turn)), return_inverse=True)
-        masks.append(np.eye(number.max() + 1, dtype=np.float32)[number])
-    return np.concatenate(masks, axis=1), np.cumsum([0] + [mask.shape[1] for mask in masks[:-1]])
+        numbers.append(number + ends[-1])
+        ends.append(ends[-1] + number.max() + 1)
+    return np.stack(numbers, axis=1), np.array(ends[1:])

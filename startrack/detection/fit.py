@@ -21,7 +21,7 @@ NOISE_BINS, MIN_PIXELS_PER_BIN = 12, 15
 MAX_CORRELATION = 2.0
 MEDIAN_OF_SQUARE = 0.4549  # of a unit Gaussian
 MIN_MODEL_ERROR = 0.005
-NO_PIXELS, NO_SIGNAL = (np.zeros((0, 0, 0), dtype=kind) for kind in (np.bool_, np.float32))
+NO_PIXELS, NO_SIGNAL = np.zeros((0, 0), dtype=np.bool_), np.zeros((0, 0), dtype=np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +58,13 @@ class Stamps:
     centres: Ints
     surround: Array
 
+    @property
+    def pixels(self) -> tuple[Pixels, Pixels, Bools]:
+        """Light, variance and usability (n, s^2) for kernels; the last has no rows where all pixels are usable."""
+        size = self.data[0].size
+        usable = NO_PIXELS if self.usable is None else self.usable.reshape(-1, size)
+        return self.data.reshape(-1, size), self.variance.reshape(-1, size), usable
+
     def take(self, which: slice | Ints) -> Stamps:
         """Some of them."""
         usable = None if self.usable is None else self.usable[which]
@@ -78,14 +85,13 @@ def fit_points(
     """
     from startrack.detection.fit_kernel import fit_stamps
 
-    n = len(which)
+    n, pixels = len(which), stamps.pixels
     offset, values, covariance = np.empty((n, 2)), np.empty((n, 8)), np.empty((n, 4, 4))
-    usable = NO_PIXELS if stamps.usable is None else stamps.usable
+    light = NO_SIGNAL if signal is None else signal.reshape(n, -1)
     centres, surround = stamps.centres[which], stamps.surround[which]
     fit_stamps(
-        stamps.data, stamps.variance, usable, NO_SIGNAL if signal is None else signal, RESIDUAL_FRACTION, which,
-        start_xy_px - centres, sigma_px, source_noise.per_unit, source_noise.model_error, rounds, surround, offset,
-        values, covariance,
+        *pixels, light, RESIDUAL_FRACTION, which, start_xy_px - centres, sigma_px, source_noise.per_unit,
+        source_noise.model_error, rounds, surround, offset, values, covariance,
     )  # fmt: skip
     flux, level, chi2, chi2_pixel, count, above, norm, own = np.ascontiguousarray(values.T)
     # Pixels of the surroundings hold the star: their level lowers signal by `own_part`, noise by its root.

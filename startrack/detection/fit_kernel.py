@@ -1,4 +1,7 @@
-"""The compiled loop of the point-source fits: Gauss-Newton on one stamp after the other."""
+"""The compiled loop of the point-source fits: Gauss-Newton on one stamp after the other.
+
+Pixels are in single precision, twice as many at a time; positions, fluxes and their equations in double precision.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,9 @@ from startrack.psf import ERF_COEFFICIENTS, ERF_T
 MAX_STEP_PX = 0.5
 POSITION_PRIOR = 0.1  # per px^2: positions within about 3 px of the start keep sources without light solvable
 FLUX_PRIOR = 1e-12
+NARROWEST_PX = 0.1  # a narrower PSF is one pixel as well; its exponentials would overflow
+LANES = 32  # stamps are filled up to a multiple of these pixels, which the compiler treats together
+ZERO, ONE, LEAST = np.float32(0.0), np.float32(1.0), np.float32(1e-30)  # literals would be of double precision
 SQRT_2PI = math.sqrt(2.0 * math.pi)
 ERF_SCALE, A1, A2, A3, A4, A5 = float(ERF_T), *(float(a) for a in ERF_COEFFICIENTS)
 
@@ -22,20 +28,23 @@ def fit_stamps(
     data, variance, usable, signal, signal_error, which, start_px, sigma_px, per_unit, model_error, rounds, surround,
     xy_px, values, covariance,
 ) -> None:  # fmt: skip
-    """Fit one point source to each of the stamps `which` (m,) of (n, s, s), and fill the outputs.
+    """Fit one point source to each of the stamps `which` (m,) of (n, s^2), and fill the outputs.
 
-    `usable` (n, s, s) may have no rows: all pixels then are. `signal` (m, s, s), the neighbours' light with the
+    `usable` (n, s^2) may have no rows: all pixels then are. `signal` (m, s^2), the neighbours' light with the
     relative error `signal_error`, is subtracted; it may have no rows either. `start_px` (m, 2) are offsets from the
     middle pixel, `per_unit` and `model_error` the noise of the source's own light, `surround` (m,) the level of its
     surroundings. Outputs: offsets `xy_px` (m, 2); `covariance` (m, 4, 4) of x, y, flux, level; `values` (m, 8): flux,
     level, chi^2, chi^2 of a single pixel, usable pixels, and the sums over pixels of the matched filter times the light
     above the surroundings, times the profile, and times the profile with the own photons' noise.
     """
-    side = data.shape[1]
+    side = round(math.sqrt(data.shape[1]))
     radius = side // 2
-    profile, slope, centre = np.zeros((2, side)), np.zeros((2, side)), np.zeros(2)
+    profile, slope, centre = np.zeros((2, side), np.float32), np.zeros((2, side), np.float32), np.zeros(2)
+    bell = bell_curve(sigma_px, radius)
     # Pixel by pixel: light, variance, 1 where usable; profile of the source and its slopes in x and y.
-    pixels, shapes = np.zeros((3, side * side)), np.zeros((3, side * side))
+    padded = (side * side + LANES - 1) // LANES * LANES
+    pixels, shapes = np.zeros((3, padded), np.float32), np.zeros((3, padded), np.float32)
+    pixels[1] = ONE
     size = covariance.shape[1]  # 4
     normal, right, delta = np.zeros((size, size)), np.zeros(size), np.zeros(size)
     for i in range(len(which)):
@@ -46,7 +55,7 @@ def fit_stamps(
         for step in range(rounds + 1):
             if step != 1:  # the first step leaves the position as it is
                 for axis in range(2):
-                    _profile(profile, slope, axis, centre[axis], sigma_px, radius)
+                    fill_profile(profile, slope, axis, centre[axis], sigma_px, bell)
                 for r in range(side):
                     for c in range(side):
                         shapes[0, r * side + c] = profile[1, r] * profile[0, c]
@@ -76,36 +85,52 @@ def fit_stamps(
                 level += delta[3]
         xy_px[i, 0], xy_px[i, 1] = centre[0], centre[1]
         values[i, 0], values[i, 1] = flux, level
-        _judge(pixels, shapes[0], flux, level, per_unit, model_error, surround[i], values[i])
+        _judge(pixels, shapes[0], side, flux, level, per_unit, model_error, surround[i], values[i])
 
 
 @njit(inline="always")
 def _read_stamp(data, variance, usable, signal, signal_error, k, i, pixels) -> None:
-    """Fill pixels (3, s^2): light, variance and usability of stamp k without the neighbours' signal i."""
-    side = data.shape[1]
-    for r in range(side):
-        for c in range(side):
-            at = r * side + c
-            pixels[0, at], pixels[1, at], pixels[2, at] = data[k, r, c], variance[k, r, c], 1.0
-            if len(signal):
-                error = signal_error * signal[i, r, c]
-                pixels[0, at] -= signal[i, r, c]
-                pixels[1, at] += error * error
-            if len(usable) and not usable[k, r, c]:
-                pixels[2, at] = 0.0
+    """Fill pixels (3, m): light, variance and usability of stamp k without the neighbours' signal i."""
+    size, error = data.shape[1], np.float32(signal_error * signal_error)
+    for p in range(size):
+        pixels[0, p], pixels[1, p], pixels[2, p] = data[k, p], variance[k, p], ONE
+    if len(signal):
+        for p in range(size):
+            pixels[0, p] -= signal[i, p]
+            pixels[1, p] += error * signal[i, p] * signal[i, p]
+    if len(usable):
+        for p in range(size):
+            pixels[2, p] = ONE if usable[k, p] else ZERO
 
 
 @njit(inline="always")
-def _profile(profile, slope, axis, offset, sigma_px, radius) -> None:
-    """Row `axis`: the pixel-integrated Gaussian and its derivative by the offset, as `psf.pixel_profile_single`."""
+def bell_curve(sigma_px, radius):
+    """exp(-x^2 / 2 sigma^2) at x = 1/2, 3/2, ..., as far as a stamp's edge is from a source at its other edge [px]."""
+    at = (np.arange(5 * radius + 2) + 0.5) / max(sigma_px, NARROWEST_PX)
+    return np.exp(-0.5 * at * at)
+
+
+@njit(inline="always")
+def fill_profile(profile, slope, axis, offset, sigma_px, bell) -> None:
+    """Row `axis`: the pixel-integrated Gaussian and its derivative by the offset, as `psf.pixel_profile_single`.
+
+    A Gaussian about the source is one about a pixel (`bell`) times exponentials of x, which are powers of one.
+    """
+    side, sigma = profile.shape[1], max(sigma_px, NARROWEST_PX)
+    whole = round(offset)
+    part = offset - whole
+    first = -(side // 2) - whole - 0.5  # the first edge from the pixel nearest to the source
+    ratio = math.exp(part / (sigma * sigma))
+    power = math.exp((first - 0.5 * part) * part / (sigma * sigma))
     last_area, last_density = 0.0, 0.0
-    for j in range(2 * radius + 2):
-        edge = (j - radius - 0.5 - offset) / sigma_px
-        density = math.exp(-0.5 * edge * edge)
+    for j in range(side + 1):
+        edge = (first + j - part) / sigma
+        density = bell[int(abs(first + j))] * power
+        power *= ratio
         t = 1.0 / (1.0 + ERF_SCALE * abs(edge))
         area = 0.5 - density * t * (A1 + t * (A2 + t * (A3 + t * (A4 + t * A5))))
         area = area if edge >= 0.0 else -area
-        density /= sigma_px * SQRT_2PI
+        density /= sigma * SQRT_2PI
         if j > 0:
             profile[axis, j - 1], slope[axis, j - 1] = area - last_area, last_density - density
         last_area, last_density = area, density
@@ -116,13 +141,14 @@ def _normal_equations(pixels, shapes, flux, level, per_unit, model_error, normal
     """Normal matrix (4, 4), symmetric, and right side (4,) for x, y, flux, level."""
     light, variance, use = pixels[0], pixels[1], pixels[2]
     shape, by_x, by_y = shapes[0], shapes[1], shapes[2]
-    shine, error = max(flux, 0.0), model_error * model_error
-    xx = yy = xy = xf = yf = xl = yl = ff = fl = ll = bx = by = bf = bl = 0.0
+    bright, flat, own_noise = np.float32(flux), np.float32(level), np.float32(per_unit)
+    shine, error = max(bright, ZERO), np.float32(model_error * model_error)
+    xx = yy = xy = xf = yf = xl = yl = ff = fl = ll = bx = by = bf = bl = ZERO
     for k in range(len(light)):
         f, x, y = shape[k], by_x[k], by_y[k]
         own = shine * f
-        weight = use[k] / (variance[k] + own * (per_unit + error * own))
-        miss = light[k] - flux * f - level
+        weight = use[k] / (variance[k] + own * (own_noise + error * own))
+        miss = light[k] - bright * f - flat
         wf, wx, wy = weight * f, weight * x, weight * y
         xx += wx * x
         yy += wy * y
@@ -180,31 +206,32 @@ def _solve(factor, x) -> None:
 
 
 @njit(inline="always")
-def _judge(pixels, shape, flux, level, per_unit, model_error, surround, values) -> None:
+def _judge(pixels, shape, side, flux, level, per_unit, model_error, surround, values) -> None:
     """Fill values[2:] for the fitted source: how well it fits, how well a single pixel does, and filter sums."""
     light, variance, use = pixels[0], pixels[1], pixels[2]
-    side = int(math.sqrt(len(light)) + 0.5)
-    hot = len(light) // 2 - side - 1  # the brightest pixel of the middle nine
+    middle = side * side // 2
+    hot = middle - side - 1  # the brightest pixel of the middle nine
     for r in range(-1, 2):
         for c in range(-1, 2):
-            k = len(light) // 2 + r * side + c
+            k = middle + r * side + c
             hot = k if light[k] > light[hot] else hot
-    shine, error = max(flux, 0.0), model_error * model_error
-    chi2 = count = above = norm = own = total = light_sum = 0.0
+    bright, flat, around, own_noise = np.float32(flux), np.float32(level), np.float32(surround), np.float32(per_unit)
+    shine, error = max(bright, ZERO), np.float32(model_error * model_error)
+    chi2 = count = above = norm = own = total = light_sum = ZERO
     for k in range(len(light)):
         plain, glow = use[k] / variance[k], shine * shape[k]
-        miss = light[k] - flux * shape[k] - level
+        miss = light[k] - bright * shape[k] - flat
         filtered = plain * shape[k]
-        chi2 += use[k] * miss * miss / (variance[k] + glow * (per_unit + error * glow))
+        chi2 += use[k] * miss * miss / (variance[k] + glow * (own_noise + error * glow))
         count += use[k]
-        above += filtered * (light[k] - surround)
+        above += filtered * (light[k] - around)
         norm += filtered * shape[k]
-        own += filtered * shape[k] / (1.0 + per_unit * glow * plain)
-    use[hot] = 0.0
+        own += filtered * shape[k] / (ONE + own_noise * glow * plain)
+    use[hot] = ZERO
     for k in range(len(light)):
         total += use[k] / variance[k]
         light_sum += use[k] / variance[k] * light[k]
-    mean, chi2_pixel = light_sum / max(total, 1e-300), 0.0
+    mean, chi2_pixel = light_sum / max(total, LEAST), ZERO
     for k in range(len(light)):
         chi2_pixel += use[k] * (light[k] - mean) ** 2 / variance[k]
     values[2], values[3], values[4] = chi2, chi2_pixel, count
@@ -219,14 +246,14 @@ def sum_neighbours(star, offset_px, flux, sigma_px, variance, limit_sigma, last,
     the light and its difference from `last` (n, s, s) exceed `limit_sigma` of a pixel's noise.
     """
     side = last.shape[1]
-    profile, slope = np.zeros((2, side)), np.zeros((2, side))
+    profile, slope, bell = np.zeros((2, side)), np.zeros((2, side)), bell_curve(sigma_px, side // 2)
     k = -1
     for i in range(len(star)):
         if i == 0 or star[i] != star[i - 1]:
             k += 1
             signal[k] = 0.0
         for axis in range(2):
-            _profile(profile, slope, axis, offset_px[i, axis], sigma_px, side // 2)
+            fill_profile(profile, slope, axis, offset_px[i, axis], sigma_px, bell)
         for r in range(side):
             for c in range(side):
                 signal[k, r, c] += max(flux[i], 0.0) * profile[1, r] * profile[0, c]

@@ -10,17 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
+from startrack.core.kernels import read_only
 from startrack.core.smooth_image import Image, SmoothImage
 from startrack.core.types import Bools, Exposure, Ints
-from startrack.detection.background import COARSE_PX
-from startrack.detection.residual_kernel import cut_light, fill_residuals
+from startrack.detection.residual_kernel import convert_counts, cut_light
 from startrack.psf import stamp_radius
 
 Pixels = NDArray[np.floating[Any]]  # stamps, in either precision
 SATURATED_FRACTION = 0.98
 MIN_BINNED_SIGMA_PX = 1.8  # PSF width from which the frame is binned
 RESIDUAL_FRACTION = 0.1  # of a known star's signal: error of its subtraction
-STRIP_PIXELS = 2**17
 NOTHING = np.zeros((0, 0), dtype=np.float32)
 MODEL_ERROR = 0.03  # of a star's signal: difference between real PSFs and the Gaussian
 
@@ -50,16 +49,13 @@ class Frame:
         """(H, W)."""
         return self.image.shape[0], self.image.shape[1]
 
-    def fill_residuals(self, out: Image, first: int, level: SmoothImage | None = None) -> None:
-        """Fill out (h, W) with the rows from `first` on, minus background and known stars, in units of both's noise.
-
-        `level`, in the same unit, is subtracted too.
-        """
-        found = NOTHING if self.found is None else self.found
-        more, side = (NOTHING, 1) if level is None else (level.rows, level.side)
-        fill_residuals(
-            self.image, self.background.rows, self.noise.rows, self.noise.side, found,
-            np.float32(self.source_noise.per_unit), np.float32(RESIDUAL_FRACTION), more, side, first, out,
+    @property
+    def light_and_noise(self) -> tuple[Any, ...]:
+        """The arguments of `fill_row`, as of all kernels that compare the image with its background and noise."""
+        return (
+            read_only(self.image), self.background.rows, self.noise.rows, self.noise.side,
+            read_only(NOTHING if self.found is None else self.found), np.float32(self.source_noise.per_unit),
+            np.float32(RESIDUAL_FRACTION),
         )  # fmt: skip
 
     def cut_light(self, centres: Ints, radius: int) -> tuple[Image, Image]:
@@ -76,8 +72,8 @@ def electrons(exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray
 
     Saturation shows in the counts as recorded, before dark frame and flat field.
     """
-    pixels_adu, ceiling = exposure.pixels_adu, exposure.saturation_adu or np.inf
-    recorded_adu, correction = exposure.recorded_adu, exposure.correction
+    pixels_adu, recorded_adu, correction = exposure.pixels_adu, exposure.recorded_adu, exposure.correction
+    ceiling = exposure.saturation_adu or np.inf
     sensor = None if camera is None else camera.sensor
     highest = SATURATED_FRACTION * (ceiling if sensor is None else min(ceiling, sensor.saturation_adu))
     gain, bias_e, image = np.float32(1.0), np.zeros((1, 1), dtype=np.float32), pixels_adu
@@ -87,19 +83,12 @@ def electrons(exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray
         if correction is not None and correction.scales_black and correction.sensitivity_1 is not None:
             bias_e = bias_e / correction.sensitivity_1
     saturated = np.zeros(recorded_adu.shape, dtype=np.bool_)
-    for top in range(0, len(image), rows_at_a_time(image.shape)):
-        rows = slice(top, top + rows_at_a_time(image.shape))
-        if not recorded_adu[rows].max() < highest:  # seldom: memory that nobody writes to costs no time
-            np.greater_equal(recorded_adu[rows], highest, out=saturated[rows])
-        if image is not pixels_adu:
-            np.multiply(pixels_adu[rows], gain, out=image[rows])
-            image[rows] -= bias_e if len(bias_e) == 1 else bias_e[rows]
+    converted = np.zeros((0, 0), dtype=np.float32) if image is pixels_adu else image
+    convert_counts(
+        read_only(pixels_adu), read_only(recorded_adu), gain, read_only(bias_e), np.float32(highest), converted,
+        saturated,
+    )  # fmt: skip
     return image, saturated
-
-
-def rows_at_a_time(shape: tuple[int, ...]) -> int:
-    """Rows of an image (H, W) that stay in the processor's cache: whole squares of COARSE_PX."""
-    return COARSE_PX * max(1, STRIP_PIXELS // (COARSE_PX * shape[1]))
 
 
 def cut_stamps(image: NDArray[Any], centres: Ints, radius: int) -> NDArray[Any]:

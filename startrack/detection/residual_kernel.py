@@ -1,4 +1,4 @@
-"""The compiled loops that compare an image with its background and noise."""
+"""The compiled loops that convert an image and compare it with its background and noise."""
 
 from __future__ import annotations
 
@@ -10,40 +10,63 @@ from startrack.core.smooth_image import Image, SmoothImage
 from startrack.core.types import Ints
 
 
-@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
-def fill_residuals(image, background, noise, side, found, per_unit, found_error, level, level_side, first, out):
-    """Fill out (h, W) with rows of the image from `first` on: light above the background in units of the noise.
+@njit(cache=True, nogil=True)
+def convert_counts(pixels_adu, recorded_adu, gain, bias_e, highest_adu, image, saturated):
+    """Fill image (H, W) [e], unless it has no rows, and mark in saturated (H, W) the counts from `highest_adu` on.
 
-    `background` and `noise` are rows of a SmoothImage with this `side`, `level` of one in units of the noise. `found`
-    is known stars' light, `per_unit` and `found_error` its noise. `found` and `level` may have no rows.
+    `bias_e` is (1, 1) or (H, W).
     """
-    one = np.float32(1.0)
-    for i in range(out.shape[0]):
-        y = first + i
-        low, high, part = rows_beside(y, side, len(background))
-        rest = one - part
-        line, light = out[i], image[y]
-        below_b, above_b, below_n, above_n = background[low], background[high], noise[low], noise[high]
-        if len(found):
-            known = found[y]
-            for x in range(len(line)):
-                sigma = below_n[x] * rest + above_n[x] * part
-                variance = sigma * sigma + known[x] * (per_unit + found_error * found_error * known[x])
-                line[x] = (light[x] - (below_b[x] * rest + above_b[x] * part) - known[x]) / np.sqrt(variance)
-        else:
-            for x in range(len(line)):
-                sigma = below_n[x] * rest + above_n[x] * part
-                line[x] = (light[x] - (below_b[x] * rest + above_b[x] * part)) / sigma
-        if len(level):
-            low, high, part = rows_beside(y, level_side, len(level))
-            rest, below_b, above_b = one - part, level[low], level[high]
-            for x in range(len(line)):
-                line[x] -= below_b[x] * rest + above_b[x] * part
+    for y in range(len(pixels_adu)):
+        counts, above = recorded_adu[y], np.int32(0)
+        for x in range(len(counts)):
+            above += np.int32(counts[x] >= highest_adu)
+        if above:  # seldom: memory that nobody writes to costs no time
+            for x in range(len(counts)):
+                saturated[y, x] = counts[x] >= highest_adu
+        if len(image):
+            line, counts = image[y], pixels_adu[y]
+            if len(bias_e) == 1:
+                bias = bias_e[0, 0]
+                for x in range(len(line)):
+                    line[x] = counts[x] * gain - bias
+            else:
+                biases = bias_e[y]
+                for x in range(len(line)):
+                    line[x] = counts[x] * gain - biases[x]
+
+
+@njit(nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
+def fill_row(image, background, noise, side, found, per_unit, found_error, y, line):
+    """Fill line (W,) with row y of the image: light above the background in units of the noise.
+
+    `background` and `noise` are rows of a SmoothImage with this `side`. `found` is known stars' light, `per_unit` and
+    `found_error` its noise; it may have no rows.
+    """
+    low, high, part = rows_beside(y, side, len(background))
+    rest, light = np.float32(1.0) - part, image[y]
+    below_b, above_b, below_n, above_n = background[low], background[high], noise[low], noise[high]
+    if len(found):
+        known = found[y]
+        for x in range(len(line)):
+            sigma = below_n[x] * rest + above_n[x] * part
+            variance = sigma * sigma + known[x] * (per_unit + found_error * found_error * known[x])
+            line[x] = (light[x] - (below_b[x] * rest + above_b[x] * part) - known[x]) / np.sqrt(variance)
+    else:
+        for x in range(len(line)):
+            sigma = below_n[x] * rest + above_n[x] * part
+            line[x] = (light[x] - (below_b[x] * rest + above_b[x] * part)) / sigma
+
+
+@njit(cache=True, nogil=True)
+def fill_residuals(image, background, noise, side, found, per_unit, found_error, out):
+    """Fill out (H, W) with all rows; the other arguments are those of `fill_row`."""
+    for y in range(len(out)):
+        fill_row(image, background, noise, side, found, per_unit, found_error, y, out[y])
 
 
 @njit(cache=True, nogil=True)
 def _fill_stamps(image, background, noise, side, centres, light, variance):
-    """Fill light and variance (n, s, s) around the pixels `centres` (n, 2); the other arguments: `fill_residuals`."""
+    """Fill light and variance (n, s, s) around the pixels `centres` (n, 2); the other arguments: `fill_row`."""
     width = light.shape[1]
     for k in range(len(centres)):
         left, top = centres[k, 0] - width // 2, centres[k, 1] - width // 2

@@ -13,6 +13,7 @@ from startrack.detection.background import CLIPPED_SIGMA
 from startrack.detection.fit import BRIGHT_STAR_SNR
 from startrack.detection.frame import Frame
 from startrack.detection.psf_width import MAX_BRIGHT_SOURCES
+from startrack.detection.residual_kernel import fill_residuals
 
 SMOOTH_PX = 1.0
 MIN_AREA_PX, MAX_AREA_PX = 12, 20_000
@@ -69,7 +70,7 @@ def find_streaks(frame: Frame) -> Streaks | None:
     """
     height, width = frame.shape
     whole = np.empty_like(frame.image)
-    frame.fill_residuals(whole, 0)
+    fill_residuals(*frame.light_and_noise, whole)
     if frame.dead is not None:
         whole = np.where(frame.dead, np.float32(50.0), whole)
     smooth = cv2.GaussianBlur(whole, (0, 0), SMOOTH_PX)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.core.kernels import REORDERED_SUMS, njit, rows_beside
+from startrack.core.kernels import REORDERED_SUMS, njit, read_only, rows_beside
 from startrack.core.types import Array, Bools, Detections, Ints
 from startrack.psf import pixel_profile_table, stamp_radius
 
@@ -64,9 +64,7 @@ def measure(detections: Detections, sources: Sources) -> Photometry:
     order, first, columns = order_by_cell(sources.xy_px, d.image_e.shape, reach_px)
     table = neighbour_profiles(sigma_px)
     measured, usable = np.empty((len(order), 4)), np.empty(len(order), dtype=np.bool_)
-    pictures = [np.ascontiguousarray(a).view() for a in (d.image_e, d.background.rows, d.noise.rows, d.dead)]
-    for picture in pictures:  # contiguous and read-only: another layout or flag would compile the loop again
-        picture.flags.writeable = False
+    pictures = [read_only(a) for a in (d.image_e, d.background.rows, d.noise.rows, d.dead)]
     measure_sources(  # type: ignore[call-arg]
         *pictures, d.background.side, d.noise.side, sources.xy_px[order], sources.flux_e[order],
         sources.fraction_sigma[order], sources.visible[order],

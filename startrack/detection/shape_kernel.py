@@ -1,0 +1,70 @@
+"""The compiled loop that compares fitted sources with the PSF, and with straight edges and lines."""
+
+from __future__ import annotations
+
+# mypy: disable-error-code="no-untyped-def"
+import math
+
+import numpy as np
+
+from startrack.core.kernels import REORDERED_SUMS, njit
+from startrack.detection.fit_kernel import LEAST, ONE, ZERO, bell_curve, fill_profile
+
+
+@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
+def compare_shapes(
+    data, variance, usable, which, offset_px, flux, level, width_px, per_unit, model_error, stripe, ends, misfit, edge
+) -> None:  # fmt: skip
+    """Fill misfit (m,) to the PSF and chi^2 as an edge (m,) for the stamps `which` (m,) of (n, s^2).
+
+    The sources of the stamps have the offset (m, 2) from the middle pixel, flux, local level and PSF width; `per_unit`
+    and `model_error` are the noise of their own light. `usable` (n, s^2) may have no rows. `stripe` (s^2, d) is the
+    stripe of each pixel in d directions, counted on from one direction to the next; `ends` (d,) the number behind each
+    direction's last.
+    """
+    size = data.shape[1]
+    side = round(math.sqrt(size))
+    profile, slope, bell, bell_px = np.zeros((2, side)), np.zeros((2, side)), np.zeros(0), 0.0
+    weight, moment = np.empty(size, np.float32), np.empty(size, np.float32)
+    sums = np.empty((ends[-1], 2), np.float32)
+    own_noise, error = np.float32(per_unit), np.float32(model_error * model_error)
+    for i in range(len(which)):
+        k = which[i]
+        if width_px[i] != bell_px:
+            bell_px = width_px[i]
+            bell = bell_curve(bell_px, side // 2)
+        for axis in range(2):
+            fill_profile(profile, slope, axis, offset_px[i, axis], bell_px, bell)
+        shine, flat = max(flux[i], 0.0), np.float32(level[i])
+        for r in range(side):
+            for c in range(side):
+                moment[r * side + c] = shine * profile[1, r] * profile[0, c]
+        excess = squared = total = ZERO
+        for p in range(size):
+            signal, light = moment[p], data[k, p]
+            noise, miss = variance[k, p] + own_noise * signal, light - signal - flat
+            use = ONE if len(usable) == 0 or usable[k, p] else ZERO
+            weight[p] = use / (noise + error * signal * signal)
+            excess += use * (miss * miss - noise)
+            squared += use * signal * signal
+            moment[p] = weight[p] * light
+            total += moment[p] * light
+        misfit[i] = math.sqrt(max(excess, ZERO) / max(squared, LEAST))
+        edge[i] = total - _most_explained(weight, moment, stripe, ends, sums)
+
+
+@njit(inline="always")
+def _most_explained(weight, moment, stripe, ends, sums):
+    """The largest reduction of chi^2 by stripes in one direction, less the number of stripes."""
+    sums[:] = ZERO
+    for p in range(len(weight)):
+        for d in range(stripe.shape[1]):
+            sums[stripe[p, d], 0] += weight[p]
+            sums[stripe[p, d], 1] += moment[p]
+    most, first = -np.inf, 0
+    for d in range(len(ends)):
+        explained = np.float32(first - ends[d])
+        for j in range(first, ends[d]):
+            explained += sums[j, 1] * sums[j, 1] / max(sums[j, 0], LEAST)
+        most, first = max(most, explained), ends[d]
+    return most

@@ -76,7 +76,9 @@ class Camera:
             shift = self.decentring.shift((angle_rad * per_off_axis)[..., None] * rays_cam[..., :2])
             u, v = u + shift[..., 0], v + shift[..., 1]
         fx, fy = self.handed_focal_px
-        return np.stack([self.centre_px[0] + fx * u, self.centre_px[1] + fy * v], axis=-1)
+        px = np.empty((*u.shape, 2))
+        px[..., 0], px[..., 1] = self.centre_px[0] + fx * u, self.centre_px[1] + fy * v
+        return px
 
     def unproject(self, px: Array) -> Array:
         """Unit rays_cam (..., 3) of the pixels `px` (..., 2): the exact inverse of `project`."""
@@ -84,7 +86,9 @@ class Camera:
         rho = length_xy(u, v)
         angle = self.lens.angle_rad(rho)
         scale = np.sin(angle) / np.where(rho > 0, rho, 1.0)
-        return np.stack([u * scale, v * scale, np.cos(angle)], axis=-1)
+        rays = np.empty((*rho.shape, 3))
+        rays[..., 0], rays[..., 1], rays[..., 2] = u * scale, v * scale, np.cos(angle)
+        return rays
 
     def angle_rad(self, px: Array) -> Array:
         """Angle (...) off the axis [rad] of the pixels `px` (..., 2)."""

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 LOG = logging.getLogger(__name__)
 VARIABLE = "NUMBA_CACHE_DIR"
-ABOVE_KERNELS = {"api", "applications", "chain", "cli", "identification", "output", "rendering"}  # no kernel uses them
+ABOVE_KERNELS = {"api", "applications", "chain", "cli", "output", "rendering"}  # no kernel uses them
 
 
 def choose_cache_folder() -> None:

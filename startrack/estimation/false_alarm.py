@@ -49,8 +49,8 @@ def log_p_value(matched: Ints | int, predicted: Ints | int, each: Array | float,
     `each`: probability that one star does. `free`: matches that the hypothesis itself produces (the stars of
     its pattern, the parameters of a fit); they are taken from both numbers.
     """
-    k, n = np.maximum(np.asarray(matched) - free, 0), np.maximum(np.asarray(predicted) - free, 0)
-    tail = binomial_tail(np.maximum(k, 1), n, each)
+    k = np.asarray(matched) - free
+    tail = binomial_tail(np.maximum(k, 1), np.asarray(predicted) - free, each)
     return np.where(k > 0, np.log(np.maximum(tail, SMALLEST_PROBABILITY)), 0.0)
 
 

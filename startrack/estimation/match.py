@@ -203,9 +203,9 @@ class CandidatePairs:
         faintest[self.detection[which]] = self.v_mag[which] + DISTINCT_MAG
         rival = (self.distance_px < radius_px) & (self.v_mag < faintest[self.detection])
         rival &= self.star != own[self.detection]
-        crowded = np.unique(self.detection[rival])
-        if not len(crowded):
+        if not rival.any():
             return which
+        crowded = np.unique(self.detection[rival])
         named, sure, detected = which.copy(), np.ones(len(which), dtype=bool), set(self.star[which].tolist())
         rows = np.searchsorted(self.detection, [crowded, crowded + 1]).T  # the pairs of a detection are adjacent
         for i, (first, last) in zip(np.searchsorted(self.detection[which], crowded), rows, strict=True):

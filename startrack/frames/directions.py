@@ -49,8 +49,8 @@ def azel_from_rays(rays_enu: ArrayLike) -> tuple[Array, Array]:
 
 def off_axis_rad(rays: ArrayLike) -> Array:
     """Angle (...) between the vectors `rays` (..., 3) and their frame's z axis [rad], exact at 0 and at pi."""
-    x, y, z = np.moveaxis(np.asarray(rays, dtype=float), -1, 0)
-    return np.arctan2(length_xy(x, y), z)
+    given = np.asarray(rays, dtype=float)
+    return np.arctan2(length_xy(given[..., 0], given[..., 1]), given[..., 2])
 
 
 def angle_between_rad(a: ArrayLike, b: ArrayLike) -> Array:

@@ -15,7 +15,6 @@ from startrack.estimation.match import (
     brightness_agreement,
     upper_median,
 )
-from startrack.frames import wahba
 from startrack.identification.attitude_search import (
     FIRST_GATE_PX,
     GATE_PX,
@@ -24,6 +23,7 @@ from startrack.identification.attitude_search import (
     AttitudeHypothesis,
     Sources,
 )
+from startrack.identification.star_grid import rotation_between
 
 MATCH_ROUNDS = 4  # of matching and rotating; one suffices if the bright stars determine the attitude
 SETTLED_PX = 0.15
@@ -73,7 +73,7 @@ def refine_attitude(sources: Sources, hypothesis: AttitudeHypothesis) -> Attitud
         used = matched[agree]
         if len(used) < MIN_MATCHES:
             return None
-        refined = wahba(sources.rays_cam[detection[used]] / variance[agree][:, None], rays_icrs[used])
+        refined = rotation_between(sources.rays_cam[detection[used]], rays_icrs[used], 1.0 / variance[agree])
         if np.abs(refined - R).max() / scale.axis_rad_per_px < SETTLED_PX:
             break
         R = refined

@@ -16,8 +16,9 @@ from startrack.camera import Camera
 from startrack.core.types import Array, Centroids, Ints
 from startrack.estimation.false_alarm import PATTERN_MATCHES, expected_false_alarms
 from startrack.frames import wahba
-from startrack.identification.index import CatalogPatterns, Neighbours, PixelScale
+from startrack.identification.index import CatalogPatterns, PixelScale
 from startrack.identification.near_attitude import agreeing_pairs
+from startrack.identification.star_grid import Neighbours, rotation_between, settle_rotation
 from startrack.identification.triangles import PatternIndex, sides_of_few, triangles
 
 PREFIXES = (0, 7, 10, 14, 20, 28)  # number of brightest detections that form triangles, round by round
@@ -37,7 +38,7 @@ GATE_PX = 6.0  # from a predicted star, in which detections are matched
 FIRST_GATE_PX = GATE_PX / 2
 INLIER_PX = 1.5  # largest distance of a detection on its star
 ONE_SOURCE_SIGMAS = 3.0  # of the PSF: radius within which stars share one detection
-SETTLING_ROUNDS = 10  # two or three suffice
+SETTLING_LOOKUPS = 4  # one or two suffice
 # Of a rough attitude that is the right one: 0.8 of rendered frames, 0.45 of coarse pixels. One that is a degree off
 # fits the stars about one axis only.
 LEAST_PART = 0.3
@@ -190,7 +191,9 @@ class AttitudeSearch:
             if hits < MIN_MATCHES:
                 continue
             if self._false_alarms(hits - PATTERN_MATCHES, rays, near.depth, radius) < PLAUSIBLE:
-                yield self._settle(R, near, first, radius)
+                settled = self._settle(R, near, first, radius)
+                if len(settled.star) >= MIN_MATCHES:
+                    yield settled
 
     def _neighbours(self, R: Array, first: int) -> Neighbours:
         """The stars near the detections up to some beyond the `first`, at the attitude `R`."""
@@ -203,31 +206,27 @@ class AttitudeSearch:
         It begins at `R`, with the stars `near` the detections there. Whatever attitude in its surroundings proposes it,
         the result is the same.
         """
-        cam, icrs, start = self.rays_cam[near.ray], self.patterns.stars.rays_icrs[near.star], R
-        hit = near.chord < radius
-        for _ in range(SETTLING_ROUNDS):
-            R, before = wahba(cam[hit], icrs[hit]), hit
-            if np.abs(start - R).max() > MAX_DRIFT_PX * self.scale.axis_rad_per_px:
-                near, start = self._neighbours(R, first), R
-                cam, icrs = self.rays_cam[near.ray], self.patterns.stars.rays_icrs[near.star]
-            off = cam - icrs @ R.T
-            hit = np.einsum("ni,ni->n", off, off) < radius**2
-            if np.array_equal(hit, before):
+        for _ in range(SETTLING_LOOKUPS):
+            pairs = self.rays_cam[near.ray], self.patterns.stars.rays_icrs[near.star]
+            before, (R, hit) = R, settle_rotation(*pairs, near.chord < radius, radius**2)
+            if np.abs(R - before).max() < MAX_DRIFT_PX * self.scale.axis_rad_per_px:
                 break
+            near = self._neighbours(R, first)
         is_whole = len(self.rays_cam) <= first + VERIFIED_DETECTIONS
-        return AttitudeHypothesis(R, near.ray[hit], near.star[hit], near if is_whole else None, float(hit.mean()))
+        part = np.count_nonzero(hit) / len(hit)
+        return AttitudeHypothesis(R, near.ray[hit], near.star[hit], near if is_whole else None, part)
 
     def _supported_attitudes(self, cam: Array, icrs: Array, some: Array, radius: float, depth: int) -> Iterator[Array]:
         """R_cam_icrs of the closest match, which is nearly always right, then of matches that detections support."""
         if len(cam):
-            yield wahba(cam[0], icrs[0])
-        tree = self.patterns.tree(depth)
+            yield rotation_between(cam[0], icrs[0], np.ones(len(cam[0])))
         for start in range(1, len(cam), PRETESTED):
             R = wahba(cam[start : start + PRETESTED], icrs[start : start + PRETESTED])
-            distance = tree.query(some @ R, distance_upper_bound=radius)[0]
-            hits = np.count_nonzero(distance < radius, axis=1)
+            near = self.patterns.neighbours((some @ R).reshape(-1, 3), 2 * np.arcsin(radius / 2), depth)
+            hit = near.ray[np.diff(near.ray, prepend=-1) > 0]  # each once
+            hits = np.bincount(hit // len(some), minlength=len(R))
             best = np.argsort(-hits, kind="stable")
-            expected = self._false_alarms(np.maximum(hits[best] - PATTERN_MATCHES, 1), len(some), tree.n, radius)
+            expected = self._false_alarms(np.maximum(hits[best] - PATTERN_MATCHES, 1), len(some), near.depth, radius)
             yield from R[best[expected < PLAUSIBLE]]
 
     def _false_alarms(self, further: Ints | int, rays: int, depth: int, radius: float) -> Array:

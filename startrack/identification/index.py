@@ -1,4 +1,4 @@
-"""Catalogue patterns for one field of view: triangles and pairs of bright stars, and k-d trees of stars by depth.
+"""Catalogue patterns for one field of view: triangles and pairs of bright stars, and grids of stars by depth.
 
 Patterns and the angular size of a camera's pixels are computed once per catalogue and camera, and kept.
 """
@@ -15,11 +15,11 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.core.types import Array, Ints, Stars
+from startrack.core.types import Array, Stars
+from startrack.identification.star_grid import Neighbours, StarGrid
 from startrack.identification.triangles import BRIGHT, DEEP, PairIndex, PatternIndex, build_index, build_pairs
 
-SHALLOWEST_TREE = 1000  # brightest stars in the smallest tree; each next one holds twice as many
-NEIGHBOURS_OF_RAY = 10  # looked up at once; more only in clusters
+FEWEST_STARS = 1000  # brightest stars in the smallest grid; each next one holds twice as many
 CACHED_PATTERNS = 6  # of catalogues and fields
 SCALE_GRID = 33  # pixels per axis at which the solid angle of the field is summed
 SCALE_ANGLES = 64
@@ -89,7 +89,7 @@ class CatalogPatterns:
     def __init__(self, stars: Stars, field_sr: float) -> None:
         """`stars` are sorted, brightest first."""
         self.stars, self.field_sr = stars, field_sr
-        self._trees: dict[int, Any] = {}
+        self._grids: dict[int, StarGrid] = {}
 
     @cached_property
     def bright_index(self) -> PatternIndex:
@@ -106,49 +106,17 @@ class CatalogPatterns:
         """Pairs of bright stars."""
         return build_pairs(self.stars, self.field_sr)
 
-    def tree(self, count: int) -> Any:
-        """scipy.spatial.cKDTree of at least the `count` brightest stars."""
-        from scipy.spatial import cKDTree
-
-        level = SHALLOWEST_TREE << max((count - 1) // SHALLOWEST_TREE, 0).bit_length()
-        if level not in self._trees:
-            self._trees[level] = cKDTree(self.stars.rays_icrs[:level])
-        return self._trees[level]
-
-    def neighbours(self, rays_icrs: Array, radius_rad: float, count: int, most: int = NEIGHBOURS_OF_RAY) -> Neighbours:
-        """All pairs of a ray (n, 3) and a star closer than the radius, of the `count` brightest stars and some more.
-
-        `most`: stars of each ray that are looked up at first.
-        """
-        tree, chord = self.tree(count), 2 * np.sin(radius_rad / 2)
-        distance, star = tree.query(rays_icrs, most, distance_upper_bound=chord)
-        close = np.flatnonzero(distance < chord)  # a missing neighbour is infinitely far
-        near = close // most, star.ravel()[close], distance.ravel()[close]
-        crowded = np.flatnonzero(distance[:, -1] < chord)  # in star clusters
-        if len(crowded):
-            more = self.neighbours(rays_icrs[crowded], radius_rad, count, 4 * most)
-            plain = np.isin(near[0], crowded, invert=True)
-            found = crowded[more.ray], more.star, more.chord
-            order = np.argsort(np.concatenate([near[0][plain], found[0]]), kind="stable")
-            ray, star, apart = (np.concatenate([a[plain], b])[order] for a, b in zip(near, found, strict=True))
-            return Neighbours(ray, star, apart, tree.n)
-        return Neighbours(*near, tree.n)
-
-
-@dataclass(frozen=True)
-class Neighbours:
-    """Pairs of a ray and a star near it."""
-
-    ray: Ints  # (k,) ascending
-    star: Ints  # (k,)
-    chord: Array  # (k,) distance on the unit sphere
-    depth: int  # number of the brightest stars that were searched
+    def neighbours(self, rays_icrs: Array, radius_rad: float, count: int) -> Neighbours:
+        """All pairs of a ray (n, 3) and a star closer than the radius, of the `count` brightest stars and some more."""
+        level = FEWEST_STARS << max((count - 1) // FEWEST_STARS, 0).bit_length()
+        if level not in self._grids:
+            self._grids[level] = StarGrid(self.stars.rays_icrs[:level])
+        return self._grids[level].neighbours(rays_icrs, 2 * np.sin(radius_rad / 2))
 
 
 def patterns_of(stars: Stars, field_sr: float) -> CatalogPatterns:
     """The patterns of these stars; patterns of the last few catalogues and fields are kept."""
-    key = (len(stars), stars.rays_icrs[:2000].tobytes(), field_sr)
-    return keep_last_few(_KEPT, key, lambda: CatalogPatterns(stars, field_sr))
+    return keep_last_few(_KEPT, (*sky_key_of(stars), field_sr), lambda: CatalogPatterns(stars, field_sr))
 
 
 def keep_last_few(kept: OrderedDict[Any, Computed], key: Hashable, compute: Callable[[], Computed]) -> Computed:
@@ -161,4 +129,5 @@ def keep_last_few(kept: OrderedDict[Any, Computed], key: Hashable, compute: Call
     return kept[key]
 
 
+sky_key_of = PerObject(lambda stars: (len(stars), stars.rays_icrs[:2000].tobytes()))
 _KEPT: OrderedDict[Any, CatalogPatterns] = OrderedDict()

@@ -68,7 +68,9 @@ class Identifier:
             raise NotIdentified(_describe_few(len(inside), len(centroids), camera), detected=len(inside))
         is_whole = len(inside) == len(centroids)
         some = centroids if is_whole else centroids.take(inside)
-        sources = Sources(some, rays_cam[inside], camera, scale, patterns_of(stars, scale.field_sr))
+        sources = Sources(
+            some, rays_cam if is_whole else rays_cam[inside], camera, scale, patterns_of(stars, scale.field_sr)
+        )
         search = AttitudeSearch(sources)
         tolerance_px, rough_px = self.tolerances_px
         tolerance_px = min(max(tolerance_px, TOLERANCE_SIGMAS * upper_median(sources.variance_px2) ** 0.5), rough_px)

@@ -11,7 +11,6 @@ MOST_OFF_RAD = np.radians(12.0)  # of a rough attitude
 MOST_OFF_OF_FIELD = 0.2  # of the field's diameter, at most
 NEAR_DETECTIONS = 32  # brightest detections
 NEAR_STARS_1 = 3  # brightest stars of the field for each of them
-NEIGHBOURS = 32  # of a detection, looked up at once
 MOST_PAIRS = 200  # those closest together
 AGREEING_1 = 0.5  # of the pairs that agree with the best one: a right pair agrees with all right ones
 
@@ -27,7 +26,7 @@ def agreeing_pairs(
     """
     rays, radius = rays_cam[:NEAR_DETECTIONS], min(MOST_OFF_RAD, MOST_OFF_OF_FIELD * diameter_rad)
     depth = int(NEAR_STARS_1 * 4 * np.pi / patterns.field_sr * len(rays))
-    near = patterns.neighbours(rays @ R_cam_icrs, radius, depth, NEIGHBOURS)
+    near = patterns.neighbours(rays @ R_cam_icrs, radius, depth)
     bright = np.flatnonzero(near.star < depth)
     bright = np.sort(bright[np.argsort(near.chord[bright], kind="stable")[:MOST_PAIRS]])
     detection, star = near.ray[bright], near.star[bright]

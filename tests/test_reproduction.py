@@ -365,6 +365,10 @@ def test_a_progress_bar_on_a_terminal_only(monkeypatch):
             bar.advance(10)
         shown[kind] = sys.stderr.getvalue()
     assert shown[io.StringIO] == "" and "fixes" in shown[Terminal]
+    with progress("predict", 1000, jobs=2):
+        assert "predict: about 8 minutes" in sys.stderr.getvalue()
+    with progress("predict", 1000, shown=False):
+        assert sys.stderr.getvalue().count("about") == 1
 
 
 def test_directions_are_from_north_through_east():

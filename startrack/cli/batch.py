@@ -177,7 +177,12 @@ class _Shown:
         """Table values of each image that was done; the others are missing where the batch was halted."""
         records: list[dict[str, Any]] = []
         try:
-            bar_shown = progress("locate", self.total, shown=not self.args.quiet)
+            bar_shown = progress(
+                f"locate {self.total} images",
+                self.total,
+                shown=not self.args.quiet,
+                jobs=self.args.jobs or count_cores(),
+            )
             with bar_shown as bar, closing(batch.locate_images(runner, tasks)) as outcomes:
                 for record, kept in outcomes:
                     records.append(batch.table_values(record))

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 
 from startrack.applications import calibration
 from startrack.camera import SENSOR, load_camera, save_camera
@@ -18,7 +16,7 @@ from startrack.cli.camera_files import (
     write_camera,
     write_record,
 )
-from startrack.cli.console import print_left_out, print_outcome, progress, refusal
+from startrack.cli.console import named_steps, print_left_out, print_outcome, refusal
 from startrack.cli.flags import checked_flag
 from startrack.cli.images import approximate_camera, check_one_time, flag_site, read, site_of
 from startrack.core.compilation import announce_compilation
@@ -43,7 +41,9 @@ def run(args: argparse.Namespace) -> int:
     exposures = [read(path, args) for path in args.images]
     announce_compilation()
     start = approximate_camera(args, exposures)
-    with _bar(args, 2 * len(exposures) + 3) as show_step:
+    with named_steps(
+        args, f"calibrate with {len(exposures)} images", calibration.count_steps(len(exposures))
+    ) as show_step:
         try:
             found = calibration.calibrate(
                 exposures, load_catalog(), camera=start, fov_rad=args.fov, site=site_of(args, exposures),
@@ -80,7 +80,7 @@ def run_board(args: argparse.Namespace) -> int:
     check_name(args)
     out = check_camera_output(args)
     exposures = [read(path, args) for path in args.images]
-    with _bar(args, len(exposures) + 1) as show_step:
+    with named_steps(args, f"calibrate-board with {len(exposures)} pictures", len(exposures) + 1) as show_step:
         try:
             board = calibration.Board(columns, rows, args.charuco, args.marker)
             found = calibration.calibrate_board(exposures, board, name=args.name or out.stem, progress=show_step)
@@ -103,7 +103,7 @@ def verify(args: argparse.Namespace) -> int:
         named = args.camera or exposure.camera
         if named is None:
             raise BadInput("no_calibration", "no camera file to verify is known: give -c FILE")
-        with _bar(args, 1) as show_step:
+        with named_steps(args, "verify", 1) as show_step:
             try:
                 show_step(f"verifying with {exposure.name}")
                 camera, site = load_camera(named), site_of(args, [exposure])
@@ -116,10 +116,3 @@ def verify(args: argparse.Namespace) -> int:
                 outcome = refusal(cause, exposure.name, image=exposure.name)
         worst = max(worst, print_outcome(args, *outcome))
     return worst
-
-
-@contextmanager
-def _bar(args: argparse.Namespace, steps: int) -> Iterator[Callable[[str], None]]:
-    """A bar over the steps; the function to call with the name of each."""
-    with progress("calibrate", steps, shown=not (args.quiet or args.json)) as bar:
-        yield lambda text: bar.advance(text=text)

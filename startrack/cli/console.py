@@ -6,7 +6,7 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,13 @@ from startrack.core.errors import BadInput, NoSolution, Reason
 if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
 
+STEP_S = {  # of a step, by the first word of what is done: images of 4 Mpx, draws on a height map, 2 cores
+    "calibrate": 0.25, "calibrate-board": 1.0, "horizon": 0.7, "horizons": 30.0, "locate": 0.6, "predict": 1.0,
+    "render": 1.3, "track": 1.0,
+}  # fmt: skip
+ANNOUNCED_S = 5.0  # a longer wait is announced
+MOST_UNITS = 100  # of a duration, from which a larger unit is used
+UNITS = (1.0, "s"), (60.0, "minutes"), (3600.0, "hours")
 Outcome = tuple[dict[str, Any], str]  # of an image: the JSON object, and the line or lines
 
 
@@ -88,8 +95,11 @@ class Progress:
 
 
 @contextmanager
-def progress(what: str, total: int | None = None, *, shown: bool = True) -> Iterator[Progress]:
-    """A bar on stderr with a text behind it, if `shown` and stderr is a terminal; it disappears at the end."""
+def progress(what: str, total: int | None = None, *, shown: bool = True, jobs: int = 1) -> Iterator[Progress]:
+    """A bar on stderr with the time left and a text, if `shown` and stderr is a terminal; it disappears at the end.
+
+    A line before it says what is done, by the first word of `what`, in `jobs` processes, and how long that may take.
+    """
     if not shown or total == 0 or not sys.stderr.isatty():
         yield Progress()
         return
@@ -97,6 +107,21 @@ def progress(what: str, total: int | None = None, *, shown: bool = True) -> Iter
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as RichProgress
 
+    if (wait_s := STEP_S.get(what.split()[0], 0.0) * (total or 1) / jobs) > ANNOUNCED_S:
+        print(f"{what}: about {duration_text(wait_s)}", file=sys.stderr, flush=True)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with RichProgress(*columns, TextColumn("{task.fields[text]}"), console=Console(stderr=True), transient=True) as bar:
         yield Progress(bar, bar.add_task(what, total=total, text=""))
+
+
+@contextmanager
+def named_steps(args: argparse.Namespace, what: str, total: int) -> Iterator[Callable[[str], None]]:
+    """A bar over `total` steps, as of `progress`; the function to call with the name of each when it begins."""
+    with progress(what, total, shown=not (args.quiet or args.json)) as bar:
+        yield lambda text: bar.advance(text=text)
+
+
+def duration_text(seconds: float) -> str:
+    """A duration in words: 40 s, 12 minutes, 5 hours."""
+    unit_s, unit = next((one for one in UNITS if seconds < MOST_UNITS * one[0]), UNITS[-1])
+    return f"{max(round(seconds / unit_s), 1)} {unit}"

@@ -11,7 +11,7 @@ import numpy as np
 
 from startrack.applications import horizon
 from startrack.catalog import load_catalog
-from startrack.cli.console import Outcome, print_left_out, print_outcome, progress, refusal
+from startrack.cli.console import Outcome, named_steps, print_left_out, print_outcome, refusal
 from startrack.cli.images import approximate_camera, check_fov, check_one_time, read, site_of
 from startrack.core.errors import BadInput, BadOutput, NoSolution
 
@@ -40,12 +40,13 @@ def _measure(args: argparse.Namespace) -> Outcome:
     if site.body != "earth":
         raise BadInput("bad_terrain", f"the site is on the {site.body}: this command is for cameras on the Earth")
     camera = approximate_camera(args, exposures)
-    with progress("horizon", 2, shown=not (args.quiet or args.json)) as bar:
-        bar.advance(0, text="identifying the stars")
-        frames, left_out = horizon.orient_frames(exposures, load_catalog(), site, camera=camera, fov_rad=args.fov)
+    steps = 2 * len(exposures) + 1
+    with named_steps(args, f"horizon from {len(exposures)} images", steps) as show_step:
+        frames, left_out = horizon.orient_frames(
+            exposures, load_catalog(), site, camera=camera, fov_rad=args.fov, progress=show_step
+        )
         print_left_out(left_out if frames else ())  # else the refusal names them
-        bar.advance(text="measuring the skyline")
-        found = horizon.measure_frames(frames, left_out, site)
+        found = horizon.measure_frames(frames, left_out, site, show_step)
     horizon.write_skyline(args.output, found.skyline, site, overwrite=args.overwrite)
     unknown = int((~found.skyline.known).sum())
     note = f"{unknown} of them interpolated" if horizon.needs_all_azimuths(args.output) and unknown else ""

@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     for path in written:  # all first: nothing is written half-way to an error
         check_output(path, overwrite=args.overwrite)
     poses = [series.pose(number) for number in range(len(images))] if args.every is not None else []
-    with progress("render", len(images), shown=len(images) > 2) as bar:
+    with progress(f"render {len(images)} images", len(images), shown=len(images) > 2) as bar:
         for number, image in enumerate(images):
             summary = _render_one(args, series, number, image)
             if args.json or not args.quiet:

@@ -45,8 +45,8 @@ def predict(args: argparse.Namespace) -> int:
     prepare(plan.terrain, args)
     if args.cluster is None and not is_compiled():
         compile_kernels(plan.terrain)
-    start, bar, depth = time.perf_counter(), partial(progress, shown=not args.quiet), None
-    jobs = args.jobs or count_cores()
+    start, depth, jobs = time.perf_counter(), None, args.jobs or count_cores()
+    bar = partial(progress, shown=not args.quiet, jobs=jobs)
     try:
         with prediction.draw_store(out, draws=args.draws, jobs=jobs, progress=bar, cluster=args.cluster) as store:
             if args.cluster is not None:

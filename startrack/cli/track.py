@@ -86,7 +86,9 @@ class TrackRun:
             paths = [one.path for one in images_under(first, self.args.dir)]
             if not paths:
                 raise BadInput("bad_image", f"{first}: no images in this folder")
-        with progress("track", len(paths or ()), shown=paths is not None and not self.args.quiet) as bar:
+        with progress(
+            f"track {len(paths or ())} images", len(paths or ()), shown=paths is not None and not self.args.quiet
+        ) as bar:
             if paths is None:
                 bag = tracking.read_bag_exposures(first, self.args.image_topic, **self.session.facts)
                 sources = ((exposure.name, partial(self._add_exposure, exposure)) for exposure in bag)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -68,13 +69,17 @@ def grow_from_matches(
     return fit.camera, fit.R_cam_icrs[0]
 
 
-def fit_frames(frames: tuple[Frame, ...], camera: Camera, R_cam_icrs: Array) -> JointFit:
+def fit_frames(
+    frames: tuple[Frame, ...], camera: Camera, R_cam_icrs: Array, progress: Callable[[str], None] = lambda text: None
+) -> JointFit:
     """The lens of all frames together: matches with a shrinking gate and fits, until the matches settle.
 
-    `R_cam_icrs` (frames, 3, 3) and the camera must be right within a few pixels where stars were matched.
+    `R_cam_icrs` (frames, 3, 3) and the camera must be right within a few pixels where stars were matched. `progress` is
+    called with a text in each of FINAL_ROUNDS or fewer rounds.
     """
     before, gates_px, gate_px = 0, JOINT_GATES_PX[1:], 0.0
     for k in range(FINAL_ROUNDS):
+        progress(f"fitting the lens to all images, round {k + 1}")
         first = k < len(gates_px)
         gate_px = gates_px[k] if first else gate_px
         within = camera.calibrated_angle_rad + RING_RAD

@@ -25,7 +25,7 @@ from startrack.core.runner import map_in_threads
 from startrack.core.types import Array, BadInput, Bools, Exposure, Identification, NoSolution, NotIdentified
 from startrack.detection import Detector
 from startrack.estimation.frame_matching import Frame, frame_of, require_body, require_time
-from startrack.estimation.joint_fit import JointFit, fit_frames, grow_from_matches
+from startrack.estimation.joint_fit import FINAL_ROUNDS, JointFit, fit_frames, grow_from_matches
 from startrack.exposure import combine_masks, with_facts
 from startrack.frames import Site
 from startrack.identification import WIDE_FIELD_RAD, Identifier, identify_unknown_lens
@@ -127,6 +127,11 @@ def calibrate(
         photometry=photometry,
         obstructed=find_obstructions(joint, same) if mask is None else None,
     )
+
+
+def count_steps(images: int) -> int:
+    """How often `calibrate` calls its `progress` at most."""
+    return 2 * images + FINAL_ROUNDS + 1
 
 
 def load_frame(exposure: Exposure, catalog: StarCatalog, site: Site | None, camera: Camera | None = None) -> Frame:
@@ -261,9 +266,8 @@ def _fit_jointly(run: _Run) -> tuple[JointFit, tuple[Frame, ...]]:
             text = "it is the mirror image of the others: one camera has one handedness"
             run.refuse(one.frame.exposure.name, NotIdentified(text, reason="mirrored"))
     R = np.stack([one.R_cam_icrs for one in same])
-    run.progress("fitting the lens to all images")
     frames = tuple(one.frame for one in same)
-    return fit_frames(remove_static_sources(frames, R), camera, R), frames
+    return fit_frames(remove_static_sources(frames, R), camera, R, run.progress), frames
 
 
 def _max_angle_rad(fitted: Camera, start: Camera | None, fov_rad: float | None) -> float:

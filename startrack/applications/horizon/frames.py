@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +25,8 @@ from startrack.estimation.frame_matching import frame_of, require_body, require_
 from startrack.estimation.joint_fit import JointFit, fit_frames
 from startrack.frames import R_enu_icrs, Site
 from startrack.identification import WIDE_FIELD_RAD
+
+Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,13 +61,19 @@ class LeftOut:
 
 
 def orient_frames(
-    exposures: Sequence[Exposure], catalog: StarCatalog, site: Site, *, camera: Camera | None, fov_rad: float | None
+    exposures: Sequence[Exposure],
+    catalog: StarCatalog,
+    site: Site,
+    *,
+    camera: Camera | None,
+    fov_rad: float | None,
+    progress: Progress = lambda text: None,
 ) -> tuple[tuple[SkyFrame, ...], tuple[LeftOut, ...]]:
     """The `exposures` at the `site` with identified stars of the `catalog`, and those without.
 
     The lens is that of `camera`, or found from `fov_rad`, and then fitted to the stars of all frames in their apparent
-    directions. Raises BadInput (no_time, no_calibration, size_mismatch, bad_terrain of another body,
-    inconsistent_evidence where stars below the horizon are seen).
+    directions. `progress` is called with a text at each step. Raises BadInput (no_time, no_calibration, size_mismatch,
+    bad_terrain of another body, inconsistent_evidence where stars below the horizon are seen).
     """
     if camera is None and fov_rad is None:
         raise BadInput("no_calibration", "no camera is known: give a camera file (-c) or the field of view (--fov)")
@@ -84,6 +92,7 @@ def orient_frames(
         return identify(exposure, camera, catalog, site=site)
 
     def take(exposure: Exposure, outcome: Oriented | Refused) -> None:
+        progress(f"identified the stars of {exposure.name}")
         if isinstance(outcome, Oriented):
             _require_above_horizon(outcome, site)
             identified.append(outcome)
@@ -101,6 +110,7 @@ def orient_frames(
     if not identified:
         return (), tuple(left_out)
     frames = tuple(frame_of(one.exposure, one.detections, catalog, site) for one in identified)
+    progress("fitting the lens")
     lead = max(identified, key=lambda one: len(one.identification))
     joint = fit_frames(frames, lead.camera, np.stack([one.attitude_fit.attitude.R_cam_icrs for one in identified]))
     fitted = joint.fit.camera

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, COLUMNS_PER_AZIMUTH, SKYLINE_AZIMUTHS, WIDTHS
-from startrack.applications.horizon.frames import LeftOut, SkyFrame, orient_frames
+from startrack.applications.horizon.frames import LeftOut, Progress, SkyFrame, orient_frames
 from startrack.applications.horizon.posterior import (
     WEAKEST_CONTRAST,
     add_step_log_likelihood,
@@ -65,17 +65,21 @@ def measure_skyline(
     return measure_frames(frames, left_out, site)
 
 
-def measure_frames(frames: tuple[SkyFrame, ...], left_out: tuple[LeftOut, ...], site: Site) -> SkylineResult:
+def measure_frames(
+    frames: tuple[SkyFrame, ...], left_out: tuple[LeftOut, ...], site: Site, progress: Progress = lambda text: None
+) -> SkylineResult:
     """The skyline at a `site` from `frames` with their attitudes; `left_out` are the photographs without.
 
-    Raises NoSolution if there is no frame.
+    `progress` is called with a text at each step. Raises NoSolution if there is no frame.
     """
     if not frames:
         first = left_out[0]
         raise NoSolution(f"{first.name}: {first.message}", reason=first.reason)
-    stars, steps, evidence = zip(*map_in_threads(_measure_frame, frames), strict=True)
-    total = column_log_prior()
-    for log_likelihood in evidence:
+    total, stars, steps = column_log_prior(), [], []
+    for frame, (light, by_width, log_likelihood) in zip(frames, map_in_threads(_measure_frame, frames), strict=True):
+        progress(f"measured the skyline of {frame.name}")
+        stars.append(light)
+        steps.append(by_width)
         total += log_likelihood
     # The columns' posterior as bins of one degree; the errors that the frames share are added once.
     mean, sigma = combine_columns(total)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import statistics
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from functools import partial
@@ -93,6 +94,17 @@ def solve_narrow(find: Callable[[Any], object], solver: Callable[[float], Callab
         solve = solver(width)
         runs += [partial(solve_one, solve, p) for p in synthetic_pictures(stars, width, 3)]
     print_ms(*runs)
+
+
+def live_answer() -> None:
+    """From an image's file to the line of `track --follow` on one core; the median of five [s], two before them."""
+    import live
+
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        live.render_drive(root, "shackleton-rendered", live.WARM_UP + 5)
+        times_s = live.measure_times(root, root / "out")
+    print(statistics.median(wall for wall, _ in times_s[live.WARM_UP :]))
 
 
 def print_ms(*runs: Callable[[], object], parts: float = 1.0) -> None:

@@ -41,7 +41,7 @@ def _is_locked(given: Any, dtype: Any) -> bool:
     if type(given) is not np.ndarray or given.flags.writeable or not given.flags.c_contiguous:
         return False
     base = given.base
-    return np.issubdtype(given.dtype, dtype) and (
+    return (given.dtype.type is dtype or np.issubdtype(given.dtype, dtype)) and (
         base is None or (type(base) is np.ndarray and not base.flags.writeable)
     )
 

@@ -9,7 +9,6 @@ import numpy as np
 from startrack.core.types import Array, Bools, Ints
 from startrack.core.values import Rows, array
 from startrack.detection.frame import MODEL_ERROR, RESIDUAL_FRACTION, Pixels, SourceNoise
-from startrack.psf import pixel_profile
 
 FIT_ROUNDS = 3  # iterations of a first fit
 FIT_ROUNDS_AGAIN = FIT_ROUNDS - 1
@@ -44,7 +43,7 @@ class PointFits(Rows):
         values = {name: values.copy() for name, values in vars(self).items()}
         for name, value in values.items():
             value[which] = getattr(others, name)
-            value.flags.writeable = False  # locked values need no copy
+            value.flags.writeable = False
         return PointFits(**values)
 
 
@@ -93,7 +92,9 @@ def fit_points(
         *pixels, light, RESIDUAL_FRACTION, which, start_xy_px - centres, sigma_px, source_noise.per_unit,
         source_noise.model_error, rounds, surround, offset, values, covariance,
     )  # fmt: skip
-    flux, level, chi2, chi2_pixel, count, above, norm, own = np.ascontiguousarray(values.T)
+    columns = np.ascontiguousarray(values.T)
+    columns.flags.writeable = covariance.flags.writeable = False  # locked values need no copy
+    flux, level, chi2, chi2_pixel, count, above, norm, own = columns
     # Pixels of the surroundings hold the star: their level lowers signal by `own_part`, noise by its root.
     undiluted = np.sqrt(np.maximum(norm, 1e-30) * (1.0 - own_part))
     return PointFits(
@@ -170,23 +171,14 @@ def _squared_residuals(s: Stamps, fits: PointFits, sigma: float) -> tuple[Array,
 
     Last, the correlation of the stars' residuals: 1 for independent ones.
     """
-    radius = s.data.shape[1] // 2
-    offset, n = fits.xy_px - s.centres, len(s.data)
-    px, dx = pixel_profile(offset[:, 0], sigma, radius)
-    py, dy = pixel_profile(offset[:, 1], sigma, radius)
-    flux = np.maximum(fits.flux, 0.0)[:, None, None]
-    shape = py[:, :, None] * px[:, None, :]
-    signal = flux * shape
-    gradient = [flux * py[:, :, None] * dx[:, None, :], flux * dy[:, :, None] * px[:, None, :], shape, 1.0 + 0 * shape]
-    g = np.stack([q.reshape(n, -1) for q in gradient], axis=1)
-    residual = (s.data - signal - fits.level[:, None, None]).reshape(n, -1)
-    squared = np.square(residual)
-    variance = s.variance.reshape(n, -1).astype(np.float64)
-    seen = np.maximum(squared, variance + np.square(MODEL_ERROR * signal.reshape(n, -1)))
-    leverage = np.sum(g * np.matmul(fits.covariance, g), axis=1) / seen
-    use = (signal.reshape(n, -1) > FAINT_FRACTION * variance) & (leverage < MAX_LEVERAGE)
-    relative = residual / flux[:, :, 0]
-    # Equal weight for each star.
-    relative /= np.maximum(np.sqrt(np.mean(np.square(relative), axis=1, keepdims=True)), 1e-30)
+    from startrack.detection.shape_kernel import fill_squared_residuals
+
+    light, variance, _ = s.pixels
+    signal, squared, relative = np.empty((3, *light.shape))
+    lit = np.empty(light.shape, dtype=np.bool_)
+    fill_squared_residuals(
+        light, variance, fits.xy_px - s.centres, fits.flux, fits.level, fits.covariance, sigma, MODEL_ERROR,
+        FAINT_FRACTION, MAX_LEVERAGE, signal, squared, relative, lit,
+    )  # fmt: skip
     correlation = float(np.sum(np.square(relative.sum(axis=0))) / np.sum(np.square(relative)))
-    return signal.reshape(n, -1)[use], (squared / (1.0 - leverage))[use], variance[use], correlation
+    return signal[lit], squared[lit], variance[lit].astype(np.float64), correlation

@@ -31,20 +31,22 @@ def find_maxima(
     """
     height, width = image.shape
     reach = len(taps) - 1
-    lag, kept = max(reach, COARSE_PX * (beside + 2)), 2 * reach + 1
+    has_level = level_factor > ZERO
+    lag, kept = max(reach, COARSE_PX * (beside + 2) if has_level else 0), 2 * reach + 1
     lines, across = np.zeros((lag + 1, width + 2 * reach), np.float32), np.zeros((kept, width), np.float32)
     filtered = np.zeros((3, (width + CHUNK_PX - 1) // CHUNK_PX * CHUNK_PX), np.float32)
     squares, columns = (height + COARSE_PX - 1) // COARSE_PX, (width + COARSE_PX - 1) // COARSE_PX
     column, means = np.zeros(COARSE_PX * columns, np.float32), np.empty((squares, columns), np.float32)
-    levels, filled = np.empty((3, COARSE_PX * columns), np.float32), 0
+    levels, filled = np.zeros((3, COARSE_PX * columns), np.float32), 0
     padded, mean = np.empty(columns + 2 * beside, np.float32), np.empty(columns, np.float32)
     peaks, count = np.empty((0, PEAK_FIELDS)), 0
     for y in range(height + lag):
         if y < height:
             line = lines[y % (lag + 1), reach : reach + width]
             fill_row(image, background, noise, side, found, per_unit, found_error, y, line)
-            _add_clipped(line, column)
-            if (y + 1) % COARSE_PX == 0 or y + 1 == height:
+            if has_level:
+                _add_clipped(line, column)
+            if has_level and ((y + 1) % COARSE_PX == 0 or y + 1 == height):
                 _take_means(column, y % COARSE_PX + 1, width, means[y // COARSE_PX])
         done = y - lag
         if 0 <= done + reach < height:
@@ -54,7 +56,7 @@ def find_maxima(
         if done < 0:
             continue
         low, high, part = rows_beside(done, COARSE_PX, squares)
-        while filled <= high:
+        while has_level and filled <= high:
             _average(means, filled, beside, level_factor, padded, mean)
             _widen(mean, levels[filled % 3])
             filled += 1

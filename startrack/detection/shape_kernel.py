@@ -1,4 +1,4 @@
-"""The compiled loop that compares fitted sources with the PSF, and with straight edges and lines."""
+"""The compiled loops that compare fitted sources with the PSF, and with straight edges and lines."""
 
 from __future__ import annotations
 
@@ -68,3 +68,43 @@ def _most_explained(weight, moment, stripe, ends, sums):
             explained += sums[j, 1] * sums[j, 1] / max(sums[j, 0], LEAST)
         most, first = max(most, explained), ends[d]
     return most
+
+
+@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
+def fill_squared_residuals(
+    data, variance, offset_px, flux, level, covariance, sigma_px, model_error, faint, most, signal, squared, relative,
+    lit,
+) -> None:  # fmt: skip
+    """Fill the outputs (n, s^2) for the fitted sources of stamps (n, s^2).
+
+    Outputs: the sources' `signal`; the `squared` residual, corrected by the leverage of the pixel; the `relative`
+    residual, of unit mean square in each stamp; which pixels are `lit` by more than `faint` of their variance, with a
+    leverage below `most`. `covariance` (n, 4, 4) is that of offset, flux and level.
+    """
+    side = round(math.sqrt(data.shape[1]))
+    profile, slope, bell = np.zeros((2, side)), np.zeros((2, side)), bell_curve(sigma_px, side // 2)
+    for i in range(len(data)):
+        for axis in range(2):
+            fill_profile(profile, slope, axis, offset_px[i, axis], sigma_px, bell)
+        shine, c, total = max(flux[i], 0.0), covariance[i], 0.0
+        for row in range(side):
+            for column in range(side):
+                p = row * side + column
+                f = profile[1, row] * profile[0, column]
+                x, y = shine * profile[1, row] * slope[0, column], shine * slope[1, row] * profile[0, column]
+                signal[i, p] = shine * f
+                residual = data[i, p] - signal[i, p] - level[i]
+                error = model_error * signal[i, p]
+                spread = (
+                    x * (c[0, 0] * x + 2.0 * (c[0, 1] * y + c[0, 2] * f + c[0, 3]))
+                    + y * (c[1, 1] * y + 2.0 * (c[1, 2] * f + c[1, 3]))
+                    + f * (c[2, 2] * f + 2.0 * c[2, 3])
+                    + c[3, 3]
+                )
+                leverage = spread / max(residual * residual, variance[i, p] + error * error)
+                lit[i, p] = signal[i, p] > faint * variance[i, p] and leverage < most
+                squared[i, p] = residual * residual / (1.0 - leverage)
+                relative[i, p] = residual
+                total += residual * residual
+        for p in range(data.shape[1]):
+            relative[i, p] /= max(math.sqrt(total / data.shape[1]), 1e-30)

@@ -23,7 +23,7 @@ from test_identification import (
 )
 
 from startrack.core.types import NotIdentified
-from startrack.estimation.match import CandidatePairs, PhotometricScale, is_last_occurrence
+from startrack.estimation.match import CandidatePairs, PhotometricScale, pair_mutually
 from startrack.frames import R_from_rotvec, wahba
 from startrack.identification import Identifier
 from startrack.identification.attitude_search import AttitudeSearch
@@ -185,9 +185,18 @@ def test_a_blend_is_named_after_the_clearly_brighter_star(case: str) -> None:
         assert pairs.star[plain].tolist() == named
 
 
-def test_is_last_occurrence() -> None:
-    assert is_last_occurrence(np.array([4, 2, 4, 7, 2])).tolist() == [False, False, True, True, True]
-    assert is_last_occurrence(np.zeros(0, dtype=np.int64)).tolist() == []
+def test_pairs_are_the_cheapest_of_their_star_and_of_their_detection() -> None:
+    rng = np.random.default_rng(7)
+    for _ in range(50):
+        detection = np.sort(rng.integers(0, 15, 40))
+        star, cost = 1000 * rng.integers(0, 20, 40), rng.random(40)
+        cost[rng.random(40) < 0.1] = np.inf
+        agrees = rng.random(40) < 0.8
+        best = [i for i in range(40) if np.isfinite(cost[i]) and cost[i] == cost[star == star[i]].min() and agrees[i]]
+        expected = [i for i in best if cost[i] == min(cost[j] for j in best if detection[j] == detection[i])]
+        assert pair_mutually(detection, star, cost, agrees).tolist() == expected
+    none = np.zeros(0, dtype=np.int64)
+    assert pair_mutually(none, none, np.zeros(0), np.zeros(0, dtype=bool)).tolist() == []
 
 
 @pytest.mark.parametrize("field_sr", [2 * np.pi, 0.5])

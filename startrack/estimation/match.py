@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from startrack.core.kernels import njit
 from startrack.core.types import Array, Bools, Ints
 
 DEPTH_BELOW_THRESHOLD_MAG = (
@@ -38,13 +39,35 @@ def upper_median(values: Array) -> float:
     return float(np.sort(values)[len(values) // 2])
 
 
-def is_last_occurrence(numbers: Ints) -> Bools:
-    """Whether each of the numbers (n,), all at least 0, occurs at no later index."""
-    index = np.arange(len(numbers))
-    last = np.empty(numbers.max(initial=-1) + 1, dtype=np.int64)
-    last[numbers] = index  # of equal numbers the last assignment stays
-    standing: Bools = last[numbers] == index
-    return standing
+@njit(cache=True, nogil=True)
+def pair_mutually(detection, star, cost, agrees):  # type: ignore[no-untyped-def]
+    """Ascending indices of the pairs (k,) of least finite cost of their star and, where they agree, their detection.
+
+    `detection` ascends.
+    """
+    slots = 4
+    while slots < 2 * len(star):
+        slots *= 2
+    of_slot, is_best = np.full(slots, -1), np.zeros(len(star), np.bool_)
+    for i in range(len(star)):
+        if cost[i] < np.inf:
+            at = star[i] & (slots - 1)  # a hash table with open addressing
+            while of_slot[at] >= 0 and star[of_slot[at]] != star[i]:
+                at = (at + 1) & (slots - 1)
+            if of_slot[at] < 0 or cost[i] < cost[of_slot[at]]:
+                of_slot[at] = i
+    for i in of_slot:
+        if i >= 0:
+            is_best[i] = agrees[i]
+    kept, k = np.empty(len(star), np.int64), 0
+    for i in range(len(star)):
+        if is_best[i]:
+            if k == 0 or detection[kept[k - 1]] != detection[i]:
+                kept[k] = i
+                k += 1
+            elif cost[i] < cost[kept[k - 1]]:
+                kept[k - 1] = i
+    return kept[:k]
 
 
 def select_closest(detection: Ints, distance: Array) -> Ints:
@@ -184,11 +207,9 @@ class CandidatePairs:
 
         Distance and difference in brightness are added, PX_PER_MAG for a magnitude.
         """
-        by_cost = np.argsort(-self.distance_px - PX_PER_MAG * np.abs(self.dimming_mag))
-        by_cost = by_cost[np.isfinite(self.distance_px[by_cost])]
-        by_cost = by_cost[is_last_occurrence(self.star[by_cost])]
-        by_cost = by_cost[self.agrees_in_brightness[by_cost]]
-        return np.sort(by_cost[is_last_occurrence(self.detection[by_cost])])
+        cost = self.distance_px + PX_PER_MAG * np.abs(self.dimming_mag)
+        matched: Ints = pair_mutually(self.detection, self.star, cost, self.agrees_in_brightness)
+        return matched
 
     def select_unambiguous(self, which: Ints, variance_px2: Array, radius_px: float) -> Ints:
         """The one-to-one pairs `which` (m,) with an unambiguous star; `variance_px2` (m,) is per axis.

@@ -15,7 +15,9 @@ from pathlib import Path
 from typing import Any
 
 SAMPLE = Path(__file__).parent.parent / "sample_images/near-wall.png"
+SCENES = Path(__file__).parent.parent.parent / "shared/scenes/thesis"  # where there are any
 RUNS = 15
+LISTS = 500
 
 
 def read_to_fix() -> None:
@@ -105,6 +107,56 @@ def live_answer() -> None:
         live.render_drive(root, "shackleton-rendered", live.WARM_UP + 5)
         times_s = live.measure_times(root, root / "out")
     print(statistics.median(wall for wall, _ in times_s[live.WARM_UP :]))
+
+
+def listed_stars() -> None:
+    """80 stars and 20 false ones on a lens of 180 degrees; the median list."""
+    from _identify_peers import startrack
+
+    print_median_list(startrack)
+
+
+def ruststartracker_listed_stars() -> None:
+    """The same by ruststartracker to V 4.5 and 90 degrees, the middle of its settings."""
+    from math import radians
+
+    from _identify_peers import ruststartracker
+
+    print_median_list(lambda camera, stars: ruststartracker(camera, stars, 4.5, radians(90)))
+
+
+def print_median_list(solver: Callable[[Any, Any], Any]) -> None:
+    """The median CPU time of the lists of stars_identification.py."""
+    import numpy as np
+    from stars_identification import cases, run, star_list
+
+    from startrack.catalog import load_catalog
+
+    case, stars = cases()[0], load_catalog().at(None, None)
+    rngs = [np.random.default_rng([0, number]) for number in range(LISTS)]
+    lists = [star_list(case.camera, stars, case.true, case.false, case.noise_px, rng=rng) for rng in rngs]
+    print(statistics.median(run(solver(case.camera, stars), lists, np.inf).ms))
+
+
+def next_frames() -> None:
+    """Stars of rendered frames, each a minute after the one before and, where the code can, near its attitude."""
+    from datetime import timedelta
+    from inspect import signature
+
+    from startrack import identify
+    from startrack.catalog import load_catalog
+    from startrack.chain import stars_at
+    from startrack.identification import Identifier
+
+    identifier, has_near = Identifier(), "near_R_cam_icrs" in signature(Identifier.__call__).parameters
+    runs = []
+    for path in (SAMPLE, *sorted(SCENES.glob("*.png"))[:3]):
+        found = identify(path).result
+        when, R = found.exposure.time_utc, found.attitude_fit.attitude.R_cam_icrs
+        skies = iter([stars_at(load_catalog(), when + timedelta(minutes=k), None) for k in range(RUNS + 1)])
+        near = (R,) if has_near else ()
+        runs.append(lambda f=found, skies=skies, near=near: identifier(f.detections, f.camera, next(skies), *near))
+    print_ms(*runs)
 
 
 def print_ms(*runs: Callable[[], object], parts: float = 1.0) -> None:

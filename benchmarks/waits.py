@@ -272,6 +272,17 @@ ROWS = (
     Row("`horizon`, 4 photographs", "<= 8 s", horizon_of, runs=3),
     Row("`predict`, 10 places x 10 draws on Shackleton's floor", "<= 30 s", predicted, runs=1),
     Row("live track on a height map, file to answer", "<= 1 s", partial(in_process, "live_answer"), runs=1),
+    Row(
+        "lost in space from a list; ruststartracker",
+        "<= 1 peer",
+        partial(in_process, "listed_stars"),
+        "ms",
+        partial(in_process, "ruststartracker_listed_stars"),
+        3,
+    ),
+    Row(
+        "identification of the next frame, after detection", "<= 5 ms", partial(in_process, "next_frames"), "ms", runs=3
+    ),
     Row("first use, cylinder: compilation", "<= 10 s", partial(first_use, image=lambda: SAMPLE), runs=1),
     Row("first use, height map: compilation", "<= 20 s", partial(first_use, image=height_map_frame), runs=1),
     Row("packages of the core", "<= 760 MB", core_mb, "MB", runs=1),

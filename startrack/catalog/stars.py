@@ -25,6 +25,7 @@ HIPPARCOS_EPOCH_YR = 1991.25  # J1991.25 (TT), ESA SP-1200 (1997), vol. 1
 ANGLE_UNIT_RAD = 2 * np.pi / 2**32  # of the file's ra and dec columns
 MAS_RAD = np.pi / 648_000_000
 JULIAN_YEAR_S = 365.25 * 86400.0
+BLOCK_OF_STARS = 8192  # computed together: they stay in the cache, which halves the time
 GAIA_EPOCH_YR = 2016.0  # Gaia DR3
 SAME_STAR_RAD = np.radians(6.0 / 3600)  # Hipparcos carried to 2016 agrees to 0.1 arcsec; companions of doubles drop too
 V_MINUS_G = 0.15  # of the typical star of magnitude 8 (Gaia DR3 documentation, table 5.9, B-V = 0.7)
@@ -93,11 +94,12 @@ class StarCatalog(Rows):
         """
         seconds = 0.0 if time is None else seconds_since_2000(time)  # TT and UTC differ by a minute: at most 0.02 mas
         years = 2000.0 + seconds / JULIAN_YEAR_S - self.epoch_yr
-        rays = years * self.motion_rad_yr
-        rays += self.rays_icrs
-        rays /= np.sqrt(np.einsum("ni,ni->n", rays, rays))[:, None]
-        if velocity_m_s is not None:
-            rays = aberrate(rays, velocity_m_s)
+        rays = np.empty_like(self.rays_icrs)
+        for start in range(0, len(rays), BLOCK_OF_STARS):
+            some = slice(start, start + BLOCK_OF_STARS)
+            moved = self.rays_icrs[some] + years * self.motion_rad_yr[some]
+            moved /= np.sqrt(np.einsum("ni,ni->n", moved, moved))[:, None]
+            rays[some] = moved if velocity_m_s is None else aberrate(moved, velocity_m_s)
         rays.flags.writeable = False
         return Stars(
             catalog_id=self.catalog_id, hip=self.hip, rays_icrs=rays, v_mag=self.v_mag, v_sigma_mag=self.v_sigma_mag

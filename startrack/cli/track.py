@@ -16,9 +16,10 @@ from typing import Any
 from startrack.applications import tracking
 from startrack.applications.batch import images_under
 from startrack.applications.tracking import FrameStore, ObservedFrame, Odometry, OdometryFile, Track, TrackSession
+from startrack.catalog import load_catalog
 from startrack.chain import Settings
 from startrack.cli.console import progress, worst_code
-from startrack.cli.images import flag_facts, odometry_errors, prepare_reference
+from startrack.cli.images import compile_kernels, flag_facts, odometry_errors, prepare_reference
 from startrack.core.errors import EXIT_BAD_INPUT, EXIT_REFUSED, EXIT_STOPPED, BadInput, BadOutput, exit_code_of
 from startrack.core.files import make_folder, printable
 from startrack.core.types import Exposure
@@ -105,6 +106,9 @@ class TrackRun:
     def follow(self) -> None:
         """Take images as they come; Ctrl-C and SIGTERM end it, before the first image with the code of a stop."""
         folder = self.args.frames[0]
+        load_catalog()  # before the first image comes
+        if (terrain := prepare_reference(self.args.terrain, self.args)) is not None:
+            compile_kernels(terrain)
         former = signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             for path in tracking.follow_images(

@@ -94,6 +94,18 @@ class Rows(Value):
             object.__setattr__(taken, f.name, part)
         return taken
 
+    def with_rows(self, which: Ints, others: Self) -> Self:
+        """The same with the rows of `others`, which are checked too, at the indices `which`."""
+        changed = object.__new__(type(self))
+        for f in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, f.name)
+            if f.metadata.get("shape", ())[:1] == ("n",):
+                value = value.copy()
+                value[which] = getattr(others, f.name)
+                value.flags.writeable = False
+            object.__setattr__(changed, f.name, value)
+        return changed
+
     @classmethod
     def concatenate(cls, *parts: Self, **shared: Any) -> Self:
         """The rows of all `parts` in one value; its other fields are `shared`."""

@@ -45,14 +45,15 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = 
         last = cut_stamps(frame.found, centres, radius)
         last[:refined] -= source_signal(known.xy_px - centres[:refined], known.flux, sigma, radius)
         last[np.square(last).max(axis=(1, 2)) <= NEIGHBOUR_SIGMA**2 * variance[:, radius, radius]] = 0.0
-    fits = PointFits.concatenate(*(
+    parts = [
         fit_points(
             stamps, which, peaks.start_xy_px[which], sigma, frame.source_noise, peaks.own_part, rounds,
             None if known is None else last[which],
         )
         for which, rounds in ((every[:refined], FIT_ROUNDS_AGAIN), (every[refined:], FIT_ROUNDS))
         if len(which)
-    ))  # fmt: skip
+    ]  # fmt: skip
+    fits = parts[0] if len(parts) == 1 else PointFits.concatenate(*parts)
     pairs = cKDTree(centres).query_pairs(1.5 * radius + 3.0 * sigma, output_type="ndarray")  # stamps that overlap
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
     star, other = pairs[np.argsort(pairs[:, 0], kind="stable")].T

@@ -38,14 +38,6 @@ class PointFits(Rows):
     significance: Array = array("n", may_be_nan=True)  # matched-filter SNR against background noise alone
     snr: Array = array("n", may_be_nan=True)  # matched-filter SNR, the source's own photon noise included
 
-    def with_rows(self, which: Ints, others: PointFits) -> PointFits:
-        """These fits with `others` at the indices `which`."""
-        values = {name: values.copy() for name, values in vars(self).items()}
-        for name, value in values.items():
-            value[which] = getattr(others, name)
-            value.flags.writeable = False
-        return PointFits(**values)
-
 
 @dataclass(frozen=True)
 class Stamps:

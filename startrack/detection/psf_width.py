@@ -10,7 +10,6 @@ from startrack.core.types import Array, Bools, Ints
 from startrack.detection.fit import FIT_ROUNDS_AGAIN, PointFits, Stamps, fit_points
 from startrack.detection.frame import Frame, Pixels, radius_for
 from startrack.detection.peaks import bright_pixels, find_peaks
-from startrack.psf import pixel_profile_single
 
 WIDTH_SNR = 12.0  # of the sources from which the width is measured
 WIDTH_TOLERANCE = 0.12  # a measured PSF that differs by more than this fraction from the expected one replaces it
@@ -63,18 +62,10 @@ def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array
     that the fit explains, about 1 for a star. Refined by a parabola through chi^2; flux and level are free, the
     position is `offset_px` from the middle pixel.
     """
-    radius, m = data.shape[1] // 2, len(widths_px)
-    moment = weights * data
-    total, signal = weights.sum(axis=(1, 2)).astype(np.float64), moment.sum(axis=(1, 2)).astype(np.float64)
-    profiles = []
-    for axis in range(2):
-        profile, _ = pixel_profile_single(np.repeat(offset_px[:, axis], m), np.tile(widths_px, len(data)), radius)
-        profiles.append(profile.reshape(len(data), m, 2 * radius + 1))
-    px, py = profiles
-    ss, s1, sd = _sums(weights, py * py, px * px), _sums(weights, py, px), _sums(moment, py, px)
-    # Reduction of chi^2 by a star of each width on a constant background.
-    part, excess = ss - s1 * s1 / total[:, None], sd - s1 * (signal / total)[:, None]
-    explained = np.square(excess) / np.maximum(part, 1e-30)
+    from startrack.detection.shape_kernel import explain_by_widths
+
+    size, explained, variance = data[0].size, np.empty((len(data), len(widths_px))), np.empty(len(data))
+    explain_by_widths(data.reshape(-1, size), weights.reshape(-1, size), offset_px, widths_px, explained, variance)
     best = np.argmax(explained, axis=1)
     inside = (best > 0) & (best < len(widths_px) - 1)
     best = np.clip(best, 1, len(widths_px) - 2)
@@ -83,15 +74,9 @@ def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array
     bend = 2 * middle - left - right
     shift = np.divide(0.5 * (right - left), bend, out=np.zeros_like(bend), where=bend > 0)
     log_width = np.log(widths_px)
-    variance = np.einsum("nij,nij->n", moment, data, dtype=np.float64) - signal * signal / total
-    beyond_noise = np.maximum(variance - data[0].size, 1e-30)
+    beyond_noise = np.maximum(variance - size, 1e-30)
     widths = np.exp(log_width[best] + np.clip(shift, -1, 1) * (log_width[1] - log_width[0]))
     return widths, inside, middle / np.maximum(beyond_noise, 0.5 * middle)
-
-
-def _sums(stamp: Pixels, down: Pixels, across: Pixels) -> Array:
-    """Sums (n, m) of the stamps (n, s, s) times profiles (n, m, s) in y and in x."""
-    return np.einsum("nms,nms->nm", np.matmul(down, stamp), across).astype(np.float64)
 
 
 def guess_psf_width(prepare: Callable[[float], Frame], sigma: float) -> float:

@@ -108,3 +108,33 @@ def fill_squared_residuals(
                 total += residual * residual
         for p in range(data.shape[1]):
             relative[i, p] /= max(math.sqrt(total / data.shape[1]), 1e-30)
+
+
+@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
+def explain_by_widths(data, weights, offset_px, widths_px, explained, variance):
+    """Fill explained (n, m): how much a star of each width on a constant level reduces chi^2 of the stamps (n, s^2).
+
+    `weights` are 1 / variance of the pixels, `offset_px` (n, 2) the stars' positions from the middle pixel. `variance`
+    (n,) becomes chi^2 of a constant level alone.
+    """
+    side = round(math.sqrt(data.shape[1]))
+    profile, slope = np.zeros((2, side)), np.zeros((2, side))
+    for j in range(len(widths_px)):
+        bell = bell_curve(widths_px[j], side // 2)
+        for i in range(len(data)):
+            for axis in range(2):
+                fill_profile(profile, slope, axis, offset_px[i, axis], widths_px[j], bell)
+            total = signal = squared = ss = s1 = sd = 0.0
+            for row in range(side):
+                for column in range(side):
+                    light, weight = data[i, row * side + column], weights[i, row * side + column]
+                    weighted = weight * profile[1, row] * profile[0, column]
+                    total += weight
+                    signal += weight * light
+                    squared += weight * light * light
+                    ss += weighted * profile[1, row] * profile[0, column]
+                    s1 += weighted
+                    sd += weighted * light
+            excess = sd - s1 * signal / total
+            explained[i, j] = excess * excess / max(ss - s1 * s1 / total, 1e-30)
+            variance[i] = squared - signal * signal / total

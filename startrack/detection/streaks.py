@@ -51,11 +51,11 @@ def are_elongated(frame: Frame, centres: Ints) -> bool:
     if len(centres) < MIN_STREAKS:
         return False
     signal, variance = frame.cut_light(centres, ELONGATION_RADIUS_PX)
-    signal = np.where(signal > ELONGATION_SIGMAS * np.sqrt(variance), signal, 0.0)
-    offset = np.arange(-ELONGATION_RADIUS_PX, ELONGATION_RADIUS_PX + 1)
-    x, y = np.meshgrid(offset, offset)
-    total = np.maximum(signal.sum(axis=(1, 2)), 1e-9)
-    xx, xy, yy = (np.sum(signal * q, axis=(1, 2)) / total for q in (x * x, x * y, y * y))
+    signal = np.where(signal > ELONGATION_SIGMAS * np.sqrt(variance), signal, np.float32(0.0))
+    offset = np.arange(-ELONGATION_RADIUS_PX, ELONGATION_RADIUS_PX + 1, dtype=np.float32)
+    x, y = (q.ravel() for q in np.meshgrid(offset, offset))
+    total, xx, xy, yy = (signal.reshape(len(signal), -1) @ np.stack([np.ones_like(x), x * x, x * y, y * y], axis=1)).T
+    xx, xy, yy = (q / np.maximum(total, 1e-9) for q in (xx, xy, yy))
     trace, spread = xx + yy, np.hypot(xx - yy, 2.0 * xy)
     long = (trace + spread) > ELONGATION * (trace - spread + 0.2)
     return bool(np.mean(long & (trace + spread > 2.0 * ELONGATION)) > 0.5)

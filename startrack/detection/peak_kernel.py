@@ -27,7 +27,8 @@ def find_maxima(
     over the square of COARSE_PX and `beside` others on each side of it, interpolated between their middles. `dead`
     (H, W) pixels are no peaks; it may have no rows. The first arguments are those of `fill_row`.
 
-    Filtered rows follow the rows of the image when these are there that the level needs.
+    Filtered rows follow the rows of the image when these are there that filter and level need; with one tap and no
+    level they are the residuals.
     """
     height, width = image.shape
     reach = len(taps) - 1
@@ -42,25 +43,26 @@ def find_maxima(
     peaks, count = np.empty((0, PEAK_FIELDS)), 0
     for y in range(height + lag):
         if y < height:
-            line = lines[y % (lag + 1), reach : reach + width]
+            line = filtered[y % 3, :width] if lag == 0 else lines[y % (lag + 1), reach : reach + width]
             fill_row(image, background, noise, side, found, per_unit, found_error, y, line)
             if has_level:
                 _add_clipped(line, column)
             if has_level and ((y + 1) % COARSE_PX == 0 or y + 1 == height):
                 _take_means(column, y % COARSE_PX + 1, width, means[y // COARSE_PX])
         done = y - lag
-        if 0 <= done + reach < height:
-            _filter_in_x(lines[(done + reach) % (lag + 1)], taps, across[(done + reach) % kept])
-        elif done + reach >= height:
-            across[(done + reach) % kept] = ZERO
-        if done < 0:
-            continue
-        low, high, part = rows_beside(done, COARSE_PX, squares)
-        while has_level and filled <= high:
-            _average(means, filled, beside, level_factor, padded, mean)
-            _widen(mean, levels[filled % 3])
-            filled += 1
-        _filter_in_y(across, done, taps, levels[low % 3], levels[high % 3], part, filtered[done % 3, :width])
+        if lag > 0:
+            if 0 <= done + reach < height:
+                _filter_in_x(lines[(done + reach) % (lag + 1)], taps, across[(done + reach) % kept])
+            elif done + reach >= height:
+                across[(done + reach) % kept] = ZERO
+            if done < 0:
+                continue
+            low, high, part = rows_beside(done, COARSE_PX, squares)
+            while has_level and filled <= high:
+                _average(means, filled, beside, level_factor, padded, mean)
+                _widen(mean, levels[filled % 3])
+                filled += 1
+            _filter_in_y(across, done, taps, levels[low % 3], levels[high % 3], part, filtered[done % 3, :width])
         row = done - 1
         if margin <= row < height - margin:
             if count + width > len(peaks):

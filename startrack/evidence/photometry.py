@@ -70,11 +70,12 @@ def measure(detections: Detections, sources: Sources) -> Photometry:
         sources.fraction_sigma[order], sources.visible[order],
         first, columns, reach_px, reach_px, radius, table, measured, usable,
     )  # fmt: skip
-    given = np.argsort(order)
-    flux_e, variance_e2, own_shot, neighbour_variance_e2 = np.ascontiguousarray(measured[given].T)
+    columns_e, is_usable = np.empty(measured.shape[::-1]), np.empty_like(usable)
+    columns_e[:, order], is_usable[order] = measured.T, usable
+    flux_e, variance_e2, own_shot, neighbour_variance_e2 = columns_e
     return Photometry(
         flux_e=flux_e, variance_e2=variance_e2, own_shot=own_shot, neighbour_variance_e2=neighbour_variance_e2,
-        usable=usable[given],
+        usable=is_usable,
     )  # fmt: skip
 
 

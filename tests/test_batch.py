@@ -242,6 +242,7 @@ def test_a_changed_sidecar_or_flag_is_another_task(night, tmp_path):
     assert (refused["status"], refused["reason"]) == ("refused", "no_calibration")
 
 
+@pytest.mark.slow
 def test_dask_with_a_killed_worker_equals_the_local_run(night, batch_output, monkeypatch):
     distributed = pytest.importorskip("distributed")
     out, killed = night / "dask", []

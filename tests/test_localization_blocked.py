@@ -81,7 +81,12 @@ def test_a_ridge_of_a_hundred_degrees_is_refused_or_moves_no_fix(seed):
 
 
 @pytest.mark.parametrize(
-    ("height_deg", "width_deg", "middle_deg"), [(1.0, 110, 154), (1.0, 50, 259), (0.8, 60, 214)]
+    ("height_deg", "width_deg", "middle_deg"),
+    [
+        (1.0, 110, 154),
+        pytest.param(1.0, 50, 259, marks=pytest.mark.slow),
+        pytest.param(0.8, 60, 214, marks=pytest.mark.slow),
+    ],
 )  # fmt: skip
 def test_a_low_ridge_moves_no_fix(height_deg, width_deg, middle_deg):
     for seed in (3, 4, 5):
@@ -123,7 +128,9 @@ def test_a_fix_beside_a_blocked_quarter_is_right(located: Any) -> None:
     assert result.fix.blocked.hides(result.light.azimuth_rad).any()
 
 
-@pytest.mark.parametrize("width_deg", [60, 90, 120, 180])
+@pytest.mark.parametrize(
+    "width_deg", [60, pytest.param(90, marks=pytest.mark.slow), pytest.param(120, marks=pytest.mark.slow), 180]
+)
 @pytest.mark.parametrize("place_m", [(6000.0, -2500.0), (500.0, 400.0), (-4000.0, 5000.0)])
 def test_a_wall_to_the_zenith_moves_no_fix(place_m, width_deg):
     """Up to 90 degrees the position is found; behind a wider wall it may be refused, but is not wrong."""

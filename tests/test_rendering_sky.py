@@ -51,8 +51,8 @@ def test_vignetting_and_gradient():
     "changes",
     [
         {},
-        {"lens": KannalaBrandt((-0.03, 0.004, -0.001))},
-        {"decentring": Decentring(0.02, -0.01)},  # up to 20 px, far more than the PSF
+        pytest.param({"lens": KannalaBrandt((-0.03, 0.004, -0.001))}, marks=pytest.mark.slow),
+        pytest.param({"decentring": Decentring(0.02, -0.01)}, marks=pytest.mark.slow),  # 20 px, far more than the PSF
         {"lens": KannalaBrandt((-0.03,)), "decentring": Decentring(-0.02, 0.005), "mirrored": True},
     ],
 )

@@ -266,6 +266,7 @@ def test_any_number_of_workers_gives_the_same_bytes(tmp_path, monkeypatch, capsy
     assert capsys.readouterr().out.count("table3.1: pseudo-gradient") == 2
 
 
+@pytest.mark.slow
 def test_a_cluster_gives_the_same_bytes(tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed")
     monkeypatch.setattr("startrack.applications.reproduction.QUICK", TINY)

@@ -107,6 +107,7 @@ def test_a_signal_while_processes_start_neither_hangs_nor_kills_them():
     assert process.stdout == f"{list(range(8))} True\n", process.stderr
 
 
+@pytest.mark.slow
 def test_an_image_that_kills_dask_workers_is_given_up_and_the_others_are_done(tmp_path):
     distributed = pytest.importorskip("distributed")
     dask = pytest.importorskip("dask")

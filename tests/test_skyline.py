@@ -160,6 +160,7 @@ def test_a_black_sky_leaves_the_stars(catalog: StarCatalog) -> None:
     assert alone.reason == "insufficient_geometry" and "light of the sky" in alone.message
 
 
+@pytest.mark.slow
 def test_a_camera_that_shows_little_of_the_skyline_leaves_the_stars(catalog: StarCatalog) -> None:
     """The frame is a part of the camera's on one side: a quarter of the skyline must be in it."""
     for width, source in ((324, "both"), (184, "stars")):

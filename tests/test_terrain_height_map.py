@@ -142,6 +142,43 @@ def test_bounds_hold_the_horizons_of_small_steps(shackleton, half, turn):
     assert np.median(high - low) < np.radians(0.02 * half + 0.3 * (turn > 0))
 
 
+@pytest.mark.parametrize("half", [0.01, 1.5])
+def test_bounds_of_sectors_hold_near_a_crest(half):
+    """Ground that makes the horizon stands on either side of the middle of a table's cell."""
+    terrain = load_terrain("shackleton")
+    latitude, longitude = latlon_from_enu(terrain.site, 7361.0, 7000.0, 0.0)
+    site = Site("moon", float(latitude), float(longitude))
+    crest, rng = replace(terrain, site=site, search_radius_m=350.0), np.random.default_rng(8)
+    centres, azimuths = rng.uniform(-245, 245, (400, 1, 2)), (np.arange(240) + 0.5) * 2 * np.pi / 240
+    low, high = crest.horizon_bounds_rad(centres, np.array(half), azimuths, np.pi / 240)
+    for _ in range(6):
+        places = centres + rng.uniform(-half, half, (400, 240, 2))
+        horizon = crest.without_table().horizon_rad(places, azimuths + rng.uniform(-1, 1, 240) * np.pi / 240)
+        assert np.all(low - 1e-5 <= horizon)
+        assert np.all(horizon <= high + 1e-5)
+
+
+def test_the_bounds_of_a_rough_map_hold_in_every_cell():
+    rng, line = np.random.default_rng(5), 20.0 * (np.arange(300) - 149.5)
+    rough = np.cumsum(np.cumsum(rng.normal(size=(300, 300)), axis=0), axis=1) * 0.05 + rng.normal(size=(300, 300))
+    projection = Projection(kind=STEREOGRAPHIC, latitude_rad=0.5, longitude_rad=0.2)
+    raster = Raster(
+        heights_m=(rough + 0.1 * np.hypot(line[:, None], line)).astype(np.float32), projection=projection,
+        x0_m=line[0], y0_m=-line[0], dx_m=20.0, dy_m=-20.0, source="rough.tif",
+    )  # fmt: skip
+    terrain = HeightMap(name="rough", site=Site("moon", 0.5, 0.2), maps=(raster,), search_radius_m=600.0)
+    square, step = terrain.table.square, 2 * np.pi / 360
+    inside = np.flatnonzero(np.hypot(*square.centres_m.T) < 500.0)
+    low, high = terrain.table.pyramid[0]
+    angles = [(a.reshape(-1, 360)[inside] * np.pi / 65_000 - np.pi / 2) for a in (low, high)]
+    for _ in range(20):
+        places = square.centres_m[inside][:, None] + rng.uniform(-1, 1, (len(inside), 360, 2)) * square.half_m
+        azimuths = (np.arange(360) + rng.random((len(inside), 360))) * step
+        horizon = terrain.without_table().horizon_rad(places, azimuths)
+        assert np.all(angles[0] <= horizon + 1e-6)
+        assert np.all(horizon <= angles[1] + 1e-6)
+
+
 def test_bounds_do_not_depend_on_what_was_traced_before(shackleton):
     terrain, rng = replace(shackleton, search_radius_m=150.0), np.random.default_rng(6)
     centres, azimuths = rng.uniform(-100, 100, (2000, 2)), rng.uniform(0, 2 * np.pi, 2000)

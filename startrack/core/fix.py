@@ -172,7 +172,7 @@ class Fix(Value):
     modes: tuple[Mode, ...]  # heaviest first; weights sum to 1
     at_time_m: Any = None  # (2,) position if the stated time is right; None: that of `position_enu_m`
     ambiguous: bool  # modes outside the main mode's 99.9 % circle hold more than 1 %
-    dropped_probability: float | None = None  # bound on the posterior's part that the search left out; None: no search
+    dropped_probability: float | None = None  # bound on what the search left out of the posterior; None: none below 1
     search: str = "proven"  # no other position fits; "beam": not proven to the end; "approximate": no posterior
     horizon_error_rad: float = 0.0  # common to all azimuths: how much higher the true horizon is than the map's
     clock: ClockError | None = None  # as the evidence shows it; None: not estimated

@@ -120,7 +120,8 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
     blocked = Blocked(1.0 - clear)
     return Fix(
         position_enu_m=camera_at(middle, terrain), covariance_m2=covariance, radius95_m=radius95, radius999_m=radius999,
-        modes=modes, ambiguous=ambiguous, dropped_probability=dropped_probability, search=explored.search,
+        modes=modes, ambiguous=ambiguous, search=explored.search,
+        dropped_probability=dropped_probability if dropped_probability < 1.0 else None,
         horizon_error_rad=_mean_error(best, "bias_rad"), clock=_clock(whole), blocked=blocked if blocked else None,
         integrity=integrity, unstated=_unstated_facts(whole), raised_rad=best.model.rise_rad(parameters),
         at_time_m=parameters[:2], shown=_shown_errors(best),

@@ -9,13 +9,12 @@ import numpy as np
 from startrack.core.types import Array, Evidence
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.neighbourhood import Neighbourhood, SectorRows
-from startrack.localization.search import BEAMS, Guess, beam_search
+from startrack.localization.search import BEAMS, Guess, beam_search, explains_sectors
 from startrack.localization.sector_moments import solve_linear
 from startrack.localization.shared_errors import SharedErrors
 from startrack.terrain import Terrain
 
 NEARBY_M = 40.0  # horizons are prepared that far about a position
-EXPLAINED_NATS = -0.57  # mean over the sectors with rows; true positions: -0.10 to -0.52, the best false one: -0.62
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +52,7 @@ def find_start(likelihood: PositionLikelihood) -> tuple[PositionLikelihood, Gues
         at_bias, guess = at_likeliest_bias(likelihood, beam_search(likelihood, beam))
         if guess.best > found.best:
             best, found = at_bias, guess
-        if found.best > EXPLAINED_NATS * likelihood.sectors.occupied:
+        if explains_sectors(found, likelihood):
             break
     return best, found
 

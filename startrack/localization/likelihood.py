@@ -14,7 +14,7 @@ from startrack.terrain import Terrain, require_horizons
 
 SECTOR_RAD = 2 * np.pi / SECTORS
 SECTOR_EPSILON = 1e-4  # probability that a sector is wholly wrong
-POINT_M = 0.5  # half side of a box that stands for a point
+POINT_M = 0.01  # half side of a box that stands for a point
 
 
 @dataclass(frozen=True, eq=False)

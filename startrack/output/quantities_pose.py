@@ -120,8 +120,8 @@ POSITION_QUANTITIES: tuple[Quantity, ...] = (
       SEARCHES, optional=True, form="%s",
       shown=(Show("text", "error", "; search {}"), Show("notebook page", "search", "{}"))),
     Q("position.dropped_probability", "", has_position, lambda v: v.fix.dropped_probability,
-      "upper bound of the probability of the positions that the search left out; 1: not bounded; null: a "
-      "method without a posterior", "chance", nullable=True, optional=True),
+      "upper bound of the probability of the positions that the search left out; null: no bound below 1 is known, as "
+      "of most searches that end as `beam`, or a method without a posterior", "chance", nullable=True, optional=True),
     Q("position.lacking", "", Located, lacking_circle, "the circle that is not stated", derived=True,
       shown=(Show("text", "error", "; {}"), Show("notebook page", "95 % within", "{}"))),
     Q("position.caution", "", Located, caution_text, "of a method without a posterior", derived=True,

@@ -81,17 +81,18 @@ def _step_bounds(s0, s1, s2, z0, z1, z2, slack, low_up, high_up, reach, cos_turn
 
 @njit(cache=True, nogil=True)
 def bounds(
-    ground, east, north, up, low_up, high_up, slope_e, slope_n, half, sin_a, cos_a, turn, start_m, end_m, hint_m,
-    tilt_to_crest, found,
+    ground, east, north, height, up, low_up, high_up, slope_e, slope_n, half, sin_a, cos_a, turn, start_m, end_m,
+    hint_m, tilt_to_crest, found,
 ):  # fmt: skip
     """Bounds of the horizon over a box, written to `found`.
 
-    The box reaches `half` to each side of (east, north), the camera stands between low_up and high_up there (at `up` in
-    the middle), and azimuths reach `turn` to each side. Ground nearer than start_m or beyond end_m is left out.
+    The box reaches `half` to each side of (east, north), the camera stands `height` above the ground, between low_up
+    and high_up there (at `up` in the middle), and azimuths reach `turn` to each side. Ground nearer than start_m or
+    beyond end_m is left out.
     A ray from the box passes the middle line's point s within w = r + (s + r) tan(turn) to the side, at a distance
     between s - r and (s + r) / cos(turn) of its own, r the half width of the box seen along the ray. There the ground
     is within w times the steepest slope to the side of what it is on the middle line. Close to the box the horizon is
-    no higher than the steepest slope along the ray, as the camera stands above the ground.
+    no higher than the steepest slope along the ray, less what the height of the camera makes of it.
 
     Slopes to the side come from the pyramid. With `tilt_to_crest`, where a step may make the horizon and w is below
     about a post, they are taken again from the cells that the band touches, in STEP_PARTS parts of the step.
@@ -263,7 +264,7 @@ def bounds(
                             if bottom > low:
                                 low, low_s, low_z, low_rise = bottom, bottom_s, bottom_z, part_rise
                             if near:
-                                top = min(top, steepest)
+                                top = min(top, steepest - height * cos_turn / (t2 + reach))
                             if not probing and top >= low and t2 > -reach:
                                 first, last = min(first, t0), max(last, t2)
                                 high = max(high, top)

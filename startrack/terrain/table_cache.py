@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from startrack.terrain.traced_map import TracedMap
 
 LOG = logging.getLogger(__name__)
-VERSION = 4  # of the tracing and of the table's format
+VERSION = 5  # of the tracing and of the table's format
 UNKNOWN_FROM = 12  # points across the square at which the ends of the maps are looked up
 
 # Terrains that need the same table share one in memory, for as long as one of them lives.

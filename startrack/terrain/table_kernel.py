@@ -69,7 +69,7 @@ def _bounds_by_line(v, along, aside, wide, low_up, high_up, cell_half):
     height = np.int64(v[6])
     height = height - 65_536 if height > 32_767 else height
     near, far = v[2] * DISTANCE_STEP_M - along - wide, v[3] * DISTANCE_STEP_M - along - wide
-    if v[3] < FARTHEST and near > 0.0:
+    if v[3] < FARTHEST and v[2] > 0 and near > 0.0:  # 0: such ground stands behind the cell's middle, too
         tan = np.tan(v[5] * ANGLE_STEP_RAD - np.pi / 2)
         rise, tan_turn = v[9] * RISE_STEP, np.tan(BIN_RAD / 2)
         width = aside + wide + 2 * cell_half * tan_turn
@@ -155,7 +155,7 @@ def box_bounds(ground, values, across, reach, camera_height, centres, half, azim
             near[1] += wide
             near[2] = around[2]
         bounds(
-            ground, centres[k, 0], centres[k, 1], middle + camera_height, lowest + camera_height,
+            ground, centres[k, 0], centres[k, 1], camera_height, middle + camera_height, lowest + camera_height,
             highest + camera_height, slope_e, slope_n, half[k], np.sin(azimuths[k]), np.cos(azimuths[k]), turn[k],
             near[0], near[1], near[2], True, found,
         )  # fmt: skip
@@ -187,7 +187,7 @@ def fill_cells(ground, centres, half, camera_height, sin_a, cos_a, turn, found):
         guess = 0.0
         for j in range(len(sin_a)):
             bounds(
-                ground, centres[k, 0], centres[k, 1], middle + camera_height, low + camera_height,
+                ground, centres[k, 0], centres[k, 1], camera_height, middle + camera_height, low + camera_height,
                 high + camera_height, 0.0, 0.0, half, sin_a[j], cos_a[j], turn, 0.0, FAR_M, guess, False, found[k, j],
             )  # fmt: skip
             guess = found[k, j, 4]

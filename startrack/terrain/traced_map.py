@@ -36,6 +36,7 @@ REACH_RADII = 1.15  # of the search radius: so far is searched, to notice that t
 SLOPE_STEP_M = 5.0
 MIN_RAYS_FOR_THREADS = 1500  # fewer take less time than starting threads
 MAX_THREADS = 8
+POINT_M, WIDE_RAD = 1.0, np.radians(2.0)  # boxes up to this half side are points: bounds that are wider are traced
 MAX_TRACED_TURN_RAD = 0.25 * 2 * np.pi / AZIMUTH_BINS  # half widths of azimuths: bounds over wider ones are looked up
 NO_VALUES = np.zeros((0, AZIMUTH_BINS, FIELDS), dtype=np.uint16)
 
@@ -158,6 +159,12 @@ class TracedMap(Terrain):
             self._trace_bounds(centres, half, azimuths, turn, low, high)
         elif not traced.any() and np.all(half == half[0]):
             self._look_up_bounds(centres, half, azimuths, turn, low, high)
+            wide = high - low > WIDE_RAD
+            if half[0] <= POINT_M and wide.any():
+                some = [a[wide] for a in (centres, half, azimuths, turn)]
+                results = np.empty((2, len(some[0])))
+                _run_in_threads(box_bounds, self._kernel_arguments(self.table), (*some, *results))
+                low[wide], high[wide] = results
         else:
             parts = [(self._look_up_bounds, ~traced & (half == kind)) for kind in np.unique(half[~traced])]
             for bounds, which in [*parts, (self._trace_bounds, traced)]:
@@ -177,7 +184,7 @@ class TracedMap(Terrain):
         """Bounds from the table over boxes of one size; arrays as in `_trace_bounds`."""
         ground, values, *square = self._kernel_arguments(self.table)
         level = self.table.pyramid[self.table.level_for(float(arrays[1][0]))]
-        many_sector_bounds(ground, values, *level, *square, *arrays)
+        _run_in_threads(many_sector_bounds, (ground, values, *level, *square), arrays)
 
     def _kernel_arguments(self, table: HorizonTable | None) -> tuple[Any, ...]:
         """The first arguments of kernels: maps, table, number of its cells and half its side, height of the camera."""

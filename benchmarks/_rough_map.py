@@ -10,6 +10,7 @@ self-affine with Hurst exponent 0.8 up to 2 km, and 5 degrees of slope (RMS) bet
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,15 +30,15 @@ HEIGHT_SIGMA_M = 0.48  # rendered from the map itself; what its roughness shows 
 SEED = 30
 
 
-def rough_terrain(folder: Path) -> Path:
-    """The terrain file in the folder; it is made if it does not exist."""
+def rough_terrain(folder: Path, errors: Sequence[str] = ("--sigma", str(HEIGHT_SIGMA_M))) -> Path:
+    """The terrain file in the folder; it is made if it does not exist, with flags that state the `errors`."""
     terrain, source = folder / "rough.toml", folder / "rough-source.tif"
     if terrain.exists():
         return terrain
     folder.mkdir(parents=True, exist_ok=True)
     write_map(source, rough_crater())
-    words = ["--latitude", str(LATITUDE_DEG), "--longitude", str(LONGITUDE_DEG), "--radius", str(SEARCH_RADIUS_M),
-             "--sigma", str(HEIGHT_SIGMA_M)]  # fmt: skip
+    words = ["--latitude", str(LATITUDE_DEG), "--longitude", str(LONGITUDE_DEG), "--radius", str(SEARCH_RADIUS_M)]
+    words += errors
     if startrack(["terrain", "import", str(source), "-o", str(terrain), *words, "-q"]) != 0:
         raise SystemExit("the rough map could not be imported")
     return terrain

@@ -5,6 +5,7 @@ Runs under the code that PYTHONPATH holds, also that of an older commit: it uses
 
 from __future__ import annotations
 
+import os
 import statistics
 import sys
 import tempfile
@@ -157,6 +158,64 @@ def next_frames() -> None:
         near = (R,) if has_near else ()
         runs.append(lambda f=found, skies=skies, near=near: identifier(f.detections, f.camera, next(skies), *near))
     print_ms(*runs)
+
+
+def horizon_table() -> None:
+    """The table of horizons of a rough map of 1500 x 1500 posts, on all cores [s]; kernels are compiled before."""
+    from dataclasses import replace
+
+    from _rough_map import rough_terrain
+
+    from startrack.terrain import load_terrain
+
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["XDG_CACHE_HOME"] = folder
+        terrain = load_terrain(rough_terrain(Path(folder)))
+        replace(terrain, search_radius_m=100.0).prepare()
+        start = time.perf_counter()
+        terrain.prepare()
+    print(time.perf_counter() - start)
+
+
+def own_map() -> None:
+    """Image to fix on this map with the errors that it shows itself; the median of nine places [s]."""
+    print(statistics.median(own_map_times_s()))
+
+
+def own_map_largest() -> None:
+    """The same; the largest."""
+    print(max(own_map_times_s()))
+
+
+def own_map_times_s() -> list[float]:
+    """Times at five places on the floor and four on the wall, after one that loads what it needs."""
+    import numpy as np
+    from _rough_map import rough_terrain
+    from craters import FLOOR_DEG, WALL_DEG, draw_night, draw_positions
+
+    from startrack.camera import load_camera
+    from startrack.catalog import load_catalog
+    from startrack.chain import locate
+    from startrack.rendering import Series, render
+    from startrack.terrain import load_terrain
+
+    rng, camera, catalog, times_s = np.random.default_rng(2024), load_camera("fisheye-2048"), load_catalog(), []
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["XDG_CACHE_HOME"] = folder
+        terrain = load_terrain(rough_terrain(Path(folder), errors=()))
+        terrain.prepare()
+        positions = [*draw_positions(terrain, 5, FLOOR_DEG, rng), *draw_positions(terrain, 4, WALL_DEG, rng)]
+        for number, (place, _) in enumerate(positions[:1] + positions):
+            series = Series(
+                camera=camera, terrain=terrain, catalog=catalog.brighter_than(10.0), seed=77,
+                time_utc=draw_night(terrain.site, rng), east_m=float(place[0]), north_m=float(place[1]),
+            )  # fmt: skip
+            scene, noise = series.scene(number, f"frame-{number}")
+            exposure, _ = render(scene, rng=noise)
+            start = time.perf_counter()
+            locate(exposure, camera, terrain, catalog)
+            times_s.append(time.perf_counter() - start)
+    return times_s[1:]
 
 
 def print_ms(*runs: Callable[[], object], parts: float = 1.0) -> None:

@@ -271,6 +271,9 @@ ROWS = (
     Row("`calibrate`, 17 images of 4 Mpx, 2,000 stars each", "<= 15 s", calibrated, runs=3),
     Row("`horizon`, 4 photographs", "<= 8 s", horizon_of, runs=3),
     Row("`predict`, 10 places x 10 draws on Shackleton's floor", "<= 30 s", predicted, runs=1),
+    Row("a table of horizons, 1500 x 1500 posts of 20 m", "<= 20 s", partial(in_process, "horizon_table"), runs=1),
+    Row("image to fix on a rough map, 9 places: median", "<= 1.5 s", partial(in_process, "own_map"), runs=1),
+    Row("the same: the largest", "<= 4 s", partial(in_process, "own_map_largest"), runs=1),
     Row("live track on a height map, file to answer", "<= 1 s", partial(in_process, "live_answer"), runs=1),
     Row(
         "lost in space from a list; ruststartracker",

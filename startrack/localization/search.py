@@ -33,7 +33,7 @@ BOXES_AT_ONCE = 2000  # so that memory stays flat
 # That is foreseen below this half side, of the searched radius: on a rough map from 125 m, in 34 searches always right.
 FORESEEN_PART, FORESEEN_BUDGETS = 1 / 30, 2.0
 LOOK_UP_COST = 0.08  # of a bound, in horizons traced
-LAST_MOST_BOXES = 16_000  # of a level: it is the last one; from a quarter of it on a better position is sought
+LAST_MOST_BOXES = 16_000  # of a level: it is the last one; from a sixteenth of it on a better position is sought
 
 
 class Explored(NamedTuple):

@@ -178,7 +178,7 @@ class PatternIndex:
         best = np.argsort(off / sides[row, 0], kind="stable")
         best = best[off[best] < tolerance]
         row, found = row[best], found[best]
-        if len(row) > most:
+        if len(row) and np.bincount(row).max() > most:
             rank = np.argsort(row, kind="stable")
             first = np.searchsorted(row[rank], row[rank])
             kept = np.sort(rank[np.arange(len(rank)) - first < most])

@@ -113,11 +113,15 @@ def settle_rotation(cam, icrs, hit, squared_radius):  # type: ignore[no-untyped-
     `cam`, `icrs` (k, 3): the rays of pairs of a detection and a star. It begins with the pairs that `hit` (k,), of
     which some may be wrong.
     """
-    R = np.eye(3)
+    R, weight = np.eye(3), np.empty(len(cam))
     for _ in range(SETTLING_ROUNDS):
-        if np.sum(hit) < LEAST_PAIRS:
+        hits = 0
+        for i in range(len(cam)):
+            weight[i] = 1.0 if hit[i] else 0.0  # a second type of weights would be compiled by itself
+            hits += hit[i]
+        if hits < LEAST_PAIRS:
             break
-        R, same, now = rotation_between(cam, icrs, hit), True, np.empty(len(cam), np.bool_)
+        R, same, now = rotation_between(cam, icrs, weight), True, np.empty(len(cam), np.bool_)
         for i in range(len(cam)):
             squared = 0.0
             for a in range(3):

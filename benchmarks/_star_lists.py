@@ -12,8 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from startrack.camera import Camera
-from startrack.core.smooth_image import SmoothImage
-from startrack.core.types import Detections, Stars
+from startrack.core.types import Centroids, Stars
 
 CLOSE_PX = 3.0
 SCATTER_MAG = 0.1
@@ -30,14 +29,12 @@ class StarList:
     R_cam_icrs: np.ndarray
     noise_px: float
 
-    def detections(self) -> Detections:
-        """The list in the form of the package's detector."""
+    def detections(self) -> Centroids:
+        """The list as the package's identifier takes it."""
         n, flux = len(self.xy_px), 10 ** (-0.4 * (self.v_mag - ZERO_MAG))
-        return Detections(
+        return Centroids(
             xy_px=self.xy_px, covariance_px2=np.tile(self.noise_px**2 * np.eye(2), (n, 1, 1)), flux_e=flux,
-            flux_sigma_e=np.sqrt(flux + 1e8), snr=flux / np.sqrt(flux + 1e8), saturated=np.zeros(n, dtype=bool),
-            psf_sigma_px=1.0, image_e=np.zeros((2, 2), np.float32), dead=np.zeros((2, 2), bool),
-            background=SmoothImage.of(np.zeros((2, 2), np.float32)), noise=SmoothImage.of(np.ones((2, 2), np.float32)),
+            snr=flux / np.sqrt(flux + 1e8), saturated=np.zeros(n, dtype=bool), psf_sigma_px=1.0,
         )  # fmt: skip
 
 

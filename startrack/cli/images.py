@@ -38,7 +38,11 @@ LOADERS: dict[str, Callable[[str], object]] = {  # of the files among these fact
     "flat": images.read_flat,
 }  # fmt: skip
 RAYS = 360  # of the fix that compiles the kernels: one a degree above the skyline and one below
-COMPILE = f"import sys, {__name__} as images; images.compile_kernels(images.load_terrain(sys.argv[1]))"
+COMPILE = (
+    f"import sys, {__name__} as images; images.compile_measurement(); "
+    "images.compile_kernels(images.load_terrain(sys.argv[1]))"
+)
+LISTED_STARS = 300  # in the sky that is identified for that
 OFFSET_RAD = 0.01  # of these rays from the skyline
 
 
@@ -156,6 +160,27 @@ def compile_kernels(terrain: Terrain) -> None:
     )
     with suppress(NotLocated):  # the kernels are compiled in any case
         ExactPosterior()(evidence, terrain)
+
+
+def compile_measurement() -> None:
+    """Compile the kernels of identification and photometry, by a list of stars and a dark picture."""
+    from startrack.catalog import load_catalog
+    from startrack.core.smooth_image import SmoothImage
+    from startrack.core.types import Detections
+    from startrack.evidence import Sources, measure
+    from startrack.identification import identify_centroids
+
+    camera, stars = load_camera("fisheye-2048"), load_catalog().at(None, None)
+    xy_px, inside = camera.project(stars.rays_icrs[:LISTED_STARS])
+    xy_px, v_mag = xy_px[inside], stars.v_mag[:LISTED_STARS][inside]
+    identify_centroids(xy_px, camera=camera, flux=10 ** (-0.4 * v_mag), stars=stars)
+    none, ones, dark = np.zeros(0), np.ones(len(xy_px)), np.zeros(camera.size_px[::-1], np.float32)
+    picture = Detections(
+        xy_px=np.zeros((0, 2)), covariance_px2=np.zeros((0, 2, 2)), flux_e=none, snr=none, flux_sigma_e=none,
+        saturated=none > 0, psf_sigma_px=1.0, image_e=dark, dead=dark > 0,
+        background=SmoothImage.of(dark), noise=SmoothImage.of(dark + 1),
+    )  # fmt: skip
+    measure(picture, Sources(xy_px=xy_px, flux_e=ones, fraction_sigma=ones, visible=ones))
 
 
 @cache

@@ -21,7 +21,7 @@ def column_lines(form: str, values: Any) -> bytes:
         size = np.abs(values[values == values])
         largest = LARGEST_NUMBER if is_general else LARGEST_NUMBER / 10 ** int(digits)
         if size.max(initial=0.0) < largest and not (is_general and ((size > 0) & (size < SMALLEST_NUMBER)).any()):
-            return bytes(_number_lines(np.asarray(values, dtype=np.float64), int(digits), is_general))
+            return bytes(_number_lines(np.ascontiguousarray(values, dtype=np.float64), int(digits), is_general))
     listed = values.tolist() if isinstance(values, np.ndarray) else values
     if form == "%s" and isinstance(values, np.ndarray) and values.dtype.kind == "U":
         return "".join([f"{one}\n" for one in listed]).encode()

@@ -130,7 +130,7 @@ def calibrate(
 
 
 def count_steps(images: int) -> int:
-    """How often `calibrate` calls its `progress` at most."""
+    """How often `calibrate` calls its `progress` at most, for so many `images`."""
     return 2 * images + FINAL_ROUNDS + 1
 
 

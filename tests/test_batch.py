@@ -266,6 +266,7 @@ def test_dask_with_a_killed_worker_equals_the_local_run(night, batch_output, mon
     assert tables(out) == tables(batch_output)
 
 
+@pytest.mark.slow
 def test_a_batch_killed_at_any_time_is_resumed(night, batch_output):
     out, command = night / "killed", [sys.executable, "-m", "startrack.cli.main", "batch", str(night / "images"), "-q"]
     for results in (1, 2):

@@ -179,6 +179,7 @@ def test_refused_images_are_bridged_by_the_odometry(drive, tmp_path):
     assert bridged["filtered_radius95_m"] > record["frames"][1]["filtered_radius95_m"]
 
 
+@pytest.mark.slow
 def test_the_library_gives_the_track_of_the_command(drive, tracked):
     images = sorted((drive / "frames").glob("*.png"))
     track = startrack.track(images, odometry=str(drive / "frames" / "odometry.tum"))

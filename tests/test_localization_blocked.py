@@ -96,6 +96,7 @@ def test_a_low_ridge_moves_no_fix(height_deg, width_deg, middle_deg):
             assert 2 * np.pi * fix.blocked.whole.mean() < np.radians(width_deg + 3)
 
 
+@pytest.mark.slow
 def test_a_skyline_that_rises_over_most_of_the_horizon_is_refused_or_wide() -> None:
     for seed in (1, 2, 3):
         fix, reason = locate_or_refuse(rows_seen(seed, triangle(1.0, 300, 90)), CRATER)

@@ -81,6 +81,7 @@ def test_the_summary_fits_its_schema_and_the_table(area):
     assert (area / "predict.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_two_workers_write_the_same_bytes(area, tmp_path):
     assert run(tmp_path, "--spacing", 9000, "--draws", 1, "-j", 2) == 0
     for name in ("predict.tif", "predict.ecsv", "predict.json", "predict.png"):

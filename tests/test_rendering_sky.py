@@ -159,6 +159,7 @@ def test_the_wall_reflects_and_the_frame_is_dark_off_the_image_circle():
     )
 
 
+@pytest.mark.slow
 def test_a_picture_on_a_height_map_does_not_depend_on_its_table(own_cache):
     """A table of horizons makes other last digits of a traced horizon: the picture must not show them."""
     terrain = replace(load_terrain("shackleton"), search_radius_m=150.0)

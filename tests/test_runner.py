@@ -69,6 +69,7 @@ def test_few_tasks_are_repeated_after_a_death():
     assert not {*done} & {*suspects}
 
 
+@pytest.mark.slow
 def test_a_stopped_process_does_not_block_the_end():
     done = outcomes(Runner(work, jobs=JOBS, limit_s=10.0), ["0", "1-stopping", "2", "3"])
     assert [name for name, outcome in done.items() if isinstance(outcome, Died)] == ["1-stopping"]

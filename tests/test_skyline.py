@@ -147,6 +147,7 @@ def test_the_sky_stops_where_the_skyline_is(bright: Frame, by_source: dict[str, 
     assert abs(np.mean(off[used])) < 0.03
 
 
+@pytest.mark.slow
 def test_a_black_sky_leaves_the_stars(catalog: StarCatalog) -> None:
     frame = expose(catalog, PLACES_M["near the middle"], None)
     found = locate(frame, catalog)

@@ -101,6 +101,7 @@ def test_predictions_by_the_others_are_those_without_the_frame_or_the_move():
     np.testing.assert_allclose(whole.frame_residual[2], drive.estimates[2].mean - state_less - by_posts, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_positions_have_their_stated_errors_and_the_plain_sum_has_not():
     errors, covariances, plain_errors, plain_covariances = [], [], [], []
     for seed in range(60):

@@ -6,7 +6,7 @@ import hashlib
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import UTC
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +25,6 @@ from startrack.applications.tracking.track import Track, estimate_track, odometr
 from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.catalog import load_catalog
 from startrack.chain import (
-    NearAttitude,
     Settings,
     input_hashes,
     job_sha256,
@@ -36,7 +35,6 @@ from startrack.chain import (
 from startrack.core.errors import BadInput
 from startrack.estimation.observations import USUAL_ODOMETRY, OdometryErrors
 from startrack.exposure import NO_TIME
-from startrack.frames import R_enu_icrs
 
 if TYPE_CHECKING:
     from startrack.camera import Camera
@@ -84,8 +82,7 @@ class TrackSession:
         key = "" if self.store is None or path is None else self._key(exposure, path, shared)
         frame = self.store.read(key) if self.store and key else None
         if frame is None:
-            settings = replace(self.settings, near_attitude=self._near_attitude(camera, terrain, exposure.time_utc))
-            outcome = locate(exposure, camera, terrain, load_catalog(), settings)
+            outcome = locate(exposure, camera, terrain, load_catalog(), self.settings)
             frame = observe_frame(outcome, replace(shared, gross=facts_of(outcome, shared)), terrain)
             if self.store and key:
                 self.store.write(key, frame)
@@ -152,14 +149,6 @@ class TrackSession:
 
     def _steps(self, frames: Sequence[ObservedFrame], odometry: Odometry | None) -> Steps:
         return odometry_steps(frames, odometry, self.odometry_errors)
-
-    def _near_attitude(self, camera: Camera, terrain: Terrain, when: datetime) -> NearAttitude | None:
-        """That of the frame next to the time `when`; None where there is none."""
-        known = [(frame.time_utc, frame.R_body_enu) for frame in self.frames if frame.R_body_enu is not None]
-        if not known or terrain.site is None:
-            return None
-        time_utc, R_body_enu = min(known, key=lambda one: abs(one[0] - when))
-        return NearAttitude.of(camera.R_body_cam.T @ R_body_enu @ R_enu_icrs(terrain.site, time_utc), time_utc)
 
     def _load_references(self, exposure: Exposure) -> tuple[Camera, Terrain, TrackErrors]:
         """Camera, terrain and shared errors of the track: those of its first image. Raises BadInput for another's."""

@@ -62,7 +62,7 @@ class Settings:
     localizer: Localizer = field(default_factory=lambda: require_localizer(DEFAULT_LOCALIZER))
     evidence_sources: str = "both"  # "stars", "sky" (the light of the sky at the skyline) or "both"
     near: PositionPrior | None = None  # of the position; None: anywhere in the search area of the terrain
-    near_attitude: NearAttitude | None = None  # tried first; it saves time and changes no answer
+    near_attitude: NearAttitude | None = None  # tried first: it saves time
     deep_stars: bool = True  # use Gaia's stars too, where they are installed and the frame is deeper than Hipparcos
 
     def __post_init__(self) -> None:

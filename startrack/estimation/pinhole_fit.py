@@ -12,7 +12,6 @@ from startrack.core.kernels import njit
 HALF_WEIGHT_CHI2 = 4.0  # of a match: Cauchy's loss, wrong matches count little
 LONGEST_STEP = 0.1  # radians, logarithm of the focal length, distortion
 RIDGE = 1e-12  # on the diagonal of the normal equations, whose diagonal is 1
-LENS = 2  # parameters before the rotation: logarithm of the focal length, distortion
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -50,7 +49,7 @@ def fit_pinhole(xy_px, rays_icrs, centre_px, mirror, sigma_px, steps, is_distort
         step = np.minimum(np.maximum(right, -LONGEST_STEP), LONGEST_STEP)
         lens[0] *= math.exp(step[0])
         lens[1] += step[1]
-        R[:] = _rotation(step[LENS:]) @ R
+        R[:] = _rotation(step[2:]) @ R  # behind the logarithm of the focal length and the distortion
 
 
 @njit(error_model="numpy")

@@ -101,7 +101,7 @@ REFUSED = [
     ({"dem": {"file": "none.tif"}}, "none.tif"), ({"dem": {"file": []}}, "file"), ({"dem": {"file": 3}}, "file"),
     ({"dem": {"height_sigma_m": -1.0}}, "height_sigma_m"), ({"dem": {"height_sigma_m": "big"}}, "height_sigma_m"),
     ({"search": {"radius_m": 5000.0}}, "cover"), ({"search": {"max_slope_deg": 0.0}}, "max_slope_deg"),
-    ({"search": {"glare_deg": [10.0]}}, "glare_deg"), ({"body": "earth"}, "moon"),
+    ({"search": {"glare_deg": [10.0]}}, "glare_deg"), ({"body": "earth"}, "a map of the Moon"),
     ({"cylinder": {"diameter_m": 100.0, "depth_m": 10.0}}, "two grounds"),
     ({"origin": {"latitude_deg": 0.0}}, "not near the origin"),
 ]  # fmt: skip
@@ -119,7 +119,7 @@ def test_maps_without_position_of_other_bodies_or_with_holes_are_refused(tmp_pat
 
     path = terrain_file(tmp_path)
     tifffile.imwrite(tmp_path / "hill.tif", np.zeros((50, 50), dtype=np.int16))
-    with pytest.raises(BadInput, match="position on the Moon"):
+    with pytest.raises(BadInput, match="position on a body"):
         load_terrain(path)
     (tmp_path / "hill.tif").write_bytes(b"II*\x00 not a tiff")
     with pytest.raises(BadInput, match="can be read"):
@@ -345,7 +345,7 @@ def test_pixels_without_their_label_are_refused_with_advice(tmp_path, capfd):
     with pytest.raises(BadInput, match=r"HILL\.LBL"):
         read_map(tmp_path / "HILL.IMG")
     Image.fromarray(np.zeros((40, 40), dtype=np.uint8)).save(tmp_path / "plain.png")
-    with pytest.raises(BadInput, match="position on the Moon"):
+    with pytest.raises(BadInput, match="position on a body"):
         read_map(tmp_path / "plain.png")
     assert capfd.readouterr().err == ""
 

@@ -25,7 +25,7 @@ CAMERA_OUTPUT = (flags.FILE, NAME, flags.DIR, flags.OVERWRITE, flags.NO_PLOTS, f
 STATED_ERRORS = {  # keys of the file, and the unit of each
     "depth_sigma_m": "M", "diameter_sigma_m": "M", "ellipse_sigma_1": "X", "rim_tilt_sigma_deg": "DEG",
     "height_sigma_m": "M", "horizon_sigma_deg": "DEG", "stretch_sigma_1": "X", "vertical_sigma_deg": "DEG",
-    "camera_height_sigma_m": "M",
+    "camera_height_sigma_m": "M", "terrestrial_refraction_sigma": "X",
 }  # fmt: skip
 
 
@@ -168,11 +168,12 @@ COMMANDS = (
                 "a terrain file and GeoTIFF crops from elevation data", None,
                 {
                     "input": (
-                        flag("maps MAP", "GeoTIFF, COG, PDS label ..., the finest first", nargs="+"),
+                        flag("maps MAP", "GeoTIFF, COG, PDS label, .hgt, USGS .dem ..., the finest first", nargs="+"),
                         flag("--latitude DEG", "of the origin, north positive", float, required=True),
                         flag("--longitude DEG", "east positive", float, required=True),
                         flag("--radius M", "of the search area", float, default=10_000.0),
-                        flag("--half M", "half side of each map's crop (30000 for the first, then 300000)", float,
+                        flag("--half M", "half side of each map's crop (30000 for the first, then 300000; on the Earth "
+                             "150000 at most)", float,
                              nargs="+"),
                         flag("--scale M", "metres per unit of each map; needed for integers if the files lack it",
                              float, nargs="+"),
@@ -184,6 +185,10 @@ COMMANDS = (
                             "anyway)", nargs="+", default=(),
                         ),
                         flag("--camera-height M", "above the ground", float, default=1.5),
+                        flag(
+                            "--highest-beyond M", "ground off the maps is no higher (default: 8850 on the Earth; on "
+                            "the Moon the highest of the maps)", float,
+                        ),
                     ),
                     "output": (
                         flag("-o --output NAME.toml", "the terrain file", required=True), flags.OVERWRITE, flags.JSON,

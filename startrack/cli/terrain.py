@@ -77,7 +77,8 @@ def import_map(args: argparse.Namespace) -> int:
     imported = terrains.import_maps(
         args.maps, args.output, latitude_rad=radians(args.latitude), longitude_rad=radians(args.longitude), half_m=half,
         radius_m=args.radius, scale=args.scale or (), offset_m=args.offset or (), height_sigma_m=args.sigma,
-        compare=args.compare, camera_height_m=args.camera_height, overwrite=args.overwrite,
+        compare=args.compare, camera_height_m=args.camera_height, highest_beyond_m=args.highest_beyond,
+        overwrite=args.overwrite,
     )  # fmt: skip
     facts = _facts_of(load_terrain(imported.path))
     facts |= {"sigma_from": imported.errors.origin, "sigma_comment": imported.errors.comment}
@@ -148,7 +149,10 @@ def _lines_of(facts: dict[str, Any]) -> Iterator[str]:
             f"heights {m['lowest_m']:g} to {m['highest_m']:g} m"
         )
     if "height_sigma_m" in facts:
-        sources = {"map": " (from the map's roughness)", "comparison": " (compared with a finer map)"}
+        sources = {
+            "map": " (from the map's roughness)", "comparison": " (compared with a finer map)",
+            "product": " (published, and from the map's roughness)",
+        }  # fmt: skip
         source, shared = sources.get(facts.get("sigma_from", ""), ""), facts["horizon_sigma_deg"]
         all_around = "three times what these make of it" if shared is None else f"{shared:g} degrees"
         single = f"of single posts {facts['height_sigma_m']:g} m{source}"

@@ -35,6 +35,7 @@ from startrack.frames.site import (
     observer_velocity_m_s,
     position_fixed_m,
     sky_rotvec_rad,
+    sphere_radius_m,
 )
 from startrack.frames.time import as_utc, format_utc, parse_utc, seconds_since_2000
 
@@ -44,5 +45,6 @@ __all__ = [
     "azel_from_rays", "barycentric_state", "enu_from_latlon", "et_s", "format_utc",
     "heading_pitch_roll_from_R_body_enu", "latlon_from_enu", "length_xy", "nearest_rotation", "observer_state",
     "observer_velocity_m_s", "off_axis_rad", "parse_utc", "position_fixed_m", "quat_xyzw_from_R", "rays_from_azel",
-    "refract_rad", "seconds_since_2000", "sky_rotvec_rad", "tum_line", "turn_azel", "wahba",
+    "refract_rad", "seconds_since_2000", "sky_rotvec_rad", "sphere_radius_m", "tum_line", "turn_azel",
+    "wahba",
 ]  # fmt: skip

@@ -59,6 +59,23 @@ def position_fixed_m(site: Site) -> Array:
     return _fixed_from_latlon(site.body, site.latitude_rad, site.longitude_rad, site.height_m)
 
 
+def sphere_radius_m(site: Site) -> float:
+    """Radius [m] of the sphere through the site with its centre on the site's vertical that fits the body's surface.
+
+    On the Moon that of its own sphere. On the Earth the Gaussian radius of curvature, sqrt(M N) of the ellipsoid, of
+    the surface that is parallel to it at the site's height.
+    """
+    if site.body == "moon":
+        return MOON_RADIUS_M + site.height_m
+    import erfa
+
+    a, f = erfa.eform(erfa.WGS84)
+    e2 = float(f * (2.0 - f))
+    w2 = 1.0 - e2 * np.sin(site.latitude_rad) ** 2
+    meridian, normal = a * (1.0 - e2) / w2**1.5, a / np.sqrt(w2)
+    return float(np.sqrt((meridian + site.height_m) * (normal + site.height_m)))
+
+
 def enu_from_latlon(site: Site, latitude_rad: ArrayLike, longitude_rad: ArrayLike, height_m: ArrayLike = 0.0) -> Array:
     """Points (..., 3) in the site's enu [m] of `latitude_rad`, `longitude_rad`, `height_m` (...) on the site's body.
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.core.kernels import njit
-from startrack.frames import MOON_RADIUS_M
 from startrack.terrain.ground_kernel import level_of, slope_range, steepness
 from startrack.terrain.horizon_kernel import (
     FAR_M,
@@ -91,8 +90,9 @@ def bounds(
     beyond end_m is left out.
     A ray from the box passes the middle line's point s within w = r + (s + r) tan(turn) to the side, at a distance
     between s - r and (s + r) / cos(turn) of its own, r the half width of the box seen along the ray. There the ground
-    is within w times the steepest slope to the side of what it is on the middle line. Close to the box the horizon is
-    no higher than the steepest slope along the ray, less what the height of the camera makes of it.
+    is within w times the steepest slope to the side of what it is on the middle line. What air makes of the distance
+    s counts as height of the ground; of the ray's own distance it differs by `bent` at most. Close to the box the
+    horizon is no higher than the steepest slope along the ray, less what the height of the camera makes of it.
 
     Slopes to the side come from the pyramid. With `tilt_to_crest`, where a step may make the horizon and w is below
     about a post, they are taken again from the cells that the band touches, in STEP_PARTS parts of the step.
@@ -108,7 +108,7 @@ def bounds(
     higher than that plus g w at w aside; 7, 8: an s and a height that the ground reaches everywhere there, and 10: the
     slope to the side that this assumes. 5 to 10 hold only if the slopes are zero and not `tilt_to_crest`.
     """
-    grid, heights, posts, tops, wide_tops, slopes, blocks, levels, slope_unit, post_m, moon, highest = ground
+    grid, heights, posts, tops, wide_tops, slopes, blocks, levels, slope_unit, post_m, radius, highest, sag = ground
     reach = half * (abs(sin_a) + abs(cos_a))
     tan_turn, cos_turn = np.tan(turn), np.cos(turn)
     aside = abs(east * cos_a - north * sin_a)
@@ -116,15 +116,15 @@ def bounds(
     if tilt_to_crest and half > 0.0 and middle_tan > LOWEST_TAN:
         width = reach + (best_at + reach) * tan_turn
         e, n = east + best_at * sin_a, north + best_at * cos_a
-        z0 = surface(grid, posts, heights, moon, e - width * cos_a, n + width * sin_a, up + middle_tan * best_at)
-        z2 = surface(grid, posts, heights, moon, e + width * cos_a, n - width * sin_a, z0)
+        z0 = surface(grid, posts, heights, radius, e - width * cos_a, n + width * sin_a, up + middle_tan * best_at)
+        z2 = surface(grid, posts, heights, radius, e + width * cos_a, n - width * sin_a, z0)
         side_rise = (z2 - z0) / (2 * width)
         to_e, to_n = middle_tan * sin_a + side_rise * cos_a, middle_tan * cos_a - side_rise * sin_a
         spread = half * (abs(slope_e - to_e) + abs(slope_n - to_n))
         low_up, high_up, slope_e, slope_n = low_up - spread, high_up + spread, to_e, to_n
     along_rise, side_rise = slope_e * sin_a + slope_n * cos_a, slope_e * cos_a - slope_n * sin_a  # of the plane
     tilted = abs(side_rise)
-    whole = start_m <= 0.0
+    whole, sink = start_m <= 0.0, max(sag, 0.0)
     low, high = LOWEST_TAN, LOWEST_TAN
     first, last = FAR_M, -FAR_M
     line_from = -FAR_M
@@ -141,15 +141,17 @@ def bounds(
         e, n = east + s * sin_a, north + s * cos_a
         width = reach + (abs(s) + reach) * tan_turn
         if probing:
-            known_z = surface(grid, posts, heights, moon, e, n, known_z)
-            line = moon + known_z
+            known_z = surface(grid, posts, heights, radius, e, n, known_z)
+            line = radius + known_z
         else:
-            line = moon + low_up + low * (max(s - reach, 0.0) if low >= 0.0 else (abs(s) + reach) / cos_turn)
-            line += along_rise * s - tilted * width
+            line = radius + low_up + low * (max(s - reach, 0.0) if low >= 0.0 else (abs(s) + reach) / cos_turn)
+            own_most = (s + reach) / cos_turn  # most distance of this ground from a camera in the box
+            line += along_rise * s - tilted * width - sink * own_most * own_most
         m, column, row = locate(grid, posts, e, n, line)
         r = np.sqrt(e * e + n * n + line * line)
-        climb = (e * sin_a + n * cos_a + line * (low + along_rise - tilted * tan_turn)) / r
-        floor = r - MOON_RADIUS_M - (aside + width) / moon * width
+        fall = 2 * sink * (s + reach) / (cos_turn * cos_turn)
+        climb = (e * sin_a + n * cos_a + line * (low + along_rise - tilted * tan_turn - fall)) / r
+        floor = r - radius - (aside + width) / radius * width
         if m < 0 or (not probing and (s >= end_m or (climb >= 0.0 and floor >= highest and s > reach))):
             running = probing
             if probing:
@@ -163,7 +165,7 @@ def bounds(
                 to_column, to_row = (column2 - column) / step, (row2 - row) / step
                 straight_map, straight_low, at_before = m, low, -1
                 straight_to = s + STRAIGHT_M
-            least_level = level_of(levels, m, post_m, moon, width * (1 + 3 * tan_turn), e, n)
+            least_level = level_of(levels, m, post_m, radius, width * (1 + 3 * tan_turn), e, n)
             near = whole and s < 6.0 * reach and not probing
             level = least_level if near or probing else min(max(level, least_level), levels[m] - 1)
             descending, skipped = not (near or probing), False
@@ -178,26 +180,28 @@ def bounds(
                 else:
                     level -= 1
             if not skipped:
-                at, bend = block_at(blocks, m, least_level, column, row), np.sqrt(e * e + n * n) / moon
+                at, bend = block_at(blocks, m, least_level, column, row), np.sqrt(e * e + n * n) / radius
                 if at != at_before:
                     right = steepness(slopes, at, slope_unit[m], to_column, to_row)
                     left = steepness(slopes, at, slope_unit[m], -to_column, -to_row)
                     ahead = steepness(slopes, at, slope_unit[m], d_column, d_row)
                     at_before = at
                 if known_s != s:
-                    known_z, known = surface_place(grid, posts, heights, moon, e, n, known_z)
+                    known_z, known = surface_place(grid, posts, heights, radius, e, n, known_z)
                 whole_level = 0 if probing else least_level
                 span = exit_of(column, row, d_column, d_row, whole_level)
-                end_z, end = surface_place(grid, posts, heights, moon, e + span * sin_a, n + span * cos_a, known_z)
+                end_z, end = surface_place(grid, posts, heights, radius, e + span * sin_a, n + span * cos_a, known_z)
                 if whole_level > 0 and (end[0] != known[0] or end[0] < 0):
                     whole_level, span = 0, exit_of(column, row, d_column, d_row, 0)
-                    end_z, end = surface_place(grid, posts, heights, moon, e + span * sin_a, n + span * cos_a, known_z)
+                    end_z, end = surface_place(
+                        grid, posts, heights, radius, e + span * sin_a, n + span * cos_a, known_z
+                    )
                 run_column, run_row = (end[1] - known[1]) / span, (end[2] - known[2]) / span
                 floor += tilted * width
                 to_side, steep = max(right - side_rise, left + side_rise, 0.0), max(abs(right), abs(left))
-                rise_aside = to_side + steep * (0.005 + 2 * bend) + (aside + width + span * tan_turn) / moon
+                rise_aside = to_side + steep * (0.005 + 2 * bend) + (aside + width + span * tan_turn) / radius
                 if near:
-                    along = abs(ahead) * (0.01 + 2 * bend) + bend + width / moon + steep * tan_turn
+                    along = abs(ahead) * (0.01 + 2 * bend) + bend + width / radius + steep * tan_turn
                     steepest = max(steepest, ahead - along_rise + along)
                 begun, z_begun, is_known = 0.0, known_z, True
                 while begun < span:  # from grid line to grid line
@@ -207,32 +211,35 @@ def bounds(
                         done = span
                     length = done - begun
                     width += length * tan_turn
-                    slack = rise_aside * width
+                    own_most = (s + done + reach) / cos_turn
+                    bent = abs(sag) * max(own_most * own_most - (s + done) * (s + done), reach * reach)
+                    slack = rise_aside * width + bent
                     low_here = floor + climb * begun + min(climb * length, 0.0)
                     is_open = near or probing or low_here < tops[block_at(blocks, m, 0, column, row)] + slack
                     if is_open:
                         if not is_known:
                             z_begun = height_on_line(
-                                heights, posts, moon, known, run_column, run_row, e, n, sin_a, cos_a, begun
+                                heights, posts, radius, known, run_column, run_row, e, n, sin_a, cos_a, begun
                             )
                         middle, z1, z2 = begun + 0.5 * length, 0.0, end_z
                         if end[0] == known[0] and end[0] >= 0:
                             z1 = height_on_line(
-                                heights, posts, moon, known, run_column, run_row, e, n, sin_a, cos_a, middle
+                                heights, posts, radius, known, run_column, run_row, e, n, sin_a, cos_a, middle
                             )
                             if done < span:
                                 z2 = height_on_line(
-                                    heights, posts, moon, known, run_column, run_row, e, n, sin_a, cos_a, done
+                                    heights, posts, radius, known, run_column, run_row, e, n, sin_a, cos_a, done
                                 )
                         else:
-                            z1 = surface(grid, posts, heights, moon, e + middle * sin_a, n + middle * cos_a, z_begun)
+                            z1 = surface(grid, posts, heights, radius, e + middle * sin_a, n + middle * cos_a, z_begun)
                         next_z = z2
                         s0, s1, s2 = s + begun, s + middle, s + done
-                        z0, z1, z2 = z_begun - along_rise * s0, z1 - along_rise * s1, z2 - along_rise * s2
+                        z0 = z_begun - along_rise * s0 + sag * s0 * s0
+                        z1, z2 = z1 - along_rise * s1 + sag * s1 * s1, z2 - along_rise * s2 + sag * s2 * s2
                         top, bottom, bottom_s, bottom_z = _step_bounds(
                             s0, s1, s2, z0, z1, z2, slack, low_up, high_up, reach, cos_turn
                         )
-                        parts, part_slack = 1, KINK_M * min(width, 1.0)
+                        parts, part_slack = 1, KINK_M * min(width, 1.0) + bent
                         if tilt_to_crest and top >= low and width < FINE_POSTS * post_m[m]:
                             parts = STEP_PARTS
                         bend_k = (z0 - 2 * z1 + z2) * 2 / (length * length)
@@ -250,7 +257,7 @@ def bounds(
                                 if least <= most:
                                     part_rise = max(most - side_rise, side_rise - least, 0.0)
                                     part_rise += (
-                                        max(abs(least), abs(most)) * (0.005 + 2 * bend) + (aside + width) / moon
+                                        max(abs(least), abs(most)) * (0.005 + 2 * bend) + (aside + width) / radius
                                     )
                                     part_rise = min(part_rise, rise_aside)
                                 t0, t1, t2 = s0 + a0, s0 + a1, s0 + a2
@@ -264,12 +271,14 @@ def bounds(
                             if bottom > low:
                                 low, low_s, low_z, low_rise = bottom, bottom_s, bottom_z, part_rise
                             if near:
-                                top = min(top, steepest - height * cos_turn / (t2 + reach))
+                                top = min(
+                                    top, steepest + sink * (t2 + reach) / cos_turn - height * cos_turn / (t2 + reach)
+                                )
                             if not probing and top >= low and t2 > -reach:
                                 first, last = min(first, t0), max(last, t2)
                                 high = max(high, top)
                                 most_rise = max(most_rise, part_rise)
-                                over = max(2 * y1 - y0 - y2, 0.0) / 8
+                                over = max(2 * y1 - y0 - y2, 0.0) / 8 + bent
                                 line_from = max(line_from, over + y0 - middle_tan * t0, over + y1 - middle_tan * t1)
                                 line_from = max(line_from, over + y2 - middle_tan * t2)
                         z_begun = next_z

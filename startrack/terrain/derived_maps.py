@@ -17,15 +17,16 @@ from startrack.terrain.traced_map import TracedMap, flatten_rays
 
 TILT_ROUNDS = 2  # of the azimuth towards that of the turned skyline: each leaves a thousandth of the difference
 SETTLED_RAD = 1e-8  # of the azimuth: a change of 2 milliarcsec needs no further round
+MOST_REFRACTION_1 = 0.95  # sight lines that bend as the body does would never leave it
 WIDER_RAD = 0.1  # by which azimuths are widened to find the highest skyline that a tilt may turn into a direction
 
 
 class DeformedMap(ForwardingTerrain):
     """The ground of a height map with errors of its shape, given by the names of `shape_errors`.
 
-    In this order: the camera stands higher, tan of the horizon is stretched, the horizon rises by the bias, and the
-    skyline is turned about a horizontal axis. It has no further errors of its shape. Its bounds need the table of a
-    map with the camera at the changed height; the horizon does without.
+    In this order: the camera stands higher, sight lines bend more, tan of the horizon is stretched, the horizon rises
+    by the bias, and the skyline is turned about a horizontal axis. It has no further errors of its shape. Its bounds
+    need the table of a map with the camera at the changed height and such lines; the horizon does without.
     """
 
     whole: TracedMap
@@ -34,10 +35,10 @@ class DeformedMap(ForwardingTerrain):
 
     def __init__(
         self, whole: TracedMap, *, bias_rad: float = 0.0, stretch_1: float = 0.0, vertical_east_rad: float = 0.0,
-        vertical_north_rad: float = 0.0, camera_height_m: float = 0.0,
+        vertical_north_rad: float = 0.0, camera_height_m: float = 0.0, terrestrial_refraction_1: float = 0.0,
     ) -> None:  # fmt: skip
         super().__init__(whole)
-        self._raised_m = camera_height_m
+        self._raised_m, self._refraction_1 = camera_height_m, terrestrial_refraction_1
         self._bias_rad, self._stretch_1 = bias_rad, stretch_1
         self._tilt_rad = float(np.hypot(vertical_east_rad, vertical_north_rad))
         self._R_turned_map = R_from_rotvec([vertical_north_rad, -vertical_east_rad, 0.0])
@@ -49,10 +50,12 @@ class DeformedMap(ForwardingTerrain):
 
     @cached_property
     def _raised(self) -> TracedMap:
-        if not self._raised_m:
+        if not self._raised_m and not self._refraction_1:
             return self.whole
-        raised = replace(self.whole, camera_height_m=self.camera_height_m)
-        raised.__dict__["ground"] = self.whole.ground  # the same
+        refraction_1 = min(self.whole.terrestrial_refraction_1 + self._refraction_1, MOST_REFRACTION_1)
+        raised = replace(self.whole, camera_height_m=self.camera_height_m, terrestrial_refraction_1=refraction_1)
+        same = self.whole.ground
+        raised.__dict__["ground"] = same._replace(sag_per_m=refraction_1 / (2 * same.radius_m))
         return raised
 
     def without_table(self) -> DeformedMap:

@@ -9,13 +9,14 @@ highest post, the highest of it and its eight neighbours, and the range of the s
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.types import Array, Ints
-from startrack.frames import MOON_RADIUS_M, Site, enu_from_latlon, latlon_from_enu
+from startrack.core.types import Array, Bools, Ints
+from startrack.frames import Site, enu_from_latlon, latlon_from_enu, sphere_radius_m
 from startrack.terrain.protocol import NO_POST
 from startrack.terrain.raster import Raster
 
@@ -27,8 +28,8 @@ SMALLEST_BLOCKS = 4  # a pyramid ends where a level has no more blocks than this
 class Ground(NamedTuple):
     """The maps as the kernels read them: plain arrays in a tuple, which numba takes."""
 
-    grid: Array  # (maps, 16), see Raster.grid_numbers
-    heights: NDArray[np.float32]  # all posts [m above the sphere]
+    grid: Array  # (maps, 16) on the Moon, (maps, n, 2) on the Earth, see Raster.grid_numbers
+    heights: NDArray[np.float32]  # all posts [m above the sphere through the origin of enu]
     posts: Ints  # (maps, 3): where a map's posts begin, rows, columns
     tops: NDArray[np.float32]  # highest post of each block [m]
     wide_tops: NDArray[np.float32]  # highest post of each block and its neighbours [m]
@@ -37,25 +38,37 @@ class Ground(NamedTuple):
     levels: Ints  # (maps,)
     slope_unit: Array  # (maps,) [m per post]
     post_m: Array  # (maps,) spacing of the posts
-    radius_m: float  # from the Moon's centre to the origin of enu
+    radius_m: float  # of that sphere
     highest_m: float  # highest post of all maps
+    sag_per_m: float = 0.0  # half the curvature of a sight line in air
 
 
-def pack_maps(site: Site, maps: Sequence[Raster]) -> Ground:
-    """The maps, finest first, ready for tracing in the site's enu."""
+def pack_maps(site: Site, maps: Sequence[Raster], *, keep_voids: bool = False) -> Ground:
+    """The maps, finest first, ready for tracing in the site's enu.
+
+    Voids have the ground of a coarser map, else the height of the nearest post. With `keep_voids` the latter have NaN,
+    for tracing where the known ground ends.
+    """
     heights, posts, tops, wide, slopes, blocks = [], [], [], [], [], []
     first_post, first_block = 0, 0
     units = []
     for number, height_map in enumerate(maps):
-        h = height_map.heights_m
+        h = height_map.heights_above_origin_m(site)
+        voids = np.isnan(h)
+        if voids.any():
+            h = _fill_voids(h, voids, site, height_map, maps[number + 1 :])
+            voids = np.isnan(h)
+            known = _fill_nearest(h, voids) if voids.any() else h
+            h = h if keep_voids else known
         heights.append(h.ravel())
         posts.append((first_post, *h.shape))
         first_post += h.size
-        steepest = max(np.abs(h[:, 1:] - h[:, :-1]).max(), np.abs(h[1:] - h[:-1]).max())
+        sloping = known if keep_voids and voids.any() else h
+        steepest = max(np.abs(sloping[:, 1:] - sloping[:, :-1]).max(), np.abs(sloping[1:] - sloping[:-1]).max())
         unit = max(float(steepest) * 2.05 / SLOPE_STEPS, 1e-6)  # across the corner too
         units.append(unit)
         block_table = []
-        top, slope = _raise_to_finer_maps(_cell_tops(h), height_map, maps[:number]), _cell_slopes(h, unit)
+        top, slope = _raise_to_finer_maps(_cell_tops(h), height_map, maps[:number], site), _cell_slopes(sloping, unit)
         while True:
             tops.append(top.ravel())
             wide.append(_spread_largest(top).ravel())
@@ -68,8 +81,10 @@ def pack_maps(site: Site, maps: Sequence[Raster]) -> Ground:
             slope = merge_blocks(slope, np.maximum)
         blocks.append(block_table)
     most = max(len(table) for table in blocks)
+    grid = [m.grid_numbers(site) for m in maps]
+    most_numbers = max(map(len, grid))
     return Ground(
-        grid=np.array([m.grid_numbers(site) for m in maps]),
+        grid=np.array([np.concatenate([one, np.zeros((most_numbers - len(one), *one.shape[1:]))]) for one in grid]),
         heights=np.concatenate(heights),
         posts=np.array(posts, dtype=np.int64),
         tops=np.concatenate(tops),
@@ -79,9 +94,30 @@ def pack_maps(site: Site, maps: Sequence[Raster]) -> Ground:
         levels=np.array([len(table) for table in blocks], dtype=np.int64),
         slope_unit=np.array(units),
         post_m=np.array([m.post_m for m in maps]),
-        radius_m=MOON_RADIUS_M + site.height_m,
-        highest_m=float(max(part.max() for part in tops)),
+        radius_m=sphere_radius_m(site),
+        highest_m=float(np.nanmax([np.nanmax(part) for part in tops])),
     )
+
+
+def _fill_voids(
+    h: NDArray[np.float32], voids: Bools, site: Site, height_map: Raster, coarser: Sequence[Raster]
+) -> NDArray[np.float32]:
+    """Heights (rows, columns) of a map with those of coarser maps in its voids, where they have any."""
+    h, where = h.copy(), np.argwhere(voids).astype(np.float64)
+    place = height_map.projection.latlon_from_xy(*height_map.xy(where))
+    found = np.full(len(where), np.nan)
+    for one in coarser:
+        above = replace(one, heights_m=one.heights_above_origin_m(site))
+        found = np.where(np.isnan(found), above.sample(above.row_column(*place)), found)
+    h[voids] = found
+    return h
+
+
+def _fill_nearest(h: NDArray[np.float32], voids: Bools) -> NDArray[np.float32]:
+    from scipy.ndimage import distance_transform_edt
+
+    nearest = distance_transform_edt(voids, return_distances=False, return_indices=True)
+    return np.asarray(h[tuple(nearest)])
 
 
 def _cell_tops(h: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -123,12 +159,14 @@ def _spread_largest(a: np.ndarray) -> np.ndarray:
     return wide
 
 
-def _raise_to_finer_maps(tops: NDArray[np.float32], height_map: Raster, finer: Sequence[Raster]) -> NDArray[np.float32]:
+def _raise_to_finer_maps(
+    tops: NDArray[np.float32], height_map: Raster, finer: Sequence[Raster], site: Site
+) -> NDArray[np.float32]:
     """Cells of a coarse map where finer maps lie are as high as any post of these there or close by."""
     tops = tops.copy()
     for fine in finer:
         size = 1
-        high = _cell_tops(fine.heights_m)
+        high = _cell_tops(fine.heights_above_origin_m(site))
         while size * fine.post_m < 0.5 * height_map.post_m and max(high.shape) > 1:
             high, size = merge_blocks(high, np.maximum), 2 * size
         rows, columns = (np.indices(high.shape) + 0.5) * size
@@ -146,7 +184,6 @@ def ground_up_m(site: Site, maps: Sequence[Raster], points_m: Array) -> Array:
     """Height in enu (...) of the surface at east and north (..., 2) [m]; NaN where no map reaches."""
     east, north = points_m[..., 0], points_m[..., 1]
     up = np.zeros(np.shape(east))
-    level2 = east * east + north * north
     for _ in range(SURFACE_ROUNDS):
         lat, lon = latlon_from_enu(site, east, north, np.nan_to_num(up))
         height = np.full(np.shape(east), np.nan)
@@ -155,7 +192,7 @@ def ground_up_m(site: Site, maps: Sequence[Raster], points_m: Array) -> Array:
             if not missing.any():
                 break
             height = np.where(missing, height_map.sample(height_map.row_column(lat, lon)), height)
-        up = np.sqrt((MOON_RADIUS_M + height) ** 2 - level2) - MOON_RADIUS_M - site.height_m
+        up = enu_from_latlon(site, lat, lon, height)[..., 2]
     return np.asarray(up)
 
 

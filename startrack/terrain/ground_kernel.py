@@ -33,9 +33,9 @@ def steepness(slopes, at, unit, d_column, d_row):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def level_of(levels, m, post_m, moon, width, e, n):
+def level_of(levels, m, post_m, radius, width, e, n):
     """Lowest level whose blocks' neighbours reach `width` to the side."""
-    shift = SHIFT_HEIGHT_M * np.sqrt(e * e + n * n) / moon  # how far 1 km of height moves a place on the map
+    shift = SHIFT_HEIGHT_M * np.sqrt(e * e + n * n) / radius  # how far 1 km of height moves a place on the map
     across = (1.05 * width + shift) / post_m[m] + 1e-6
     level = 0
     while (1 << level) < across and level < levels[m] - 1:
@@ -91,23 +91,23 @@ def box_height_bounds(ground, east, north, half, tilted):
     With `tilted` heights are relative to the plane through the middle of the box that fits the corners, which rises by
     the two slopes to the east and north. Otherwise the slopes are zero.
     """
-    grid, heights, posts, _, _, slopes, blocks, levels, slope_unit, post_m, moon, _ = ground
-    middle = surface(grid, posts, heights, moon, east, north, 0.0)
-    middle = surface(grid, posts, heights, moon, east, north, middle)
+    grid, heights, posts, _, _, slopes, blocks, levels, slope_unit, post_m, radius, _, _ = ground
+    middle = surface(grid, posts, heights, radius, east, north, 0.0)
+    middle = surface(grid, posts, heights, radius, east, north, middle)
     low, high = middle, middle
     map0, cell0, alike = -2, -1, True
     wide_column, wide_row, column0, row0 = 0.0, 0.0, 0.0, 0.0
     slope_e, slope_n = 0.0, 0.0
     for corner in range(4 * (tilted and half > 0.0)):
         to_e, to_n = 2 * (corner & 1) - 1, corner - (corner & 1) - 1
-        z = surface(grid, posts, heights, moon, east + half * to_e, north + half * to_n, middle)
+        z = surface(grid, posts, heights, radius, east + half * to_e, north + half * to_n, middle)
         slope_e += to_e * z / (4 * half)
         slope_n += to_n * z / (4 * half)
     for corner in range(4):
         e = east + half * (2 * (corner & 1) - 1)
         n = north + half * (corner - (corner & 1) - 1)
-        z = surface(grid, posts, heights, moon, e, n, middle)
-        m, column, row = locate(grid, posts, e, n, moon + z)
+        z = surface(grid, posts, heights, radius, e, n, middle)
+        m, column, row = locate(grid, posts, e, n, radius + z)
         z -= slope_e * (e - east) + slope_n * (n - north)
         low, high = min(low, z), max(high, z)
         cell = int(row) * posts[m, 2] + int(column) if m >= 0 else -1
@@ -119,27 +119,27 @@ def box_height_bounds(ground, east, north, half, tilted):
         at = posts[map0, 0] + cell0
         columns = posts[map0, 2]
         twist = abs(heights[at] - heights[at + 1] - heights[at + columns] + heights[at + columns + 1])
-        slack = twist * wide_column * wide_row / 2 + half * half / moon
+        slack = twist * wide_column * wide_row / 2 + half * half / radius
     else:
         step = 2 * half / BOX_STEPS
         for k in range((BOX_STEPS + 1) * (BOX_STEPS + 1)):
             i = k // (BOX_STEPS + 1)
             e, n = east - half + step * i, north - half + step * (k - i * (BOX_STEPS + 1))
-            z = surface(grid, posts, heights, moon, e, n, middle) - slope_e * (e - east) - slope_n * (n - north)
+            z = surface(grid, posts, heights, radius, e, n, middle) - slope_e * (e - east) - slope_n * (n - north)
             low, high = min(low, z), max(high, z)
-        m, column, row = locate(grid, posts, east, north, moon + middle)
+        m, column, row = locate(grid, posts, east, north, radius + middle)
         slack = 2 * half
         if m >= 0:
-            level = level_of(levels, m, post_m, moon, 1.5 * half, east, north)
+            level = level_of(levels, m, post_m, radius, 1.5 * half, east, north)
             at = block_at(blocks, m, level, column, row)
             a, b = 0.0, 0.0
             for turn in range(4):  # steepest to the four sides
                 to_e, to_n = post_m[m] * (turn == 0) - post_m[m] * (turn == 1), post_m[m] * (turn > 1) * (5 - 2 * turn)
-                column2, row2 = map_cell(grid, m, east + to_e, north + to_n, moon + middle)
+                column2, row2 = map_cell(grid, m, east + to_e, north + to_n, radius + middle)
                 rise = steepness(slopes, at, slope_unit[m], (column2 - column) / post_m[m], (row2 - row) / post_m[m])
                 if turn < 2:
                     a = max(a, abs(rise - slope_e * (1 - 2 * turn)) + 0.03 * abs(rise))
                 else:
                     b = max(b, abs(rise - slope_n * (5 - 2 * turn)) + 0.03 * abs(rise))
-            slack = (a + b) * step / 2 + half * half / moon + half * (abs(east) + abs(north)) / moon
+            slack = (a + b) * step / 2 + half * half / radius + half * (abs(east) + abs(north)) / radius
     return middle, low - slack, high + slack, slope_e, slope_n

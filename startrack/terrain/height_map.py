@@ -18,11 +18,12 @@ from startrack.terrain.shape import (
     BIAS,
     CAMERA_ERROR,
     EXACT,
+    REFRACTION,
     STRETCH,
-    VERTICAL,
     ShapeError,
     errors_by_name,
     select_slopes,
+    vertical_fact,
 )
 from startrack.terrain.traced_map import TracedMap
 
@@ -40,6 +41,7 @@ class HeightMap(TracedMap):
     stretch_sigma_1: float | None = EXACT  # of the factor of tan H, less 1; None: not stated, see `terrain.shape`
     vertical_sigma_rad: float | None = EXACT  # of a tilt of the whole map, of each of two axes
     camera_height_sigma_m: float | None = EXACT
+    terrestrial_refraction_sigma_1: float | None = EXACT
     most_slope_rad: float = np.pi / 2  # a rover does not stand on steeper ground
     glare_rad: Sectors = ()  # lit by the Sun: no evidence there
     unstated_errors: tuple[str, ...] = ()
@@ -67,10 +69,12 @@ class HeightMap(TracedMap):
 
     @cached_property
     def shape_errors(self) -> tuple[ShapeError, ...]:  # type: ignore[override]
-        """Bias, stretch, tilt of the vertical, and height of the camera. The bias needs the table of horizons."""
+        """Bias, stretch, tilt, height of the camera, refraction. The bias needs the table of horizons."""
         return (
             *BIAS.shape_errors(self.common_sigma_rad), *STRETCH.shape_errors(self.stretch_sigma_1),
-            *VERTICAL.shape_errors(self.vertical_sigma_rad), *CAMERA_ERROR.shape_errors(self.camera_height_sigma_m),
+            *vertical_fact(self.site.body).shape_errors(self.vertical_sigma_rad),
+            *CAMERA_ERROR.shape_errors(self.camera_height_sigma_m),
+            *REFRACTION.shape_errors(self.terrestrial_refraction_sigma_1),
         )  # fmt: skip
 
     def shape_slopes_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
@@ -84,6 +88,7 @@ class HeightMap(TracedMap):
         slopes = {
             "bias_rad": np.ones(1), "stretch_1": tan * flat, "vertical_east_rad": np.sin(azimuths_rad),
             "vertical_north_rad": np.cos(azimuths_rad), "camera_height_m": -(1.0 / distance) * flat,
+            "terrestrial_refraction_1": distance / (2 * self.ground.radius_m) * flat,
         }  # fmt: skip
         return select_slopes(self.shape_errors, slopes, np.shape(tan))
 
@@ -138,13 +143,14 @@ class HeightMap(TracedMap):
         return describe_masks(self.glare_rad, self.table.unknown_rad)
 
     def error_warnings(self) -> list[str]:
-        """One line of text if the terrain file leaves out errors: the ground then counts as exact."""
+        """Lines of text: errors that the terrain file leaves out, so that they count as 0; datums of unknown place."""
+        shifts = [(one.source, one.projection.transformation_warning) for one in self.maps]
         return [
             f"terrain {self.name}: its file states no {key}: taken as 0; circles are too small unless the ground is "
             "exactly so; state the errors (0 for a model from which pictures are rendered)"
             for key in self.unstated_errors
             if not getattr(self, key)
-        ]
+        ] + [f"map {source}: {warning}" for source, warning in shifts if warning]
 
     def facts(self) -> dict[str, Any]:
         """Facts about the maps and their errors, as JSON values."""

@@ -4,6 +4,10 @@ A ray leaves the camera's place at an azimuth; s is the horizontal distance alon
 tan = (z(s) - z(camera)) / s over the ground's heights z(s) in enu. The ray goes from crossing to crossing of the map's
 grid lines; blocks of cells that lie wholly below the sight line to the best horizon so far are stepped over at once.
 
+Air bends the line of sight: z(s) counts with `sag` s^2 more, half the line's curvature times the squared distance. The
+sight line then falls below a straight one by as much. It still bends less than the sphere: seen from the sphere's
+centre it is convex, so that its tangent lies below it. On the Moon `sag` is 0.
+
 Helpers have one exit and take plain arrays: numba then needs no reference counts, which cost ten times the arithmetic.
 """
 
@@ -11,10 +15,11 @@ from __future__ import annotations
 
 # mypy: disable-error-code="no-untyped-def"
 import numpy as np
+from numba.extending import overload
 
 from startrack.core.kernels import njit
-from startrack.frames import MOON_RADIUS_M
 
+FIRST_COEFFICIENT = 3  # of a map of the Earth in its numbers
 LOWEST_TAN = -50.0
 NUDGE_M = 0.05  # past a grid line; a kink is missed by that much at most
 FIXED_POINT_ROUNDS = 3
@@ -24,9 +29,7 @@ FIRST_GUESS_M, LAST_GUESS_M, GUESS_RATIO = 300.0, 50_000.0, 1.12
 STRAIGHT_M = 150.0  # over which a ray crosses a map in one direction: it climbs 60 m at most and bends by a centimetre
 
 
-@njit(cache=True, nogil=True, inline="always")
-def map_cell(grid, m, east, north, up):
-    """(column, row) on map m of the direction of (east, north, up) from the Moon's centre."""
+def _cell_by_projection(grid, m, east, north, up):
     v1 = grid[m, 1] * east + grid[m, 2] * north + grid[m, 3] * up
     v2 = grid[m, 4] * east + grid[m, 5] * north + grid[m, 6] * up
     v3 = grid[m, 7] * east + grid[m, 8] * north + grid[m, 9] * up
@@ -38,6 +41,34 @@ def map_cell(grid, m, east, north, up):
         k = grid[m, 10] / (r + v3) if kind == 0.0 else grid[m, 10] / r
         x, y = k * v1, k * v2
     return (x - grid[m, 12]) * grid[m, 13], (y - grid[m, 14]) * grid[m, 15]
+
+
+def _cell_by_polynomials(grid, m, east, north, up):
+    column, row = -1.0, -1.0
+    x, y = (east / up - grid[m, 1, 0]) * grid[m, 2, 0], (north / up - grid[m, 1, 1]) * grid[m, 2, 1]
+    if up > 0.0 and abs(x) <= 1.0 and abs(y) <= 1.0:
+        column, row, k = 0.0, 0.0, FIRST_COEFFICIENT
+        for terms in range(1, int(grid[m, 0, 0]) + 2):  # Horner's rule in x, of polynomials in y
+            a, b = 0.0, 0.0
+            for _ in range(terms):
+                a, b = a * y + grid[m, k, 0], b * y + grid[m, k, 1]
+                k += 1
+            column, row = column * x + a, row * x + b
+    return column, row
+
+
+def map_cell(grid, m, east, north, up):
+    """(column, row) on map m of the direction of (east, north, up) from the sphere's centre.
+
+    grid: `Raster.grid_numbers` of the maps. Off the Earth's maps (-1, -1) where their polynomials do not hold.
+    """
+    return _choose_map_cell(grid, m, east, north, up)(grid, m, east, north, up)
+
+
+@overload(map_cell, jit_options={"forceinline": True, "error_model": "numpy"})
+def _choose_map_cell(grid, m, east, north, up):
+    """The function for a grid of its dimensions: kernels of the Moon's maps are compiled without the Earth's."""
+    return _cell_by_projection if grid.ndim == 2 else _cell_by_polynomials
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -64,7 +95,7 @@ def height_at(heights, posts, m, column, row):
 
 
 @njit(cache=True, nogil=True)
-def surface_place(grid, posts, heights, moon, east, north, guess):
+def surface_place(grid, posts, heights, radius, east, north, guess):
     """As `surface`, and where on the maps that is: the map, -1 where none reaches, column and row."""
     level2 = east * east + north * north
     up, before, rounds = guess, guess + 1.0, 0
@@ -72,29 +103,29 @@ def surface_place(grid, posts, heights, moon, east, north, guess):
     while rounds < FIXED_POINT_ROUNDS and abs(up - before) > SETTLED_M:
         rounds += 1
         before = up
-        m, column, row = locate(grid, posts, east, north, moon + up)
+        m, column, row = locate(grid, posts, east, north, radius + up)
         if m >= 0:
-            r = MOON_RADIUS_M + height_at(heights, posts, m, column, row)
-            up = np.sqrt(r * r - level2) - moon
+            r = radius + height_at(heights, posts, m, column, row)
+            up = np.sqrt(r * r - level2) - radius
     return up, (m, column, row)
 
 
 @njit(cache=True, nogil=True)
-def surface(grid, posts, heights, moon, east, north, guess):
+def surface(grid, posts, heights, radius, east, north, guess):
     """Height in enu of the ground at (east, north); the guess where no map reaches."""
-    return surface_place(grid, posts, heights, moon, east, north, guess)[0]
+    return surface_place(grid, posts, heights, radius, east, north, guess)[0]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def height_on_line(heights, posts, moon, place, d_column, d_row, east, north, sin_a, cos_a, s):
+def height_on_line(heights, posts, radius, place, d_column, d_row, east, north, sin_a, cos_a, s):
     """Height in enu of the ground at s along the ray from `place` (map, column, row), which is at (east, north).
 
     The ray goes d_column, d_row per metre there.
     """
     e, n = east + s * sin_a, north + s * cos_a
     column, row = place[1] + s * d_column, place[2] + s * d_row
-    r = MOON_RADIUS_M + height_at(heights, posts, place[0], column, row)
-    return np.sqrt(r * r - e * e - n * n) - moon
+    r = radius + height_at(heights, posts, place[0], column, row)
+    return np.sqrt(r * r - e * e - n * n) - radius
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -144,40 +175,43 @@ def best_in_step(tan, at, s0, s2, z0, z1, z2):
 
 @njit(cache=True, nogil=True)
 def horizon(ground, east, north, up, sin_a, cos_a, start_m, end_m, hint_m):
-    """tan of the horizon, the distance it stands at, and the distance at which the maps end (1e9: not reached).
+    """tan of the horizon, the distance it stands at, and the distance at which the maps end or have a void (1e9: not
+    reached).
 
     Ground nearer than `start_m` or farther than `end_m` is left out. `hint_m` says about where the horizon may stand
     (0: a row of places is tried): a first sight line over the ground there lets most blocks be stepped over.
     """
-    grid, heights, posts, tops, _, _, blocks, levels, _, post_m, moon, highest = ground
+    grid, heights, posts, tops, _, _, blocks, levels, _, post_m, radius, highest, sag = ground
     tan, at, s, level, edge = LOWEST_TAN, start_m, start_m, 0, FAR_M
     guess, z = hint_m, up
     if hint_m <= 0.0:
         guess = max(start_m, FIRST_GUESS_M)
     while start_m < guess < min(end_m, LAST_GUESS_M if hint_m <= 0.0 else FAR_M):
         before = z
-        z = surface(grid, posts, heights, moon, east + guess * sin_a, north + guess * cos_a, z)
-        if z != before and z - up > tan * guess:  # no change: the maps do not reach there
-            tan, at = (z - up) / guess, guess
+        z = surface(grid, posts, heights, radius, east + guess * sin_a, north + guess * cos_a, z)
+        z = before if np.isnan(z) else z  # a void
+        above = z - up + sag * guess * guess
+        if z != before and above > tan * guess:  # no change: the maps do not reach there
+            tan, at = above / guess, guess
         guess = guess * GUESS_RATIO if hint_m <= 0.0 else FAR_M
     if tan == LOWEST_TAN and start_m > 0.0:  # a sight line straight down would not get far
         before = z
-        z = surface(grid, posts, heights, moon, east + start_m * sin_a, north + start_m * cos_a, z)
-        if z != before:
-            tan, at = (z - up) / start_m, start_m
+        z = surface(grid, posts, heights, radius, east + start_m * sin_a, north + start_m * cos_a, z)
+        if z != before and not np.isnan(z):
+            tan, at = (z - up) / start_m + sag * start_m, start_m
     known_s, known_z, known = -1.0, up, (-1, 0.0, 0.0)  # the last place where the ground's height was worked out
     d_column, d_row, straight_map, straight_to, straight_tan = 0.0, 0.0, -1, -1.0, tan
     running = True
     while running and s < end_m:
         e, n = east + s * sin_a, north + s * cos_a
-        z = moon + up + tan * s  # of the sight line, from the Moon's centre
+        z = radius + up + tan * s - sag * s * s  # of the sight line, from the sphere's centre
         m, column, row = locate(grid, posts, e, n, z)
         r = np.sqrt(e * e + n * n + z * z)
-        climb = (e * sin_a + n * cos_a + z * tan) / r
+        climb = (e * sin_a + n * cos_a + z * (tan - 2 * sag * s)) / r
         if m < 0:
             edge = s
             running = False
-        elif climb >= 0.0 and r - MOON_RADIUS_M >= highest:
+        elif climb >= 0.0 and r - radius >= highest:
             running = False
         else:
             if s > straight_to or m != straight_map or tan != straight_tan:
@@ -190,7 +224,7 @@ def horizon(ground, east, north, up, sin_a, cos_a, start_m, end_m, hint_m):
             length = 0.0
             while descending:
                 length = exit_of(column, row, d_column, d_row, level)
-                lowest = r - MOON_RADIUS_M + min(climb * length, 0.0)
+                lowest = r - radius + min(climb * length, 0.0)
                 if lowest >= tops[block_at(blocks, m, level, column, row)]:
                     s += length
                     level += 2
@@ -202,26 +236,36 @@ def horizon(ground, east, north, up, sin_a, cos_a, start_m, end_m, hint_m):
                 level = 0
                 stop = s + length
                 if known_s != s:
-                    known_z, known = surface_place(grid, posts, heights, moon, e, n, z - moon)
+                    known_z, known = surface_place(grid, posts, heights, radius, e, n, z - radius)
                 half = 0.5 * length
-                b, there = surface_place(grid, posts, heights, moon, e + length * sin_a, n + length * cos_a, known_z)
+                there_z, there = surface_place(
+                    grid, posts, heights, radius, e + length * sin_a, n + length * cos_a, known_z
+                )
                 if there[0] == known[0] and there[0] >= 0:
                     run_column, run_row = (there[1] - known[1]) / length, (there[2] - known[2]) / length
-                    c = height_on_line(heights, posts, moon, known, run_column, run_row, e, n, sin_a, cos_a, half)
+                    c = height_on_line(heights, posts, radius, known, run_column, run_row, e, n, sin_a, cos_a, half)
                 else:
-                    c = surface(grid, posts, heights, moon, e + half * sin_a, n + half * cos_a, 0.5 * (known_z + b))
-                tan, at = best_in_step(tan, at, s, stop, known_z - up, c - up, b - up)
-                known_s, known_z, known, s = stop, b, there, stop
+                    c = surface(
+                        grid, posts, heights, radius, e + half * sin_a, n + half * cos_a, 0.5 * (known_z + there_z)
+                    )
+                if np.isnan(known_z + c + there_z):  # a void: as where the maps end
+                    edge = s
+                    running = False
+                else:
+                    middle = s + half
+                    a, b, c = known_z + sag * s * s, there_z + sag * stop * stop, c + sag * middle * middle
+                    tan, at = best_in_step(tan, at, s, stop, a - up, c - up, b - up)
+                    known_s, known_z, known, s = stop, there_z, there, stop
     return tan, at, edge
 
 
 @njit(cache=True, nogil=True)
 def surfaces(ground, points, up):
     """Fill up (n,) with the height in enu of the ground at points (n, 2)."""
-    grid, heights, posts, _, _, _, _, _, _, _, moon, _ = ground
+    grid, heights, posts, _, _, _, _, _, _, _, radius, _, _ = ground
     for k in range(len(up)):
-        z = surface(grid, posts, heights, moon, points[k, 0], points[k, 1], 0.0)
-        up[k] = surface(grid, posts, heights, moon, points[k, 0], points[k, 1], z)
+        z = surface(grid, posts, heights, radius, points[k, 0], points[k, 1], 0.0)
+        up[k] = surface(grid, posts, heights, radius, points[k, 0], points[k, 1], z)
 
 
 @njit(cache=True, nogil=True, inline="always")

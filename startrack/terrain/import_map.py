@@ -13,29 +13,37 @@ import numpy as np
 from startrack.core.errors import BadOutput, length_text
 from startrack.core.files import check_output, data_dir
 from startrack.core.types import BadInput
+from startrack.terrain.earth_projection import EARTH_MEAN_RADIUS_M
 from startrack.terrain.height_map import HeightMap
 from startrack.terrain.io import terrain_from_dict
 from startrack.terrain.map_comparison import compare_with_finest, crest_angle_rad_per_m
 from startrack.terrain.map_error import carried_spacing, error_between_posts_m
+from startrack.terrain.map_products import find_product
 from startrack.terrain.map_reading import read_map
 from startrack.terrain.map_writing import write_map
 from startrack.terrain.raster import Raster
-from startrack.terrain.shape import CAMERA_ERROR, STRETCH, VERTICAL
+from startrack.terrain.shape import CAMERA_ERROR, EARTH_HIGHEST_M, REFRACTION, REFRACTION_1, STRETCH, vertical_fact
 
-STATED_SIGMAS = {"stretch_sigma_1": STRETCH.sigma, "vertical_sigma_deg": round(float(np.degrees(VERTICAL.sigma)), 9)}
 RIM_RADII = 1.5  # of the search area: most of the rim is nearer
 MAX_POST_RADII = 0.2  # of the search area: with posts further apart its shape is not resolved
 MEASURED_PER_ESTIMATE = 1.6  # of the 240 m map on the ground of site01-10m.tif: 5.4 m measured, 3.3 m by its roughness
 COMMENT_CHARS = 118
+IN_ITS_PLACE = {
+    "moon": "in its place to 15 m (vertical_sigma_deg)",
+    "earth": "with heights above the geoid, whose slope is a tilt (vertical_sigma_deg; state it as geoid_slope_arcsec)",
+}
 OTHER_FACTS = (
-    "The map is taken to be to scale (stretch_sigma_1) and in its place to 15 m (vertical_sigma_deg), the camera at "
-    "its height to 2 cm (camera_height_sigma_m): change what you know better."
+    "The map is taken to be to scale (stretch_sigma_1) and {place}, the camera at its height to 2 cm "
+    "(camera_height_sigma_m): change what you know better."
 )
+SEEN_BEYOND_RAD = float(np.radians(5.0))  # higher ground off the maps is warned of: it hides what decides positions
 
 
 @dataclass(frozen=True, kw_only=True)
 class StatedErrors:
-    """Errors of a map, and their origin: "flag", "comparison" (with a finer map) or "map" (its own roughness)."""
+    """Errors of a map, and their origin: "flag", "comparison" (with a finer map), "product" (published) or "map"
+    (its own roughness).
+    """
 
     height_sigma_m: float
     common_crest_sigma_m: float | None = None  # of heights, shared by the crests about a position; None: not measured
@@ -43,15 +51,15 @@ class StatedErrors:
     comment: str
     warnings: tuple[str, ...] = ()
 
-    def comment_lines(self) -> str:
-        """The comment of a terrain file on its errors."""
+    def comment_lines(self, body: str) -> str:
+        """The comment of a terrain file on its errors; `body` is that of the map."""
         text = f"{self.comment}."
         if self.common_crest_sigma_m is not None:
             text += (
                 f" horizon_sigma_deg: crests wrong by {length_text(self.common_crest_sigma_m)} all around, at their "
                 "median distance; at least three times the error of heights, as at the sharp rim of Shackleton."
             )
-        text += f" {OTHER_FACTS}"
+        text += f" {OTHER_FACTS.format(place=IN_ITS_PLACE[body])}"
         return textwrap.fill(text, COMMENT_CHARS, initial_indent="# ", subsequent_indent="# ") + "\n"
 
 
@@ -68,15 +76,16 @@ def import_maps(
     maps: Sequence[str | Path], output: str | Path, *, latitude_rad: float, longitude_rad: float,
     half_m: Sequence[float], radius_m: float, scale: Sequence[float] = (), offset_m: Sequence[float] = (),
     height_sigma_m: float | None = None, compare: Sequence[str | Path] = (), camera_height_m: float = 1.5,
-    overwrite: bool = False,
+    highest_beyond_m: float | None = None, overwrite: bool = False,
 ) -> ImportedTerrain:  # fmt: skip
     """Write the terrain file `output` and, beside it, a crop of each map: NAME-1.tif, the finest, and so on.
 
     latitude_rad, longitude_rad: the origin. half_m: half the side of each crop about it [m]. radius_m: of the search
     area. scale, offset_m: of each map, the finest first, where the files do not state them. height_sigma_m: error
     of single posts [m]; None measures it where a finer map covers a part of the map that makes the horizon: one of the
-    `maps`, of the files `compare`, or a shipped one; else it is estimated from the map's roughness. camera_height_m:
-    above the ground [m]. overwrite: replace existing files.
+    `maps`, of the files `compare`, or a shipped one; else it is estimated from the map's roughness, with the published
+    error of products that are known. camera_height_m: above the ground [m]. highest_beyond_m: ground off the maps is no
+    higher; None: as `io.KEYS` says. overwrite: replace existing files.
 
     Raises BadInput bad_terrain, BadOutput of `output`; nothing is then written.
     """
@@ -90,10 +99,11 @@ def import_maps(
     files = [output.with_name(f"{output.stem}-{k + 1}.tif") for k in range(len(maps))]
     for path in (output, *files):
         check_output(path, overwrite=overwrite, reason="bad_terrain")
-    crops = []
+    crops: list[Raster] = []
     for k, (source, half) in enumerate(zip(maps, half_m, strict=True)):
         own = {"scale": scale[k] if k < len(scale) else None, "offset_m": offset_m[k] if k < len(offset_m) else None}
-        crop = read_map(source, near=origin, **own).crop_around(*origin, half)
+        body = crops[0].projection.body if crops else None
+        crop = read_map(source, near=origin, body=body, **own).crop_around(*origin, half)
         if min(crop.heights_m.shape) < 2:
             raise BadInput("bad_terrain", f"{source}: it does not reach {latitude_deg:g}, {longitude_deg:g}")
         crops.append(replace(crop, source=Path(source).name))
@@ -103,15 +113,26 @@ def import_maps(
         errors = measure_errors(rim, [*crops, *map(read_map, compare)])
     else:
         errors = StatedErrors(height_sigma_m=float(height_sigma_m), origin="flag", comment="height_sigma_m: as given")
-    values = {
-        "format": 1, "name": output.stem, "body": "moon",
+    body = crops[0].projection.body
+    values: dict[str, Any] = {
+        "format": 1, "name": output.stem, "body": body,
         "origin": {"latitude_deg": latitude_deg, "longitude_deg": longitude_deg},
-        "dem": {"file": [path.name for path in files], "height_sigma_m": errors.height_sigma_m, **STATED_SIGMAS},
+        "dem": {
+            "file": [path.name for path in files], "height_sigma_m": errors.height_sigma_m,
+            "stretch_sigma_1": STRETCH.sigma,
+            "vertical_sigma_deg": round(float(np.degrees(vertical_fact(body).sigma)), 9),
+        },
         "rover": {"camera_height_m": float(camera_height_m), "camera_height_sigma_m": CAMERA_ERROR.sigma},
         "search": {"radius_m": float(radius_m)},
     }  # fmt: skip
+    if highest_beyond_m is not None:
+        values["dem"]["highest_beyond_m"] = float(highest_beyond_m)
+    if body == "earth":
+        at = crops[0].row_column(np.array(latitude_rad), np.array(longitude_rad))
+        values["origin"]["height_m"] = float(np.nan_to_num(np.round(crops[0].sample(at))))
+        values["air"] = {"terrestrial_refraction": REFRACTION_1, REFRACTION.key: REFRACTION.sigma}
     _write_terrain(output, values, errors, dict(zip(files, crops, strict=True)))
-    warnings = [*errors.warnings, *spacing_warnings(crops, radius_m)]
+    warnings = [*errors.warnings, *spacing_warnings(crops, radius_m), *_place_warnings(crops, values)]
     warnings += smoothness_warnings(rim, errors.height_sigma_m)
     return ImportedTerrain(path=output, errors=errors, warnings=warnings)
 
@@ -133,7 +154,7 @@ def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, c
         if errors.common_crest_sigma_m is not None:
             angle_rad = errors.common_crest_sigma_m * crest_angle_rad_per_m(cast(HeightMap, terrain))
             values["dem"]["horizon_sigma_deg"] = float(f"{np.degrees(angle_rad):.2g}")
-        output.write_text(errors.comment_lines() + tomli_w.dumps(values), encoding="utf-8")
+        output.write_text(errors.comment_lines(values["body"]) + tomli_w.dumps(values), encoding="utf-8")
     except BaseException:
         for path in written:
             path.unlink(missing_ok=True)
@@ -145,7 +166,7 @@ def measure_errors(rim: Raster, others: Sequence[Raster]) -> StatedErrors:
 
     Without one they are estimated from the roughness of the map itself.
     """
-    shipped = map(read_map, sorted(data_dir("terrain").glob("*.tif")))
+    shipped = map(read_map, sorted(data_dir("terrain").glob("*.tif")) if rim.projection.body == "moon" else ())
     comparison = compare_with_finest(rim, [*others, *shipped])
     if comparison is not None and comparison.same_ground:
         return StatedErrors(
@@ -159,8 +180,17 @@ def measure_errors(rim: Raster, others: Sequence[Raster]) -> StatedErrors:
             f"both are, and heights vary there by {length_text(comparison.heights_sigma_m, 3)}: is its projection or "
             "its scale wrong?",
         )
+    product = find_product(rim.source) if rim.projection.body == "earth" else None
+    between_m = MEASURED_PER_ESTIMATE * error_between_posts_m(rim)
+    if product is not None:
+        return StatedErrors(
+            height_sigma_m=float(f"{np.hypot(product.height_sigma_m, between_m):.2g}"), origin="product",
+            warnings=warnings,
+            comment=f"height_sigma_m: {product.name}, {product.height_sigma_m:g} m ({product.source}), and "
+            f"{length_text(between_m)} between posts by the map's roughness",
+        )  # fmt: skip
     return StatedErrors(
-        height_sigma_m=float(f"{MEASURED_PER_ESTIMATE * error_between_posts_m(rim):.2g}"), origin="map",
+        height_sigma_m=float(f"{between_m:.2g}"), origin="map",
         warnings=warnings,
         comment=f"{rim.source or 'the map'} could not be compared with a finer map: height_sigma_m is "
         f"{MEASURED_PER_ESTIMATE:g} times the error that its own roughness shows, the ratio that was measured on the "
@@ -181,6 +211,24 @@ def smoothness_warnings(rim: Raster, height_sigma_m: float) -> list[str]:
         f"{length_text(error_m)} (height_sigma_m is {length_text(height_sigma_m)}); give the map it was made "
         "from, or a known error"
     ]
+
+
+def _place_warnings(maps: Sequence[Raster], values: dict[str, Any]) -> list[str]:
+    """Warnings about datums of unknown place, and about unknown ground that may hide stars beyond the maps' ends."""
+    found = [f"{one.source}: {one.projection.transformation_warning}" for one in maps]
+    found = [line for line, one in zip(found, maps, strict=True) if one.projection.transformation_warning]
+    if values["body"] == "moon":
+        return found
+    reach_m = max(0.5 * min(one.heights_m.shape) * one.post_m for one in maps)
+    highest_m = values["dem"].get("highest_beyond_m", EARTH_HIGHEST_M) - values["origin"]["height_m"]
+    beyond_rad = float(np.arctan((highest_m - 0.5 * reach_m**2 / EARTH_MEAN_RADIUS_M) / reach_m))
+    if beyond_rad > SEEN_BEYOND_RAD:
+        found.append(
+            f"the maps end about {length_text(reach_m)} from the origin: ground beyond could stand up to "
+            f"{np.degrees(beyond_rad):.0f} degrees high, and no evidence is taken below that where the "
+            "maps' horizon is lower; add a wider map, or state how high ground beyond is (--highest-beyond M)"
+        )
+    return found
 
 
 def spacing_warnings(maps: Sequence[Raster], radius_m: float) -> list[str]:

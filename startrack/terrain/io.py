@@ -17,9 +17,22 @@ from startrack.core.types import BadInput
 from startrack.frames import Site
 from startrack.terrain.cylinder import CYLINDER_KEYS, Cylinder
 from startrack.terrain.protocol import Terrain
-from startrack.terrain.shape import AMOUNT, BIAS, CAMERA_ERROR, CYLINDER_FACTS, LENGTH, MAX_LENGTH_M, STRETCH, VERTICAL
+from startrack.terrain.shape import (
+    AMOUNT,
+    BIAS,
+    CAMERA_ERROR,
+    CYLINDER_FACTS,
+    EARTH_HIGHEST_M,
+    LENGTH,
+    MAX_LENGTH_M,
+    REFRACTION,
+    REFRACTION_1,
+    STRETCH,
+    VERTICAL,
+)
 
 FILE = Text(max_chars=4000)
+HEIGHT = Number(low=-MAX_LENGTH_M, high=MAX_LENGTH_M)
 KEYS = Table(
     keys={
         "format": Choice(values=(1,), default=1),
@@ -31,7 +44,7 @@ KEYS = Table(
             keys={
                 "latitude_deg": Number(low=-90.0, high=90.0, required=True),
                 "longitude_deg": Number(low=-360.0, high=360.0, required=True, description="east positive"),
-                "height_m": Number(low=-MAX_LENGTH_M, high=MAX_LENGTH_M, default=0.0),
+                "height_m": replace(HEIGHT, default=0.0),
             },
         ),
         "cylinder": Table(
@@ -39,7 +52,8 @@ KEYS = Table(
             keys=CYLINDER_KEYS,
         ),
         "dem": Table(
-            description="Height maps on the Moon's sphere; heights above it, posts at pixel centres, bilinear between.",
+            description="Height maps on the Moon's sphere or the Earth's ellipsoid; heights above it, posts at pixel "
+                        "centres, bilinear between.",
             keys={
                 "file": Either(kinds=(FILE, List(each=FILE, least=1, most=100)), required=True,
                                description="finest first"),
@@ -49,6 +63,20 @@ KEYS = Table(
                 "scale": Number(low=-1e6, high=1e6, description="metres per unit, where the files do not state it"),
                 "offset_m": Number(low=-MAX_LENGTH_M, high=MAX_LENGTH_M,
                                    description="height of value 0, where the files do not state it"),
+                "geoid_m": replace(HEIGHT, description="height of the geoid above the ellipsoid at the origin, if "
+                                   "heights are above the geoid; earth only"),
+                "geoid_slope_arcsec": List(each=Number(low=-600.0, high=600.0), count=2, description="rise of the "
+                                           "geoid above the ellipsoid to the east and to the north; earth only"),
+                "highest_beyond_m": replace(HEIGHT, description="ground off the maps is no higher; if absent 8850 on "
+                                            "the earth, and on the moon the highest of the maps"),
+            },
+        ),
+        "air": Table(
+            description="earth only",
+            keys={
+                "terrestrial_refraction": Number(low=-1.0, high=0.8, default=REFRACTION_1, description="curvature of a "
+                                                 "level sight line to the ground, relative to the Earth's"),
+                REFRACTION.key: REFRACTION.limits,
             },
         ),
         "rover": Table(
@@ -143,6 +171,10 @@ def terrain_from_dict(values: dict[str, Any], default_name: str = "terrain", fol
         longitude_rad=float(np.radians(origin["longitude_deg"])),
         height_m=origin["height_m"],
     )
+    only_earth = [key for key in ("geoid_m", "geoid_slope_arcsec") if key in keys.get("dem", {})]
+    only_earth += ["[air]"] if "air" in keys else []
+    if site.body != "earth" and only_earth:
+        raise BadInput("bad_terrain", f"{only_earth[0]} is for the Earth, and the body is the {site.body.title()}")
     makers = [make for ground, make in MAKERS.items() if ground in keys]
     if len(makers) != 1:
         what = "it has two grounds" if makers else "it has no ground"
@@ -179,16 +211,27 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
     from startrack.terrain.height_map import HeightMap
     from startrack.terrain.map_reading import read_map
 
-    if site.body != "moon":
-        raise BadInput("bad_terrain", "[dem] maps are heights above the Moon's sphere: body must be moon")
     dem, rover, search = keys["dem"], keys["rover"], keys["search"]
-    scaling = {key: dem[key] for key in ("scale", "offset_m") if key in dem}
     near, files = (site.latitude_rad, site.longitude_rad), _map_files(keys, folder)
+    scaling = {key: dem[key] for key in ("scale", "offset_m") if key in dem}
+    maps = tuple(read_map(file, near=near, body=site.body, **scaling) for file in files)
+    on_earth = {}
+    if site.body == "earth":
+        from startrack.terrain.ellipsoid_fit import above_ellipsoid, check_height
+
+        check_height(site, maps)
+        air = keys.get("air", {})
+        maps = tuple(above_ellipsoid(one, site, dem.get("geoid_m", 0.0), dem.get("geoid_slope_arcsec")) for one in maps)
+        on_earth = {
+            "terrestrial_refraction_1": air.get("terrestrial_refraction", REFRACTION_1),
+            "terrestrial_refraction_sigma_1": air.get(REFRACTION.key),
+        }
+    default_highest = EARTH_HIGHEST_M if site.body == "earth" else -np.inf
     return HeightMap(
         name=name,
         site=site,
         camera_height_m=rover["camera_height_m"],
-        maps=tuple(read_map(file, near=near, **scaling) for file in files),
+        maps=maps,
         files=tuple(files),
         search_radius_m=search.get("radius_m", Terrain.search_radius_m),
         height_sigma_m=dem.get("height_sigma_m", 0.0),
@@ -199,6 +242,8 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
         camera_height_sigma_m=rover.get("camera_height_sigma_m"),
         most_slope_rad=float(np.radians(search["max_slope_deg"])),
         glare_rad=tuple((float(np.radians(a)), float(np.radians(b))) for a, b in search.get("glare_deg", ())),
+        highest_beyond_m=dem.get("highest_beyond_m", default_highest),
+        **on_earth,
     )
 
 

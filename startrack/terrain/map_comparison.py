@@ -72,7 +72,8 @@ class MapComparison:
 
 def compare_with_finest(height_map: Raster, others: Iterable[Raster]) -> MapComparison | None:
     """The comparison with the finest of the other maps that is finer and overlaps; None where there is none."""
-    finer = [one for one in others if FINER * one.post_m <= height_map.post_m]
+    body = height_map.projection.body
+    finer = [one for one in others if one.projection.body == body and FINER * one.post_m <= height_map.post_m]
     for one in sorted(finer, key=lambda raster: raster.post_m):
         found = compare_maps(height_map, one)
         if found is not None:
@@ -111,7 +112,7 @@ def _terrains_of(height_map: Raster, finer: Raster, overlap: Array) -> tuple[Hei
     """Both maps as terrains about the middle of the overlap (n, 2), with the largest search area that both cover."""
     low, high = overlap.min(axis=0), overlap.max(axis=0)
     lat, lon = finer.projection.latlon_from_xy(*finer.xy((low + high) / 2))
-    site = Site("moon", float(lat), float(lon))
+    site = Site(finer.projection.body, float(lat), float(lon))
     radius_m = 0.5 * float((high - low).min()) * finer.post_m
     while 2 * radius_m >= MIN_POSTS_ACROSS * height_map.post_m:
         try:

@@ -1,57 +1,53 @@
-"""Height maps from files: GeoTIFF by its own tags, everything else (COG, PDS, JPEG 2000 ...) through rasterio."""
+"""Height maps from files: GeoTIFF and SRTM decoded here, everything else (PDS, USGS DEM ...) through rasterio."""
 
 from __future__ import annotations
 
-import logging
 import os
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
-from xml.etree import ElementTree
+from typing import Any
 
 import numpy as np
 
-from startrack.core.files import MAX_CAUSE_CHARS, TIFF_COMPRESSIONS
 from startrack.core.types import MAX_PIXELS, BadInput
 from startrack.frames import MOON_RADIUS_M
-from startrack.terrain.map_writing import METRE, PROJECTION_CODES
-from startrack.terrain.raster import EQUIRECTANGULAR, ORTHOGRAPHIC, STEREOGRAPHIC, Raster, projection_of
+from startrack.terrain.earth_projection import FOOT_M, EarthProjection, is_earth, project_earth
+from startrack.terrain.map_formats import UNITS_M, Stored, one_line_refusal, read_geotiff, read_hgt
+from startrack.terrain.raster import Projection, Raster, projection_of
 from startrack.terrain.shape import MAX_LENGTH_M
 
-WINDOW_HALF_M = 300_000.0  # about the origin; farther away even 10 km mountains are below the horizontal
-METRES = {"m", "meter", "meters", "metre", "metres"}
-STEREOGRAPHIC_CODES = (PROJECTION_CODES[STEREOGRAPHIC], 15, 16)  # oblique, and two variants of the polar one
-
-
-class Stored(NamedTuple):
-    """The content of a map file: height = offset + scale x value."""
-
-    values: Raster  # as the file has them
-    scale: float | None  # [m]; None where the file does not state it
-    offset_m: float
-    no_data: float | None
+# Half the side of what is read about the origin. On the Moon 10 km mountains are below the horizontal farther away. On
+# the Earth the highest stand 2.8 degrees high at most farther away, where the air leaves few stars.
+WINDOW_HALF_M = {"moon": 300_000.0, "earth": 150_000.0}
+LOWEST_M, HIGHEST_ABOVE_SEA_M = -11_050.0, 9_000.0  # of the Earth: the deepest sea and the highest mountain, and 100 m
+HEIGHT_NAMES = "altitude", "dem", "elevation", "height", "topo", "z"  # of the grid of heights among others of a file
 
 
 def read_map(
     path: str | Path, *, scale: float | None = None, offset_m: float | None = None,
-    near: tuple[float, float] | None = None,
+    near: tuple[float, float] | None = None, body: str | None = None,
 ) -> Raster:  # fmt: skip
     """The height map of the file `path`.
 
     scale and offset_m: height = offset + scale x value, unless the file states them.
-    near: latitude and longitude [rad] about which large maps are cut. Raises BadInput bad_terrain for a file that is
-    missing or damaged, or that is no height map of the Moon near there.
+    near: latitude and longitude [rad] about which large maps are cut. body: that it must be of, "moon" or "earth".
+    Raises BadInput bad_terrain for a file that is missing or damaged, or that is no height map of this body near there.
     """
     path = Path(path)
     if not os.path.isfile(path):  # False also for names that the system cannot take
         raise BadInput("bad_terrain", f"{path}: no such file")
-    stored = _read_geotiff(path) if path.suffix.lower() in (".tif", ".tiff") else None
-    raster = _heights_of(stored or _read_with_rasterio(path, near), path, scale, offset_m)
-    cut = raster if near is None else raster.crop_around(*near, WINDOW_HALF_M)
+    reader = READERS.get(path.suffix.lower(), lambda _: None)
+    stored = reader(path) or _read_with_rasterio(path, near)
+    found = stored.values.projection.body
+    if body is not None and found != body:
+        raise BadInput(
+            "bad_terrain", f"{path}: it is a map of the {found.title()}, and the terrain's body is the {body.title()}"
+        )
+    raster = _heights_of(stored, path, scale, offset_m)
+    cut = raster if near is None else raster.crop_around(*near, WINDOW_HALF_M[found])
     if min(cut.heights_m.shape) < 2:
         raise BadInput(
             "bad_terrain", f"{path}: it is not near the origin: give the latitude and longitude of a place on this map"
@@ -90,97 +86,28 @@ def _heights_of(stored: Stored, path: Path, scale: float | None, offset_m: float
         missing |= values == stored.no_data
     if missing.all():
         raise BadInput("bad_terrain", f"{path}: no post has a height")
-    if np.median(heights[~missing]) > MOON_RADIUS_M / 2:  # counted from the Moon's centre
+    if raster.projection.body == "earth":
+        _check_range(path, float(heights[~missing].min()), float(heights[~missing].max()))
+    elif np.median(heights[~missing]) > MOON_RADIUS_M / 2:  # counted from the Moon's centre
         heights -= MOON_RADIUS_M
     heights[missing] = np.nan
     return replace(raster, heights_m=heights.astype(np.float32), source=path.name)
 
 
-@contextmanager
-def _one_line_refusal(what: str) -> Iterator[None]:
-    """Errors of a decoder as BadInput bad_terrain: damaged files make decoders raise errors of nearly any class."""
-    log = logging.getLogger("tifffile")
-    log.disabled = True  # the exception has the cause
-    try:
-        yield
-    except BadInput:
-        raise
-    except Exception as cause:
-        text = " ".join(str(cause).split())[:MAX_CAUSE_CHARS] or type(cause).__name__
-        raise BadInput("bad_terrain", f"{what}: {text}") from cause
-    finally:
-        log.disabled = False
-
-
-def _read_geotiff(path: Path) -> Stored | None:
-    """The content of a GeoTIFF, or None where its place, size, projection or compression is one for rasterio.
-
-    Raises BadInput bad_terrain for a file that cannot be decoded.
-    """
-    import tifffile
-
-    refusal = _one_line_refusal(f"{path}: not a TIFF file that can be read")
-    with refusal, tifffile.TiffFile(path) as file:
-        page = file.pages.first
-        keys = file.geotiff_metadata
-        if not keys:
-            raise BadInput("bad_terrain", f"{path}: it has no position on the Moon (no GeoTIFF tags)")
-        if not isinstance(keys, dict) or "ModelPixelScale" not in keys or "ModelTiepoint" not in keys:
-            return None
-        parameters = _proj_parameters(keys)
-        decoded = page.compression in TIFF_COMPRESSIONS and page.size <= MAX_PIXELS and len(page.shape) == 2
-        if parameters is None or not decoded:
-            return None
-        scale, offset = _gdal_scale(page.tags.valueof("GDAL_METADATA"))
-        no_data = page.tags.valueof("GDAL_NODATA")
-        dx, dy = float(keys["ModelPixelScale"][0]), -float(keys["ModelPixelScale"][1])
-        i, j, _, x, y, _ = (float(v) for v in keys["ModelTiepoint"][:6])
-        middle = 0.0 if int(keys.get("GTRasterTypeGeoKey", 1)) == 2 else 0.5  # 2: the tie point is a post
-        raster = Raster(
-            heights_m=np.asarray(page.asarray()), projection=projection_of(parameters),
-            x0_m=x + (middle - i) * dx, y0_m=y + (middle - j) * dy, dx_m=dx, dy_m=dy,
-        )  # fmt: skip
-        return Stored(raster, scale, offset, None if no_data is None else float(str(no_data).strip("\x00 ")))
-
-
-def _gdal_scale(items: Any) -> tuple[float | None, float]:
-    """SCALE and OFFSET of GDAL's metadata: None where the step is not known, and 0."""
-    found = {}
-    if isinstance(items, str):
-        found = {str(e.get("name")).upper(): e.text or "" for e in ElementTree.fromstring(items).iter("Item")}
-    metres = 1.0 if str(found.get("UNITTYPE", "")).lower() in METRES else None
-    return (float(found["SCALE"]) if "SCALE" in found else metres), float(found.get("OFFSET", 0.0))
-
-
-def _proj_parameters(keys: Mapping[str, Any]) -> dict[str, Any] | None:
-    """PROJ's parameters of GeoTIFF keys; None for projections that only rasterio reads."""
-
-    def number(*names: str, default: float = 0.0) -> float:
-        return next((float(keys[name]) for name in names if name in keys), default)
-
-    p: dict[str, Any] = {"x_0": number("ProjFalseEastingGeoKey", "ProjFalseOriginEastingGeoKey")}
-    p["y_0"] = number("ProjFalseNorthingGeoKey", "ProjFalseOriginNorthingGeoKey")
-    if "GeogSemiMajorAxisGeoKey" not in keys:
-        return None
-    p["a"] = number("GeogSemiMajorAxisGeoKey")
-    p["b"] = number("GeogSemiMinorAxisGeoKey", default=p["a"])
-    if int(keys.get("GTModelTypeGeoKey", 0)) == 2:
-        return {**p, "proj": "longlat", "lon_0": 0.0}
-    if "ProjLinearUnitsGeoKey" in keys and int(keys["ProjLinearUnitsGeoKey"]) != METRE:
-        return None
-    code = int(keys.get("ProjCoordTransGeoKey", 0))
-    p["lon_0"] = number("ProjStraightVertPoleLongGeoKey", "ProjCenterLongGeoKey", "ProjNatOriginLongGeoKey")
-    p["lat_0"] = number("ProjCenterLatGeoKey", "ProjNatOriginLatGeoKey")
-    if code in STEREOGRAPHIC_CODES:
-        p["k_0"] = number("ProjScaleAtNatOriginGeoKey", default=1.0)
-        if code == 15 and abs(p["lat_0"]) < 90:  # the variant that names the latitude of true scale
-            p["lat_ts"], p["lat_0"] = p["lat_0"], 90.0 if p["lat_0"] > 0 else -90.0
-        return {**p, "proj": "stere"}
-    if code == PROJECTION_CODES[ORTHOGRAPHIC]:
-        return {**p, "proj": "ortho"}
-    if code == PROJECTION_CODES[EQUIRECTANGULAR]:
-        return {**p, "proj": "eqc", "lat_ts": number("ProjStdParallel1GeoKey")}
-    return None
+def _check_range(path: Path, lowest_m: float, highest_m: float) -> None:
+    """Raise BadInput bad_terrain for heights that no ground of the Earth has."""
+    if lowest_m >= LOWEST_M and highest_m <= HIGHEST_ABOVE_SEA_M:
+        return
+    fits = lowest_m * FOOT_M >= LOWEST_M and highest_m * FOOT_M <= HIGHEST_ABOVE_SEA_M
+    cause = (
+        f"are they feet? Then state --scale {FOOT_M} of terrain import, or scale = {FOOT_M} in [dem]"
+        if fits
+        else "is a value for voids unstated, or the unit another?"
+    )
+    raise BadInput(
+        "bad_terrain",
+        f"{path}: heights from {lowest_m:.0f} to {highest_m:.0f} m are not of the Earth's ground: {cause}",
+    )
 
 
 def _read_with_rasterio(path: Path, near: tuple[float, float] | None) -> Stored:
@@ -189,16 +116,29 @@ def _read_with_rasterio(path: Path, near: tuple[float, float] | None) -> Stored:
     if find_spec("rasterio") is None or find_spec("pyproj") is None:
         raise BadInput(
             "bad_terrain",
-            f"{path}: not a GeoTIFF on the Moon in a known projection and compression; other maps need "
-            "rasterio and pyproj: pip install '.[dem]' in a clone of startrack",
+            f"{path}: not a GeoTIFF on the Moon in a known projection, or in longitude and latitude of WGS 84, with a "
+            "known compression; other maps need rasterio and pyproj: pip install '.[dem]' in a clone of startrack",
         )
     import rasterio
 
-    with _one_line_refusal(f"{path}: not a map that can be read{hint}"), warnings.catch_warnings():
+    with one_line_refusal(f"{path}: not a map that can be read{hint}"), warnings.catch_warnings():
         # About files without a position, which have their own message, and about terms that PROJ lacks beside WKT.
         warnings.simplefilter("ignore")
         with rasterio.open(path) as file:
+            parts = file.subdatasets if file.crs is None else []
+            if not parts:
+                return _content_of(file, path, near, hint)
+        with rasterio.open(_heights_among(parts, path)) as file:
             return _content_of(file, path, near, hint)
+
+
+def _heights_among(parts: Sequence[str], path: Path) -> str:
+    """The part of a file of several grids that is named as heights are. Raises BadInput bad_terrain."""
+    named = [part for part in parts if part.rpartition(":")[2].strip("/").lower() in HEIGHT_NAMES]
+    if len(named) == 1:
+        return named[0]
+    names = ", ".join(part.rpartition(":")[2] for part in parts)
+    raise BadInput("bad_terrain", f"{path}: which of its grids has the heights? It has {names}; cut out one (gdalwarp)")
 
 
 def _content_of(file: Any, path: Path, near: tuple[float, float] | None, hint: str) -> Stored:
@@ -207,24 +147,34 @@ def _content_of(file: Any, path: Path, near: tuple[float, float] | None, hint: s
     from rasterio.windows import Window
 
     if file.crs is None or file.transform.is_identity:
-        raise BadInput("bad_terrain", f"{path}: it has no position on the Moon{hint}")
+        raise BadInput("bad_terrain", f"{path}: it has no position on a body{hint}")
     t = file.transform
     if t.b or t.d:
         raise BadInput("bad_terrain", f"{path}: a rotated grid; bring it to north up (gdalwarp)")
-    projection = projection_of(pyproj.CRS.from_wkt(file.crs.to_wkt()).to_dict())
+    crs = pyproj.CRS.from_wkt(file.crs.to_wkt())
+    projection: Projection | EarthProjection
+    if crs.ellipsoid is not None and is_earth(crs.ellipsoid.semi_major_metre):
+        projection = project_earth(crs, (t.c + 0.5 * t.a * file.width, t.f + 0.5 * t.e * file.height), near)
+    else:
+        projection = projection_of(crs.to_dict())
     raster = Raster(
         heights_m=np.broadcast_to(np.float32(0), (file.height, file.width)), projection=projection,
         x0_m=t.c + 0.5 * t.a, y0_m=t.f + 0.5 * t.e, dx_m=float(t.a), dy_m=float(t.e),
     )  # fmt: skip
     rows, columns = slice(0, file.height), slice(0, file.width)
     if near is not None:
-        rows, columns = raster.window(*near, WINDOW_HALF_M)
+        rows, columns = raster.window(*near, WINDOW_HALF_M[projection.body])
     shape = rows.stop - rows.start, columns.stop - columns.start
     if shape[0] * shape[1] > MAX_PIXELS:
         raise BadInput("bad_terrain", f"{path}: too large; cut it to the area (startrack terrain import --half)")
     values = file.read(1, window=Window(columns.start, rows.start, shape[1], shape[0]))
     scale, offset = file.scales[0], file.offsets[0]
-    stated = (scale, offset) != (1.0, 0.0) or str(file.units[0]).lower() in METRES
+    unit = UNITS_M.get(str(file.units[0]).lower())
+    stated = (scale, offset) != (1.0, 0.0) or unit is not None
     x0_m, y0_m = raster.x0_m + columns.start * t.a, raster.y0_m + rows.start * t.e
     raster = replace(raster, heights_m=values, x0_m=x0_m, y0_m=y0_m)
-    return Stored(raster, float(scale) if stated else None, float(offset), file.nodata)
+    scale, offset = float(scale) * (unit or 1.0), float(offset) * (unit or 1.0)
+    return Stored(raster, scale if stated else None, offset, file.nodata)
+
+
+READERS = {".tif": read_geotiff, ".tiff": read_geotiff, ".hgt": read_hgt}  # by suffix: without rasterio

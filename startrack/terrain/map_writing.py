@@ -1,4 +1,4 @@
-"""Height maps and other maps on the Moon's sphere, written as GeoTIFF."""
+"""Height maps and other maps, written as GeoTIFF: with own tags, or on the Earth with those of rasterio."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.files import atomic_file
+from startrack.terrain.earth_projection import WGS84_CODE, EarthProjection
 from startrack.terrain.raster import EQUIRECTANGULAR, ORTHOGRAPHIC, STEREOGRAPHIC, Projection, Raster
 
 MIN_STEP_M = 0.01  # of the heights in files that are written
@@ -35,7 +36,12 @@ def write_map(path: str | Path, raster: Raster, *, step_m: float | None = None, 
         f'<Item name="SCALE" sample="0" role="scale">{step!r}</Item>'
         f'<Item name="OFFSET" sample="0" role="offset">{offset!r}</Item>'
     )
-    tags = _tags(raster, items, str(NO_HEIGHT) if np.isnan(h).any() else None)
+    no_data = NO_HEIGHT if np.isnan(h).any() else None
+    if raster.projection.wkt:
+        with atomic_file(path) as temporary:
+            _write_with_rasterio(temporary, raster, values[None], no_data, scales=(step,), offsets=(offset,))
+        return
+    tags = _tags(raster, items, None if no_data is None else str(no_data))
     with atomic_file(path) as temporary:
         tifffile.imwrite(
             temporary, values, compression="deflate", compressionargs={"level": 9}, predictor=True, extratags=tags,
@@ -54,11 +60,34 @@ def write_bands(path: str | Path, frame: Raster, bands: Mapping[str, NDArray[np.
         f'<Item name="DESCRIPTION" sample="{k}" role="description">{name}</Item>' for k, name in enumerate(bands)
     )
     values = np.stack([np.asarray(band, dtype=np.float32) for band in bands.values()])
+    if frame.projection.wkt:
+        with atomic_file(path) as temporary:
+            _write_with_rasterio(temporary, frame, values, np.nan, descriptions=tuple(bands))
+        return
     with atomic_file(path) as temporary:
         tifffile.imwrite(
             temporary, values, photometric="minisblack", planarconfig="separate", compression="deflate",
             compressionargs={"level": 9}, extratags=_tags(frame, items, "nan"), metadata=None, software="startrack",
         )  # fmt: skip
+
+
+def _write_with_rasterio(
+    path: Path, frame: Raster, values: NDArray[Any], no_data: float | None, **facts: tuple[Any, ...]
+) -> None:
+    """Write bands (bands, rows, columns) at the posts of a map of the Earth; `facts` of each by rasterio's names."""
+    import rasterio
+
+    place = rasterio.Affine(
+        frame.dx_m, 0.0, frame.x0_m - 0.5 * frame.dx_m, 0.0, frame.dy_m, frame.y0_m - 0.5 * frame.dy_m
+    )
+    with rasterio.open(
+        path, "w", driver="GTiff", height=values.shape[1], width=values.shape[2], count=len(values),
+        dtype=values.dtype, crs=frame.projection.wkt, transform=place, nodata=no_data, compress="deflate", zlevel=9,
+        predictor=2 if values.dtype == np.uint16 else 1,
+    ) as file:  # fmt: skip
+        file.write(values)
+        for name, value in facts.items():
+            setattr(file, name, value)
 
 
 def _tags(m: Raster, items: str, no_data: str | None) -> list[tuple[int, str, int, Any, bool]]:
@@ -91,8 +120,10 @@ def _tags(m: Raster, items: str, no_data: str | None) -> list[tuple[int, str, in
     return [(codes[name], *tag, True) for name, tag in tags.items()]
 
 
-def _geo_keys(p: Projection) -> dict[int, int | float | str]:
+def _geo_keys(p: Projection | EarthProjection) -> dict[int, int | float | str]:
     """Keys of a projection: whole numbers as such, others as floats, texts with their end mark."""
+    if isinstance(p, EarthProjection):
+        return {1024: 2, 1025: 1, 2048: WGS84_CODE, 2054: DEGREE}
     degrees = p.kind == EQUIRECTANGULAR and p.scale_y != 1.0  # latitude and longitude themselves
     radius = float(p.radius_m)
     keys: dict[int, int | float | str] = {

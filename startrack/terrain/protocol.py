@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from startrack.core.types import Array, BadInput, Bools, Ints
 from startrack.frames import Site
+from startrack.terrain.earth_projection import EarthProjection
 from startrack.terrain.raster import STEREOGRAPHIC, Projection
 from startrack.terrain.shape import ShapeError
 
@@ -71,7 +72,7 @@ class Terrain(ABC):
         return 1.25 * self.search_radius_m
 
     @property
-    def projection(self) -> Projection | None:
+    def projection(self) -> Projection | EarthProjection | None:
         """That of maps of this ground: stereographic about the origin. None where that is not on the Moon."""
         if self.site is None or self.site.body != "moon":
             return None

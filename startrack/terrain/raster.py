@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from startrack.core.types import Array, BadInput
-from startrack.frames import MOON_RADIUS_M, R_enu_fixed, Site, latlon_from_enu
+from startrack.frames import MOON_RADIUS_M, R_enu_fixed, Site, enu_from_latlon, latlon_from_enu
+from startrack.terrain.earth_projection import EarthProjection, is_earth
 
 STEREOGRAPHIC, ORTHOGRAPHIC, EQUIRECTANGULAR = 0, 1, 2
 PROJECTION_NAMES = ("stereographic", "orthographic", "equirectangular")
@@ -34,6 +35,9 @@ class Projection:
     false_x_m: float = 0.0
     false_y_m: float = 0.0
     radius_m: float = MOON_RADIUS_M
+    body = "moon"
+    wkt = ""  # the fields say all
+    transformation_warning = ""  # of the shift to the datum of sites
 
     def __post_init__(self) -> None:
         numbers = (self.latitude_rad, self.longitude_rad, self.scale, self.scale_y, self.false_x_m, self.false_y_m)
@@ -44,6 +48,17 @@ class Projection:
                 "bad_terrain",
                 f"the map is of a body of {self.radius_m / 1000:.1f} km radius, not the Moon's 1737.4 km sphere",
             )
+
+    @property
+    def name(self) -> str:
+        """Of the projection, for people."""
+        return PROJECTION_NAMES[self.kind]
+
+    def units_per_m(self, latitude_rad: float) -> tuple[float, float]:
+        """Map units of a metre on the ground along x and y at a latitude; of azimuthal projections at the centre."""
+        if self.kind == EQUIRECTANGULAR:
+            return self.scale / float(np.cos(latitude_rad)), self.scale_y
+        return self.scale, self.scale
 
     @property
     def R_projection_fixed(self) -> Array:
@@ -93,12 +108,12 @@ class Projection:
 
 
 def projection_of(p: Mapping[str, Any]) -> Projection:
-    """The projection of PROJ's parameters. Raises BadInput bad_terrain for one that is not known here."""
+    """The Moon's projection of PROJ's parameters. Raises BadInput bad_terrain for one that is not known here."""
     radius = float(p.get("R", p.get("a", MOON_RADIUS_M)))
+    if is_earth(radius) or str(p.get("ellps", p.get("datum", ""))).upper() in ("WGS84", "GRS80"):
+        raise BadInput("bad_terrain", "the map is of the Earth, not of the Moon")
     if "a" in p and "b" in p and abs(float(p["a"]) - float(p["b"])) > 1:
         raise BadInput("bad_terrain", "the map is on an ellipsoid, not on the Moon's 1737.4 km sphere")
-    if str(p.get("ellps", p.get("datum", ""))).upper() in ("WGS84", "GRS80"):
-        raise BadInput("bad_terrain", "the map is of the Earth, not of the Moon")
     common = {
         "longitude_rad": float(np.radians(float(p.get("lon_0", 0.0)))), "radius_m": radius,
         "false_x_m": float(p.get("x_0", 0.0)), "false_y_m": float(p.get("y_0", 0.0)),
@@ -127,11 +142,14 @@ def projection_of(p: Mapping[str, Any]) -> Projection:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Raster:
-    """Heights above the sphere. Post (row, column) stands at x = x0 + column dx, y = y0 + row dy."""
+    """Heights above the Moon's sphere, or the Earth's ellipsoid.
+
+    Post (row, column) stands at x = x0 + column dx, y = y0 + row dy.
+    """
 
     heights_m: NDArray[np.float32]  # (rows, columns); NaN where the map has a hole
-    projection: Projection
-    x0_m: float
+    projection: Projection | EarthProjection
+    x0_m: float  # in the units of the projection, as all that follow
     y0_m: float
     dx_m: float
     dy_m: float  # negative where the first row is the northern one
@@ -140,6 +158,11 @@ class Raster:
     @property
     def post_m(self) -> float:
         """Spacing of the posts, the wider of the two [m]."""
+        if isinstance(self.projection, EarthProjection):
+            at = np.array(self.heights_m.shape) / 2 + [[0, 0], [0, 1], [1, 0]]
+            lat, lon = self.projection.latlon_from_xy(*self.xy(at))
+            steps = enu_from_latlon(Site("earth", lat[0], lon[0]), lat[1:], lon[1:])
+            return float(np.linalg.norm(steps, axis=-1).max())
         stretch = np.array([1.0, 1.0])
         if self.projection.kind == EQUIRECTANGULAR:
             _, middle = self.xy(np.array(self.heights_m.shape) / 2)
@@ -153,9 +176,9 @@ class Raster:
             "file": self.source,
             "posts": list(self.heights_m.shape),
             "post_m": round(self.post_m, 3),
-            "projection": PROJECTION_NAMES[self.projection.kind],
-            "lowest_m": round(float(self.heights_m.min()), 1),
-            "highest_m": round(float(self.heights_m.max()), 1),
+            "projection": self.projection.name,
+            "lowest_m": round(float(np.nanmin(self.heights_m)), 1),
+            "highest_m": round(float(np.nanmax(self.heights_m)), 1),
         }
 
     def xy(self, row_column: Array) -> tuple[Array, Array]:
@@ -181,17 +204,37 @@ class Raster:
         return np.asarray(top * (1 - down) + bottom * down)
 
     def grid_numbers(self, site: Site) -> Array:
-        """Projection of a vector from the Moon's centre in the site's enu axes to (column, row), as 16 numbers.
+        """Projection of a vector from the sphere's centre in the site's enu axes to (column, row), as 16 numbers.
 
-        kind, R_projection_enu (9), size along x and y [m], column = (x - n12) n13, row = (y - n14) n15.
+        kind, R_projection_enu (9), size along x and y [m], column = (x - n12) n13, row = (y - n14) n15. On the Earth
+        (n, 2) numbers, see `ellipsoid_fit.fit_cells`.
         """
         p = self.projection
+        if isinstance(p, EarthProjection):
+            from startrack.terrain.ellipsoid_fit import fit_cells
+
+            return fit_cells(self, site)
         R_projection_enu = p.R_projection_fixed @ R_enu_fixed(site).T
         size = p.radius_m * p.scale * (2.0 if p.kind == STEREOGRAPHIC else 1.0)
         return np.array([
             p.kind, *R_projection_enu.ravel(), size, p.radius_m * p.scale_y,
             self.x0_m - p.false_x_m, 1 / self.dx_m, self.y0_m - p.false_y_m, 1 / self.dy_m,
         ], dtype=np.float64)  # fmt: skip
+
+    def heights_above_origin_m(self, site: Site) -> NDArray[np.float32]:
+        """Heights [m] above the sphere through the site, see `frames.sphere_radius_m`."""
+        if isinstance(self.projection, EarthProjection):
+            from startrack.terrain.ellipsoid_fit import heights_above_sphere
+
+            return heights_above_sphere(self, site)
+        return self.heights_m - np.float32(site.height_m) if site.height_m else self.heights_m
+
+    def place_bytes(self, site: Site) -> bytes:
+        """What the places of the posts in the site's enu follow from."""
+        p = self.projection
+        if isinstance(p, EarthProjection):
+            return f"{p.wkt} {p.near} {[self.x0_m, self.y0_m, self.dx_m, self.dy_m]}".encode()
+        return self.grid_numbers(site).tobytes()
 
     def crop(self, rows: slice, columns: slice) -> Raster:
         """The part of the map within the given rows and columns."""
@@ -207,9 +250,9 @@ class Raster:
         """Rows and columns within `half_m` of `latitude_rad`, `longitude_rad`, and a little more; empty off the map."""
         side = np.linspace(-1.0, 1.0, 33) * half_m
         east, north = np.meshgrid(side, side)
-        lat, lon = latlon_from_enu(Site("moon", latitude_rad, longitude_rad), east, north, 0.0)
+        lat, lon = latlon_from_enu(Site(self.projection.body, latitude_rad, longitude_rad), east, north, 0.0)
         at = self.row_column(lat, lon).reshape(-1, 2)
-        if not np.isfinite(at).all():  # on the other side of the Moon
+        if not np.isfinite(at).all():  # on the other side of the body
             return slice(0, 0), slice(0, 0)
         slices = []
         for low, high, n in zip(at.min(axis=0), at.max(axis=0), self.heights_m.shape, strict=True):

@@ -109,8 +109,28 @@ CAMERA_ERROR = Fact(
     key="camera_height_sigma_m", errors=("camera_height_m",), sigma=0.02, meaning="error of the camera's height [m]",
     limits=replace(AMOUNT, description="if absent 0.02 above a height map, and 0 in a cylinder"),
 )  # fmt: skip
+REFRACTION = Fact(
+    key="terrestrial_refraction_sigma", errors=("terrestrial_refraction_1",), sigma=0.1,
+    meaning="error of the coefficient of terrestrial refraction",
+    limits=Number(low=0.0, high=0.5, description="of the coefficient; if absent 0.1"),
+)  # fmt: skip
+# Maps of the Earth count heights from the geoid. Its slope against the ellipsoid, the deflection of the vertical, is 7
+# arcsec along each axis in the mean of the Earth, 10 to 15 in mountains, and up to 100.
+VERTICAL_EARTH = replace(
+    VERTICAL, sigma=float(np.radians(0.003)), gross_sigma=float(np.radians(0.02)),
+    meaning="tilt of the whole map about each of two axes, the geoid's slope included [deg]",
+)  # fmt: skip
+REFRACTION_1 = (
+    0.13  # mean coefficient of terrestrial refraction (Gauss 1826; Bomford, Geodesy: 0.13 by day, more at night)
+)
+EARTH_HIGHEST_M = 8850.0  # the highest ground of the Earth
 CYLINDER_FACTS = (DEPTH, DIAMETER, ELLIPSE, RIM_TILT)
 MAP_FACTS = (BIAS, STRETCH, VERTICAL, CAMERA_ERROR)
+
+
+def vertical_fact(body: str) -> Fact:
+    """The fact of a tilt of the whole map, on the Moon or the Earth."""
+    return VERTICAL_EARTH if body == "earth" else VERTICAL
 
 
 def select_slopes(errors: Sequence[ShapeError], slopes_rad: dict[str, Array], shape: Iterable[int]) -> Array:

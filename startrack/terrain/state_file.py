@@ -12,7 +12,17 @@ import numpy as np
 from startrack.core.files import parse_toml
 from startrack.core.types import BadInput
 from startrack.terrain.io import read_keys
-from startrack.terrain.shape import BIAS, CAMERA_ERROR, CYLINDER_FACTS, DEPTH, DIAMETER, STRETCH, VERTICAL, Fact
+from startrack.terrain.shape import (
+    BIAS,
+    CAMERA_ERROR,
+    CYLINDER_FACTS,
+    DEPTH,
+    DIAMETER,
+    REFRACTION,
+    STRETCH,
+    Fact,
+    vertical_fact,
+)
 
 HEIGHT_KEY = "height_sigma_m"
 
@@ -31,6 +41,7 @@ class StateableError:
 def stateable_errors(text: str) -> list[StateableError]:
     """The errors that a terrain file with this `text` states or could state. Raises BadInput bad_terrain."""
     keys = read_keys(text)
+    vertical = vertical_fact(keys["body"])
     dem, rover, cylinder = keys.get("dem", {}), keys.get("rover", {}), keys.get("cylinder")
     if cylinder is not None:
         sizes_m = {DEPTH.key: cylinder["depth_m"], DIAMETER.key: cylinder["diameter_m"]}
@@ -43,9 +54,11 @@ def stateable_errors(text: str) -> list[StateableError]:
     else:
         rows = [
             ("dem", BIAS, f"three times what {HEIGHT_KEY} makes of the horizon", BIAS.key not in dem),
-            *(("dem", fact, _default_text(fact), fact.key not in dem) for fact in (STRETCH, VERTICAL)),
+            *(("dem", fact, _default_text(fact), fact.key not in dem) for fact in (STRETCH, vertical)),
             ("rover", CAMERA_ERROR, _default_text(CAMERA_ERROR), CAMERA_ERROR.key not in rover),
         ]
+        if keys["body"] == "earth":
+            rows.append(("air", REFRACTION, _default_text(REFRACTION), REFRACTION.key not in keys.get("air", {})))
     found = [
         StateableError(table=table, key=fact.key, meaning=fact.meaning, default=default, is_missing=missing)
         for table, fact, default, missing in rows

@@ -54,9 +54,11 @@ def key_of_table(ground: TracedMap) -> str:
     site, square = ground.site, ground.square
     numbers = [site.latitude_rad, site.longitude_rad, site.height_m, ground.camera_height_m]
     numbers += [square.reach_m, float(square.across), ground.search_radius_m]
+    if ground.terrestrial_refraction_1 or ground.highest_beyond_m > -np.inf:
+        numbers += [ground.terrestrial_refraction_1, ground.highest_beyond_m]
     digest.update(np.array(numbers).tobytes())
     for raster in ground.maps:
-        digest.update(raster.grid_numbers(site).tobytes())
+        digest.update(raster.place_bytes(site))
         digest.update(np.ascontiguousarray(raster.heights_m).data)
     return digest.hexdigest()
 
@@ -171,10 +173,10 @@ def _unknown_rad(ground: TracedMap) -> Array:
     places = places[np.hypot(*places.T) <= ground.search_radius_m]
     bins = np.repeat((np.arange(AZIMUTH_BINS)[:, None] + [0.02, 0.5, 0.98]).ravel(), len(places))
     azimuths, where = bins * 2 * np.pi / AZIMUTH_BINS, np.tile(places, (3 * AZIMUTH_BINS, 1))
-    tan, _, edge = ground.without_table().horizons(where, azimuths)
+    tan, _, edge = ground.with_voids().horizons(where, azimuths)
     up = ground.ground_m(places) + ground.camera_height_m
     away = where + edge[:, None] * np.stack([np.sin(azimuths), np.cos(azimuths)], axis=-1)
     drop = np.sum(np.minimum(np.abs(away), 1e7) ** 2, axis=-1) / (2 * ground.ground.radius_m)
-    possible = (ground.ground.highest_m - drop - np.tile(up, 3 * AZIMUTH_BINS)) / edge
+    possible = (ground.ground.highest_m - drop - np.tile(up, 3 * AZIMUTH_BINS)) / edge + ground.ground.sag_per_m * edge
     unknown = np.where((edge < 1e9) & (possible > tan), np.arctan(possible), -np.pi / 2)
     return np.asarray(unknown.reshape(AZIMUTH_BINS, -1).max(axis=1))

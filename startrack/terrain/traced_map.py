@@ -16,6 +16,7 @@ import numpy as np
 from startrack.core.runner import count_cores
 from startrack.core.types import Array, BadInput
 from startrack.frames import Site
+from startrack.terrain.earth_projection import EarthProjection
 from startrack.terrain.ground import Ground, ground_up_m, pack_maps
 from startrack.terrain.horizon_kernel import surfaces
 from startrack.terrain.horizon_table import AZIMUTH_BINS, FIELDS, HorizonTable, Square
@@ -43,10 +44,11 @@ NO_VALUES = np.zeros((0, AZIMUTH_BINS, FIELDS), dtype=np.uint16)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TracedMap(Terrain):
-    """The surface that is bilinear between the posts of height maps, as true 3-D points on the Moon's sphere.
+    """The surface that is bilinear between the posts of height maps, as true 3-D points on the body.
 
-    tan H = max over s of (z(p + s u) - z(p) - camera height) / s, u the azimuth's direction. Where several maps cover
-    a point the first holds. Raises BadInput bad_terrain if the maps do not cover the search area. See `Terrain`.
+    tan H = max over s of (z(p + s u) - z(p) - camera height + k s^2 / 2 R) / s, u the azimuth's direction, k the
+    coefficient of terrestrial refraction, R the body's radius. Where several maps cover a point the first holds.
+    Raises BadInput bad_terrain if the maps do not cover the search area. See `Terrain`.
     """
 
     name: str = "height map"
@@ -55,25 +57,46 @@ class TracedMap(Terrain):
     files: tuple[Path, ...] = ()  # of them
     camera_height_m: float = 1.5
     search_radius_m: float = Terrain.search_radius_m
+    terrestrial_refraction_1: float = 0.0  # curvature of a level sight line in air, relative to the body's
+    highest_beyond_m: float = -np.inf  # ground off the maps is no higher, nor than their highest post; as their heights
     finest_m = 0.45  # no height map is more accurate
     _uses_table = True  # traces begin at the horizon's distance of a table in memory
 
     def __post_init__(self) -> None:
         if not self.maps:
             raise BadInput("bad_terrain", "[dem] needs at least one map")
+        other = [one.source for one in self.maps if one.projection.body != self.site.body]
+        if other:
+            raise BadInput(
+                "bad_terrain", f"{other[0]} is not a map of the {self.site.body.title()}, where the origin is"
+            )
         if not self._covers(self.search_radius_m):
             area = f"the search area of {self.search_radius_m:.0f} m about the origin"
             raise BadInput("bad_terrain", f"the maps do not cover {area}, or have holes in it")
 
     @property
-    def projection(self) -> Projection:  # type: ignore[override]
+    def projection(self) -> Projection | EarthProjection:  # type: ignore[override]
         """That of the finest map."""
         return self.maps[0].projection
 
     @cached_property
     def ground(self) -> Ground:
         """The maps packed for tracing."""
-        return pack_maps(self.site, self.maps)
+        return self._pack(keep_voids=False)
+
+    def with_voids(self) -> Self:
+        """The same map whose `horizons` end at its voids, without its table."""
+        other = self.without_table()
+        if any(np.isnan(one.heights_m).any() for one in self.maps):
+            other.__dict__["ground"] = self._pack(keep_voids=True)
+        return other
+
+    def _pack(self, keep_voids: bool) -> Ground:
+        packed = pack_maps(self.site, self.maps, keep_voids=keep_voids)
+        return packed._replace(
+            sag_per_m=self.terrestrial_refraction_1 / (2 * packed.radius_m),
+            highest_m=max(packed.highest_m, self.highest_beyond_m - self.site.height_m),
+        )
 
     @cached_property
     def reach_m(self) -> float:

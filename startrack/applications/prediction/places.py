@@ -14,7 +14,7 @@ from startrack.core.types import Array, BadInput, Ints
 from startrack.frames import Site, enu_from_latlon, latlon_from_enu
 from startrack.output import nice_step
 from startrack.rendering import STEP_ROUNDING_1, Drive
-from startrack.terrain import EQUIRECTANGULAR, Raster, Terrain
+from startrack.terrain import Raster, Terrain
 
 DEFAULT_CELLS_ACROSS = 10  # of the default spacing
 HEIGHT_STEPS = 4  # the horizontal position of a map's point depends on its height: 1 part in 1000 a step
@@ -80,13 +80,13 @@ def area_cells(terrain: Terrain, spacing_m: float) -> AreaCells:
     """
     site, projection = terrain.site, terrain.projection
     if site is None or projection is None:
-        raise BadInput("bad_terrain", f"terrain {terrain.name} has no map projection: only those on the Moon have one")
+        raise BadInput(
+            "bad_terrain", f"terrain {terrain.name} has no map projection: give one of height maps, or on the Moon"
+        )
     ring_m = terrain.search_radius_m * np.stack([np.sin(PLACES_RING_RAD), np.cos(PLACES_RING_RAD)], axis=-1)
     x, y = projection.xy_from_latlon(*latlon_from_enu(site, ring_m[:, 0], ring_m[:, 1], 0.0))
     middle_x, middle_y = projection.xy_from_latlon(site.latitude_rad, site.longitude_rad)
-    x_per_m = y_per_m = projection.scale  # map units of a metre on the ground at the origin
-    if projection.kind == EQUIRECTANGULAR:
-        x_per_m, y_per_m = projection.scale / np.cos(site.latitude_rad), projection.scale_y
+    x_per_m, y_per_m = projection.units_per_m(site.latitude_rad)
     dx, dy = spacing_m * x_per_m, spacing_m * y_per_m
     half_x = int(np.ceil(np.max(np.abs(x - middle_x)) / dx))
     half_y = int(np.ceil(np.max(np.abs(y - middle_y)) / dy))

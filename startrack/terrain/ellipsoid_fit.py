@@ -1,0 +1,140 @@
+"""Maps of the Earth as the kernels trace them: on a sphere about the origin, with polynomials for the map's projection.
+
+The sphere goes through the origin of enu, as curved as the ellipsoid is there; its centre is on the origin's vertical.
+The exact place of a post in enu gives its direction from that centre and its height above that sphere. The column and
+row of the map are a smooth function of the direction. The height of the ellipsoid above the sphere is one, too: 0 at
+the origin, and some metres 100 km away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.core.types import Array, BadInput
+from startrack.frames import Site, enu_from_latlon, latlon_from_enu, sphere_radius_m
+from startrack.terrain.earth_projection import FOOT_M
+from startrack.terrain.raster import Raster
+
+MOST_DEGREE = 12
+FIT_NODES, CHECK_NODES = 28, 41  # along each side, for the fit and for its check
+MARGIN_POSTS, MARGIN_1 = 6.0, 0.02  # beyond the map's posts, where steps of a ray still ask for columns and rows
+# Largest error of a place on the map: 1/100 of a post but no more than 10 cm, or, far away, 2e-6 of the distance from
+# the origin. On ground of 45 degrees the latter changes a horizon by 0.0001 degrees.
+TOLERANCE_POSTS, TOLERANCE_M, TOLERANCE_RAD = 0.01, 0.1, 2e-6
+FOOT_TOLERANCE_1, LOW_M = 0.03, 100.0  # stated heights that low do not show the unit
+HEIGHT_NODES = 65  # along each side of a map, between which the sphere's height is interpolated: it bends by 1e-9 / m
+
+
+def fit_cells(raster: Raster, site: Site) -> Array:
+    """Numbers (n, 2) of a map for `map_cell`, in two columns for x and y, or for column and row.
+
+    The degree, the middle, 1 / half width, and the coefficients.
+    x = east / up and y = north / up of a direction from the sphere's centre. Raises BadInput bad_terrain for a map
+    whose projection no polynomial of the highest degree fits.
+    """
+    heights = raster.heights_m[np.isfinite(raster.heights_m)]
+    low, high = (float(heights.min()), float(heights.max())) if heights.size else (0.0, 0.0)
+    middle, half = _extent(raster, site, 0.5 * (low + high))
+    nodes = np.cos(np.pi * (np.arange(FIT_NODES) + 0.5) / FIT_NODES)
+    at = np.stack(np.meshgrid(nodes, nodes, indexing="ij"), axis=-1).reshape(-1, 2)
+    cells = _cells_at(raster, site, middle + half * at, 0.5 * (low + high))
+    line = np.linspace(-1.0, 1.0, CHECK_NODES)
+    tests = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
+    wanted = [_cells_at(raster, site, middle + half * tests, height) for height in (low, high)]
+    if not all(np.isfinite(one).all() for one in (cells, *wanted)):
+        raise BadInput("bad_terrain", f"{raster.source}: its projection does not reach all of its own posts")
+    away_m = np.hypot(*(middle + half * tests).T) * sphere_radius_m(site)
+    allowed = np.maximum(min(TOLERANCE_POSTS * raster.post_m, TOLERANCE_M), TOLERANCE_RAD * away_m)
+    off_m = np.inf
+    for degree in range(1, MOST_DEGREE + 1):
+        found = np.linalg.lstsq(_powers(at, degree), cells, rcond=None)[0]
+        fitted = _powers(tests, degree) @ found
+        off_m = max(float(np.max(np.hypot(*(fitted - one).T) * raster.post_m / allowed)) for one in wanted)
+        if off_m <= 1.0:
+            return np.concatenate([[[degree, 0.0], middle, 1 / half], found])
+    raise BadInput(
+        "bad_terrain",
+        f"{raster.source}: the map's projection ({raster.projection.name}) bends too much over its area: "
+        "cut the map to a smaller area (startrack terrain import --half), or bring it to UTM (gdalwarp -r bilinear)",
+    )
+
+
+def heights_above_sphere(raster: Raster, site: Site) -> NDArray[np.float32]:
+    """Heights (rows, columns) [m] of the posts above the sphere through the origin; NaN where the map has none."""
+    radius, height = sphere_radius_m(site), float(np.nanmean(raster.heights_m))
+    centre = np.array([0.0, 0.0, -radius])
+    above = _smooth_over_posts(raster, site, lambda points: np.linalg.norm(points - centre, axis=-1) - radius - height)
+    return np.asarray(raster.heights_m + above, dtype=np.float32)
+
+
+def above_ellipsoid(raster: Raster, site: Site, geoid_m: float, slope_arcsec: Sequence[float] | None) -> Raster:
+    """The map with heights above the ellipsoid, of one with heights above a geoid that stands `geoid_m` at the site.
+
+    slope_arcsec: how the geoid rises there above the ellipsoid to the east and to the north; None: it does not.
+    """
+    if not geoid_m and slope_arcsec is None:
+        return raster
+    slope = np.tan(np.radians(np.array(slope_arcsec or (0.0, 0.0)) / 3600.0))
+    raised = _smooth_over_posts(raster, site, lambda points: geoid_m + points[..., :2] @ slope)
+    return replace(raster, heights_m=np.asarray(raster.heights_m + raised, dtype=np.float32))
+
+
+def check_height(site: Site, maps: Sequence[Raster]) -> None:
+    """Raise BadInput bad_terrain if the maps have the site's stated height in other units than metres."""
+    at = np.array([site.latitude_rad]), np.array([site.longitude_rad])
+    for one in maps:
+        found = float(one.sample(one.row_column(*at))[0])
+        feet = [found / site.height_m, site.height_m / found] if abs(site.height_m) > LOW_M and found else []
+        if any(abs(ratio * FOOT_M - 1.0) < FOOT_TOLERANCE_1 for ratio in feet):
+            raise BadInput(
+                "bad_terrain",
+                f"{one.source}: at the origin it has {found:.0f}, where the terrain file states height_m = "
+                f"{site.height_m:.0f}: one of them is in feet; of the map state scale = {FOOT_M} in [dem] (--scale of "
+                "terrain import)",
+            )
+
+
+def _smooth_over_posts(raster: Raster, site: Site, function: Callable[[Array], Array]) -> Array:
+    """Values (rows, columns) at the posts of a smooth function of points (..., 3) in enu, interpolated."""
+    from scipy.interpolate import RectBivariateSpline
+
+    lines = [np.linspace(0, n - 1, min(n, HEIGHT_NODES)) for n in raster.heights_m.shape]
+    at = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
+    height = float(np.nanmean(raster.heights_m))
+    points = enu_from_latlon(site, *raster.projection.latlon_from_xy(*raster.xy(at)), height)
+    order = [min(len(line) - 1, 3) for line in lines]
+    every = [np.arange(n, dtype=np.float64) for n in raster.heights_m.shape]
+    return np.asarray(RectBivariateSpline(*lines, function(points), kx=order[0], ky=order[1])(*every))
+
+
+def _extent(raster: Raster, site: Site, height_m: float) -> tuple[Array, Array]:
+    """Middle (2,) and half widths (2,) of x and y of the directions to a map's posts, with a margin."""
+    lines = [np.linspace(0, n - 1, CHECK_NODES) for n in raster.heights_m.shape]
+    at = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 2)
+    points = enu_from_latlon(site, *raster.projection.latlon_from_xy(*raster.xy(at)), height_m)
+    radius = sphere_radius_m(site)
+    up = points[:, 2:] + radius
+    if not np.isfinite(points).all() or not (up > 0.5 * radius).all():
+        raise BadInput("bad_terrain", f"{raster.source}: its posts are not all near the origin: cut it (--half)")
+    low, high = (points[:, :2] / up).min(axis=0), (points[:, :2] / up).max(axis=0)
+    half = 0.5 * (high - low) * (1.0 + MARGIN_1) + MARGIN_POSTS * raster.post_m / radius
+    return 0.5 * (low + high), half
+
+
+def _cells_at(raster: Raster, site: Site, xy: Array, height_m: float) -> Array:
+    """Column and row (n, 2) of the map in the directions x, y (n, 2), of ground at this height."""
+    radius = sphere_radius_m(site)
+    rays = np.column_stack([xy, np.ones(len(xy))])
+    points = rays * ((radius - site.height_m + height_m) / np.linalg.norm(rays, axis=1, keepdims=True))
+    place = latlon_from_enu(site, points[:, 0], points[:, 1], points[:, 2] - radius)
+    return raster.row_column(*place)[:, ::-1]
+
+
+def _powers(xy: Array, degree: int) -> Array:
+    """Powers x^i y^j (n, terms), i + j at most the degree, in the order in which Horner's rule reads them."""
+    x, y = xy.T
+    return np.stack([x**i * y**j for i in range(degree, -1, -1) for j in range(degree - i, -1, -1)], axis=-1)

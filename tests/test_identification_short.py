@@ -23,12 +23,14 @@ from test_identification import (
 )
 
 from startrack.core.types import NotIdentified
-from startrack.estimation.match import CandidatePairs, PhotometricScale, pair_mutually
+from startrack.estimation.match import CandidatePairs, PhotometricScale, brightness_agreement
+from startrack.estimation.match_kernel import BRIGHTER_MAG, pair_mutually
 from startrack.frames import R_from_rotvec, wahba
 from startrack.identification import Identifier
 from startrack.identification.attitude_search import AttitudeSearch
 from startrack.identification.index import CatalogPatterns, PerObject
-from startrack.identification.triangles import build_pairs, sides_of_few, triangles
+from startrack.identification.triangle_kernel import are_same_handed, sides_of_few
+from startrack.identification.triangles import build_pairs, triangles
 
 
 def hundred_stars(seed: int, false: int = 20, true: int = 80, noise_px: float = 0.2) -> Frame:
@@ -120,14 +122,22 @@ def test_pairs_are_those_of_a_brute_force_search() -> None:
 def test_the_sides_of_few_are_those_of_the_general_search(fresh: int) -> None:
     rays = np.random.default_rng(5).normal((0, 0, 1.5), 1.0, (14, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    vertices, chords = sides_of_few(rays, fresh)
-    few = {tuple(v): np.sort(2 * np.arcsin(c / 2)) for v, c in zip(vertices.tolist(), chords, strict=True)}
+    vertices, chords = sides_of_few(rays, fresh, 2.0)
+    few = {tuple(v): 2 * np.arcsin(c / 2) for v, c in zip(vertices.tolist(), chords, strict=True)}
     assert len(few) == len(list(combinations(range(14), 3))) - len(list(combinations(range(fresh), 3)))
     every = triangles(rays, 0.9)
     fresher = every.take(every.vertices.max(axis=1) >= fresh)
     assert len(fresher) > 15
     for v, sides in zip(fresher.vertices.tolist(), fresher.sides_rad, strict=True):
-        assert few[tuple(sorted(v))] == pytest.approx(sides, abs=1e-14)
+        assert few[tuple(v)] == pytest.approx(sides, abs=1e-14)
+    short = {tuple(v) for v in sides_of_few(rays, fresh, 2 * np.sin(0.45))[0].tolist()}
+    assert short == {v for v, sides in few.items() if sides[2] < 0.9}
+
+
+def test_a_mirror_image_of_a_triangle_has_the_other_hand() -> None:
+    one, R = np.random.default_rng(8).normal(size=(20, 3, 3)), R_from_rotvec(np.array([0.3, -1.0, 0.7]))
+    assert are_same_handed(one, one @ R.T).all()
+    assert not are_same_handed(one, one * [1, -1, 1]).any()
 
 
 def test_wahba_solutions_are_the_best_rotations() -> None:
@@ -197,6 +207,17 @@ def test_pairs_are_the_cheapest_of_their_star_and_of_their_detection() -> None:
         assert pair_mutually(detection, star, cost, agrees).tolist() == expected
     none = np.zeros(0, dtype=np.int64)
     assert pair_mutually(none, none, np.zeros(0), np.zeros(0, dtype=bool)).tolist() == []
+
+
+@pytest.mark.parametrize("ascending", [True, False])
+def test_the_part_that_agrees_in_brightness_is_that_of_all_pairs(ascending: bool) -> None:
+    rng = np.random.default_rng(9)
+    v_mag, measured = rng.normal(5, 1, 60), rng.normal(5, 2, 40)
+    fainter = measured - v_mag[:, None]
+    expected = np.mean((fainter >= -BRIGHTER_MAG) & (fainter < 1.6))
+    found = brightness_agreement(np.sort(v_mag) if ascending else v_mag, measured, 1.6)
+    assert found == pytest.approx(expected, abs=1e-12)
+    assert brightness_agreement(v_mag[:0], measured) == 1.0
 
 
 @pytest.mark.parametrize("field_sr", [2 * np.pi, 0.5])

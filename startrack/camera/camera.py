@@ -11,7 +11,7 @@ from startrack.camera.lens import Lens
 from startrack.camera.lenses import KannalaBrandt
 from startrack.camera.optics import Decentring, Sensor
 from startrack.core.types import Array, Bools, Mask
-from startrack.frames import length_xy, off_axis_rad
+from startrack.frames import length_xy
 
 # Body x (forward) = image top = -cam y, body y (left) = +cam x, body z (up) = +cam z: it looks at the zenith.
 ZENITH_MOUNT_R_BODY_CAM = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -54,9 +54,10 @@ class Camera:
     def project(self, rays_cam: Array) -> tuple[Array, Bools]:
         """Pixels (..., 2) of `rays_cam` (..., 3), and which of them (...) are inside the image circle and the frame."""
         rays_cam = np.asarray(rays_cam, dtype=np.float64)
-        angle = off_axis_rad(rays_cam)
+        off_axis = length_xy(rays_cam[..., 0], rays_cam[..., 1])
+        angle = np.arctan2(off_axis, rays_cam[..., 2])
         imaged = angle <= min(self.max_angle_rad, self.lens.max_invertible_rad)
-        px = self._pixels(rays_cam, angle, self.lens.rho(np.where(imaged, angle, 0.0)))
+        px = self._pixels(rays_cam, off_axis, angle, self.lens.rho(np.where(imaged, angle, 0.0)))
         x, y = px[..., 0], px[..., 1]
         within = (x >= -0.5) & (y >= -0.5) & (x <= self.size_px[0] - 0.5) & (y <= self.size_px[1] - 0.5)
         return px, imaged & within
@@ -64,11 +65,11 @@ class Camera:
     def project_unlimited(self, rays_cam: Array) -> Array:
         """Pixels (..., 2) of `rays_cam` (..., 3) by the lens's formula alone, also beyond the image circle."""
         rays_cam = np.asarray(rays_cam, dtype=np.float64)
-        angle = off_axis_rad(rays_cam)
-        return self._pixels(rays_cam, angle, self.lens.rho(angle))
-
-    def _pixels(self, rays_cam: Array, angle_rad: Array, rho: Array) -> Array:
         off_axis = length_xy(rays_cam[..., 0], rays_cam[..., 1])
+        angle = np.arctan2(off_axis, rays_cam[..., 2])
+        return self._pixels(rays_cam, off_axis, angle, self.lens.rho(angle))
+
+    def _pixels(self, rays_cam: Array, off_axis: Array, angle_rad: Array, rho: Array) -> Array:
         per_off_axis = 1.0 / np.where(off_axis > 0, off_axis, 1.0)
         scale = rho * per_off_axis
         u, v = scale * rays_cam[..., 0], scale * rays_cam[..., 1]

@@ -13,15 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from startrack.core.kernels import njit
 from startrack.core.types import Array, Bools, Ints
+from startrack.estimation.match_kernel import BRIGHTER_MAG, compare_pairs, count_alike
 
 DEPTH_BELOW_THRESHOLD_MAG = (
     0.7  # about the faintest detections: fainter stars are not detected, brighter ones are in open sky
 )
-BRIGHTER_MAG = 0.8  # a detection is at most this much brighter than its star
-DIMMED_MAG = 1.6  # and at most this much fainter: haze, branches, the edge of the lens
-PX_PER_MAG = 0.6  # distance with the same cost as a difference of one magnitude
 DISTINCT_MAG = 0.3  # if one of the stars that share a detection is this much brighter, the detection is named after it
 DECISIVE_BLEND_NATS = 12.0  # log-likelihood ratio that decides between two positions
 SIGNIFICANT_SNR = 10.0  # detections above this should have a catalogue star
@@ -37,37 +34,6 @@ def instrumental_mag(flux: Array) -> Array:
 def upper_median(values: Array) -> float:
     """The upper median of values (n,), in a third of the time of numpy.median."""
     return float(np.sort(values)[len(values) // 2])
-
-
-@njit(cache=True, nogil=True)
-def pair_mutually(detection, star, cost, agrees):  # type: ignore[no-untyped-def]
-    """Ascending indices of the pairs (k,) of least finite cost of their star and, where they agree, their detection.
-
-    `detection` ascends.
-    """
-    slots = 4
-    while slots < 2 * len(star):
-        slots *= 2
-    of_slot, is_best = np.full(slots, -1), np.zeros(len(star), np.bool_)
-    for i in range(len(star)):
-        if cost[i] < np.inf:
-            at = star[i] & (slots - 1)  # a hash table with open addressing
-            while of_slot[at] >= 0 and star[of_slot[at]] != star[i]:
-                at = (at + 1) & (slots - 1)
-            if of_slot[at] < 0 or cost[i] < cost[of_slot[at]]:
-                of_slot[at] = i
-    for i in of_slot:
-        if i >= 0:
-            is_best[i] = agrees[i]
-    kept, k = np.empty(len(star), np.int64), 0
-    for i in range(len(star)):
-        if is_best[i]:
-            if k == 0 or detection[kept[k - 1]] != detection[i]:
-                kept[k] = i
-                k += 1
-            elif cost[i] < cost[kept[k - 1]]:
-                kept[k - 1] = i
-    return kept[:k]
 
 
 def select_closest(detection: Ints, distance: Array) -> Ints:
@@ -156,9 +122,10 @@ class PhotometricScale:
     def from_matches(cls, flux_e: Array, saturated: Bools, v_mag: Array, detection: Ints) -> PhotometricScale:
         """Scale from stars of magnitudes `v_mag` (k,) that lie on the detections `detection` (k,)."""
         brightness = instrumental_mag(flux_e)
-        usable = ~saturated[detection]
-        if np.count_nonzero(usable) >= MIN_UNSATURATED:
-            v_mag, detection = v_mag[usable], detection[usable]
+        if saturated.any():
+            usable = ~saturated[detection]
+            if np.count_nonzero(usable) >= MIN_UNSATURATED:
+                v_mag, detection = v_mag[usable], detection[usable]
         measured = brightness + upper_median(v_mag - brightness[detection])
         faintest = float(measured.max())
         return cls(measured, saturated, faintest + DEPTH_BELOW_THRESHOLD_MAG, faintest)
@@ -166,10 +133,8 @@ class PhotometricScale:
 
 def brightness_agreement(v_mag: Array, measured_mag: Array, dimmed_mag: float = BRIGHTER_MAG) -> float:
     """Fraction of all pairs (star, detection) that agree in brightness, stars dimmed by at most `dimmed_mag`."""
-    ordered = np.sort(measured_mag)
-    first = np.searchsorted(ordered, v_mag - BRIGHTER_MAG)
-    last = np.searchsorted(ordered, v_mag + dimmed_mag)
-    return float((last - first).sum() / (len(v_mag) * len(ordered))) if len(v_mag) else 1.0
+    pairs = len(v_mag) * len(measured_mag)
+    return float(count_alike(v_mag, np.sort(measured_mag), dimmed_mag) / pairs) if pairs else 1.0
 
 
 @dataclass(frozen=True)
@@ -184,22 +149,9 @@ class CandidatePairs:
     scale: PhotometricScale
 
     @cached_property
-    def dimming_mag(self) -> Array:
-        """Magnitudes (k,) by which a detection is fainter than its star, beyond twice the catalogue's sigma."""
-        dimmed = self.scale.measured_mag[self.detection] - self.v_mag
-        dimmed[self.scale.saturated[self.detection] & (dimmed > 0)] = 0.0
-        beyond: Array = np.copysign(np.maximum(np.abs(dimmed) - 2 * self.v_sigma_mag, 0.0), dimmed)
-        return beyond
-
-    @cached_property
     def brightness_misfit(self) -> Array:
-        """Difference in brightness (k,) as a fraction of the limit: DIMMED_MAG or BRIGHTER_MAG."""
-        return np.maximum(self.dimming_mag / DIMMED_MAG, self.dimming_mag / -BRIGHTER_MAG)
-
-    @cached_property
-    def agrees_in_brightness(self) -> Bools:
-        """Whether star and detection (k,) may be equally bright."""
-        return self.brightness_misfit < 1.0
+        """Difference in brightness (k,), beyond twice the catalogue's sigma: DIMMED_MAG or BRIGHTER_MAG are 1."""
+        return self._compared[0]
 
     @cached_property
     def one_to_one_pairs(self) -> Ints:
@@ -207,9 +159,15 @@ class CandidatePairs:
 
         Distance and difference in brightness are added, PX_PER_MAG for a magnitude.
         """
-        cost = self.distance_px + PX_PER_MAG * np.abs(self.dimming_mag)
-        matched: Ints = pair_mutually(self.detection, self.star, cost, self.agrees_in_brightness)
-        return matched
+        return self._compared[1]
+
+    @cached_property
+    def _compared(self) -> tuple[Array, Ints]:
+        found: tuple[Array, Ints] = compare_pairs(
+            self.detection, self.star, self.distance_px, self.v_mag, self.v_sigma_mag,
+            self.scale.measured_mag[self.detection], self.scale.saturated[self.detection],
+        )  # fmt: skip
+        return found
 
     def select_unambiguous(self, which: Ints, variance_px2: Array, radius_px: float) -> Ints:
         """The one-to-one pairs `which` (m,) with an unambiguous star; `variance_px2` (m,) is per axis.
@@ -241,7 +199,7 @@ class CandidatePairs:
     def _is_decided(self, own: int, group: Ints, variance_px2: float) -> bool:
         """Whether the pair `own` explains its detection, and no nearly as bright star of the pairs `group` does."""
         squared = np.square(self.distance_px[group]) - self.distance_px[own] ** 2
-        if squared.min(initial=0.0) < -2 * DECISIVE_BLEND_NATS * variance_px2 or not self.agrees_in_brightness[own]:
+        if squared.min(initial=0.0) < -2 * DECISIVE_BLEND_NATS * variance_px2 or self.brightness_misfit[own] >= 1.0:
             return False
         rivals = (self.v_mag[group] < self.v_mag[own] + DISTINCT_MAG) & (self.star[group] != self.star[own])
         return not np.any(squared[rivals] < 2 * DECISIVE_BLEND_NATS * variance_px2)

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from startrack.core.kernels import njit
 from startrack.core.types import Array, Bools, Centroids, Ints
 from startrack.estimation.adjust import CHI2_2DOF_MEDIAN, SMALLEST_EXTRA_PX2, STAR_OUTLIER_CHI2
 from startrack.estimation.match import (
-    BRIGHTER_MAG,
     CandidatePairs,
     PhotometricScale,
     brightness_agreement,
-    upper_median,
 )
+from startrack.estimation.match_kernel import BRIGHTER_MAG
 from startrack.identification.attitude_search import (
     FIRST_GATE_PX,
     GATE_PX,
@@ -57,48 +57,84 @@ def refine_attitude(sources: Sources, hypothesis: AttitudeHypothesis) -> Attitud
     if near is None or near.depth < limit:
         near = sources.patterns.neighbours(sources.rays_cam @ R, sources.neighbour_radius_rad, limit)
     detection, star = near.ray, near.star
-    rays_icrs, v_mag = stars.rays_icrs[star], stars.v_mag[star]
+    rays_icrs, v_mag = stars.rays_icrs.take(star, axis=0), stars.v_mag[star]
     v_sigma_mag = stars.v_sigma_mag[star] + d.brightness_sigma_mag
-    xy_px = d.xy_px[detection]
+    xy_px = d.xy_px.take(detection, axis=0)
     for _ in range(MATCH_ROUNDS):
-        px, inside = sources.camera.project(rays_icrs @ R.T)
-        off = px - xy_px
-        distance = np.sqrt(np.einsum("ni,ni->n", off, off))
-        distance[~inside | (distance > GATE_PX)] = np.inf
+        distance = distances_in_gate(xy_px, *sources.camera.project(rays_icrs @ R.T))
         pairs = CandidatePairs(detection, star, distance, v_mag, v_sigma_mag, photometry)
         matched = pairs.one_to_one_pairs
         if len(matched) < MIN_MATCHES:
             return None
-        agree, variance = _select_inliers(pairs, matched, sources.variance_px2)
-        used = matched[agree]
-        if len(used) < MIN_MATCHES:
+        agree, variance, refined, change = rotate_by_inliers(
+            matched, detection, distance, sources.variance_px2, sources.rays_cam, rays_icrs, R
+        )
+        if np.count_nonzero(agree) < MIN_MATCHES:
             return None
-        refined = rotation_between(sources.rays_cam[detection[used]], rays_icrs[used], 1.0 / variance[agree])
-        if np.abs(refined - R).max() / scale.axis_rad_per_px < SETTLED_PX:
+        if change / scale.axis_rad_per_px < SETTLED_PX:
             break
         R = refined
     visible = stars.rays_icrs[:complete] @ R[2] > np.cos(sources.camera.max_angle_rad)
-    squared, misfit = np.square(pairs.distance_px[matched]), pairs.brightness_misfit[matched]
-    inlier = squared < np.maximum(INLIER_PX**2, STAR_OUTLIER_CHI2 * sources.variance_px2[detection[matched]])
-    # Position and brightness may not both be at the edge of what is allowed.
-    named = inlier & agree & (squared / (STAR_OUTLIER_CHI2 * variance) + misfit * misfit < 1.0)
+    inlier, named = name_matches(
+        matched, detection, distance, pairs.brightness_misfit, sources.variance_px2, agree, variance
+    )
     return AttitudeMatch(refined, pairs, matched, named, inlier, variance, stars.v_mag[:complete][visible])
 
 
-def _select_inliers(pairs: CandidatePairs, which: Ints, variance_px2: Array) -> tuple[Bools, Array]:
-    """Which of the pairs are no outliers, and their variance per axis [px^2], the common error added.
+@njit(cache=True, nogil=True)
+def distances_in_gate(xy_px, px, inside):  # type: ignore[no-untyped-def]
+    """Distances (k,) of detections (k, 2) and predicted stars (k, 2); infinite beyond GATE_PX and outside the frame."""
+    distance = np.empty(len(px))
+    for i in range(len(px)):
+        x, y = px[i, 0] - xy_px[i, 0], px[i, 1] - xy_px[i, 1]
+        distance[i] = np.sqrt(x * x + y * y)
+        if not inside[i] or distance[i] > GATE_PX:
+            distance[i] = np.inf
+    return distance
 
-    The common error is estimated as in `extra_variance_px2`, but in closed form: for one variance per star.
+
+@njit(cache=True, nogil=True)
+def rotate_by_inliers(which, detection, distance, variance_px2, rays_cam, rays_icrs, R):  # type: ignore[no-untyped-def]
+    """Which of the pairs `which` (m,) are no outliers (m,), their variance (m,), their attitude, its change from `R`.
+
+    The variance is per axis [px^2], the common error added. This is estimated as in `extra_variance_px2`, but in closed
+    form: for one variance per star. `detection`, `distance` (k,) and `rays_icrs` (k, 3) are of all pairs.
     """
-    distance = pairs.distance_px[which]
-    stated = variance_px2[pairs.detection[which]]
-    first = distance < FIRST_GATE_PX
-    if not first.any():
-        return first, stated
-    squared = np.square(distance)
-    extra = upper_median(squared[first]) / CHI2_2DOF_MEDIAN - upper_median(stated[first])
-    variance = stated + max(extra, SMALLEST_EXTRA_PX2)
-    return first & (squared < STAR_OUTLIER_CHI2 * variance), variance
+    m, n = len(which), 0
+    agree, variance, squared = np.zeros(m, np.bool_), np.empty(m), np.empty(m)
+    first_squared, first_stated = np.empty(m), np.empty(m)
+    for i in range(m):
+        variance[i], squared[i] = variance_px2[detection[which[i]]], distance[which[i]] ** 2
+        if distance[which[i]] < FIRST_GATE_PX:
+            first_squared[n], first_stated[n] = squared[i], variance[i]
+            n += 1
+    if n == 0:
+        return agree, variance, np.eye(3), np.inf
+    extra = np.sort(first_squared[:n])[n // 2] / CHI2_2DOF_MEDIAN - np.sort(first_stated[:n])[n // 2]
+    cam, icrs, weight, n = np.empty((m, 3)), np.empty((m, 3)), np.empty(m), 0
+    for i in range(m):
+        variance[i] += max(extra, SMALLEST_EXTRA_PX2)
+        agree[i] = distance[which[i]] < FIRST_GATE_PX and squared[i] < STAR_OUTLIER_CHI2 * variance[i]
+        if agree[i]:
+            weight[n] = 1.0 / variance[i]
+            for a in range(3):
+                cam[n, a], icrs[n, a] = rays_cam[detection[which[i]], a], rays_icrs[which[i], a]
+            n += 1
+    refined = rotation_between(cam[:n], icrs[:n], weight[:n])
+    return agree, variance, refined, np.abs(refined - R).max()
+
+
+@njit(cache=True, nogil=True)
+def name_matches(which, detection, distance, misfit, variance_px2, agree, variance):  # type: ignore[no-untyped-def]
+    """`inlier` and `named` (m,) of AttitudeMatch, of the pairs `which` (m,), of which some `agree` (m,)."""
+    inlier, named = np.empty(len(which), np.bool_), np.empty(len(which), np.bool_)
+    for i in range(len(which)):
+        squared, limit = distance[which[i]] ** 2, STAR_OUTLIER_CHI2 * variance_px2[detection[which[i]]]
+        inlier[i] = squared < max(INLIER_PX**2, limit)
+        # Position and brightness may not both be at the edge of what is allowed.
+        edge = squared / (STAR_OUTLIER_CHI2 * variance[i]) + misfit[which[i]] ** 2
+        named[i] = inlier[i] and agree[i] and edge < 1.0
+    return inlier, named
 
 
 def agreement_of(centroids: Centroids, v_mag: Array, measured_mag: Array, dimmed_mag: float = BRIGHTER_MAG) -> float:

@@ -19,7 +19,8 @@ from startrack.frames import wahba
 from startrack.identification.index import CatalogPatterns, PixelScale
 from startrack.identification.near_attitude import agreeing_pairs
 from startrack.identification.star_grid import Neighbours, rotation_between, settle_rotation
-from startrack.identification.triangles import PatternIndex, sides_of_few, triangles
+from startrack.identification.triangle_kernel import are_same_handed, sides_of_few
+from startrack.identification.triangles import PatternIndex, triangles
 
 PREFIXES = (0, 7, 10, 14, 20, 28)  # number of brightest detections that form triangles, round by round
 WINDOW_RANKS = 24  # ranks of brightness that form triangles beyond these, half of them new in each window
@@ -137,24 +138,19 @@ class AttitudeSearch:
         self, index: PatternIndex, first: int, fresh: int, end: int, tolerance: float
     ) -> Iterator[AttitudeHypothesis]:
         """From triangles of the detections `first` to `end` that have a vertex from the `fresh`-th of them on."""
-        vertices, sides = sides_of_few(self.rays_cam[first:end], fresh)
-        ordered = np.sort(sides, axis=1)
-        short = np.flatnonzero(ordered[:, 2] < index.longest_chord)
-        left, right = index.candidates(ordered[short], tolerance, MATCHES_EACH)
+        some = self.rays_cam[first:end]
+        vertices, sides = sides_of_few(some, fresh, index.longest_chord)
+        left, right = index.candidates(sides, tolerance, MATCHES_EACH)
         if len(left):
-            left = short[left]
-            order = np.argsort(sides[left], axis=1)
-            vertex = vertices[left[:, None], order] + first
-            icrs = index.rays_icrs[index.vertices[right]]
-            yield from self._test_triangles(self.rays_cam[vertex], icrs, index.handedness[right], first, tolerance)
+            cam, icrs = some[vertices[left]], index.rays_icrs[index.vertices[right]]
+            yield from self._test_triangles(cam, icrs, first, tolerance)
 
     def _attitudes_from_pairs(self, tolerance: float) -> Iterator[AttitudeHypothesis]:
         index, few = self.patterns.pairs, self.rays_cam[:PIVOTS]
         for pivot in range(len(few) - 2):
             image, catalogue = index.triangles(few[pivot:], tolerance)
             if len(image):
-                icrs = index.rays_icrs[catalogue]
-                yield from self._test_triangles(few[image + pivot], icrs, np.linalg.det(icrs), 0, tolerance)
+                yield from self._test_triangles(few[image + pivot], index.rays_icrs[catalogue], 0, tolerance)
 
     def _attitudes_from_short_triangles(self, tolerance: float) -> Iterator[AttitudeHypothesis]:
         index = self.patterns.deep_index
@@ -165,14 +161,12 @@ class AttitudeSearch:
         left, right = left[:MAX_ROUGH], right[:MAX_ROUGH]
         if len(left):
             cam, icrs = self.rays_cam[image.vertices[left]], index.rays_icrs[index.vertices[right]]
-            yield from self._test_triangles(cam, icrs, index.handedness[right], 0, tolerance)
+            yield from self._test_triangles(cam, icrs, 0, tolerance)
 
-    def _test_triangles(
-        self, cam: Array, icrs: Array, handedness: Array, first: int, tolerance: float
-    ) -> Iterator[AttitudeHypothesis]:
-        """Attitudes that rotate rays icrs (m, 3, 3), of this handedness (m,), to cam (m, 3, 3), by bright stars."""
+    def _test_triangles(self, cam: Array, icrs: Array, first: int, tolerance: float) -> Iterator[AttitudeHypothesis]:
+        """Attitudes that rotate rays icrs (m, 3, 3) to cam (m, 3, 3), tested by bright stars; no mirror images."""
         self.tried += len(cam)
-        same = np.linalg.det(cam) * handedness > 0
+        same = are_same_handed(cam, icrs)
         some = self.rays_cam[max(first - WINDOW_RANKS, 0) : first + PRETESTED]
         supported = self._supported_attitudes(cam[same], icrs[same], some, 2.0 * tolerance, self._depth(first))
         yield from self._test_attitudes(supported, first, 2.0 * tolerance)
@@ -207,7 +201,7 @@ class AttitudeSearch:
         the result is the same.
         """
         for _ in range(SETTLING_LOOKUPS):
-            pairs = self.rays_cam[near.ray], self.patterns.stars.rays_icrs[near.star]
+            pairs = self.rays_cam.take(near.ray, axis=0), self.patterns.stars.rays_icrs.take(near.star, axis=0)
             before, (R, hit) = R, settle_rotation(*pairs, near.chord < radius, radius**2)
             if np.abs(R - before).max() < MAX_DRIFT_PX * self.scale.axis_rad_per_px:
                 break

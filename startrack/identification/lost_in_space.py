@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from math import log, sqrt
 
 import numpy as np
 
@@ -18,7 +19,8 @@ from startrack.estimation.false_alarm import (
     log_trials,
     probability,
 )
-from startrack.estimation.match import DIMMED_MAG, SIGNIFICANT_SNR, upper_median
+from startrack.estimation.match import SIGNIFICANT_SNR, upper_median
+from startrack.estimation.match_kernel import DIMMED_MAG
 from startrack.identification.attitude_refinement import AttitudeMatch, agreement_of, refine_attitude
 from startrack.identification.attitude_search import (
     FIRST_GATE_PX,
@@ -125,17 +127,17 @@ class Identifier:
         named_distance = distance[match.named]
         if len(named_distance) < MIN_MATCHES:
             raise NotIdentified(f"only {len(named_distance)} stars match", matched=len(named_distance))
-        rms_px = float(np.sqrt(0.5 * (named_distance @ named_distance) / len(named_distance)))
+        rms_px = sqrt(0.5 * (named_distance @ named_distance) / len(named_distance))
         radius_px = min(FIRST_GATE_PX, max(TOLERANCE_SIGMAS * rms_px, SMALLEST_RADIUS_PX))
         hits = int(np.count_nonzero(distance < radius_px))
         log_p = self._log_p_value(match, hits, radius_px, sources) + log_trials(tried)
-        if log_p > np.log(self.max_false_alarm):
+        if log_p > log(self.max_false_alarm):
             raise NotIdentified(f"the {hits} stars that match might do so by chance", matched=hits)
         if self.whole_field:
             # A camera that fits only a part of the field biases the attitude: by 0.8 degrees for 1 % of focal length.
             bright = match.inlier[pairs.detection[match.matched] < BRIGHT_DETECTIONS]
             inliers, near = int(np.count_nonzero(bright)), len(bright)
-            if inliers < INLIER_FRACTION * near - 3.0 * np.sqrt(INLIER_FRACTION * (1 - INLIER_FRACTION) * near):
+            if inliers < INLIER_FRACTION * near - 3.0 * sqrt(INLIER_FRACTION * (1 - INLIER_FRACTION) * near):
                 raise _WrongCamera(
                     f"only {inliers} of {near} bright stars lie within {INLIER_PX:g} px of where the camera file puts "
                     f"them, the others up to {GATE_PX:g} px off: it is not the calibration of this lens",

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
-from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from startrack.core.types import Array, Ints, Stars
 from startrack.identification.star_grid import StarGrid
+from startrack.identification.triangle_kernel import keep_closest
 
 CLOSE_PAIR_RAD = np.radians(0.05)  # stars this close are one detection
 LONGEST_SIDE_OF_FIELD = 0.8  # of a field's diameter: longer sides seldom fit into it
@@ -53,27 +52,6 @@ def triangles(rays: Array, longest_rad: float, most: int = 2_000_000) -> Triangl
     volume = np.linalg.det(rays[vertices])
     good = (np.abs(volume) > 0.05 * sides[:, 2] ** 2 * 0.5) & (np.diff(sides, axis=1).min(axis=1) > 0.01 * sides[:, 2])
     return Triangles(vertices=vertices[good], sides_rad=sides[good], handedness=np.sign(volume[good]))
-
-
-def sides_of_few(rays: Array, fresh: int = 0) -> tuple[Ints, Array]:
-    """All triples (m, 3) of a few dozen rays with a vertex from index `fresh` on, and their opposite sides (m, 3).
-
-    Sides are chords in the order of the vertices; the caller sorts those that it needs.
-    """
-    i, j, vertices, opposite = _combinations(len(rays), fresh)
-    apart = rays[i] - rays[j]
-    return vertices, np.sqrt(np.einsum("ni,ni->n", apart, apart))[opposite]
-
-
-@lru_cache(maxsize=64)
-def _combinations(n: int, fresh: int) -> tuple[Ints, Ints, Ints, Ints]:
-    """Pairs i < j, triples (m, 3), and for each vertex of a triple the index of the opposite pair."""
-    i, j = np.triu_indices(n, 1)
-    number = np.zeros((n, n), dtype=np.int64)
-    number[i, j] = np.arange(len(i))
-    triples = [t for t in combinations(range(n), 3) if t[2] >= fresh]
-    a, b, c = np.array(triples, dtype=np.int64).reshape(-1, 3).T
-    return i, j, np.stack([a, b, c], axis=1), np.stack([number[b, c], number[a, c], number[a, b]], axis=1)
 
 
 def triad_attitude(cam: Array, icrs: Array) -> Array:
@@ -162,7 +140,6 @@ class PatternIndex:
     rays_icrs: Array  # (m, 3) of the pattern stars
     longest_chord: float  # of the sides
     vertices: Ints  # (n, 3) indices into rays_icrs, ordered by the opposite side, shortest first
-    handedness: Array  # (n,) sign of the triple product
     sides: Array  # (n, 3) chords, ascending
     grid: StarGrid  # of the sides as points of a cube, by `to_cube`
 
@@ -173,16 +150,7 @@ class PatternIndex:
         """
         reach = CUBE_DIAGONAL * tolerance * 2.0 / self.longest_chord
         near = self.grid.neighbours(to_cube(sides, self.longest_chord), reach)
-        row, found = near.ray, near.star
-        off = np.abs(sides[row] - self.sides[found]).max(axis=1)
-        best = np.argsort(off / sides[row, 0], kind="stable")
-        best = best[off[best] < tolerance]
-        row, found = row[best], found[best]
-        if len(row) and np.bincount(row).max() > most:
-            rank = np.argsort(row, kind="stable")
-            first = np.searchsorted(row[rank], row[rank])
-            kept = np.sort(rank[np.arange(len(rank)) - first < most])
-            row, found = row[kept], found[kept]
+        row, found = keep_closest(sides, self.sides, near.ray, near.star, tolerance, most)
         return row, found
 
 
@@ -201,9 +169,7 @@ def build_index(stars: Stars, field_sr: float, size: PatternSize) -> PatternInde
     found = triangles(rays, longest_side)
     sides = 2 * np.sin(found.sides_rad / 2)
     longest_chord = float(2 * np.sin(longest_side / 2))
-    return PatternIndex(
-        rays, longest_chord, found.vertices, found.handedness, sides, StarGrid(to_cube(sides, longest_chord))
-    )
+    return PatternIndex(rays, longest_chord, found.vertices, sides, StarGrid(to_cube(sides, longest_chord)))
 
 
 @dataclass(frozen=True)

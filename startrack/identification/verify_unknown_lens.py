@@ -16,7 +16,6 @@ from startrack.estimation.false_alarm import (
     log_trials,
 )
 from startrack.estimation.match import (
-    BRIGHTER_MAG,
     DEPTH_BELOW_THRESHOLD_MAG,
     MIN_UNSATURATED,
     SIGNIFICANT_SNR,
@@ -24,6 +23,7 @@ from startrack.estimation.match import (
     is_isolated,
     match_by_brightness,
 )
+from startrack.estimation.match_kernel import BRIGHTER_MAG
 from startrack.identification.attitude_refinement import agreement_of
 from startrack.identification.attitude_search import GATE_PX, INLIER_PX, ONE_SOURCE_SIGMAS
 from startrack.identification.region_growing import FEWEST, GATE_OVER_SIGMA, fit_camera, match_in_view, with_file_lens

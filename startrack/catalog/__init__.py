@@ -5,6 +5,7 @@ from startrack.catalog.sky import (
     MOST_BELOW_PART,
     Sky,
     airmass,
+    airmass_at,
     apparent_bodies,
     apparent_elevation_rad,
     bodies,
@@ -22,7 +23,7 @@ from startrack.catalog.stars import (
 )
 
 __all__ = [
-    "LOWEST_STAR_RAD", "MOST_BELOW_PART", "Sky", "StarCatalog", "airmass", "apparent_bodies",
+    "LOWEST_STAR_RAD", "MOST_BELOW_PART", "Sky", "StarCatalog", "airmass", "airmass_at", "apparent_bodies",
     "apparent_elevation_rad", "bodies", "has_deep_catalog", "hipparcos_rows_in_deep", "is_below_horizon",
     "load_catalog", "load_deep_catalog", "proper_name_designations", "sky_at", "star_names",
 ]  # fmt: skip

@@ -95,6 +95,13 @@ def airmass(elevation_rad: Array) -> Array:
     return 1.0 / (s + 0.025 * np.exp(-11.0 * s))
 
 
+def airmass_at(rays_enu: Array, site: Site | None) -> Array | None:
+    """Airmass (n,) of lines of sight `rays_enu` (n, 3) from a `site` on the Earth; None where there is no air."""
+    if site is None or site.body != "earth":
+        return None
+    return airmass(np.maximum(azel_from_rays(rays_enu)[1], 0.0))
+
+
 def is_below_horizon(rays_icrs: Array, site: Site, time_utc: datetime) -> Bools:
     """Whether stars in the directions `rays_icrs` (n, 3) are below the horizon of a `site` at `time_utc`."""
     return np.asarray(azel_from_rays(rays_icrs @ R_enu_icrs(site, time_utc).T)[1] < LOWEST_STAR_RAD)

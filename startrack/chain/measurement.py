@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from startrack.catalog import has_deep_catalog, hipparcos_rows_in_deep, load_catalog, load_deep_catalog
+from startrack.catalog import airmass_at, has_deep_catalog, hipparcos_rows_in_deep, load_catalog, load_deep_catalog
 from startrack.chain.orientation import require_time_and_site
 from startrack.chain.stages import Located, Measured, Oriented, Settings, StarFix, StarRays, extend
 from startrack.core.types import Array, Detections, Evidence, Ints, Stars
@@ -79,7 +79,8 @@ def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
     if not np.array_equal(oriented.stars.hip, load_catalog().hip):
         return oriented
     found, when = oriented.identification, oriented.exposure.time_utc
-    scale = flux_scale(oriented.detections, oriented.camera, oriented.stars, found)
+    R_cam_icrs = oriented.attitude_fit.attitude.R_cam_icrs
+    scale = flux_scale(oriented.detections, oriented.camera, oriented.stars, found, R_cam_icrs)
     limiting_mag = scale.zero_mag - 2.5 * np.log10(SURE_SIGMAS * filtered_noise_e(oriented.detections))
     if when is None or limiting_mag < COMPLETE_V_MAG or not has_deep_catalog():
         return oriented
@@ -158,16 +159,19 @@ def _photometry(
     visible: Array | None = None,
 ) -> StarPhotometry:
     """Photometry of all stars, or of those with the indices `only`; 0 evidence where the terrain is not known."""
+    R, stars = oriented.attitude_fit.attitude.R_cam_icrs, oriented.stars
+    air = airmass_at(oriented.stars.rays_icrs @ R_enu_icrs.T, terrain.site)
     light = photometry(
         detections,
         oriented.camera,
-        oriented.stars if only is None else oriented.stars.take(only),
+        stars if only is None else stars.take(only),
         list(oriented.bodies),
-        oriented.attitude_fit.attitude.R_cam_icrs,
+        R,
         R_enu_icrs,
-        flux_scale(oriented.detections, oriented.camera, oriented.stars, oriented.identification),
+        flux_scale(oriented.detections, oriented.camera, stars, oriented.identification, R, air),
         oriented.attitude_fit.extra_sigma_px,
         visible,
+        air if air is None or only is None else air[only],
     )
     light = light if only is None else replace(light, star=only[light.star])
     rays = light.azimuth_rad, light.elevation_rad

@@ -13,15 +13,12 @@ from startrack.chain.stages import Detected, Identified, Inputs, Oriented, Setti
 from startrack.core.compilation import announce_compilation
 from startrack.core.types import Array, BadInput, Exposure, NotIdentified, Stars, TooFewStars
 from startrack.detection import Detector
-from startrack.estimation.attitude import AttitudeFit, solve_attitude
+from startrack.estimation.lens_correction import correct_lens
 from startrack.exposure import NO_TIME, are_fractions
 from startrack.frames import Site, observer_velocity_m_s
 from startrack.identification import check_single_field
 from startrack.terrain import Terrain
 
-LEAST_SHIFT_PX, MOST_SHIFT_PX = 0.1, 8.0  # of the image's centre; a larger one is another camera
-SHIFT_CHI2 = 30.0  # of a shift in two coordinates: one in three million by chance
-SHIFT_ROUNDS = 3  # stars that the shift made outliers come back
 ANYWHERE = Site("moon", 0.0, 0.0)  # used for an unknown site: 0.7 arcsec of aberration at most
 
 
@@ -119,36 +116,20 @@ def identify_unknown_lens(detected: Detected, fovs_rad: Array, catalog: StarCata
 def solve_orientation(identified: Identified) -> Oriented:
     """The attitude that fits the `identified` stars. Raises NotIdentified.
 
-    Where the stars show that the image stands off the centre that the camera file states, as of a loose sensor, the
-    value's camera has the centre by the stars.
+    Where the stars show that the lens differs from its file the value's camera is the corrected one.
     """
-    camera, fit = identified.camera, _fit_attitude(identified, identified.camera)
-    offset_px = fit.centre_shift_px
-    if LEAST_SHIFT_PX < np.linalg.norm(offset_px) < MOST_SHIFT_PX and fit.centre_chi2 > SHIFT_CHI2:
-        for _ in range(SHIFT_ROUNDS):
-            x, y = np.array(identified.camera.centre_px) + offset_px
-            camera = replace(identified.camera, centre_px=(float(x), float(y)))
-            fit = _fit_attitude(identified, camera)
-            offset_px = offset_px + fit.centre_shift_px
-    moved_px = float(np.linalg.norm(np.subtract(camera.centre_px, identified.camera.centre_px)))
-    return extend(identified, Oriented, camera=camera, attitude_fit=fit, centre_shift_px=moved_px)
+    found, detections = identified.identification, identified.detections
+    camera, fit, change_px = correct_lens(
+        identified.camera, detections.xy_px[found.detection], detections.covariance_px2[found.detection],
+        identified.stars.rays_icrs[found.star], found.R_cam_icrs,
+    )  # fmt: skip
+    return extend(identified, Oriented, camera=camera, attitude_fit=fit, lens_change_px=change_px)
 
 
 def check_one_attitude(oriented: Oriented) -> None:
     """Raises NotLocated (inconsistent_evidence) where the sources of `oriented` show a second attitude, too."""
     known = replace(oriented.identification, R_cam_icrs=oriented.attitude_fit.attitude.R_cam_icrs)
     check_single_field(oriented.detections, oriented.camera, oriented.stars, known)
-
-
-def _fit_attitude(identified: Identified, camera: Camera) -> AttitudeFit:
-    found, detections = identified.identification, identified.detections
-    return solve_attitude(
-        camera,
-        detections.xy_px[found.detection],
-        detections.covariance_px2[found.detection],
-        identified.stars.rays_icrs[found.star],
-        found.R_cam_icrs,
-    )
 
 
 def stars_at(catalog: StarCatalog, when: datetime | None, site: Site | None) -> Stars:

@@ -44,6 +44,7 @@ from startrack.terrain import Terrain
 
 EVIDENCE_SOURCES = ("both", "stars", "sky")  # of a position; "sky" begins with a fix by the stars
 UNKNOWN_TIME_SIGMA_RAD = np.radians(60 / 3600)  # aberration and proper motion left out
+SHOWN_CHANGE_PX = 0.1
 STAGES = ("read", "detect", "identify", "attitude", "evidence", "locate")  # keys of `timing_ms`
 T = TypeVar("T")
 
@@ -136,13 +137,13 @@ class Oriented(Identified):
     """Identified stars with the attitude of the camera among the stars."""
 
     attitude_fit: AttitudeFit
-    centre_shift_px: float = 0.0  # by which `camera` has its centre off that of the camera file, as the stars show it
+    lens_change_px: float = 0.0  # by which `camera` differs from the camera file, as the stars show it; RMS
 
     @property
     def warnings(self) -> list[str]:
-        """Those of `Inputs`, and the shift of the image."""
-        shift = f"the image stands {self.centre_shift_px:.2f} px off the camera file's centre: corrected by the stars"
-        return [*super().warnings, *([shift] if self.centre_shift_px else [])]
+        """Those of `Inputs`, and the difference of the lens from its file."""
+        text = f"the lens differs from the camera file by {self.lens_change_px:.2f} px (RMS): corrected by the stars"
+        return [*super().warnings, *([text] if self.lens_change_px > SHOWN_CHANGE_PX else [])]
 
     @property
     def attitude(self) -> Attitude:

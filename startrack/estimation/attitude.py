@@ -9,7 +9,7 @@ import numpy as np
 from startrack.camera import Camera, lens_jacobian
 from startrack.core.types import Array, Attitude, Bools, NotIdentified
 from startrack.estimation.adjust import HUBER_WITH_CUT, MIN_ATTITUDE_STARS, STAR_OUTLIER_CHI2, Scheme, State, adjust
-from startrack.estimation.normal_equations import NormalEquations, Terms, observations_of_image
+from startrack.estimation.normal_equations import Terms, observations_of_image
 
 MIN_FOR_SCATTER = 30  # stars from which the scatter of the residuals is a better covariance than the stated one
 SCHEME = Scheme(loss=HUBER_WITH_CUT, steps=12, estimates_extra=True)
@@ -25,8 +25,7 @@ class AttitudeFit:
     used: Bools  # (n,) not rejected as outliers
     rms_px: float  # of the used stars, per axis
     extra_sigma_px: float  # error per axis beyond the stated centroid errors (lens, blends, catalogue)
-    centre_shift_px: Array  # (2,) by which the image stands off the camera's centre, by the used stars
-    centre_chi2: float  # of that shift, which is fitted beside a rotation: two degrees of freedom; 0 of few stars
+    weight: Array  # (m, 2, 2) inverse covariances of the used stars, times the factor of the robust loss
 
 
 def solve_attitude(
@@ -46,24 +45,14 @@ def solve_attitude(
     used = found.chi2 < STAR_OUTLIER_CHI2
     pose, weight, residual = found.terms.pose[used], found.weight[used], found.residual_px[used]
     by_stars = _covariance_by_stars(pose, found.inverse[used], weight, residual)
-    rays_cam = found.state.rays_cam(points)[used]
-
-    def equations_with(free: tuple[str, ...]) -> NormalEquations:
-        """The equations of the used stars with the lens parameters `free` beside the attitude."""
-        terms = Terms(lens_jacobian(camera, rays_cam, free), pose, np.zeros(len(pose), dtype=np.int64), 1)
-        return terms.normal_equations(weight, residual)
-
     by_lens = np.zeros((3, 3))
     if camera.covariance is not None:
         # For a lens fitted to these very stars the sum of both covariances is the marginal of the joint fit, provided
         # that the camera's covariance is its marginal too (the inverse of a matrix in blocks).
-        (response,) = equations_with(camera.covariance_order).pose_by_lens
+        lens = lens_jacobian(camera, found.state.rays_cam(points)[used], camera.covariance_order)
+        terms = Terms(lens, pose, np.zeros(len(pose), dtype=np.int64), 1)
+        (response,) = terms.normal_equations(weight, residual).pose_by_lens
         by_lens = response @ camera.covariance @ response.T
-    centre_shift, centre_chi2 = np.zeros(2), 0.0
-    if len(residual) >= MIN_FOR_SCATTER:
-        shifted = equations_with(("cx", "cy"))
-        centre_shift, _ = shifted.solve()
-        centre_chi2 = float(centre_shift @ np.linalg.solve(shifted.lens_covariance, centre_shift))
     return AttitudeFit(
         attitude=Attitude(R_cam_icrs=found.state.R_cam_icrs[0], covariance_rad2=by_stars + by_lens),
         centroid_covariance_rad2=by_stars,
@@ -71,8 +60,7 @@ def solve_attitude(
         used=used,
         rms_px=float(np.sqrt(np.mean(residual**2))),
         extra_sigma_px=float(np.sqrt(found.extra_px2)),
-        centre_shift_px=centre_shift,
-        centre_chi2=centre_chi2,
+        weight=weight,
     )
 
 

@@ -1,8 +1,10 @@
 """Exposure, attitude and catalogue to rays, each with the log-likelihood ratio of sky against ground."""
 
 from startrack.evidence.double_exposure import check_single_skyline
-from startrack.evidence.expected_stars import SURE_SIGMAS, FluxScale, expect_stars, expected_flux_scale, flux_scale
+from startrack.evidence.expected_stars import expect_stars
+from startrack.evidence.flux_scale import FluxScale, expected_flux_scale, flux_scale
 from startrack.evidence.photometry import (
+    SURE_SIGMAS,
     Photometry,
     Sources,
     half_width,

@@ -2,7 +2,8 @@
 
 Where it moved and kept its attitude among the stars, both parts show one sky above two skylines. A star above both
 shines with all its light, one above a single skyline with the part of the exposure in which that was there, and one
-below both not at all. A single skyline makes no star shine with a part of its light. (The light of the sky has two
+below both not at all. A single skyline dims stars only within a narrow band, the same all around, where it is soft
+(trees, haze, blur). (The light of the sky has two
 steps then; it does not decide here, as dust, glare and the ground's own light make steps, too.)
 
 "Two positions and the parts of the exposure there" is compared with "one position", and with "each star between the
@@ -17,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.core.types import Array, Bools, NotLocated
-from startrack.evidence.expected_stars import CLIPPED_SIGMAS
+from startrack.evidence.photometry import CLIPPED_SIGMAS
 from startrack.evidence.sky_step import SKYLINE_POINTS, Skyline
 from startrack.evidence.star_evidence import StarPhotometry
 from startrack.terrain import Terrain
@@ -26,6 +27,7 @@ PRIOR = 1e-3  # that a frame is a double exposure
 DECISIVE = 1 / PRIOR  # ratio of the weights, with the prior, from which a frame is refused
 EXPOSURE_PARTS = np.linspace(0.2, 0.8, 7)  # at the first position; an error of the scale feigns nine tenths
 LIGHT = np.concatenate([[0.0], EXPOSURE_PARTS, [1.0]])  # of a star: hidden, dimmed and visible
+SOFT_RAD = np.radians([0.03, 0.1, 0.3])  # widths of a soft skyline: a third of a pixel of a fisheye to two, trees
 LEAST_SNR = 3.0  # of a star whose light shows a part
 SCREENED_RAD = np.radians([0.25, 0.5, 1.0, 2.0, 4.0])  # from the skyline: bands in which dimmed stars are counted first
 SCREENED_SHARES = np.array([0.03, 0.1, 0.3, 0.8])  # of dimmed stars in a band
@@ -86,11 +88,28 @@ class _Rows:
 
     def find_above(self, terrain: Terrain, points_m: Array) -> Array:
         """1 where a star is above the skyline of a point (m, 2), else 0: (m, n)."""
-        return np.where(self.elevation_rad > terrain.horizon_rad(points_m[:, None], self.azimuth_rad), 1.0, 0.0)
+        return np.where(self.find_height(terrain, points_m) > 0.0, 1.0, 0.0)
+
+    def find_height(self, terrain: Terrain, points_m: Array) -> Array:
+        """Heights (m, n) [rad] of the stars above the skylines of points (m, 2)."""
+        return np.asarray(self.elevation_rad - terrain.horizon_rad(points_m[:, None], self.azimuth_rad))
 
     def single_fits(self, above: Array) -> Array:
         """Log-likelihoods (m,) of single skylines, `above` (m, n)."""
         return self.hidden.sum() + above @ (self.visible - self.hidden)
+
+    def soft_fits(self, above_rad: Array) -> Array:
+        """Log-likelihoods (m,) of single skylines that are soft, the best of several widths; `above_rad` (m, n)."""
+        from scipy.special import ndtr
+
+        logs = np.concatenate([self.hidden[:, None], self.dimmed, self.visible[:, None]], axis=1)
+        star = np.arange(len(logs))
+        fits = []
+        for width_rad in SOFT_RAD:
+            part = ndtr(above_rad / width_rad)
+            nearest = np.abs(part[..., None] - LIGHT).argmin(axis=-1)
+            fits.append(logs[star, nearest].sum(axis=-1))
+        return np.max(fits, axis=0)
 
     def pair_fits(self, first: Array, second: Array) -> Array:
         """Log-likelihoods (m, len(EXPOSURE_PARTS)) of pairs of skylines, `first` and `second` (m, n)."""
@@ -156,7 +175,8 @@ def _best_pair(rows: _Rows, terrain: Terrain, position_m: Array) -> DoubleExposu
         return np.where(terrain.allowed(pairs_m).all(axis=1), fits, -np.inf)
 
     def one(points_m: Array) -> Array:
-        return rows.single_fits(rows.find_above(terrain, points_m[:, 0]))
+        height_rad = rows.find_height(terrain, points_m[:, 0])
+        return np.maximum(rows.single_fits(np.where(height_rad > 0.0, 1.0, 0.0)), rows.soft_fits(height_rad))
 
     steps_m = CLIMB_STEPS * terrain.search_radius_m
     starts = pairs[np.argsort(-two(pairs), kind="stable")[:CLIMBS]]

@@ -8,16 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
-from startrack.core.statistics import robust_sigma
-from startrack.core.types import Array, Body, Detections, Identification, Ints, Mask, Stars
-from startrack.evidence.photometry import SURE_SIGMAS, Sources, half_width
+from startrack.core.types import Array, Body, Ints, Mask, Stars
+from startrack.evidence.flux_scale import LN_PER_MAG, FluxScale
+from startrack.evidence.photometry import Sources, half_width
 from startrack.exposure import touch_masked
 from startrack.frames import angle_between_rad, azel_from_rays, off_axis_rad
 from startrack.psf import noise_area_px
 
-SCALE_SNR, SCALE_STARS = 15.0, 5  # of the stars that give the scale, and their least number
-MIN_SCATTER = 0.02
-CLIPPED_SIGMAS = 4.0  # of values about a fit, in a round
 MIN_SNR = 0.6  # a sixth of the time less than with 0.5; mean errors grow by 2 % (60 frames, with the sky's light)
 MIN_PSF_AREAS_PER_STAR = 2.0  # with more stars in the pixels the same light would be counted twice
 BODY_GLARE_PX = 8.0
@@ -25,21 +22,6 @@ DISKS_RAD = {"Sun": 0.0047, "Moon": 0.0049, "Earth": 0.0180}  # largest radii, t
 VIEW_MARGIN_RAD = 1e-6  # for rounding
 CAUSES = ("", "edge of the image circle", "beyond the calibrated angle", "off the frame", "bad pixels", "masked")
 USABLE, EDGE_OF_CIRCLE, NOT_CALIBRATED, OFF_FRAME, BAD_PIXELS, MASKED = range(len(CAUSES))
-
-
-@dataclass(frozen=True)
-class FluxScale:
-    """Expected flux of a star: 10^(-0.4 (V - zero_mag)) times the lens's throughput and a residual radial trend."""
-
-    zero_mag: float  # V of a star of one electron (or ADU)
-    trend_per_rad2: float  # natural log of throughput per squared angle off the axis, beyond the camera file's
-    scatter: float  # relative scatter of bright stars about the scale
-    stars: int  # that defined it
-
-    def flux_e(self, v_mag: Array, angle_rad: Array, camera: Camera) -> Array:
-        """Expected flux (n,) of stars of `v_mag` (n,) at `angle_rad` (n,) off the axis of a `camera`."""
-        throughput = camera.sensor.throughput(angle_rad) if camera.sensor is not None else 1.0
-        return 10 ** (-0.4 * (v_mag - self.zero_mag)) * throughput * np.exp(self.trend_per_rad2 * np.square(angle_rad))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,55 +51,6 @@ class ExpectedStars:
         )  # fmt: skip
 
 
-def flux_scale(detections: Detections, camera: Camera, stars: Stars, found: Identification) -> FluxScale:
-    """Scale from the bright identified stars: median, robust scatter, and a radial trend only where it is significant.
-
-    `found` says which of the `detections` is which of the stars; the `camera` has the throughput of the lens.
-    """
-    d, s = found.detection, found.star
-    trusted = (detections.snr[d] > SCALE_SNR) & ~detections.saturated[d] & (stars.v_sigma_mag[s] < 0.1)
-    if trusted.sum() < SCALE_STARS:
-        trusted = ~detections.saturated[d] if (~detections.saturated[d]).any() else np.ones(len(d), dtype=bool)
-    d, s = d[trusted], s[trusted]
-    angle = camera.angle_rad(detections.xy_px[d])
-    throughput = camera.sensor.throughput(angle) if camera.sensor is not None else np.ones(len(d))
-    log_flux = np.log(detections.flux_e[d] / np.maximum(throughput, 1e-3))
-    offset = log_flux + 0.4 * np.log(10) * stars.v_mag[s]
-    trend = _trend(offset, np.square(angle))
-    rest = offset - trend * np.square(angle)
-    middle = float(np.median(rest))
-    scatter = robust_sigma(rest, middle)
-    noise = float(np.median(detections.flux_sigma_e[d] / detections.flux_e[d]))
-    intrinsic = max(float(np.sqrt(max(scatter**2 - noise**2, 0.0))), MIN_SCATTER)
-    return FluxScale(middle / (0.4 * np.log(10)), trend, intrinsic, len(d))
-
-
-def expected_flux_scale(zero_mag: float, noise_e: float, v_mag: Array, error_mag: Array) -> FluxScale:
-    """The scale that the bright ones of visible stars would show, for `zero_mag` and `noise_e` of a star's flux.
-
-    `v_mag` (n,) are magnitudes of the catalogue and `error_mag` (n,) their errors.
-    """
-    error = error_mag[v_mag < zero_mag - 2.5 * np.log10(SCALE_SNR * noise_e)]
-    if len(error) < SCALE_STARS:
-        return FluxScale(zero_mag, 0.0, MIN_SCATTER, len(error))
-    scatter = 0.4 * np.log(10) * robust_sigma(error)
-    return FluxScale(zero_mag - float(np.median(error)), 0.0, max(scatter, MIN_SCATTER), len(error))
-
-
-def _trend(offset: Array, angle2: Array) -> float:
-    """Slope of the offsets over the squared angle, clipped once; 0 unless it is significant."""
-    if len(offset) < 30:
-        return 0.0
-    keep = np.abs(offset - np.median(offset)) < CLIPPED_SIGMAS * robust_sigma(offset) + 1e-6
-    x, y = angle2[keep] - angle2[keep].mean(), offset[keep] - offset[keep].mean()
-    spread = float(x @ x)
-    if spread <= 0:
-        return 0.0
-    slope = float(x @ y) / spread
-    sigma = float(np.sqrt(np.mean(np.square(y - slope * x)) / spread))
-    return slope if abs(slope) > SURE_SIGMAS * sigma else 0.0
-
-
 def expect_stars(
     camera: Camera,
     stars: Stars,
@@ -130,6 +63,7 @@ def expect_stars(
     noise_e: float,
     position_sigma_px: float = 0.0,
     mask: Mask | None = None,
+    air: Array | None = None,
 ) -> ExpectedStars:
     """The stars in view of a camera and their expected light.
 
@@ -145,6 +79,7 @@ def expect_stars(
             faintest where they are too many for the image.
         position_sigma_px: error of the predicted pixels per axis.
         mask: pixels that do not count.
+        air: airmasses (len(stars),) of the stars; None without air.
     """
     near_axis = stars.rays_icrs @ R_cam_icrs[2] > np.cos(min(camera.max_angle_rad + VIEW_MARGIN_RAD, np.pi))
     star = np.flatnonzero(near_axis & (stars.v_mag < scale.zero_mag - 2.5 * np.log10(MIN_SNR * max(noise_e, 1e-9))))
@@ -155,7 +90,7 @@ def expect_stars(
     room = max(int(area_px2 / (MIN_PSF_AREAS_PER_STAR * noise_area_px(psf_sigma_px))), 1)
     brightest = np.flatnonzero(inside)[:room]
     star, xy, rays_cam = star[brightest], xy[brightest], rays_cam[brightest]
-    angle = off_axis_rad(rays_cam)
+    angle, through = off_axis_rad(rays_cam), None if air is None else air[star]
     # A misplaced profile loses light. The rays do not depend on the lens: they are the catalogue's.
     misplaced2 = position_sigma_px**2 + (
         np.square(camera.projection_sigma_px(rays_cam)) if camera.covariance_order else 0.0
@@ -171,8 +106,12 @@ def expect_stars(
         xy_px=xy,
         azimuth_rad=azimuth,
         elevation_rad=elevation,
-        expected_e=scale.flux_e(stars.v_mag[star], angle, camera),
-        fraction_sigma=np.sqrt(scale.scatter**2 + np.square(0.4 * np.log(10) * stars.v_sigma_mag[star]) + blur**2),
+        expected_e=scale.flux_e(stars.v_mag[star], rays_cam, camera, through),
+        fraction_sigma=np.sqrt(
+            np.square(scale.fraction_sigma(rays_cam, camera, through))
+            + np.square(LN_PER_MAG * stars.v_sigma_mag[star])
+            + blur**2
+        ),  # fmt: skip
         cause_code=cause,
         causes=(*CAUSES, *(f"beside {body.name}" for body in bodies)),
     )

@@ -20,6 +20,7 @@ from startrack.psf import pixel_profile_table, stamp_radius
 ZERO, ONE = np.float32(0.0), np.float32(1.0)  # literals would be of double precision
 LEAST = np.finfo(np.float32).tiny  # of a divisor
 SURE_SIGMAS = 5.0  # from here on chance is excluded: two in a million
+CLIPPED_SIGMAS = 4.0  # of values about a fit, in a round
 OUTLIER_VARIANCES = np.float32(SURE_SIGMAS**2)
 MODEL_VARIANCE = np.float32(0.05**2)  # of a star's squared light, pixel by pixel: the real PSF is no Gaussian
 MAX_MASKED_PX = 6  # a stamp with more deviant pixels is not a star on a smooth background

@@ -19,7 +19,7 @@ import numpy as np
 from startrack.core.kernels import njit, normal_cdf
 from startrack.core.statistics import relative_weights, robust_sigma
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Bools, Evidence, sector_of
-from startrack.evidence.expected_stars import SURE_SIGMAS
+from startrack.evidence.photometry import SURE_SIGMAS
 from startrack.evidence.sky_pixels import CLIP_SIGMAS, GROUND, LEVEL_SECTORS, SKY, SkyLevels, SkyPixels, measure_levels
 from startrack.evidence.sky_step import Horizon
 from startrack.evidence.star_evidence import SEEN_LLR

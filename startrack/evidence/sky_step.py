@@ -20,7 +20,7 @@ from startrack.core.kernels import njit
 from startrack.core.smooth_image import SmoothImage
 from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Bools, Detections, Ints
-from startrack.evidence.expected_stars import SURE_SIGMAS
+from startrack.evidence.photometry import SURE_SIGMAS
 from startrack.frames import azel_from_rays, off_axis_rad, rays_from_azel
 from startrack.terrain import Terrain
 

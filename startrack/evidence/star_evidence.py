@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from startrack.camera import Camera
 from startrack.core.smooth_image import SmoothImage
 from startrack.core.types import Array, Body, Bools, Detections, Evidence, Ints, NoSolution, Stars
-from startrack.evidence.expected_stars import BAD_PIXELS, USABLE, ExpectedStars, FluxScale, expect_stars
+from startrack.evidence.expected_stars import BAD_PIXELS, USABLE, ExpectedStars, expect_stars
+from startrack.evidence.flux_scale import FluxScale
 from startrack.evidence.photometry import Photometry, Sources, measure
 from startrack.frames import turn_azel
 from startrack.psf import noise_area_px
@@ -102,17 +103,18 @@ class StarEvidence:
         scale: FluxScale,
         position_sigma_px: float,
         visible: Array | None = None,
+        air: Array | None = None,
     ) -> StarPhotometry:
         """Photometry of every star in view.
 
         The image of the `detections` is measured, with its background, noise and PSF. `visible` (len(stars),) is the
         probability that each star is visible where that is known already; it is used for the star's light in its
-        neighbours' measurements only. `camera`, `stars`, `bodies`, `R_cam_icrs`, `R_enu_icrs`, `scale` and
-        `position_sigma_px` are those of `expect_stars`.
+        neighbours' measurements only. `camera`, `stars`, `bodies`, `R_cam_icrs`, `R_enu_icrs`, `scale`,
+        `position_sigma_px` and `air` are those of `expect_stars`.
         """
         found = expect_stars(
             camera, stars, bodies, R_cam_icrs, R_enu_icrs, scale, psf_sigma_px=detections.psf_sigma_px,
-            noise_e=filtered_noise_e(detections), position_sigma_px=position_sigma_px, mask=detections.mask,
+            noise_e=filtered_noise_e(detections), position_sigma_px=position_sigma_px, mask=detections.mask, air=air,
         )  # fmt: skip
         sources = found.sources(0.5)
         shining = _guess_visibility(detections, sources) if visible is None else visible[found.star[found.measurable]]

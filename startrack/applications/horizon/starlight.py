@@ -76,7 +76,9 @@ def measure_stars(frame: SkyFrame) -> StarLight:
     """Every catalogue star in view of a frame."""
     dimming = fit_dimming(frame)
     camera = replace(frame.camera, sensor=None, calibrated_angle_rad=frame.camera.max_angle_rad)
-    scale = FluxScale(0.0, 0.0, 0.4 * np.log(10) * dimming.scatter_mag, len(frame.matched_star))
+    scale = FluxScale(
+        zero_mag=0.0, scatter=0.4 * np.log(10) * dimming.scatter_mag, stars=len(frame.matched_star)
+    )  # fmt: skip
     light = StarEvidence()(
         frame.detections, camera, _dim_stars(frame, dimming), list(frame.bodies), frame.R_cam_icrs, frame.R_enu_icrs,
         scale, frame.extra_sigma_px,

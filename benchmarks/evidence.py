@@ -173,7 +173,8 @@ def _photometry(
     result: Measured, *, visible: Array | None = None, certain: bool = False, settings: StarEvidence | None = None
 ) -> StarPhotometry:
     """The frame's evidence once more, with a part left out."""
-    stars, scale = result.stars, flux_scale(result.detections, result.camera, result.stars, result.identification)
+    stars, R, found = result.stars, result.attitude_fit.attitude.R_cam_icrs, result.identification
+    scale = flux_scale(result.detections, result.camera, stars, (found.detection, found.star), R)
     extra_px = result.attitude_fit.extra_sigma_px
     if certain:
         stars, scale = replace(stars, v_sigma_mag=np.zeros(len(stars))), replace(scale, scatter=0.0)

@@ -6,9 +6,9 @@ Without files: the shipped photograph. Others of the same camera are in github.c
 (example_data/images, BSD-3-Clause). A photograph with fewer than 150 bright stars is named and left out.
 
 What no renderer has is real here: point spread, magnitudes, extinction, gradients, and a lens that differs from night
-to night. Pixels below the skyline of a crater 4 km wide and 1 km deep are replaced by pixels of the same frame outside
-its image circle; the edge is as soft as the point spread. The direction of a pixel is not startrack's: a lens is fitted
-here to the stars of the same frame, in azimuths and apparent elevations by astropy, refraction included.
+to night. Pixels below the skyline of a crater 4 km wide and 1 km deep are replaced by the level and the noise of the
+same frame outside its image circle; the edge is as soft as the point spread. The direction of a pixel is not
+startrack's: a lens is fitted here to the stars of the same frame, in azimuths and apparent elevations by astropy.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from scipy.special import ndtr
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.chain import Located, Oriented, identify, locate
+from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Exposure
 from startrack.exposure import read_exposure
 from startrack.frames import Site, rays_from_azel
@@ -49,10 +50,14 @@ TERRAIN = f"""
 format = 1
 name = "invented"
 body = "earth"
-origin = {{latitude_deg = {np.degrees(SITE.latitude_rad)}, longitude_deg = {np.degrees(SITE.longitude_rad)}, height_m = {SITE.height_m}}}
 cylinder = {{diameter_m = {2 * RADIUS_M}, depth_m = {DEPTH_M}, exact = true}}
 rover = {{camera_height_m = {CAMERA_M}}}
 search = {{radius_m = {0.95 * RADIUS_M}}}
+
+[origin]
+latitude_deg = {np.degrees(SITE.latitude_rad)}
+longitude_deg = {np.degrees(SITE.longitude_rad)}
+height_m = {SITE.height_m}
 """
 
 
@@ -136,9 +141,9 @@ def put_behind_wall(exposure: Exposure, lens: FrameLens, place_m: Array, rng: np
     part = ndtr(above / (np.hypot(PSF_SIGMA_PX, np.sqrt(1 / 12)) * np.maximum(slope, 1e-6)))
     away = np.hypot(x - lens.parameters[0], y - lens.parameters[1])
     outside = pixels[away > OUTSIDE_PX]
-    dark = rng.choice(outside, size=pixels.shape)
-    inside = away <= OUTSIDE_PX
-    mixed = np.where(inside, part * pixels + (1 - part) * dark, pixels)
+    noise = robust_sigma(np.diff(outside)) / np.sqrt(2)
+    dark = np.median(outside) + noise * rng.standard_normal(pixels.shape)
+    mixed = np.where(away <= OUTSIDE_PX, part * pixels + (1 - part) * dark, pixels)
     return replace(exposure, pixels_adu=np.rint(mixed).astype(np.float32), camera=None, terrain=None)
 
 

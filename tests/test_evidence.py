@@ -13,9 +13,10 @@ from scipy.special import expit
 from scipy.stats import norm
 from star_painter import cramer_rao, paint
 
+from startrack.catalog import airmass
 from startrack.core.smooth_image import SmoothImage
-from startrack.core.types import Body, Detections, Identification, Stars
-from startrack.evidence import FluxScale, StarEvidence, StarPhotometry, flux_scale
+from startrack.core.types import Body, Detections, Stars
+from startrack.evidence import FluxScale, StarEvidence, StarPhotometry, fit_flux_scale, flux_scale
 from startrack.evidence.photometry import Photometry, Sources, half_width, measure
 from startrack.evidence.star_evidence import CAP, visibility_llr
 from startrack.frames import azel_from_rays
@@ -212,7 +213,7 @@ def test_saturated_stamps_are_unusable() -> None:
 CAMERA = replace(FISHEYE, calibrated_angle_rad=float(np.radians(80.0)))
 R_CAM_ENU = CAMERA.R_body_cam.T @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 BACKGROUND_E = np.float32(94.0)
-SCALE = FluxScale(zero_mag=11.6, trend_per_rad2=0.0, scatter=0.03, stars=100)
+SCALE = FluxScale(zero_mag=11.6, scatter=0.03, stars=100)
 
 
 def random_stars(n: int, rng: np.random.Generator, v_mag: Any = None) -> Stars:
@@ -326,23 +327,9 @@ def test_uncertain_stars_have_weaker_evidence_when_missing() -> None:
     assert np.median(unsure) > 0.75 * np.median(sure)
 
 
-def scale_from(
-    v_mag: np.ndarray, flux: np.ndarray, *, saturated: np.ndarray | None = None, xy: np.ndarray | None = None
-) -> FluxScale:
-    n = len(v_mag)
-    rng = np.random.default_rng(11)
-    xy = rng.uniform(60, 450, (n, 2)) if xy is None else xy
-    sigma = np.sqrt(flux + 1250)
-    detections = Detections(
-        xy_px=xy, covariance_px2=np.zeros((n, 2, 2)), flux_e=flux, flux_sigma_e=sigma, snr=flux / sigma,
-        saturated=np.zeros(n, bool) if saturated is None else saturated, psf_sigma_px=1.0,
-        image_e=np.zeros((2, 2), np.float32), dead=np.zeros((2, 2), bool),
-        background=SmoothImage.of(np.zeros((2, 2), np.float32)), noise=SmoothImage.of(np.ones((2, 2), np.float32)),
-    )  # fmt: skip
-    found = Identification(
-        detection=np.arange(n), star=np.arange(n), R_cam_icrs=np.eye(3), false_alarm_probability=0.0, unexplained=0
-    )
-    return flux_scale(detections, CAMERA, stars_at(np.tile([0.0, 0.0, 1.0], (n, 1)), v_mag), found)
+def scale_from(v_mag: np.ndarray, flux: np.ndarray, *, xy: np.ndarray | None = None) -> FluxScale:
+    xy = np.random.default_rng(11).uniform(60, 450, (len(v_mag), 2)) if xy is None else xy
+    return fit_flux_scale(flux, np.sqrt(flux + 1250), v_mag, CAMERA.unproject(xy), CAMERA)
 
 
 def test_the_scale_is_found_with_its_scatter() -> None:
@@ -353,33 +340,75 @@ def test_the_scale_is_found_with_its_scatter() -> None:
     scale = scale_from(v, flux)
     assert scale.zero_mag == pytest.approx(13.0, abs=0.015)
     assert scale.scatter == pytest.approx(0.08, abs=0.02)
-    assert scale.trend_per_rad2 == 0.0
+    assert scale.response is None
     odd = flux.copy()
     odd[::10] *= 3  # every tenth is a variable star or a wrong name
     assert scale_from(v, odd).zero_mag == pytest.approx(13.0, abs=0.03)
-    clipped = v < 2
-    low = np.where(clipped, 0.3 * flux, flux)
-    assert scale_from(v, low, saturated=clipped).zero_mag == pytest.approx(13.0, abs=0.015)
 
 
-def test_unstated_vignetting_is_estimated_and_applied() -> None:
+def test_an_even_image_seldom_shows_an_uneven_throughput() -> None:
+    uneven = 0
+    for seed in range(100):
+        rng = np.random.default_rng([14, seed])
+        v, xy = rng.uniform(1, 4, 200), rng.uniform(60, 450, (200, 2))
+        flux = 10 ** (-0.4 * (v - 13.0)) * np.exp(0.05 * rng.normal(size=200))
+        uneven += scale_from(v, flux, xy=xy).response is not None
+    assert uneven <= 5
+
+
+@pytest.mark.parametrize(
+    "loss",
+    [
+        lambda rays: 0.2 * np.arccos(rays[:, 2]) ** 2,  # vignetting
+        lambda rays: 0.4 * rays[:, 0],  # a dirty side
+        lambda rays: 0.5 * np.exp(-0.5 * np.sum(np.square(rays - [0.6, 0.2, 0.77]), axis=1) / 0.3**2),  # a thin cloud
+    ],
+)
+def test_unstated_throughput_is_estimated_and_applied(loss: Any) -> None:
     rng = np.random.default_rng(13)
-    xy = rng.uniform(60, 450, (500, 2))
-    angle = CAMERA.angle_rad(xy)
-    v = rng.uniform(1, 4, 500)
-    flux = 10 ** (-0.4 * (v - 13.0)) * np.exp(-0.2 * angle**2 + 0.04 * rng.normal(size=500))
-    scale = scale_from(v, flux, xy=xy)
-    assert scale.trend_per_rad2 == pytest.approx(-0.2, abs=0.02)
-    expected = scale.flux_e(np.array([3.0, 3.0]), np.array([0.0, 1.2]), CAMERA)
-    assert expected == pytest.approx(1e4 * np.exp([0.0, -0.2 * 1.44]), rel=0.02)
+    v, rays = rng.uniform(1, 4, 700), CAMERA.unproject(rng.uniform(60, 450, (700, 2)))
+    flux = 10 ** (-0.4 * (v - 13.0)) * np.exp(-loss(rays) + 0.04 * rng.normal(size=700))
+    scale = fit_flux_scale(flux, np.sqrt(flux), v, rays, CAMERA)
+    at = CAMERA.unproject(rng.uniform(100, 410, (300, 2)))
+    expected, sigma = scale.expect(np.full(300, 3.0), at, CAMERA)
+    off = np.log(expected / (1e4 * np.exp(-loss(at))))
+    assert np.sqrt(np.mean(off**2)) < 0.04
+    assert np.all(sigma < 0.1)
+
+
+def test_extinction_is_estimated_from_the_stars_beside_the_throughput() -> None:
+    rng = np.random.default_rng(15)
+    v, rays = rng.uniform(1, 4, 600), CAMERA.unproject(rng.uniform(60, 450, (600, 2)))
+    air = airmass(np.arcsin(rays @ [0.5, 0.0, np.sqrt(0.75)]))  # the camera is tilted by 30 degrees
+    use = (air > 0) & (air < 8)
+    v, rays, air = v[use], rays[use], air[use]
+    flux = 10 ** (-0.4 * (v + 0.28 * air - 13.0)) * np.exp(0.3 * rays[:, 1] + 0.04 * rng.normal(size=len(v)))
+    scale = fit_flux_scale(flux, np.sqrt(flux), v, rays, CAMERA, air)
+    assert scale.response is not None
+    assert scale.response[-1] == pytest.approx(0.28, abs=0.03)
+    few = fit_flux_scale(flux[:3], np.sqrt(flux[:3]), v[:3], rays[:3], CAMERA, air[:3])
+    assert few.response is not None
+    assert few.response[-1] == pytest.approx(0.2, abs=0.15)  # as in clear air
 
 
 @pytest.mark.parametrize("n", [1, 3, 6])
 def test_a_few_stars_give_a_scale_too(n: int) -> None:
     v = np.linspace(2, 3, n)
     assert scale_from(v, 10 ** (-0.4 * (v - 13.0))).zero_mag == pytest.approx(13.0, abs=0.01)
-    all_saturated = scale_from(v, 10 ** (-0.4 * (v - 13.0)), saturated=np.ones(n, bool))
-    assert all_saturated.zero_mag == pytest.approx(13.0, abs=0.01)
+
+
+def test_the_scale_is_that_of_stars_measured_at_their_predicted_pixels(located: Any) -> None:
+    known = located.result
+    found = known.identification
+    truth = 2.5 * np.log10(known.camera.sensor.zero_point_e_per_s * known.exposure.exposure_s)
+    matches, R = (found.detection, found.star), known.attitude_fit.attitude.R_cam_icrs
+    assert flux_scale(known.detections, known.camera, known.stars, matches, R).zero_mag == pytest.approx(
+        truth, abs=0.03
+    )
+    off = replace(known.camera, centre_px=tuple(np.add(known.camera.centre_px, [0.7, 0.0]).tolist()))
+    shifted = flux_scale(known.detections, off, known.stars, matches, R)
+    lost = np.exp(-(0.7**2) / (4 * known.detections.psf_sigma_px**2))  # of the light in a profile that is misplaced
+    assert shifted.zero_mag == pytest.approx(truth + 2.5 * np.log10(lost), abs=0.05)
 
 
 def test_evidence_of_a_rendered_crater(located: Any) -> None:

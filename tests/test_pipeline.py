@@ -188,7 +188,7 @@ def test_identify_without_a_time_states_a_larger_sigma(located: Any, catalog: St
     result = pipeline.identify(replace(known.exposure, time_utc=None), known.camera, catalog)
     assert result.status == "ok"
     sigma = np.sqrt(np.diag(result.attitude.covariance_rad2)) / ARCSEC
-    assert sigma == pytest.approx([60.0] * 3, abs=1.0)
+    assert sigma == pytest.approx([60.0] * 3, abs=2.0)
     w = Rotation.from_matrix(located.truth.R_cam_icrs @ result.attitude.R_cam_icrs.T).as_rotvec()
     assert 1 * ARCSEC < np.linalg.norm(w) < 60 * ARCSEC  # aberration is left out
 
@@ -208,8 +208,9 @@ def test_a_sensor_that_has_moved_is_noticed_and_does_not_move_the_fix(located, c
     assert result.status == "ok"
     off = result.fix.position_enu_m[:2] - located.truth.position_enu_m[:2]
     assert np.hypot(*off) < result.fix.radius999_m
-    assert result.centre_shift_px == pytest.approx(np.hypot(*shift_px), abs=0.1)
-    assert any("off the camera file's centre" in text for text in result.warnings) == any(shift_px)
+    np.testing.assert_allclose(result.camera.centre_px, known.camera.centre_px, atol=0.15)
+    assert (result.lens_change_px > 0.0) == any(shift_px)
+    assert any("differs from the camera file" in text for text in result.warnings) == any(shift_px)
 
 
 def test_a_value_at_a_later_time_has_the_sky_of_that_time(located):

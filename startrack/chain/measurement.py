@@ -80,7 +80,7 @@ def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
         return oriented
     found, when = oriented.identification, oriented.exposure.time_utc
     R_cam_icrs = oriented.attitude_fit.attitude.R_cam_icrs
-    scale = flux_scale(oriented.detections, oriented.camera, oriented.stars, found, R_cam_icrs)
+    scale = flux_scale(oriented.detections, oriented.camera, oriented.stars, (found.detection, found.star), R_cam_icrs)
     limiting_mag = scale.zero_mag - 2.5 * np.log10(SURE_SIGMAS * filtered_noise_e(oriented.detections))
     if when is None or limiting_mag < COMPLETE_V_MAG or not has_deep_catalog():
         return oriented
@@ -159,7 +159,7 @@ def _photometry(
     visible: Array | None = None,
 ) -> StarPhotometry:
     """Photometry of all stars, or of those with the indices `only`; 0 evidence where the terrain is not known."""
-    R, stars = oriented.attitude_fit.attitude.R_cam_icrs, oriented.stars
+    R, stars, found = oriented.attitude_fit.attitude.R_cam_icrs, oriented.stars, oriented.identification
     air = airmass_at(oriented.stars.rays_icrs @ R_enu_icrs.T, terrain.site)
     light = photometry(
         detections,
@@ -168,7 +168,7 @@ def _photometry(
         list(oriented.bodies),
         R,
         R_enu_icrs,
-        flux_scale(oriented.detections, oriented.camera, stars, oriented.identification, R, air),
+        flux_scale(oriented.detections, oriented.camera, stars, (found.detection, found.star), R, air),
         oriented.attitude_fit.extra_sigma_px,
         visible,
         air if air is None or only is None else air[only],

@@ -17,10 +17,10 @@ from startrack.estimation.attitude import AttitudeFit, solve_attitude
 from startrack.estimation.normal_equations import Terms
 from startrack.estimation.prior_choice import PriorChoice, root_of, solve_with_best_prior
 
-MIN_STARS = 30
+MIN_CORRECTING_STARS = 30
 SIZES_PX = (0.0, 0.1, 0.3, 1.0, 3.0)  # of the displacement, RMS over the calibrated cap; a larger one: another camera
-ROUNDS = 3  # stars that the displacement made outliers come back
-SETTLED_PX = 0.02
+CORRECTION_ROUNDS = 3  # stars that the displacement made outliers come back
+SETTLED_LENS_PX = 0.02
 
 
 def correct_lens(
@@ -32,9 +32,9 @@ def correct_lens(
     `solve_attitude`. The corrected camera has the covariance that is left. Raises NotIdentified as `solve_attitude`.
     """
     fit, corrected, total = solve_attitude(camera, xy_px, covariance_px2, rays_icrs, R_cam_icrs), camera, None
-    for _ in range(ROUNDS):
+    for _ in range(CORRECTION_ROUNDS):
         rays_cam = rays_icrs[fit.used] @ fit.attitude.R_cam_icrs.T
-        if len(rays_cam) < MIN_STARS:
+        if len(rays_cam) < MIN_CORRECTING_STARS:
             break
         order, before = _free(camera), np.zeros(len(_free(camera))) if total is None else total
         found = _solve(camera, corrected, order, rays_cam, fit, before)
@@ -47,7 +47,7 @@ def correct_lens(
         total = found.step
         corrected = replace(changed, covariance_order=order, covariance=found.covariance)
         fit = solve_attitude(corrected, xy_px, covariance_px2, rays_icrs, fit.attitude.R_cam_icrs)
-        if moved_px < SETTLED_PX:
+        if moved_px < SETTLED_LENS_PX:
             break
     return corrected, fit, 0.0 if total is None else _displacement_px(camera, _free(camera), total)
 

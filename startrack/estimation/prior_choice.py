@@ -12,6 +12,8 @@ import numpy as np
 
 from startrack.core.types import Array
 
+FILE_PROBABILITY = 0.95  # of the first prior: that a file is right; the others are equally probable
+
 
 @dataclass(frozen=True)
 class PriorChoice:
@@ -23,17 +25,20 @@ class PriorChoice:
 
 
 def solve_with_best_prior(normal: Array, right: Array, roots: Sequence[Array]) -> PriorChoice:
-    """The posterior of unknowns from normal equations (k, k), (k,), with the best of several priors.
+    """The posterior of unknowns from normal equations (k, k), (k,), with the most probable of several priors.
 
-    Each prior is given by a root (k, j) of its covariance, root @ root.T; a direction without variance stays 0.
+    The first is that of a right file. Each is given by a root (k, j) of its covariance, root @ root.T; a direction
+    without variance stays 0.
     """
     best, most = PriorChoice(0, np.zeros(len(right)), np.zeros_like(normal)), -np.inf
     for number, root in enumerate(roots):
         inner, pull = np.eye(root.shape[1]) + root.T @ normal @ root, root.T @ right
         step = np.linalg.solve(inner, pull)
-        evidence = 0.5 * float(pull @ step) - 0.5 * float(np.linalg.slogdet(inner)[1])  # but for a constant
-        if evidence > most:
-            most, best = evidence, PriorChoice(number, root @ step, root @ np.linalg.solve(inner, root.T))
+        log_weight = 0.5 * float(pull @ step) - 0.5 * float(np.linalg.slogdet(inner)[1])  # but for a constant
+        if number > 0:
+            log_weight += float(np.log((1.0 - FILE_PROBABILITY) / FILE_PROBABILITY / (len(roots) - 1)))
+        if log_weight > most:
+            most, best = log_weight, PriorChoice(number, root @ step, root @ np.linalg.solve(inner, root.T))
     return best
 
 

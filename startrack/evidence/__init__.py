@@ -2,7 +2,7 @@
 
 from startrack.evidence.double_exposure import check_single_skyline
 from startrack.evidence.expected_stars import expect_stars
-from startrack.evidence.flux_scale import FluxScale, expected_flux_scale, flux_scale
+from startrack.evidence.flux_scale import FluxScale, expected_flux_scale, fit_flux_scale, flux_scale
 from startrack.evidence.photometry import (
     SURE_SIGMAS,
     Photometry,
@@ -66,6 +66,7 @@ __all__ = [
     "expect_stars",
     "expected_flux_scale",
     "filtered_noise_e",
+    "fit_flux_scale",
     "flux_scale",
     "half_width",
     "height_above_px",

@@ -90,7 +90,7 @@ def expect_stars(
     room = max(int(area_px2 / (MIN_PSF_AREAS_PER_STAR * noise_area_px(psf_sigma_px))), 1)
     brightest = np.flatnonzero(inside)[:room]
     star, xy, rays_cam = star[brightest], xy[brightest], rays_cam[brightest]
-    angle, through = off_axis_rad(rays_cam), None if air is None else air[star]
+    angle = off_axis_rad(rays_cam)
     # A misplaced profile loses light. The rays do not depend on the lens: they are the catalogue's.
     misplaced2 = position_sigma_px**2 + (
         np.square(camera.projection_sigma_px(rays_cam)) if camera.covariance_order else 0.0
@@ -101,17 +101,14 @@ def expect_stars(
     if mask is not None:
         cause[touch_masked(mask.masked, xy, margin) & (cause == USABLE)] = MASKED
     azimuth, elevation = azel_from_rays(stars.rays_icrs[star] @ R_enu_icrs.T)
+    expected_e, fraction = scale.expect(stars.v_mag[star], rays_cam, camera, None if air is None else air[star])
     return ExpectedStars(
         star=star,
         xy_px=xy,
         azimuth_rad=azimuth,
         elevation_rad=elevation,
-        expected_e=scale.flux_e(stars.v_mag[star], rays_cam, camera, through),
-        fraction_sigma=np.sqrt(
-            np.square(scale.fraction_sigma(rays_cam, camera, through))
-            + np.square(LN_PER_MAG * stars.v_sigma_mag[star])
-            + blur**2
-        ),  # fmt: skip
+        expected_e=expected_e,
+        fraction_sigma=np.sqrt(fraction**2 + np.square(LN_PER_MAG * stars.v_sigma_mag[star]) + blur**2),
         cause_code=cause,
         causes=(*CAUSES, *(f"beside {body.name}" for body in bodies)),
     )

@@ -1,9 +1,9 @@
-"""The light that a catalogue's star leaves in an image: zero point, throughput over the image, extinction of the air.
+"""The light that a star of the catalogue leaves in an image: zero point, throughput over the image, extinction.
 
-The natural logarithm of the flux is linear in its unknowns: a constant, terms of the image (a lens that is dirty, tilted
-or darker at its edge than its file states) and the extinction, where there is air. The terms have a normal prior; its
-width is the one that the bright identified stars make most probable, so that terms vanish where the stars show none. Of
-directions that no star tests the error is wide, and so is that of their expected flux.
+The natural logarithm of the flux is linear in its unknowns: a constant, terms of the image (a lens that is dirty,
+tilted or darker at its edge than its file states; thin cloud) and the extinction, where there is air. The terms have a
+normal prior; its width is the one that the bright identified stars make most probable, so that terms vanish where the
+stars show none. Of directions that no star tests the error is wide, and so is that of their expected flux.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.core.statistics import robust_sigma
-from startrack.core.types import Array, Detections, Identification, Stars
+from startrack.core.types import Array, Detections, Ints, Stars
 from startrack.estimation.prior_choice import solve_with_best_prior
 from startrack.evidence.photometry import Sources, half_width, measure
 from startrack.frames import off_axis_rad
@@ -30,7 +30,7 @@ TERMS = tuple((n, m) for n in range(1, MOST_DEGREE + 1) for m in range(-n, n + 1
 # Sigma of the prior of a term of degree 1, and most degree. All-sky cameras in the open: 0.3, 4.
 PRIORS = ((0.0, 0), *((size, degree) for degree in (4, MOST_DEGREE) for size in (0.03, 0.1, 0.3)))
 EXTINCTION_MAG, EXTINCTION_SIGMA_MAG = 0.2, 0.1  # prior, per airmass: clear air
-ROUNDS = 10  # of the robust weights
+WEIGHT_ROUNDS = 10  # of the robust weights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,36 +43,33 @@ class FluxScale:
     response: Array | None = None  # (k,) of a constant (0), TERMS and, with air, magnitudes per airmass; None: all 0
     covariance: Array | None = None  # (k, k) of the response; None: no error
 
-    def flux_e(self, v_mag: Array, rays_cam: Array, camera: Camera, air: Array | None = None) -> Array:
-        """Expected flux (n,) of stars of `v_mag` (n,) in directions `rays_cam` (n, 3) of a `camera`.
+    def expect(
+        self, v_mag: Array, rays_cam: Array, camera: Camera, air: Array | None = None
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """Expected flux (n,) of stars of `v_mag` (n,), and its relative error (n,) without that of the magnitudes.
 
-        `air` (n,): airmasses; None without air.
+        `rays_cam` (n, 3) are directions in the axes of the `camera`, `air` (n,) airmasses; None without air.
         """
         throughput = camera.sensor.throughput(off_axis_rad(rays_cam)) if camera.sensor is not None else 1.0
-        flux_e = 10 ** (-0.4 * (v_mag - self.zero_mag)) * throughput
-        if self.response is not None:
-            flux_e = flux_e * np.exp(_columns(camera, rays_cam, air) @ self.response)
-        return np.asarray(flux_e)
-
-    def fraction_sigma(self, rays_cam: Array, camera: Camera, air: Array | None = None) -> Array:
-        """Relative error (n,) of the expected flux in directions (n, 3), the scatter included; see `flux_e`."""
-        if self.covariance is None:
-            return np.full(len(rays_cam), self.scatter)
+        flux_e = np.asarray(10 ** (-0.4 * (v_mag - self.zero_mag)) * throughput)
+        if self.response is None or self.covariance is None:
+            return flux_e, np.full(len(flux_e), self.scatter)
         columns = _columns(camera, rays_cam, air)
-        return np.sqrt(self.scatter**2 + np.einsum("ni,ij,nj->n", columns, self.covariance, columns))
+        variance = np.sum((columns @ self.covariance) * columns, axis=1)
+        return flux_e * np.exp(columns @ self.response), np.sqrt(self.scatter**2 + variance)
 
 
 def flux_scale(
-    detections: Detections, camera: Camera, stars: Stars, found: Identification, R_cam_icrs: Array,
+    detections: Detections, camera: Camera, stars: Stars, matches: tuple[Ints, Ints], R_cam_icrs: Array,
     air: Array | None = None,
 ) -> FluxScale:  # fmt: skip
     """The scale by the bright identified stars, measured as all stars are: at their predicted pixels.
 
     A lens or a width of the PSF that differs over the image takes light from a star that is measured there.
-    `found` says which of the `detections` is which of the `stars`; `R_cam_icrs` (3, 3) is the attitude; `air`
-    (len(stars),) are the airmasses, None without air.
+    `matches` are indices (n,) of `detections` and those (n,) of their `stars`; `R_cam_icrs` (3, 3) is the attitude;
+    `air` (len(stars),) are the airmasses, None without air.
     """
-    d, s = found.detection, found.star
+    d, s = matches
     trusted = (detections.snr[d] > SCALE_SNR) & ~detections.saturated[d] & (stars.v_sigma_mag[s] < 0.1)
     if trusted.sum() < SCALE_STARS:
         trusted = ~detections.saturated[d] if (~detections.saturated[d]).any() else np.ones(len(d), dtype=bool)
@@ -86,7 +83,7 @@ def flux_scale(
 
 
 def _measure_alone(detections: Detections, xy_px: Array, flux_e: Array) -> Array:
-    """Flux (n,) [e] at pixels (n, 2) of stars of about `flux_e` (n,), without their neighbours; 0 where it is not known."""
+    """Flux (n,) [e] at pixels (n, 2) of stars of about `flux_e` (n,), each alone; 0 where it is not known."""
     room = np.array(detections.image_e.shape[::-1]) - 1 - half_width(detections.psf_sigma_px)
     inside = (xy_px >= half_width(detections.psf_sigma_px)).all(axis=1) & (xy_px <= room).all(axis=1)
     none = np.zeros(np.count_nonzero(inside))
@@ -161,7 +158,7 @@ def _fit(columns: Array, log_flux: Array, *, has_air: bool) -> tuple[Array, Arra
     mean[0] = np.median(log_flux - columns @ mean)
     weight, offset = np.full(len(log_flux), FIRST_SCATTER**-2), log_flux - columns @ mean
     roots = [_prior_root(size, degree, has_air) for size, degree in PRIORS]
-    for _ in range(ROUNDS):
+    for _ in range(WEIGHT_ROUNDS):
         scaled = weight[:, None] * columns
         found = solve_with_best_prior(scaled.T @ columns, scaled.T @ offset, roots[-1:])
         rest = offset - columns @ found.step

@@ -85,4 +85,4 @@ def _mean_square(camera: Camera, order: tuple[str, ...]) -> Array:
 
 def _displacement_px(camera: Camera, order: tuple[str, ...], step: Array) -> float:
     """RMS over the calibrated cap of the displacement by a `step` (m,) of the parameters, the best rotation removed."""
-    return float(np.sqrt(max(step @ _mean_square(camera, order) @ step, 0.0)))
+    return float(np.sqrt(np.maximum(step @ _mean_square(camera, order) @ step, 0.0)))

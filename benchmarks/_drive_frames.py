@@ -12,11 +12,11 @@ from _cameras import EXPOSURE_S, camera_for_share
 
 from startrack.applications.tracking import ObservedFrame, TrackErrors, observe_frame
 from startrack.applications.tracking.frame_estimate import estimate_frame
-from startrack.catalog import load_catalog
+from startrack.catalog import apparent_stars, load_catalog
 from startrack.chain import Located, Settings, locate
 from startrack.core.types import Array, Evidence
 from startrack.evidence.star_evidence import visibility_llr
-from startrack.frames import R_enu_icrs, azel_from_rays, observer_velocity_m_s
+from startrack.frames import R_enu_icrs, azel_from_rays
 from startrack.rendering import Series, render
 from startrack.terrain import HeightMap, Terrain
 
@@ -62,7 +62,7 @@ def simulate_evidence(
     """The stars near the skyline of one exposure."""
     site, ground = course.stated.site, course.ground
     assert site is not None
-    stars = load_catalog().at(when, observer_velocity_m_s(site, when))
+    stars = apparent_stars(load_catalog(), when, site)
     azimuth, elevation = azel_from_rays(stars.rays_icrs @ R_enu_icrs(site, when).T)
     about = np.interp(azimuth, AROUND_RAD, ground.horizon_rad(position[None], AROUND_RAD)) + course.raised_rad
     use = np.flatnonzero((stars.v_mag < FAINTEST_MAG) & (np.abs(elevation - about) < NEAR_RAD))

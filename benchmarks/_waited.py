@@ -145,8 +145,7 @@ def next_frames() -> None:
     from inspect import signature
 
     from startrack import identify
-    from startrack.catalog import load_catalog
-    from startrack.chain import stars_at
+    from startrack.catalog import apparent_stars, load_catalog
     from startrack.identification import Identifier
 
     identifier, has_near = Identifier(), "near_R_cam_icrs" in signature(Identifier.__call__).parameters
@@ -154,7 +153,7 @@ def next_frames() -> None:
     for path in (SAMPLE, *sorted(SCENES.glob("*.png"))[:3]):
         found = identify(path).result
         when, R = found.exposure.time_utc, found.attitude_fit.attitude.R_cam_icrs
-        skies = iter([stars_at(load_catalog(), when + timedelta(minutes=k), None) for k in range(RUNS + 1)])
+        skies = iter([apparent_stars(load_catalog(), when + timedelta(minutes=k), None) for k in range(RUNS + 1)])
         near = (R,) if has_near else ()
         runs.append(lambda f=found, skies=skies, near=near: identifier(f.detections, f.camera, next(skies), *near))
     print_ms(*runs)

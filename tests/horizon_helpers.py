@@ -17,7 +17,6 @@ from startrack.frames import (
     observer_velocity_m_s,
     parse_utc,
     rays_from_azel,
-    refract_rad,
 )
 
 SITE = Site("earth", np.radians(46.0), np.radians(7.0), 1000.0)
@@ -30,6 +29,16 @@ R_CAM_ENU = np.array([[-1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0]])  # looks at the 
 PRESSURE_HPA = 1010.0 * np.exp(-1000.0 / 8430.0)
 PSF_PX, PEDESTAL, SKY, GROUND, READ_NOISE = 0.9, 300.0, 400.0, 60.0, 8.0
 ZERO_MAG, EXTINCTION_MAG = 14.5, 0.2
+
+
+def bennett_rad(true_rad: np.ndarray) -> np.ndarray:
+    """Apparent elevations by Bennett (1982), J. Navigation 35, 255, as in Meeus (1998), chapter 16, at 10 C."""
+    lift_arcmin = np.zeros_like(true_rad)
+    start_deg = np.degrees(np.maximum(true_rad, np.radians(-1.0)))
+    for _ in range(12):
+        h = start_deg + lift_arcmin / 60.0
+        lift_arcmin = PRESSURE_HPA / 1010.0 / np.tan(np.radians(h + 7.31 / (h + 4.4)))
+    return true_rad + np.radians(lift_arcmin / 60.0)
 
 
 def skyline_deg(azimuth_deg: np.ndarray) -> np.ndarray:
@@ -61,7 +70,7 @@ def painted_frame(seed: int = 1, time_utc: datetime = TIME, with_stars: bool = T
 def _paint_stars(light: np.ndarray, time_utc: datetime) -> None:
     stars = load_catalog().at(time_utc, observer_velocity_m_s(SITE, time_utc))
     azimuth, elevation = azel_from_rays(stars.rays_icrs @ R_enu_icrs(SITE, time_utc).T)
-    elevation = refract_rad(elevation, PRESSURE_HPA)
+    elevation = bennett_rad(elevation)
     up = (np.degrees(elevation) > skyline_deg(np.degrees(azimuth))) & (stars.v_mag < 7.5)
     xy, inside = CAMERA.project(rays_from_azel(azimuth[up], elevation[up]) @ R_CAM_ENU.T)
     air = 1.0 / (np.sin(elevation[up]) + 0.025 * np.exp(-11 * np.sin(elevation[up])))

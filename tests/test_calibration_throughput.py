@@ -15,8 +15,9 @@ from startrack.applications.calibration.sensor import fit_photon_transfer
 from startrack.applications.calibration.throughput import StarFluxes, fit_throughput
 from startrack.applications.calibration.verify import difference_px
 from startrack.camera import Camera, KannalaBrandt, Sensor, cap_grid
-from startrack.catalog import airmass, load_catalog
+from startrack.catalog import load_catalog
 from startrack.core.types import Exposure
+from startrack.frames import airmass
 from startrack.rendering import Series, render
 from startrack.terrain import load_terrain
 
@@ -111,12 +112,6 @@ def test_photon_transfer_on_flat_fields():
     assert fit_photon_transfer([]) is None
     dark = Exposure(pixels_adu=rng.normal(300, 5, (512, 512)).astype(np.float32))
     assert fit_photon_transfer([(dark, dark)]) is None  # no range of levels
-
-
-def test_airmass():
-    """Hardie's and Rozenberg's tables agree at these heights: 1, 2, about 5.6 at 10 degrees, about 38 to 40 below."""
-    np.testing.assert_allclose(airmass(np.radians([90, 30, 10])), [1.0, 1.995, 5.6], rtol=0.02)
-    assert airmass(np.array(0.0)) == pytest.approx(40, rel=0.01)
 
 
 def star_fluxes(

@@ -29,7 +29,6 @@ from startrack.frames import (
     position_fixed_m,
     quat_xyzw_from_R,
     rays_from_azel,
-    refract_rad,
 )
 
 ARCSEC_RAD = np.radians(1 / 3600)
@@ -143,7 +142,7 @@ def test_angle_between_is_exact_where_arccos_fails(angle_rad: float) -> None:
     assert angle_between_rad([1, 0, 0], b) == pytest.approx(angle_rad, rel=1e-12, abs=1e-15)
 
 
-# --- aberration and refraction --------------------------------------------------------------------------------------
+# --- aberration -----------------------------------------------------------------------------------------------------
 
 
 def test_aberration_agrees_with_erfa() -> None:
@@ -173,29 +172,6 @@ def test_no_motion_changes_nothing_and_one_ray_keeps_its_shape() -> None:
     ray = random_rays(1)[0]
     assert aberrate(ray, np.zeros(3)).shape == (3,)
     assert angle_between_rad(aberrate(ray, np.zeros(3)), ray) < 1e-15
-
-
-def test_refraction_agrees_with_erfa_high_up() -> None:
-    a_rad, b_rad = erfa.refco(1010.0, 10.0, 0.0, 0.55)
-    apparent_rad = np.radians(np.arange(20, 91, 5.0))
-    tangent = np.tan(np.pi / 2 - apparent_rad)
-    true_rad = apparent_rad - (a_rad * tangent + b_rad * tangent**3)
-    assert np.abs(refract_rad(true_rad) - apparent_rad).max() < 1.3 * ARCSEC_RAD
-
-
-def test_refraction_agrees_with_meeus_near_the_horizon() -> None:
-    # Meeus (1998), Astronomical Algorithms, example 16.a: at apparent 0.5 degrees the lift is 28.754'.
-    true_rad = np.radians(0.5 - 28.754 / 60)
-    assert np.degrees(refract_rad(true_rad) - true_rad) * 60 == pytest.approx(
-        28.754, abs=0.1
-    )  # Bennett's correction is 0.06'
-
-
-def test_refraction_leaves_the_zenith_alone_and_scales_with_the_air() -> None:
-    assert abs(refract_rad(np.pi / 2) - np.pi / 2) < 1.0 * ARCSEC_RAD
-    assert refract_rad(0.3, pressure_hpa=0.0) == 0.3
-    deep_rad = refract_rad(np.radians([-1.0, -5.11, -90.0])) - np.radians([-1.0, -5.11, -90.0])
-    np.testing.assert_allclose(deep_rad, deep_rad[0])
 
 
 # --- quaternions ----------------------------------------------------------------------------------------------------

@@ -256,7 +256,7 @@ def test_slopes_of_the_clock_are_those_of_turned_rows(name: str) -> None:
     slope = errors.slopes_rad(terrain, place, MIDDLES_RAD, horizon)[-1]
     values = np.zeros((1, len(errors)))
     values[0, -1] = later_s
-    turned, at = turn_evidence(rows, later_s), errors.true_positions(place[None], values)
+    turned, at = turn_evidence(rows, later_s, None), errors.true_positions(place[None], values)
     higher = np.asarray(terrain.horizon_rad(at, turned.azimuth_rad)).ravel() - turned.elevation_rad
     if terrain.axisymmetric:
         assert higher == pytest.approx(later_s * slope, abs=2e-5 * later_s * np.linalg.norm(clock.turn_rad_s))

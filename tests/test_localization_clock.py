@@ -32,7 +32,7 @@ def clock_at(site: Site, sigma_s: float) -> Clock:
 def stated_early(evidence: Evidence, site: Site, offset_s: float, sigma_s: float) -> Evidence:
     """The rows as a clock shows them that is late: the true time is later by the offset."""
     clock = clock_at(site, sigma_s)
-    return replace(turn_evidence(replace(evidence, clock=clock), -offset_s), clock=clock)
+    return replace(turn_evidence(replace(evidence, clock=clock), -offset_s, site.air), clock=clock)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_a_later_time_turns_the_rows_as_the_ephemeris_does(name: str) -> None:
             azel_from_rays(rays_icrs @ R_enu_icrs(site, TIME + timedelta(seconds=s)).T) for s in (0.0, later_s)
         )
         rows = Evidence(azimuth_rad=now[0], elevation_rad=now[1], llr=np.ones(50), clock=clock_at(site, 1.0))
-        turned = turn_evidence(rows, later_s)
+        turned = turn_evidence(rows, later_s, None)
         off = np.mod(turned.azimuth_rad - later[0] + np.pi, 2 * np.pi) - np.pi
         assert np.abs(off * np.cos(later[1])).max() < 2e-5  # the Moon's axis and rate vary over half a day
         assert np.abs(turned.elevation_rad - later[1]).max() < 2e-5
@@ -87,7 +87,7 @@ def test_in_a_round_crater_the_position_lies_on_an_arc(sigma_s: float) -> None:
     weight = np.exp(-0.5 * offsets**2)
     weight /= weight.sum()
     fixes = [
-        ExactPosterior()(replace(turn_evidence(replace(rows, clock=clock), x * sigma_s), clock=None), terrain)
+        ExactPosterior()(replace(turn_evidence(replace(rows, clock=clock), x * sigma_s, None), clock=None), terrain)
         for x in offsets
     ]
     means = np.array([one.position_enu_m[:2] for one in fixes])

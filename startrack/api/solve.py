@@ -11,8 +11,8 @@ from startrack.api.solution import Solution
 from startrack.applications import tracking
 from startrack.applications.tracking import Odometry, Track
 from startrack.camera import Camera
-from startrack.catalog import load_catalog
-from startrack.chain import Image, NearAttitude, Outcome, Refused, Settings, Time, stars_at
+from startrack.catalog import apparent_stars, load_catalog
+from startrack.chain import Image, NearAttitude, Outcome, Refused, Settings, Time
 from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.errors import BAD_INPUT_REASONS, BadInput
 from startrack.core.types import Exposure
@@ -157,7 +157,7 @@ def identify(
         return identify_centroids(
             xy_px, camera=None if camera is None else chain.load_camera_input(camera),
             fov_rad=None if fov is None else chain.field_of_view_rad(fov), size_px=size_px, flux=flux,
-            sigma_px=sigma_px, stars=stars_at(load_catalog(), chain.time_input(time), None),
+            sigma_px=sigma_px, stars=apparent_stars(load_catalog(), chain.time_input(time), None),
             near_R_cam_icrs=None if near is None else near.R_cam_icrs_at(None, None),
         )  # fmt: skip
     exposure = chain.exposure_input(image, time)

@@ -4,10 +4,9 @@ from startrack.catalog.sky import (
     LOWEST_STAR_RAD,
     MOST_BELOW_PART,
     Sky,
-    airmass,
     airmass_at,
     apparent_bodies,
-    apparent_elevation_rad,
+    apparent_stars,
     bodies,
     is_below_horizon,
     sky_at,
@@ -23,7 +22,7 @@ from startrack.catalog.stars import (
 )
 
 __all__ = [
-    "LOWEST_STAR_RAD", "MOST_BELOW_PART", "Sky", "StarCatalog", "airmass", "airmass_at", "apparent_bodies",
-    "apparent_elevation_rad", "bodies", "has_deep_catalog", "hipparcos_rows_in_deep", "is_below_horizon",
-    "load_catalog", "load_deep_catalog", "proper_name_designations", "sky_at", "star_names",
+    "LOWEST_STAR_RAD", "MOST_BELOW_PART", "Sky", "StarCatalog", "airmass_at", "apparent_bodies", "apparent_stars",
+    "bodies", "has_deep_catalog", "hipparcos_rows_in_deep", "is_below_horizon", "load_catalog", "load_deep_catalog",
+    "proper_name_designations", "sky_at", "star_names",
 ]  # fmt: skip

@@ -15,10 +15,12 @@ from numpy.polynomial.polynomial import polyval
 from startrack.catalog.stars import JULIAN_YEAR_S, StarCatalog
 from startrack.core.types import Array, Body, Bools, Stars
 from startrack.frames import (
+    LOWEST_PREDICTED_RAD,
     SPEED_OF_LIGHT_M_S,
     R_enu_icrs,
     Site,
     aberrate,
+    airmass,
     angle_between_rad,
     azel_from_rays,
     barycentric_state,
@@ -26,13 +28,10 @@ from startrack.frames import (
     observer_state,
     observer_velocity_m_s,
     rays_from_azel,
-    refract_rad,
 )
 
-LOWEST_PREDICTED_RAD = np.radians(3.0)  # below it refraction is not predictable
-LOWEST_STAR_RAD = np.radians(-3.0)  # true elevation; refraction lifts a star at -0.5 degrees to the horizon
+LOWEST_STAR_RAD = np.radians(-3.0)  # apparent elevation, as seen from a mountain
 MOST_BELOW_PART = 0.01  # of the identified stars; right sites: 0; a wrong sign of latitude or longitude: 0.3 to 0.5
-SEA_LEVEL_HPA, SCALE_HEIGHT_M = 1010.0, 8430.0  # average air
 DEFAULT_SITE = Site("moon", 0.0, 0.0)  # without a site; at most 0.7 arcsec of aberration off
 ASTRONOMICAL_UNIT_M = 149_597_870_700.0  # IAU 2012, resolution B2
 
@@ -43,7 +42,7 @@ class Sky:
 
     stars: Stars
     b_v: Array  # (n,)
-    elevation_rad: Array | None = None  # (n,) true elevation; None where no site on the Earth is given
+    elevation_rad: Array | None = None  # (n,) apparent elevation; None where no site on the Earth is given
     R_enu_icrs: Array | None = None  # (3, 3) None without a site
 
     @property
@@ -61,45 +60,43 @@ def sky_at(
 
     Without a site there is no refraction: on the Earth a lens fitted to these directions then contains it.
     """
-    stars = catalog.at(time_utc, observer_velocity_m_s(site or DEFAULT_SITE, time_utc))
+    stars = apparent_stars(catalog, time_utc, site)
     if site is None:
         return Sky(stars=stars, b_v=catalog.b_v)
     R = R_enu_icrs(site, time_utc)
     if site.body != "earth":
         return Sky(stars=stars, b_v=catalog.b_v, R_enu_icrs=R)
-    azimuth, elevation = azel_from_rays(stars.rays_icrs @ R.T)
+    elevation = azel_from_rays(stars.rays_icrs @ R.T)[1]
     up = elevation > lowest_rad
-    shown = rays_from_azel(azimuth[up], apparent_elevation_rad(elevation[up], site)) @ R
-    return Sky(
-        stars=replace(stars.take(up), rays_icrs=shown), b_v=catalog.b_v[up], elevation_rad=elevation[up], R_enu_icrs=R
-    )
+    return Sky(stars=stars.take(up), b_v=catalog.b_v[up], elevation_rad=elevation[up], R_enu_icrs=R)
 
 
-def apparent_elevation_rad(elevation_rad: Array, site: Site) -> Array:
-    """Apparent elevations [rad] of sources at true `elevation_rad` (...) over a `site` on the Earth, in average air."""
-    return refract_rad(elevation_rad, float(SEA_LEVEL_HPA * np.exp(-site.height_m / SCALE_HEIGHT_M)))
+def apparent_stars(catalog: StarCatalog, time_utc: datetime | None, site: Site | None) -> Stars:
+    """The whole `catalog` as seen at `time_utc` from a `site`, with aberration, and with refraction in its air.
+
+    Stars below the horizon are there too. Without a time (None) at J2000.0 without both; without a site (None) as from
+    the Moon.
+    """
+    if time_utc is None:
+        return catalog.at(None, None)
+    stars = catalog.at(time_utc, observer_velocity_m_s(site or DEFAULT_SITE, time_utc))
+    if site is None or site.air is None:
+        return stars
+    return replace(stars, rays_icrs=site.air.refract(stars.rays_icrs, R_enu_icrs(site, time_utc)))
 
 
 def apparent_bodies(site: Site, time_utc: datetime) -> tuple[Body, ...]:
-    """Planets, Sun and Moon in apparent directions at `time_utc` over a `site` on the Earth, refraction included."""
-    R, found = R_enu_icrs(site, time_utc), []
-    for body in bodies(site, time_utc):
-        azimuth, elevation = azel_from_rays(R @ body.ray_icrs)
-        found.append(replace(body, ray_icrs=rays_from_azel(azimuth, apparent_elevation_rad(elevation, site)) @ R))
-    return tuple(found)
-
-
-def airmass(elevation_rad: Array) -> Array:
-    """Airmass (...) of lines of sight at `elevation_rad` (...), zenith = 1. Rozenberg 1966, Twilight, p. 160."""
-    s = np.sin(elevation_rad)
-    return 1.0 / (s + 0.025 * np.exp(-11.0 * s))
+    """Planets, Sun, Earth and Moon in apparent directions at `time_utc` over a `site`, refraction included."""
+    found, air = bodies(site, time_utc), site.air
+    if air is None:
+        return tuple(found)
+    R = R_enu_icrs(site, time_utc)
+    return tuple(replace(body, ray_icrs=air.refract(body.ray_icrs, R)) for body in found)
 
 
 def airmass_at(rays_enu: Array, site: Site | None) -> Array | None:
-    """Airmass (n,) of lines of sight `rays_enu` (n, 3) from a `site` on the Earth; None where there is no air."""
-    if site is None or site.body != "earth":
-        return None
-    return airmass(np.maximum(azel_from_rays(rays_enu)[1], 0.0))
+    """Airmass (n,) of lines of sight in apparent directions `rays_enu` (n, 3) from a `site`; None without air."""
+    return None if site is None or site.air is None else airmass(azel_from_rays(rays_enu)[1])
 
 
 def is_below_horizon(rays_icrs: Array, site: Site, time_utc: datetime) -> Bools:

@@ -7,7 +7,14 @@ from typing import TypeVar
 
 import numpy as np
 
-from startrack.catalog import airmass_at, has_deep_catalog, hipparcos_rows_in_deep, load_catalog, load_deep_catalog
+from startrack.catalog import (
+    airmass_at,
+    apparent_stars,
+    has_deep_catalog,
+    hipparcos_rows_in_deep,
+    load_catalog,
+    load_deep_catalog,
+)
 from startrack.chain.orientation import require_time_and_site
 from startrack.chain.stages import Located, Measured, Oriented, Settings, StarFix, StarRays, extend
 from startrack.core.types import Array, Detections, Evidence, Ints, Stars
@@ -27,10 +34,11 @@ from startrack.evidence import (
     subtract_sky_step,
     with_noise_of_blocks,
 )  # fmt: skip
-from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
+from startrack.frames import LOWEST_PREDICTED_RAD, R_enu_icrs, Site
 from startrack.localization import DEFAULT_LOCALIZER, Localizer, clock_at, clock_matters, require_localizer
 from startrack.terrain import Terrain
 
+LOW_IN_AIR = "low in the air"
 NEIGHBOURS_PX = 10.0  # of stars that are measured again: up to this distance from them the PSFs overlap
 UNDECIDED_PX = 2.0  # farther from the skyline than this, the fix decides which stars are visible
 CERTAIN_PROBABILITY = 0.99  # of being visible, or hidden, for the stars that the fix decides
@@ -88,7 +96,7 @@ def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
     return replace(
         oriented,
         catalog_name=deep.name,
-        stars=deep.at(when, observer_velocity_m_s(site, when)),
+        stars=apparent_stars(deep, when, site),
         identification=replace(found, star=hipparcos_rows_in_deep()[found.star]),
     )
 
@@ -174,7 +182,14 @@ def _photometry(
         air if air is None or only is None else air[only],
     )
     light = light if only is None else replace(light, star=only[light.star])
+    return mask_unpredictable(light, terrain)
+
+
+def mask_unpredictable(light: StarPhotometry, terrain: Terrain) -> StarPhotometry:
+    """The photometry without evidence where the terrain is not known, and of stars low in the Earth's air."""
     rays = light.azimuth_rad, light.elevation_rad
+    if terrain.air is not None:
+        light = light.mask_stars(np.where(light.elevation_rad < LOWEST_PREDICTED_RAD, LOW_IN_AIR, ""))
     return light if terrain.is_informative(*rays).all() else light.mask_stars(terrain.mask_reason(*rays))
 
 

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.catalog import StarCatalog, bodies
+from startrack.catalog import StarCatalog, apparent_bodies, apparent_stars
 from startrack.chain.stages import Detected, Identified, Inputs, Oriented, Settings, extend
 from startrack.core.compilation import announce_compilation
-from startrack.core.types import Array, BadInput, Exposure, NotIdentified, Stars, TooFewStars
+from startrack.core.types import Array, BadInput, Exposure, NotIdentified, TooFewStars
 from startrack.detection import Detector
 from startrack.estimation.lens_correction import correct_lens
 from startrack.exposure import NO_TIME, are_fractions
-from startrack.frames import Site, observer_velocity_m_s
+from startrack.frames import Site
 from startrack.identification import check_single_field
-from startrack.terrain import Terrain
-
-ANYWHERE = Site("moon", 0.0, 0.0)  # used for an unknown site: 0.7 arcsec of aberration at most
+from startrack.terrain import Terrain, site_of_terrain
 
 
 def check_inputs(inputs: Inputs) -> None:
@@ -48,6 +47,19 @@ def require_time_and_site(exposure: Exposure, terrain: Terrain) -> tuple[datetim
     return exposure.time_utc, terrain.site
 
 
+def site_on_earth(exposure: Exposure) -> Site | None:
+    """The site of the terrain that the `exposure` names, if it is on the Earth; None where nothing shows that.
+
+    Identification does not need it: a terrain that cannot be read is not its concern.
+    """
+    if exposure.terrain is None:
+        return None
+    with suppress(BadInput):
+        site = site_of_terrain(exposure.terrain)
+        return site if site.body == "earth" else None
+    return None
+
+
 def detect_sources(inputs: Inputs, camera: Camera | None, detector: Detector) -> Detected:
     """The point sources. Raises BadInput bad_image for fractions where the camera's levels are in counts.
 
@@ -73,14 +85,14 @@ def identify_stars(
     the `camera` stands. Raises NotIdentified, TooFewStars.
     """
     when, near = detected.exposure.time_utc, settings.near_attitude
-    stars = stars_at(catalog, when, site)
+    stars = apparent_stars(catalog, when, site)
     near_R_cam_icrs = None if near is None else near.R_cam_icrs_at(when, site)
     return extend(
         detected,
         Identified,
         camera=camera,
         stars=stars,
-        bodies=tuple(bodies(site, when)) if site is not None and when is not None else (),
+        bodies=apparent_bodies(site, when) if site is not None and when is not None else (),
         identification=settings.identifier(detected.detections, camera, stars, near_R_cam_icrs),
     )
 
@@ -94,7 +106,7 @@ def identify_unknown_lens(detected: Detected, fovs_rad: Array, catalog: StarCata
     """
     from startrack.identification import identify_unknown_lens as solve
 
-    stars = stars_at(catalog, detected.exposure.time_utc, None)
+    stars = apparent_stars(catalog, detected.exposure.time_utc, None)
     sources, size_px = detected.detections, detected.exposure.size_px
     for fov_rad in fovs_rad:
         try:
@@ -130,8 +142,3 @@ def check_one_attitude(oriented: Oriented) -> None:
     """Raises NotLocated (inconsistent_evidence) where the sources of `oriented` show a second attitude, too."""
     known = replace(oriented.identification, R_cam_icrs=oriented.attitude_fit.attitude.R_cam_icrs)
     check_single_field(oriented.detections, oriented.camera, oriented.stars, known)
-
-
-def stars_at(catalog: StarCatalog, when: datetime | None, site: Site | None) -> Stars:
-    """The `catalog` as seen at the time `when` from a `site`; at J2000.0 without aberration where the time is None."""
-    return catalog.at(when, observer_velocity_m_s(site or ANYWHERE, when) if when is not None else None)

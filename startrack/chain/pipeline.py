@@ -19,6 +19,7 @@ from startrack.chain.orientation import (
     detect_sources,
     identify_stars,
     identify_unknown_lens,
+    site_on_earth,
     solve_orientation,
 )  # fmt: skip
 from startrack.chain.sky_refinement import measured_skyline, refine_by_sky_light
@@ -54,9 +55,11 @@ def locate(
 
     def stages() -> Located:
         check_inputs(run.reached)
-        oriented = _orient(run, camera, settings, identify_stars, camera, catalog, settings, terrain.site)
+        ground = terrain.with_air(exposure.air)
+        run.reached = replace(run.reached, terrain=ground)
+        oriented = _orient(run, camera, settings, identify_stars, camera, catalog, settings, ground.site)
         run.time_stage("attitude", check_one_attitude, oriented)
-        measured = run.run_stage("evidence", measure_evidence, oriented, terrain, settings)
+        measured = run.run_stage("evidence", measure_evidence, oriented, ground, settings)
         first = replace(measured.evidence(), is_first_look=settings.evidence_sources != "stars")
         located = run.time_stage("locate", fix_position, measured, Located, settings.localizer, first)
         step = run.time_stage("evidence", sky_step_at, located)
@@ -111,15 +114,18 @@ def identify(
 ) -> Oriented | Refused:
     """Stars and attitude only. Without a time the `catalog` is taken at J2000.0, without aberration.
 
-    `exposure` must have the image size of the `camera`; `settings` exchanges stages; `site` (None: not known) adds
-    planets and the aberration of the body that it is on.
+    `exposure` must have the image size of the `camera`; `settings` exchanges stages; `site` adds planets and, of the
+    body that it is on, aberration and air. Without it (None) the site counts that the exposure's terrain has on the
+    Earth.
     """
     settings = settings or Settings()
     run = Run(Inputs(exposure=exposure, camera=camera, catalog_name=catalog.name))
 
     def stages() -> Oriented:
         check_inputs(run.reached)
-        return _orient(run, camera, settings, identify_stars, camera, catalog, settings, site)
+        known = site or site_on_earth(exposure)
+        where = known if known is None else known.with_air(exposure.air)
+        return _orient(run, camera, settings, identify_stars, camera, catalog, settings, where)
 
     return run.outcome(stages)
 

@@ -172,7 +172,9 @@ class StarRays:
         """The same under the sky of a time later by `seconds`, which is right to `reach_s`."""
         R = R_from_rotvec(seconds * self.clock.turn_rad_s)
         clock = replace(self.clock, offset_s=self.clock.offset_s + seconds, reach_s=reach_s)
-        return replace(self, R_enu_icrs=R @ self.R_enu_icrs, light=self.light.turn_frame(R), clock=clock)
+        return replace(
+            self, R_enu_icrs=R @ self.R_enu_icrs, light=self.light.turn_frame(R, self.terrain.air), clock=clock
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

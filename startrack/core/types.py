@@ -6,6 +6,7 @@ or raises `NoSolution`; there is no sentinel or half-filled result, NaN only whe
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
@@ -82,6 +83,7 @@ class Exposure(Value):
     exposure_s: float | None = None
     camera: str | None = None  # resolved path or shipped name of the camera file
     terrain: str | None = None  # resolved path or shipped name of the terrain file
+    air: Mapping[str, Any] | None = None  # what is stated of the air over the site, by key of `frames.AIR_KEYS`
     mask: str | Mask | None = None  # resolved path of the mask's file, or the mask; None: every pixel counts
     saturation_adu: float | None = None  # largest value the file's type can hold, None for float images
     sha256: str = ""

@@ -18,7 +18,7 @@ from startrack.estimation.false_alarm import CELLS_ACROSS
 from startrack.estimation.match import DEPTH_BELOW_THRESHOLD_MAG, instrumental_mag, is_isolated, match_by_brightness
 from startrack.exposure import NO_TIME
 from startrack.frames import Site, off_axis_rad
-from startrack.terrain import body_of_terrain
+from startrack.terrain import site_of_terrain
 
 TOLERANCE_MAG = 0.9
 BLENDED_MAG = 2.0  # a neighbour less than this fainter than the star shifts its centroid
@@ -45,7 +45,8 @@ def frame_of(exposure: Exposure, found: Centroids, catalog: StarCatalog, site: S
     """The frame of an exposure whose point sources are `found`. Raises BadInput no_time."""
     time_utc = require_time(exposure)
     sources = Centroids(**{f.name: getattr(found, f.name) for f in fields(Centroids)})
-    return Frame(exposure=exposure, time_utc=time_utc, sources=sources, sky=sky_at(catalog, time_utc, site))
+    where = None if site is None else site.with_air(exposure.air)
+    return Frame(exposure=exposure, time_utc=time_utc, sources=sources, sky=sky_at(catalog, time_utc, where))
 
 
 def require_time(exposure: Exposure) -> datetime:
@@ -59,7 +60,7 @@ def require_body(exposure: Exposure, site: Site | None) -> None:
     """Raise BadInput bad_terrain where the exposure names a terrain on another body than the site."""
     if site is None or exposure.terrain is None:
         return
-    body = body_of_terrain(exposure.terrain)
+    body = site_of_terrain(exposure.terrain).body
     if body != site.body:
         raise BadInput(
             "bad_terrain",

@@ -19,7 +19,7 @@ from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Detections, Ints, Stars
 from startrack.estimation.prior_choice import solve_with_best_prior
 from startrack.evidence.photometry import Sources, half_width, measure
-from startrack.frames import off_axis_rad
+from startrack.frames import EXTINCTION_SIGMA_MAG, USUAL_EXTINCTION_MAG, off_axis_rad
 
 SCALE_SNR, SCALE_STARS = 15.0, 5  # of the stars that give the scale, and their least number
 MIN_SCATTER, FIRST_SCATTER = 0.02, 0.3
@@ -29,7 +29,6 @@ MOST_DEGREE = 8  # waves of 45 degrees across a hemisphere: thin cloud
 TERMS = tuple((n, m) for n in range(1, MOST_DEGREE + 1) for m in range(-n, n + 1, 2))  # Zernike polynomials
 # Sigma of the prior of a term of degree 1, and most degree. All-sky cameras in the open: 0.3, 4.
 PRIORS = ((0.0, 0), *((size, degree) for degree in (4, MOST_DEGREE) for size in (0.03, 0.1, 0.3)))
-EXTINCTION_MAG, EXTINCTION_SIGMA_MAG = 0.2, 0.1  # prior, per airmass: clear air
 WEIGHT_ROUNDS = 10  # of the robust weights
 
 
@@ -154,7 +153,7 @@ def _fit(columns: Array, log_flux: Array, *, has_air: bool) -> tuple[Array, Arra
     Robust weights 1 / (1 + (r / 2 s)^2) are those of the widest prior.
     """
     mean = np.zeros(columns.shape[1])
-    mean[-1] = EXTINCTION_MAG if has_air else 0.0
+    mean[-1] = USUAL_EXTINCTION_MAG if has_air else 0.0
     mean[0] = np.median(log_flux - columns @ mean)
     weight, offset = np.full(len(log_flux), FIRST_SCATTER**-2), log_flux - columns @ mean
     roots = [_prior_root(size, degree, has_air) for size, degree in PRIORS]

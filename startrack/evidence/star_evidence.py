@@ -20,7 +20,7 @@ from startrack.core.types import Array, Body, Bools, Detections, Evidence, Ints,
 from startrack.evidence.expected_stars import BAD_PIXELS, USABLE, ExpectedStars, expect_stars
 from startrack.evidence.flux_scale import FluxScale
 from startrack.evidence.photometry import Photometry, Sources, measure
-from startrack.frames import turn_azel
+from startrack.frames import Air, turn_sky
 from startrack.psf import noise_area_px
 
 DECIDABLE_SNR = 2.0  # of stars whose own flux shows whether they are visible
@@ -64,9 +64,9 @@ class StarPhotometry(ExpectedStars):
             code[self.usable & (reason == text)] = number
         return replace(self, cause_code=code, causes=self.causes + texts, llr=np.where(code == USABLE, self.llr, 0.0))
 
-    def turn_frame(self, R: Array) -> StarPhotometry:
-        """The same under a sky turned by a rotation `R` (3, 3) in enu."""
-        azimuth, elevation = turn_azel(self.azimuth_rad, self.elevation_rad, R)
+    def turn_frame(self, R: Array, air: Air | None) -> StarPhotometry:
+        """The same under a sky that a rotation `R` (3, 3) in enu has turned beyond the `air`."""
+        azimuth, elevation = turn_sky(self.azimuth_rad, self.elevation_rad, R, air)
         return replace(self, azimuth_rad=azimuth, elevation_rad=elevation)
 
     def replace_stars(self, newer: StarPhotometry, which: Ints) -> StarPhotometry:

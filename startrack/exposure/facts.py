@@ -44,6 +44,7 @@ class Facts:
     exposure_s: float | None = None
     camera: str | None = None  # path, or name of a shipped file
     terrain: str | None = None  # path, or name of a shipped file
+    air: Mapping[str, Any] | None = None  # by key of `frames.AIR_KEYS`
     mask: str | None = None  # path
     dark: str | None = None  # path of the dark frame
     flat: str | None = None  # path of the flat field

@@ -86,6 +86,7 @@ def exposure_of_decoded(decoded: Decoded, facts: Facts, *, raw: bytes, name: str
         exposure_s=facts.exposure_s,
         camera=facts.camera,
         terrain=facts.terrain,
+        air=facts.air,
         mask=facts.mask,
         saturation_adu=decoded.saturation_adu,
         sha256=hashlib.sha256(raw).hexdigest(),

@@ -13,7 +13,7 @@ from startrack.core import MAX_EXPOSURE_S
 from startrack.core.declaration import SHOWN_CHARS, Choice, Number, Table, Text, value_text
 from startrack.core.files import MAX_CAUSE_CHARS, MAX_TEXT_BYTES, is_path, printable
 from startrack.core.types import BadInput
-from startrack.frames import parse_utc
+from startrack.frames import AIR_TABLE, parse_utc
 
 BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 # Ten days rotate the Moon's sky by a third of a turn: such a clock states no time. A larger number has another unit.
@@ -29,6 +29,7 @@ SIDECAR = Table(
         **NUMBERS,
         "camera": Text(description="a camera file, or the name of a shipped one"),
         "terrain": Text(description="a terrain file, or the name of a shipped one"),
+        "air": AIR_TABLE,
         "mask": Text(description="8-bit image of the frame's size: pixels below 128 do not count"),
         "dark": Text(description="dark frame of the frame's size, subtracted"),
         "flat": Text(description="flat field of the frame's size, divided by"),

@@ -1,4 +1,4 @@
-"""Directions and rotations: unit vectors, their angles, aberration and refraction; quaternions; attitude of the rover.
+"""Directions and rotations: unit vectors, their angles, aberration; quaternions; attitude of the rover.
 
 Components are on the last axis. Inside the library a rotation is a matrix R_to_from. Quaternions belong to files: order
 x, y, z, w (SciPy, ROS). Body axes: x forward, y left, z up. Heading is the azimuth of body x (from north through east);
@@ -80,27 +80,6 @@ def aberrate(rays_icrs: ArrayLike, velocity_m_s: ArrayLike) -> Array:
 def turn_azel(azimuth_rad: Array, elevation_rad: Array, R: Array) -> tuple[Array, Array]:
     """Azimuth and elevation (n,), (n,) of the directions `azimuth_rad`, `elevation_rad` (n,) turned by `R` (3, 3)."""
     return azel_from_rays(rays_from_azel(azimuth_rad, elevation_rad) @ R.T)
-
-
-def refract_rad(elevation_rad: ArrayLike, pressure_hpa: float = 1010.0, temperature_c: float = 10.0) -> Array:
-    """Apparent elevation (...) in the Earth's air of a source at true elevation `elevation_rad` [rad].
-
-    With lift(h) in arcminutes for the apparent elevation h in degrees, r = cot(h + 7.31 / (h + 4.4)):
-    apparent = true + lift(apparent),  lift = r - 0.06 sin(14.7 r + 13), the sine's argument in degrees,
-    scaled to `pressure_hpa` and `temperature_c`. Good to 2 arcsec in average air, down to the horizon, where the
-    weather is worth a tenth of the 34 arcmin. Below -1 degree the lift keeps its value there.
-
-    Source: Bennett (1982), J. Navigation 35, 255, with his correction; as in Meeus (1998), chapter 16.
-    """
-    true_rad = np.asarray(elevation_rad, dtype=float)
-    air = pressure_hpa / 1010.0 * 283.0 / (273.0 + temperature_c)
-    start_deg = np.degrees(np.maximum(true_rad, np.radians(-1.0)))
-    lift_arcmin = np.zeros_like(start_deg)
-    for _ in range(12):  # the lift falls by at most 0.2 arcmin per arcmin: twelve rounds converge
-        h = start_deg + lift_arcmin / 60.0
-        r = 1.0 / np.tan(np.radians(h + 7.31 / (h + 4.4)))
-        lift_arcmin = air * (r - 0.06 * np.sin(np.radians(14.7 * r + 13.0)))
-    return true_rad + np.radians(lift_arcmin / 60.0)
 
 
 def R_from_rotvec(rotvec_rad: ArrayLike) -> Array:

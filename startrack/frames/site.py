@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
+from functools import cached_property
 from math import isfinite, pi
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from startrack.core.types import Array, BadInput
+from startrack.frames.air import Air
 from startrack.frames.orientation import (
     EARTH_SPIN_RAD_S,
     NAIF,
@@ -34,6 +38,7 @@ class Site:
     latitude_rad: float  # north positive
     longitude_rad: float  # east positive; any multiple of 2 pi may be added
     height_m: float = 0.0  # above the sphere or the ellipsoid
+    stated_air: Air | None = None  # None: on the Earth that of the standard atmosphere
 
     def __post_init__(self) -> None:
         if self.body not in ("moon", "earth"):
@@ -42,6 +47,25 @@ class Site:
             raise BadInput("bad_terrain", "the origin's latitude, longitude and height must be finite numbers")
         if abs(self.latitude_rad) > pi / 2:
             raise BadInput("bad_terrain", f"latitude {np.degrees(self.latitude_rad):.6g} degrees is beyond a pole")
+        if self.body != "earth" and self.stated_air is not None:
+            raise BadInput("bad_terrain", f"[air] is for the Earth, and the body is the {self.body.title()}")
+
+    @cached_property
+    def air(self) -> Air | None:
+        """The air that refracts and dims the stars; None where there is none."""
+        if self.body != "earth":
+            return None
+        air = self.stated_air or Air.at(self.height_m)
+        return None if air.is_none else air
+
+    def with_air(self, stated: Mapping[str, Any] | None) -> Site:
+        """The site under the air that is `stated` (keys of `AIR_KEYS`), else under its own; None: itself.
+
+        Raises BadInput (bad_terrain) for impossible air, and off the Earth.
+        """
+        if stated is None:
+            return self
+        return replace(self, stated_air=(self.stated_air or Air.at(self.height_m)).with_stated(stated))
 
 
 def R_enu_fixed(site: Site) -> Array:
@@ -106,7 +130,7 @@ def latlon_from_enu(site: Site, east_m: ArrayLike, north_m: ArrayLike, up_m: Arr
 def R_enu_icrs(site: Site, time: datetime) -> Array:
     """Rotation (3, 3) from ICRS axes to east, north, up at the site and `time`: rays_enu = rays_icrs @ R_enu_icrs.T.
 
-    Apparent directions give apparent directions: see `aberrate` and `refract_rad` for aberration and refraction.
+    Apparent directions give apparent directions: see `aberrate` and `Air.refract` for aberration and refraction.
     Moon: SPICE with the DE421 orientation, MOON_ME. Earth: see R_itrs_icrs.
 
     Raises:

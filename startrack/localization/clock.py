@@ -8,7 +8,7 @@ from datetime import datetime
 import numpy as np
 
 from startrack.core.types import Array, Clock, Evidence, NotLocated
-from startrack.frames import R_from_rotvec, Site, sky_rotvec_rad, turn_azel
+from startrack.frames import Air, R_from_rotvec, Site, sky_rotvec_rad, turn_sky
 from startrack.localization.horizon_bias import LinearSolution, at_likeliest_bias
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.search import (
@@ -60,14 +60,14 @@ def duration(seconds: float) -> str:
     return f"{value:.0f} {unit}" if value >= 9.5 else f"{value:.2g} {unit}"
 
 
-def turn_evidence(evidence: Evidence, later_s: float) -> Evidence:
-    """The rows as they stand if the true time is later by that much."""
+def turn_evidence(evidence: Evidence, later_s: float, air: Air | None) -> Evidence:
+    """The rows as they stand if the true time is later by that much, with the refraction in the `air` there."""
     clock = evidence.clock
     if clock is None or later_s == 0.0:
         return evidence
     moved = replace(clock, offset_s=clock.offset_s + later_s)
     R = R_from_rotvec(later_s * clock.turn_rad_s)
-    azimuth, elevation = turn_azel(evidence.azimuth_rad, evidence.elevation_rad, R)
+    azimuth, elevation = turn_sky(evidence.azimuth_rad, evidence.elevation_rad, R, air)
     return replace(evidence, azimuth_rad=azimuth, elevation_rad=elevation, clock=moved)
 
 
@@ -169,7 +169,7 @@ class Track:
         for _ in range(TIME_ROUNDS):
             if any(abs(later_s - time_s) < 0.5 * self.step_s for time_s in found_s):
                 return None
-            solution = LinearSolution.near(turn_evidence(self.evidence, later_s), self.terrain, position_m)
+            solution = LinearSolution.near(self._rows(later_s), self.terrain, position_m)
             later_s = min(max(later_s + solution.later_s, low), high)
             position_m = solution.position_m
             if is_linear(self.clock, solution.later_s):
@@ -184,7 +184,10 @@ class Track:
         return float(self.clock.log_prior(later_s)) + float(likelihood.sectors.ceiling.sum())
 
     def _likelihood(self, later_s: float) -> PositionLikelihood:
-        return PositionLikelihood.from_evidence(turn_evidence(self.evidence, later_s), self.terrain)
+        return PositionLikelihood.from_evidence(self._rows(later_s), self.terrain)
+
+    def _rows(self, later_s: float) -> Evidence:
+        return turn_evidence(self.evidence, later_s, self.terrain.air)
 
 
 def is_wide(clock: Clock, terrain: Terrain) -> bool:
@@ -207,7 +210,7 @@ def explore_times(plain: PositionLikelihood, evidence: Evidence, clock: Clock) -
     later_s, log_share, way_m = Track(evidence, plain.terrain, clock).likely_way()
     found: list[tuple[Evidence, Explored]] = []
     for at in _peaks(later_s, log_share, clock):
-        rows = turn_evidence(evidence, float(later_s[at]))
+        rows = turn_evidence(evidence, float(later_s[at]), plain.terrain.air)
         guess = Guess(way_m[at][None], np.zeros(1))
         found.append((rows, local_posterior(plain.with_rows(rows), guess, -np.inf)))
     return found
@@ -215,7 +218,7 @@ def explore_times(plain: PositionLikelihood, evidence: Evidence, clock: Clock) -
 
 def turned_model(model: SkylineModel, later_s: float, is_rough: bool = False) -> SkylineModel:
     """The model with its rows turned to a later time; see `SectorRows.is_rough`."""
-    return model.with_rows(turn_evidence(model.seen.rows, later_s), is_rough)
+    return model.with_rows(turn_evidence(model.seen.rows, later_s, model.terrain.air), is_rough)
 
 
 def turned_models(model: SkylineModel, clock: Clock) -> list[SkylineModel]:

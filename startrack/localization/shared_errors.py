@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from startrack.core.types import Array, Bools, Clock, Ints
-from startrack.frames import R_from_rotvec, turn_azel
+from startrack.frames import R_from_rotvec, turn_sky
 from startrack.localization.sector_moments import SectorMoments
 from startrack.terrain import ShapeError, Terrain
 
@@ -112,7 +112,7 @@ class SharedErrors:
             return np.vstack([shape, np.zeros(len(azimuth_rad))])
         step_s, raised = TURN_STEP_RAD / size, []
         for later_s in (-step_s, step_s):
-            azimuth, elevation = turn_azel(azimuth_rad, horizon_rad, R_from_rotvec(later_s * turn))
+            azimuth, elevation = turn_sky(azimuth_rad, horizon_rad, R_from_rotvec(later_s * turn), terrain.air)
             raised.append(np.asarray(terrain.horizon_rad(position_m[None], azimuth)).ravel() - elevation)
         return np.vstack([shape, (raised[1] - raised[0]) / (2 * step_s)])
 

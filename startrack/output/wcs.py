@@ -38,8 +38,8 @@ def wcs_bytes(value: Oriented) -> bytes | None:
     None if no FITS projection describes the lens.
 
     World coordinates are ICRS directions without aberration, so that catalogue positions at the image's epoch fall on
-    their stars. Aberration bends a whole sky by up to 20 arcsec (0.06 px of a fisheye): the mean over the frame is
-    taken out. FITS pixel (1, 1) is our (0, 0), the first pixel stored.
+    their stars. Aberration bends a whole sky by up to 20 arcsec (0.06 px of a fisheye), and the Earth's air by more
+    near the horizon: the mean over the frame is taken out. FITS pixel (1, 1) is our (0, 0), the first pixel stored.
     """
     cards = wcs_cards(value.camera, _R_cam_catalog(value), value)
     return None if cards is None else header_block(cards)
@@ -86,8 +86,7 @@ def matches_bytes(value: Oriented) -> bytes:
     """
     camera, R = value.camera, _R_cam_catalog(value)
     found, stars = value.identification, value.stars.take(value.identification.star)
-    velocity = _velocity_m_s(value)
-    still = stars.rays_icrs if velocity is None else aberrate(stars.rays_icrs, -velocity)
+    still = _catalog_rays(value, stars.rays_icrs)
     measured = value.detections.xy_px[found.detection]
     predicted, _ = camera.project(stars.rays_icrs @ value.attitude.R_cam_icrs.T)
     field_deg, index_deg = _radec_deg(camera.unproject(measured) @ R), _radec_deg(still)
@@ -145,21 +144,23 @@ def _whole_blocks(content: bytes, filler: bytes) -> bytes:
     return content + filler * (-len(content) % BLOCK_BYTES)
 
 
-def _velocity_m_s(value: Oriented) -> Array | None:
+def _catalog_rays(value: Oriented, apparent_icrs: Array) -> Array:
+    """Directions (n, 3) in the catalogue of what appears in `apparent_icrs` (n, 3): no refraction, no aberration."""
     if value.exposure.time_utc is None:
-        return None  # the catalogue was taken without aberration
+        return apparent_icrs  # the catalogue was taken without aberration
     site = value.site if isinstance(value, Measured) else Site("moon", 0.0, 0.0)
-    return observer_velocity_m_s(site, value.exposure.time_utc)
+    if isinstance(value, Measured) and site.air is not None:
+        apparent_icrs = site.air.straighten(apparent_icrs, value.R_enu_icrs)
+    return aberrate(apparent_icrs, -observer_velocity_m_s(site, value.exposure.time_utc))
 
 
 def _R_cam_catalog(value: Oriented) -> Array:
     """R_cam_icrs (3, 3) that takes catalogue directions, without aberration, nearest to where they appear."""
-    camera, velocity = value.camera, _velocity_m_s(value)
-    if velocity is None:
+    camera = value.camera
+    if value.exposure.time_utc is None:
         return value.attitude.R_cam_icrs
     rays_cam = camera.unproject(_grid(camera))
-    still = aberrate(rays_cam @ value.attitude.R_cam_icrs, -velocity)
-    return wahba(rays_cam, still)
+    return wahba(rays_cam, _catalog_rays(value, rays_cam @ value.attitude.R_cam_icrs))
 
 
 def _grid(camera: Camera) -> Array:

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.catalog import bodies
+from startrack.catalog import apparent_bodies, apparent_stars
 from startrack.core import SKY_V_MAG_ARCSEC2
 from startrack.core.types import Array, BadInput, Stars, Value, rotation, vector
 from startrack.estimation.observations import OdometryErrors
-from startrack.frames import R_body_enu_from_heading_pitch_roll, R_enu_icrs, Site, observer_velocity_m_s, sky_rotvec_rad
+from startrack.frames import R_body_enu_from_heading_pitch_roll, R_enu_icrs, Site, sky_rotvec_rad
 from startrack.rendering.compose import draw_hot_pixels
 from startrack.rendering.drive import Drive, draw_odometry
 from startrack.rendering.scene import Scene
@@ -120,7 +120,7 @@ class Series:
             terrain=self.terrain,
             stars=stars,
             v_error_mag=v_error_mag,
-            bodies=tuple(bodies(site, time)),
+            bodies=apparent_bodies(site, time),
             position_enu_m=pose.position_enu_m,
             R_cam_enu=self.camera.R_body_cam.T @ pose.R_body_enu,
             R_enu_icrs=R_enu_icrs(site, time),
@@ -205,7 +205,7 @@ class Series:
         """
         site = self._site()
         rng = np.random.default_rng([self.seed, Stream.SKY])
-        stars = self.catalog.at(time, observer_velocity_m_s(site, time))
+        stars = apparent_stars(self.catalog, time, site)
         errors = np.zeros(len(stars))
         if self.flux_scatter_mag > 0:
             errors = draw_v_errors(stars, self.flux_scatter_mag, rng=rng)

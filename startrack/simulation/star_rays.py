@@ -10,12 +10,12 @@ from datetime import datetime
 
 import numpy as np
 
-from startrack.catalog import StarCatalog
-from startrack.chain import CERTAIN_PROBABILITY, StarRays
+from startrack.catalog import StarCatalog, apparent_stars
+from startrack.chain import CERTAIN_PROBABILITY, StarRays, mask_unpredictable
 from startrack.core.types import TIME_SIGMA_S, Array, BadInput, Bools, Ints
 from startrack.evidence import Skyline, StarEvidence, expect_stars, expected_flux_scale
 from startrack.exposure import combine_masks
-from startrack.frames import R_enu_icrs, azel_from_rays, observer_velocity_m_s, off_axis_rad
+from startrack.frames import R_enu_icrs, azel_from_rays, off_axis_rad
 from startrack.localization import clock_at
 from startrack.psf import noise_area_px
 from startrack.rendering import Scene, flux_e, sky_e_per_s, sky_gradient
@@ -71,7 +71,7 @@ def simulate_rays(
     typical_e = float(np.sqrt(pixel_e2 * noise_area_px(sensor.psf_sigma_px)))
     zero_mag = 2.5 * float(np.log10(sensor.zero_point_e_per_s * scene.exposure_s))
     scale = expected_flux_scale(zero_mag, typical_e, v_mag, error_mag)
-    stars, R_enu = catalog.at(when, observer_velocity_m_s(site, when)), R_enu_icrs(site, when)
+    stars, R_enu = apparent_stars(catalog, when, site), R_enu_icrs(site, when)
     found = expect_stars(
         camera, stars, list(scene.bodies), scene.R_cam_icrs, R_enu, scale, psf_sigma_px=sensor.psf_sigma_px,
         noise_e=typical_e, mask=combine_masks(None, camera.mask, camera.size_px),
@@ -86,10 +86,7 @@ def simulate_rays(
     light = Starlight(xy_px, light_e, sensor.psf_sigma_px).measure(
         found.sources(visible), variance, sensor.gain_e_per_adu * (sensor.saturation_adu - sensor.bias_adu), rng=rng
     )
-    measured = photometry.judge(found, light)
-    rays = measured.azimuth_rad, measured.elevation_rad
-    if not terrain.is_informative(*rays).all():
-        measured = measured.mask_stars(terrain.mask_reason(*rays))
+    measured = mask_unpredictable(photometry.judge(found, light), terrain)
     sigma_s = TIME_SIGMA_S if time_sigma_s is None else time_sigma_s
     clock = clock_at(site, when, sigma_s, is_stated=time_sigma_s is not None)
     return StarRays(terrain=terrain, R_enu_icrs=R_enu, clock=clock, light=measured)

@@ -5,17 +5,11 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from startrack.terrain.checks import require_bounds, require_horizons, require_terrain
 from startrack.terrain.cylinder import Cylinder
 from startrack.terrain.io import KEYS as TERRAIN_KEYS
-from startrack.terrain.io import MAKERS, body_of_terrain, files_of_terrain, load_terrain, terrain_from_dict
-from startrack.terrain.protocol import (
-    NO_POST,
-    ForwardingTerrain,
-    Terrain,
-    require_bounds,
-    require_horizons,
-    require_terrain,
-)
+from startrack.terrain.io import MAKERS, files_of_terrain, load_terrain, site_of_terrain, terrain_from_dict
+from startrack.terrain.protocol import NO_POST, ForwardingTerrain, Terrain
 from startrack.terrain.raster import EQUIRECTANGULAR, STEREOGRAPHIC, Projection, Raster
 from startrack.terrain.shape import ShapeError
 
@@ -27,10 +21,31 @@ if TYPE_CHECKING:
     from startrack.terrain.state_file import StateableError, state_errors, stateable_errors
 
 __all__ = [
-    "EQUIRECTANGULAR", "MAKERS", "NO_POST", "STEREOGRAPHIC", "TERRAIN_KEYS", "Cylinder", "ForwardingTerrain",
-    "HeightMap", "Projection", "Raster", "ShapeError", "StateableError", "Terrain",
-    "body_of_terrain", "files_of_terrain", "import_maps", "load_terrain", "read_map", "require_bounds",
-    "require_horizons", "require_terrain", "state_errors", "stateable_errors", "terrain_from_dict", "write_bands",
+    "EQUIRECTANGULAR",
+    "MAKERS",
+    "NO_POST",
+    "STEREOGRAPHIC",
+    "TERRAIN_KEYS",
+    "Cylinder",
+    "ForwardingTerrain",
+    "HeightMap",
+    "Projection",
+    "Raster",
+    "ShapeError",
+    "StateableError",
+    "Terrain",
+    "files_of_terrain",
+    "import_maps",
+    "load_terrain",
+    "read_map",
+    "require_bounds",
+    "require_horizons",
+    "require_terrain",
+    "site_of_terrain",
+    "state_errors",
+    "stateable_errors",
+    "terrain_from_dict",
+    "write_bands",
     "write_map",
 ]  # fmt: skip
 _LAZY_MODULES = {  # of names that few programs use: imported at the first use

@@ -14,7 +14,7 @@ import numpy as np
 from startrack.core.declaration import Choice, Either, List, Number, Table, Text
 from startrack.core.files import parse_toml, printable, read_text, resolve_named
 from startrack.core.types import BadInput
-from startrack.frames import Site
+from startrack.frames import AIR_TABLE, Site
 from startrack.terrain.cylinder import CYLINDER_KEYS, Cylinder
 from startrack.terrain.protocol import Terrain
 from startrack.terrain.shape import (
@@ -71,9 +71,10 @@ KEYS = Table(
                                             "the earth, and on the moon the highest of the maps"),
             },
         ),
-        "air": Table(
-            description="earth only",
+        "air": replace(
+            AIR_TABLE,
             keys={
+                **AIR_TABLE.keys,
                 "terrestrial_refraction": Number(low=-1.0, high=0.8, default=REFRACTION_1, description="curvature of a "
                                                  "level sight line to the ground, relative to the Earth's"),
                 REFRACTION.key: REFRACTION.limits,
@@ -122,13 +123,24 @@ def files_of_terrain(path: str | Path) -> tuple[Path, ...]:
         return ()
 
 
-def body_of_terrain(name_or_path: str | Path) -> str:
-    """The body of the terrain file that `load_terrain` finds by `name_or_path`; its maps are not read.
+def site_of_terrain(name_or_path: str | Path) -> Site:
+    """The site of the terrain file that `load_terrain` finds by `name_or_path`; its maps are not read.
 
     Raises BadInput bad_terrain.
     """
     path = resolve_named(name_or_path, "terrain", "bad_terrain")
-    return str(read_keys(read_text(path, "bad_terrain"))["body"])
+    return _site_of_keys(read_keys(read_text(path, "bad_terrain")))
+
+
+def _site_of_keys(keys: dict[str, Any]) -> Site:
+    origin = keys["origin"]
+    site = Site(
+        body=keys["body"],
+        latitude_rad=float(np.radians(origin["latitude_deg"])),
+        longitude_rad=float(np.radians(origin["longitude_deg"])),
+        height_m=origin["height_m"],
+    )
+    return site.with_air(keys.get("air"))
 
 
 def read_keys(text: str) -> dict[str, Any]:
@@ -164,15 +176,8 @@ def terrain_from_dict(values: dict[str, Any], default_name: str = "terrain", fol
     Raises BadInput bad_terrain with the key that is wrong.
     """
     keys = KEYS.read(values, "bad_terrain")
-    origin = keys["origin"]
-    site = Site(
-        body=keys["body"],
-        latitude_rad=float(np.radians(origin["latitude_deg"])),
-        longitude_rad=float(np.radians(origin["longitude_deg"])),
-        height_m=origin["height_m"],
-    )
+    site = _site_of_keys(keys)
     only_earth = [key for key in ("geoid_m", "geoid_slope_arcsec") if key in keys.get("dem", {})]
-    only_earth += ["[air]"] if "air" in keys else []
     if site.body != "earth" and only_earth:
         raise BadInput("bad_terrain", f"{only_earth[0]} is for the Earth, and the body is the {site.body.title()}")
     makers = [make for ground, make in MAKERS.items() if ground in keys]

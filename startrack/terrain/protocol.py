@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.types import Array, BadInput, Bools, Ints
-from startrack.frames import Site
+from startrack.core.types import Array, Bools, Ints
+from startrack.frames import Air, Site
 from startrack.terrain.earth_projection import EarthProjection
 from startrack.terrain.raster import STEREOGRAPHIC, Projection
 from startrack.terrain.shape import ShapeError
 
 Progress = Callable[[int, int], None]  # parts done, of how many
 NO_POST = -1
-BOUNDS_ROUNDING_RAD = 1e-9  # by which a least horizon may exceed the greatest
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +64,20 @@ class Terrain(ABC):
     table_path: Path | None = None  # file of the table that `prepare` computes; None where it computes none
     unstated_errors: tuple[str, ...] = ()  # keys of errors that the terrain file leaves out: they count as zero
     files: tuple[Path, ...] = ()  # that it was read from, beside the terrain file: what is made with it depends on them
+
+    @property
+    def air(self) -> Air | None:
+        """That of its site; None where there is none, or no site."""
+        return None if self.site is None else self.site.air
+
+    def with_air(self, stated: Mapping[str, Any] | None) -> Self:
+        """The same ground under the air that is `stated`, see `Site.with_air`; None, or no site: itself."""
+        if stated is None or self.site is None:
+            return self
+        other = copy(self)
+        other.__dict__["site"] = self.site.with_air(stated)
+        other.__dict__.pop("shape_errors", None)  # of a class that keeps them
+        return other
 
     @property
     def reach_m(self) -> float:
@@ -225,8 +238,15 @@ class ForwardingTerrain(Terrain):
 
     def without_table(self) -> Terrain:
         """A copy of this one, about `whole` without its table."""
+        return self._about(self.whole.without_table())
+
+    def with_air(self, stated: Mapping[str, Any] | None) -> Self:
+        """A copy of this one, about `whole` under the air that is `stated`."""
+        return self._about(self.whole.with_air(stated))
+
+    def _about(self, whole: Terrain) -> Self:
         other = copy(self)
-        other.__dict__["whole"] = self.whole.without_table()
+        other.__dict__["whole"] = whole
         return other
 
 
@@ -237,58 +257,3 @@ def _forward(name: str) -> Any:
 for _name in set(vars(Terrain)) - set(vars(ForwardingTerrain)):
     if not _name.startswith("_"):
         setattr(ForwardingTerrain, _name, _forward(_name))
-
-
-def require_terrain(given: Any) -> Terrain:
-    """`given`, if it is a terrain: of a class derived from Terrain, or with every member of one.
-
-    The one check of the members of a user's object; `require_bounds` and `require_horizons` check the values. All other
-    code relies on the protocol. Raises BadInput (bad_terrain) that names the required methods which are missing.
-    """
-    members = [name for name in dir(Terrain) if not name.startswith("_")]
-    if all(hasattr(type(given), name) or hasattr(given, name) for name in members):
-        return given  # type: ignore[no-any-return]
-    if isinstance(given, str):
-        raise BadInput("bad_terrain", f"{given!r} is a text, no terrain: give startrack.load_terrain({given!r})")
-    missing = [name for name in sorted(Terrain.__abstractmethods__) if not hasattr(given, name)]
-    lacks = f" (it has no {', '.join(missing)})" if missing else ""
-    raise BadInput(
-        "bad_terrain",
-        f"{type(given).__name__} is no terrain{lacks}: give a file, a name, or an object of a class derived from "
-        "startrack.Terrain",
-    )
-
-
-def require_bounds(terrain: Terrain, low_rad: Array, high_rad: Array) -> None:
-    """Raise BadInput (bad_terrain) unless what `horizon_bounds_rad` of a `terrain` gave are bounds.
-
-    `low_rad` and `high_rad` (...): the least and greatest horizons. The search asks for those of the whole search area
-    first, so that an error in a user's terrain is named before it misleads the search.
-    """
-    wrong, fault = ~(low_rad <= high_rad + BOUNDS_ROUNDING_RAD), "least horizons above the greatest"
-    if not wrong.any():
-        return
-    nan = np.isnan(low_rad) | np.isnan(high_rad)
-    if nan.any():
-        wrong, fault = nan, "NaN"
-    _refuse(terrain, "horizon_bounds_rad", fault, wrong, "sectors of boxes")
-
-
-def require_horizons(terrain: Terrain, points_m: Array, horizon_rad: Array) -> None:
-    """Raise BadInput (bad_terrain) unless a `terrain` gave finite horizons wherever a camera can stand.
-
-    `points_m` (..., 2) are the positions, `horizon_rad` (...) what `horizon_rad` gave there.
-    """
-    if not np.isfinite(horizon_rad).all():
-        wrong = ~np.isfinite(horizon_rad) & np.asarray(terrain.allowed(points_m))
-        _refuse(terrain, "horizon_rad", "NaN or infinity", wrong, "rays from ground on which a camera can stand")
-
-
-def _refuse(terrain: Terrain, method: str, fault: str, wrong: Bools, what: str) -> None:
-    """Raise BadInput (bad_terrain) if any value of a method is wrong."""
-    if wrong.any():
-        raise BadInput(
-            "bad_terrain",
-            f"terrain {terrain.name!r} ({type(terrain).__name__}): {method} gives {fault} for "
-            f"{np.count_nonzero(wrong)} of {wrong.size} {what}",
-        )

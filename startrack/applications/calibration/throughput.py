@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.camera import MIN_THROUGHPUT_1, Sensor
-from startrack.catalog import airmass
 from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Ints, Rows, array
 from startrack.estimation.joint_fit import JointFit
+from startrack.frames import airmass
 
 MIN_THROUGHPUT_STARS = 30
 MIN_FLUX_SNR = 10.0

@@ -135,7 +135,7 @@ def _require_above_horizon(one: Oriented, site: Site) -> None:
 
 
 def _sky_frame(k: int, one: Oriented, joint: JointFit, camera: Camera, catalog: StarCatalog, site: Site) -> SkyFrame:
-    time_utc = require_time(one.exposure)
+    time_utc, site = require_time(one.exposure), site.with_air(one.exposure.air)
     sky = sky_at(catalog, time_utc, site, LOWEST_STAR_RAD)
     hip_of_match = joint.frames[k].sky.stars.hip[joint.matches[k].star]
     order = np.argsort(sky.stars.hip)

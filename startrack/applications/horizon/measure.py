@@ -19,7 +19,7 @@ from startrack.applications.horizon.posterior import (
 from startrack.applications.horizon.skylight import Steps, find_steps
 from startrack.applications.horizon.starlight import StarLight, measure_stars
 from startrack.camera import Camera
-from startrack.catalog import StarCatalog, apparent_elevation_rad
+from startrack.catalog import StarCatalog
 from startrack.core.errors import NoSolution
 from startrack.core.runner import map_in_threads
 from startrack.core.types import Array, Bools, Exposure, MeasuredSkyline
@@ -139,7 +139,7 @@ def _common_sigma_rad(frames: Sequence[SkyFrame], azimuth: Array, elevation: Arr
         angle = np.minimum(off_axis_rad(rays), frame.camera.max_angle_rad)
         scale = frame.camera.mean_scale_rad_per_px(angle)
         by_frame.append(np.hypot(frame.camera.projection_sigma_px(rays) * scale, frame.attitude_sigma_rad))
-    lift = apparent_elevation_rad(elevation, site) - elevation
+    lift = 0.0 if site.air is None else site.air.lift_rad(elevation)
     return np.hypot(np.min(by_frame, axis=0), WEATHER_1 * lift)
 
 

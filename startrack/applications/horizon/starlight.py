@@ -8,10 +8,9 @@ import numpy as np
 
 from startrack.applications.horizon.columns import HIGHEST_GROUND_RAD
 from startrack.applications.horizon.frames import SkyFrame
-from startrack.catalog import airmass
 from startrack.core.types import Array, Evidence
 from startrack.evidence import SEEN_LLR, FluxScale, StarEvidence, StarPhotometry, flux_scale
-from startrack.frames import azel_from_rays
+from startrack.frames import airmass, azel_from_rays
 
 BRIGHT_SNR = 12.0  # of stars beside which the light of the sky is not measured
 STAR_GLARE_PX, GLARE_PER_DECADE_PX = 3.0, 2.5  # of the faintest of them, and more for each factor of ten
@@ -31,7 +30,7 @@ def measure_stars(frame: SkyFrame) -> StarLight:
     """Every catalogue star in view of a frame."""
     camera = replace(frame.camera, sensor=None, calibrated_angle_rad=frame.camera.max_angle_rad)
     stars = frame.sky.stars
-    air = airmass(np.maximum(azel_from_rays(stars.rays_icrs @ frame.R_enu_icrs.T)[1], 0.0))
+    air = airmass(azel_from_rays(stars.rays_icrs @ frame.R_enu_icrs.T)[1])
     matches = frame.matched_detection, frame.matched_star
     scale = flux_scale(frame.detections, camera, stars, matches, frame.R_cam_icrs, air)
     light = StarEvidence()(
@@ -54,7 +53,7 @@ def _glare(frame: SkyFrame, scale: FluxScale, light: StarPhotometry) -> tuple[Ar
     planets = [body for body in frame.bodies if body.name not in ("Sun", "Moon")]
     rays = np.array([body.ray_icrs for body in planets]).reshape(-1, 3)
     px, seen = frame.camera.project(rays @ frame.R_cam_icrs.T)
-    air = airmass(np.maximum(azel_from_rays(rays @ frame.R_enu_icrs.T)[1], 0.0))
+    air = airmass(azel_from_rays(rays @ frame.R_enu_icrs.T)[1])
     v_mag = np.array([body.v_mag for body in planets])
     flux_e, _ = scale.expect(v_mag, rays @ frame.R_cam_icrs.T, replace(frame.camera, sensor=None), air)
     snr = np.concatenate([light.expected_e, flux_e[seen]]) / noise_e

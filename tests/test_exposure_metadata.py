@@ -169,12 +169,21 @@ def test_unknown_keys_of_a_sidecar_pass_with_a_warning(image, sidecar):
     sidecar({"exposure": 5, "Camera": "a.toml", "terrain": "b"})
     exposure = read_exposure(image)
     assert (exposure.exposure_s, exposure.terrain) == (20.0, "b")
-    known = "time_utc, time_sigma_s, exposure_s, camera, terrain, mask, dark, flat, bayer_pattern"
+    known = "time_utc, time_sigma_s, exposure_s, camera, terrain, air, mask, dark, flat, bayer_pattern"
     assert exposure.warnings == tuple(
         f"sidecar frame.json: key {key!r} is none of {known}; not used" for key in ("exposure", "Camera")
     )
     sidecar({f"key {k}": k for k in range(1000)})
     assert len(read_exposure(image).warnings) < 10
+
+
+def test_the_air_of_a_sidecar_is_checked(image, sidecar):
+    sidecar({"air": {"pressure_hpa": 780, "temperature_c": -4.5}})
+    assert read_exposure(image).air == {"pressure_hpa": 780.0, "temperature_c": -4.5}
+    sidecar({"air": {"pressure_hpa": -1}})
+    with pytest.raises(BadInput, match=r"air\.pressure_hpa") as caught:
+        read_exposure(image)
+    assert caught.value.reason == "bad_image"
 
 
 def test_null_means_not_given_and_a_byte_order_mark_is_skipped(image, sidecar):

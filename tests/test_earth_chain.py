@@ -1,0 +1,103 @@
+"""The chain on the Earth: pictures rendered below its air are located, and not without the air."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from startrack.camera import load_camera
+from startrack.catalog import load_catalog
+from startrack.chain import Located, Outcome, Settings, locate
+from startrack.core.types import Array, BadInput
+from startrack.frames import LOWEST_PREDICTED_RAD, Air, Site
+from startrack.rendering import Scene, Series, render
+from startrack.terrain import Cylinder, terrain_from_dict
+
+SITE = Site("earth", np.radians(-30.24), np.radians(-70.75), 2200.0)
+NO_AIR = Air(pressure_hpa=0.0, temperature_c=0.0)
+CRATER = Cylinder(name="crater", site=SITE, diameter_m=20e3, depth_m=2000.0, camera_height_m=1.5, search_radius_m=10e3)
+SETTINGS = Settings(deep_stars=False)
+EVERY_CHI2_2DOF = 18.4  # 99.99 %
+
+
+def picture(seed: int, terrain: Cylinder = CRATER, **given: Any) -> tuple[Scene, Any]:
+    series = Series(camera=load_camera("fisheye-2048"), terrain=terrain, catalog=load_catalog(), seed=seed, **given)
+    scene, rng = series.scene(0)
+    return scene, render(scene, rng=rng)[0]
+
+
+def solve(exposure: Any, terrain: Cylinder) -> Outcome:
+    return locate(exposure, load_camera("fisheye-2048"), terrain, load_catalog(), SETTINGS)
+
+
+def miss_m(outcome: Outcome, scene: Scene) -> Array:
+    assert isinstance(outcome, Located), outcome.message
+    return np.asarray(outcome.fix.position_enu_m[:2] - scene.position_enu_m[:2])
+
+
+def nees(outcome: Any, error_m: Array) -> float:
+    return float(error_m @ np.linalg.solve(outcome.fix.covariance_m2, error_m))
+
+
+def test_a_picture_below_the_air_is_located_with_the_air_alone() -> None:
+    scene, exposure = picture(100)
+    outcome = solve(exposure, CRATER)
+    error = miss_m(outcome, scene)
+    assert np.linalg.norm(error) < 15.0
+    assert nees(outcome, error) < EVERY_CHI2_2DOF
+    assert outcome.warnings == []
+    without = solve(exposure, replace(CRATER, site=replace(SITE, stated_air=NO_AIR)))
+    assert (without.status, without.reason) == ("refused", "inconsistent_evidence")
+
+
+def test_the_sidecars_air_replaces_the_terrains() -> None:
+    cold = {"pressure_hpa": 800.0, "temperature_c": -30.0}  # 13 % more refraction than in the standard atmosphere
+    scene, exposure = picture(101, replace(CRATER, site=SITE.with_air(cold)))
+    stated = solve(replace(exposure, air=cold), CRATER)
+    error = miss_m(stated, scene)
+    assert np.linalg.norm(error) < 15.0
+    assert nees(stated, error) < EVERY_CHI2_2DOF
+    assert stated.terrain.air == SITE.with_air(cold).air
+    moon = replace(CRATER, site=Site("moon", -1.5, 0.0))
+    assert solve(replace(exposure, air=cold), moon).reason == "bad_terrain"
+
+
+def test_a_terrain_file_states_the_air() -> None:
+    file = {
+        "body": "earth", "origin": {"latitude_deg": 40.0, "longitude_deg": 10.0, "height_m": 1000.0},
+        "cylinder": {"diameter_m": 2e4, "depth_m": 2e3}, "air": {"pressure_hpa": 890.0, "temperature_c": 4.0},
+    }  # fmt: skip
+    air = terrain_from_dict(file).air
+    assert air is not None
+    assert (air.pressure_hpa, air.temperature_c, air.refraction_sigma_1) == (890.0, 4.0, 0.005)
+    assert terrain_from_dict(file | {"air": {"pressure_hpa": 0.0}}).air is None
+    with pytest.raises(BadInput, match="pressure_hpa"):
+        terrain_from_dict(file | {"air": {"pressure_hpa": -3.0}})
+    with pytest.raises(BadInput, match="Moon"):
+        terrain_from_dict(file | {"body": "moon"})
+
+
+def test_stars_low_in_the_air_are_no_evidence() -> None:
+    flat = replace(CRATER, depth_m=150.0, diameter_m=2e4)  # the rim stands 0.85 degrees high
+    _, exposure = picture(102, flat, east_m=0.0, north_m=0.0)
+    outcome = solve(exposure, flat)
+    light = (outcome if isinstance(outcome, Located) else outcome.reached).light  # type: ignore[union-attr]
+    low = light.elevation_rad < LOWEST_PREDICTED_RAD
+    assert low.sum() > 20
+    assert not light.usable[low].any()
+
+
+@pytest.mark.slow
+def test_errors_on_the_earth_agree_with_their_covariance() -> None:
+    found = []
+    for seed in range(200, 240):
+        scene, exposure = picture(seed)
+        outcome = solve(exposure, CRATER)
+        error = miss_m(outcome, scene)
+        found.append((float(np.linalg.norm(error)), nees(outcome, error)))
+    errors, all_nees = np.array(found).T
+    assert errors.mean() < 5.0  # the Moon's frames: 2.5
+    assert 1.0 < all_nees.mean() < 3.0

@@ -54,6 +54,11 @@ cylinder = {{diameter_m = {2 * RADIUS_M}, depth_m = {DEPTH_M}, exact = true}}
 rover = {{camera_height_m = {CAMERA_M}}}
 search = {{radius_m = {0.95 * RADIUS_M}}}
 
+[air]
+pressure_hpa = {PRESSURE_HPA}
+temperature_c = {TEMPERATURE_C}
+humidity_1 = {HUMIDITY_1}
+
 [origin]
 latitude_deg = {np.degrees(SITE.latitude_rad)}
 longitude_deg = {np.degrees(SITE.longitude_rad)}

@@ -25,10 +25,10 @@ SCALE_SNR, SCALE_STARS = 15.0, 5  # of the stars that give the scale, and their 
 MIN_SCATTER, FIRST_SCATTER = 0.02, 0.3
 LN_PER_MAG = 0.4 * np.log(10)
 CONSTANT_SIGMA = 10.0  # of the prior of the zero point: none
-MOST_DEGREE = 8  # waves of 45 degrees across a hemisphere: thin cloud
-TERMS = tuple((n, m) for n in range(1, MOST_DEGREE + 1) for m in range(-n, n + 1, 2))  # Zernike polynomials
+MOST_WAVES = 8  # waves of 45 degrees across a hemisphere: thin cloud
+TERMS = tuple((n, m) for n in range(1, MOST_WAVES + 1) for m in range(-n, n + 1, 2))  # Zernike polynomials
 # Sigma of the prior of a term of degree 1, and most degree. All-sky cameras in the open: 0.3, 4.
-PRIORS = ((0.0, 0), *((size, degree) for degree in (4, MOST_DEGREE) for size in (0.03, 0.1, 0.3)))
+PRIORS = ((0.0, 0), *((size, degree) for degree in (4, MOST_WAVES) for size in (0.03, 0.1, 0.3)))
 WEIGHT_ROUNDS = 10  # of the robust weights
 
 
@@ -128,7 +128,7 @@ def _columns(camera: Camera, rays_cam: Array, air: Array | None) -> Array:
     part2 = np.square(np.minimum(off_axis_rad(rays_cam) / camera.max_angle_rad, 1.0))
     turn = np.arctan2(rays_cam[:, 1], rays_cam[:, 0])
     wave = np.sqrt(part2) * np.exp(1j * turn)
-    waves = np.stack([wave**m for m in range(MOST_DEGREE + 1)])
+    waves = np.stack([wave**m for m in range(MOST_WAVES + 1)])
     columns = [np.ones(len(part2))]
     for n, m in TERMS:
         radial = np.polynomial.polynomial.polyval(part2, _radial_powers(n, abs(m)))

@@ -1,0 +1,251 @@
+"""Valleys of the Earth: real ground, air, the skies that there are. Frames are rendered and located.
+
+    python benchmarks/valleys.py [--frames 40] [--skies 10] [--rests 20] [--case NAME ...]
+
+The ground is that near Jacksboro, Tennessee, at 3 arcsec (SRTM), as it comes with matplotlib; places are valley floors
+whose mean horizon is 9 to 26 degrees. 2048 px, a star of V 6 on the axis at 5 sigma, a sky of 21.5 mag/arcsec2, stars
+refracted and dimmed by the standard atmosphere. "5 m per post": the ground differs from the map by 5 m of white noise
+at each post, which the map states. "trees": they raise 20 % of the skyline and are on no map.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from _hazard_grounds import Risen
+from _map_draws import draw_ground
+from _results import table, write_section
+from _sky_view import Hazard, Rng, View, expose, smooth_noise, turn
+from matplotlib import cbook
+
+from startrack.applications.tracking import TrackErrors, observe_frame
+from startrack.applications.tracking.filtered_positions import positions_at_rest
+from startrack.camera import Camera, load_camera
+from startrack.catalog import apparent_bodies, load_catalog
+from startrack.chain import Located, locate
+from startrack.core.runner import count_cores
+from startrack.core.types import Array
+from startrack.frames import Site, azel_from_rays, rays_from_azel
+from startrack.rendering import Series
+from startrack.terrain import HeightMap, Raster, Terrain
+from startrack.terrain.earth_projection import EarthProjection
+from startrack.terrain.ellipsoid_fit import above_ellipsoid
+
+LATITUDE_DEG, LONGITUDE_DEG = 36.59, -84.246
+RADIUS_M, HIGHEST_BEYOND_M = 9000.0, 1300.0
+HORIZON_DEG, STEEPEST_RAD = (9.0, 26.0), np.radians(15.0)
+POST_SIGMA_M = 5.0
+SKY_MAG = 21.5
+YEAR, DAYS = datetime(2026, 1, 1, tzinfo=UTC), 365
+NIGHT_RAD, TWILIGHT_RAD = np.radians(-18.0), np.radians([-14.0, -11.0])  # elevations of the Sun
+MOON_RAD, DARK_RAD = np.radians([15.0, 60.0]), np.radians(-5.0)  # elevations of the Moon, up and down
+REST_EXPOSURES, REST_EVERY_S = 12, 327.0  # an hour
+SEED = 29
+
+
+def jacksboro(height_sigma_m: float = 0.0) -> HeightMap:
+    """The valleys as a terrain whose map has this error."""
+    data = cbook.get_sample_data("jacksboro_fault_dem.npz")
+    step = float(data["dx"])
+    raster = Raster(
+        heights_m=data["elevation"].astype(np.float32), projection=EarthProjection(middle_x=float(data["xmin"]) + 200 * step),
+        x0_m=float(data["xmin"]) + step / 2, y0_m=float(data["ymin"]) - step / 2, dx_m=step, dy_m=-step, source="jacksboro",
+    )  # fmt: skip
+    site = Site("earth", float(np.radians(LATITUDE_DEG)), float(np.radians(LONGITUDE_DEG)), 300.0)
+    return HeightMap(
+        name="jacksboro", site=site, maps=(above_ellipsoid(raster, site, 0.0, None),), search_radius_m=RADIUS_M,
+        height_sigma_m=height_sigma_m, highest_beyond_m=HIGHEST_BEYOND_M, terrestrial_refraction_1=0.13,
+        terrestrial_refraction_sigma_1=None, horizon_sigma_common_rad=None if height_sigma_m else 0.0,
+    )  # fmt: skip
+
+
+def draw_floor(terrain: HeightMap, rng: Rng) -> Array:
+    """A place (2,) on a valley floor."""
+    around = np.linspace(0, 2 * np.pi, 72, endpoint=False)
+    while True:
+        at = rng.uniform(-RADIUS_M, RADIUS_M, 2)
+        if np.hypot(*at) < 0.95 * RADIUS_M and terrain.slope_rad(at) < STEEPEST_RAD:
+            mean = np.degrees(terrain.horizon_rad(at[None], around).mean())
+            if HORIZON_DEG[0] <= mean <= HORIZON_DEG[1]:
+                return at
+
+
+def draw_time(site: Site, rng: Rng, *, sun_rad: tuple[float, float], moon_rad: tuple[float, float]) -> datetime:
+    """A time with Sun and Moon at elevations in these ranges."""
+    while True:
+        when = YEAR + timedelta(days=float(rng.uniform(0, DAYS)))
+        at = {one.name: float(azel_of(one.ray_icrs, site, when)[1]) for one in apparent_bodies(site, when)[:9]}
+        if sun_rad[0] <= at["Sun"] <= sun_rad[1] and moon_rad[0] <= at["Moon"] <= moon_rad[1]:
+            return when
+
+
+def azel_of(ray_icrs: Array, site: Site, when: datetime) -> tuple[Array, Array]:
+    """Azimuth and elevation [rad] of a direction."""
+    from startrack.frames import R_enu_icrs
+
+    return azel_from_rays(R_enu_icrs(site, when) @ ray_icrs)
+
+
+def moonlight(view: View, rng: Rng) -> Array:
+    """Moonlight that the air scatters: Krisciunas and Schaefer 1991, PASP 103, 1033, equations 17 and 21."""
+    moon = next(one for one in view.scene.bodies if one.name == "Moon")
+    rays = rays_from_azel(view.azimuth_rad, view.elevation_rad)
+    away = np.degrees(np.arccos(np.clip(rays @ (view.scene.R_enu_icrs @ moon.ray_icrs), -1, 1)))
+    scattered = 10**5.36 * (1.06 + np.cos(np.radians(away)) ** 2) + 10 ** (6.15 - away / 40)
+    return view.with_sky(1 + 10 ** (-0.4 * (moon.v_mag + 12.73)) * 20.0 * scattered / 10**5.7)
+
+
+def twilight(view: View, rng: Rng) -> Array:
+    """A glow over the Sun: twice to 20 times the sky at the horizon, and half as much again all around."""
+    sun = next(one for one in view.scene.bodies if one.name == "Sun")
+    azimuth, _ = azel_from_rays(view.scene.R_enu_icrs @ sun.ray_icrs)
+    off = turn(view.azimuth_rad, float(azimuth))
+    glow = np.exp(-0.5 * (off / np.radians(60)) ** 2 - np.maximum(view.elevation_rad, 0) / np.radians(20))
+    return view.with_sky(1.5 + rng.uniform(2, 20) * glow)
+
+
+def city(view: View, rng: Rng) -> Array:
+    """Two or three domes of light at the horizon, 2 to 10 times the sky."""
+    factor = np.ones(view.azimuth_rad.shape)
+    for _ in range(rng.integers(2, 4)):
+        width, high = np.radians([rng.uniform(20, 50), rng.uniform(6, 15)])
+        off = turn(view.azimuth_rad, rng.uniform(0, 2 * np.pi))
+        factor += rng.uniform(2, 10) * np.exp(-0.5 * (off / width) ** 2 - np.maximum(view.elevation_rad, 0) / high)
+    return view.with_sky(factor)
+
+
+def thin_cloud(view: View, rng: Rng) -> Array:
+    """Cirrus that takes up to 0.8 mag in patches of 10 to 30 degrees, and is up to half as bright again as the sky."""
+    cell_px = int(view.scene.camera.focal_px[0] * np.radians(rng.uniform(10, 30)))
+    patches = np.clip(0.5 + 0.5 * smooth_noise(view.azimuth_rad.shape, cell_px, rng), 0, 1)
+    return view.with_sky(1 + 0.5 * patches, 10 ** (-0.4 * 0.8 * patches))
+
+
+def trees(ground: Terrain, place_m: Array, rng: Rng) -> Terrain:
+    """The ground with 5 to 20 m high trees on the crests of 20 % of the azimuths, seen from a place (2,)."""
+    around = np.linspace(0, 2 * np.pi, 720, endpoint=False)
+    _, distance, _ = ground.horizons(np.broadcast_to(place_m, (720, 2)), around)  # type: ignore[attr-defined]
+    covered = np.zeros(720, dtype=bool)
+    while covered.mean() < 0.2:
+        start, width = rng.integers(720), rng.integers(8, 60)
+        covered[(start + np.arange(width)) % 720] = True
+    rise = covered * rng.uniform(5, 20, 720) / np.maximum(distance, 100.0)
+    return Risen(
+        ground, lambda azimuth: np.interp(azimuth % (2 * np.pi), np.append(around, 2 * np.pi), np.append(rise, rise[0]))
+    )
+
+
+@dataclass(frozen=True)
+class Case:
+    """A kind of frames: the wanted mean error [m], the map's error, trees, the sky."""
+
+    wanted_m: float | None
+    post_m: float = 0.0
+    has_trees: bool = False
+    light: Callable[[View, Rng], Array] = lambda view, rng: view.light_e
+    sun_rad: tuple[float, float] = (-np.pi / 2, float(NIGHT_RAD))
+    moon_rad: tuple[float, float] = (-np.pi / 2, float(DARK_RAD))
+    is_sky: bool = False
+
+
+CASES = {
+    "exact map": Case(2.0),
+    "5 m per post": Case(12.0, post_m=POST_SIGMA_M),
+    "trees on 20 % of the skyline": Case(None, has_trees=True),
+    "Moon up": Case(None, light=moonlight, moon_rad=tuple(MOON_RAD), is_sky=True),
+    "twilight": Case(None, light=twilight, sun_rad=tuple(TWILIGHT_RAD), is_sky=True),
+    "city glow": Case(None, light=city, is_sky=True),
+    "thin cloud": Case(None, light=thin_cloud, is_sky=True),
+    "an hour at rest": Case(0.6),
+}
+
+
+@cache
+def _terrain(post_m: float) -> HeightMap:
+    terrain = jacksboro(post_m)
+    terrain.prepare()
+    return terrain
+
+
+@cache
+def _camera() -> Camera:
+    return load_camera("fisheye-2048")
+
+
+def locate_frame(job: tuple[str, int]) -> tuple[str, float, float, float]:
+    """Status, error [m], NEES, and the error over the radius of the 99.9 % circle of a frame of a case."""
+    name, number = job
+    case, rng = CASES[name], np.random.default_rng([SEED, number])
+    stated = _terrain(case.post_m)
+    assert stated.site is not None
+    place_m = draw_floor(_terrain(0.0), rng)
+    when = draw_time(stated.site, rng, sun_rad=case.sun_rad, moon_rad=case.moon_rad)
+    ground: Terrain = draw_ground(_terrain(0.0), case.post_m, rng) if case.post_m else _terrain(0.0)
+    ground = trees(ground, place_m, rng) if case.has_trees else ground
+    frames = REST_EXPOSURES if name == "an hour at rest" else 1
+    series = Series(
+        camera=_camera(), terrain=ground, catalog=load_catalog(), seed=int(rng.integers(1 << 30)), time_utc=when,
+        east_m=float(place_m[0]), north_m=float(place_m[1]), sky_v_mag_arcsec2=SKY_MAG,
+        every_s=REST_EVERY_S if frames > 1 else None,
+    )  # fmt: skip
+    outcomes = []
+    for k in range(frames):
+        scene, noise = series.scene(k, f"frame-{k:03d}")
+        exposure, _, _ = expose(scene, Hazard(light=case.light), noise)
+        outcomes.append(locate(exposure, _camera(), stated, load_catalog()))
+    if frames == 1:
+        one = outcomes[0]
+        if not isinstance(one, Located) or one.fix.ambiguous:
+            print(f"{name} {number}: {one.reason}: {one.message}", flush=True)
+            return str(one.reason), np.nan, np.nan, np.nan
+        return "ok", *_score(one.fix.position_enu_m[:2] - place_m, one.fix.covariance_m2, one.fix.radius999_m)
+    shared = TrackErrors.of(stated, None, True)
+    observed = [observe_frame(one, shared) for one in outcomes]
+    _, position, covariance = positions_at_rest(observed, stated, shared)
+    return "ok", *_score(position[-1] - place_m, covariance[-1], np.sqrt(13.8 * np.linalg.eigvalsh(covariance[-1])[1]))
+
+
+def _score(off_m: Array, covariance_m2: Array, radius_m: float) -> tuple[float, float, float]:
+    error_m = float(np.hypot(*off_m))
+    return error_m, float(off_m @ np.linalg.solve(covariance_m2, off_m)), error_m / float(radius_m)
+
+
+def main() -> None:
+    """Run, print and write the section."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", type=int, default=40)
+    parser.add_argument("--skies", type=int, default=10)
+    parser.add_argument("--rests", type=int, default=20)
+    parser.add_argument("--case", nargs="*", default=list(CASES))
+    parser.add_argument("--print-only", action="store_true")
+    args = parser.parse_args()
+    rows = []
+    with ProcessPoolExecutor(count_cores()) as pool:
+        for name in args.case:
+            case = CASES[name]
+            count = args.skies if case.is_sky else args.rests if "rest" in name else args.frames
+            found = list(pool.map(locate_frame, [(name, k) for k in range(count)]))
+            errors, nees, parts = (np.array([one[k] for one in found if one[0] == "ok"]) for k in (1, 2, 3))
+            rows.append([
+                name, f"{len(errors)} of {count}", f"{errors.mean():.2f}", f"{np.median(errors):.2f}", f"{errors.max():.2f}",
+                f"{nees.mean():.2f}", str(int((parts > 1).sum())), str(int((parts > 2).sum())),
+                "" if case.wanted_m is None else f"<= {case.wanted_m:g}",
+            ] if len(errors) else [name, f"0 of {count}", *7 * [""]])  # fmt: skip
+            print(*rows[-1], flush=True)
+    head = ["frames", "answered", "mean error, m", "median", "largest", "NEES", "beyond the 99.9 % circle", "beyond twice",
+            "wanted mean"]  # fmt: skip
+    body = table(head, rows)
+    print(body)
+    if not args.print_only:
+        write_section("Valleys of the Earth", "python benchmarks/valleys.py", ("numpy", "astropy", "matplotlib"), body)
+
+
+if __name__ == "__main__":
+    main()

@@ -12,6 +12,8 @@ from startrack.core.declaration import Flag
 from startrack.core.kernels import njit
 from startrack.core.types import Array, BadInput
 from startrack.terrain.crater import Crater, DeformedCrater, distance_bounds, distance_to_circle, slopes_of_round_crater
+from startrack.terrain.protocol import Terrain
+from startrack.terrain.refracted import refraction_errors, refraction_slopes_rad, with_refraction_error
 from startrack.terrain.shape import (
     AMOUNT,
     CAMERA_ERROR,
@@ -94,29 +96,35 @@ class Cylinder(Crater):
 
     @property
     def shape_errors(self) -> tuple[ShapeError, ...]:  # type: ignore[override]
-        """Errors of depth and width (relative), ellipse, tilt of the rim, and height of the camera."""
+        """Errors of depth and width (relative), ellipse, tilt of the rim, height of the camera, and refraction."""
         depth = None if self.depth_sigma_m is None else self.depth_sigma_m / self.depth_m
         diameter = None if self.diameter_sigma_m is None else self.diameter_sigma_m / self.diameter_m
         return (
             *DEPTH.shape_errors(depth), *DIAMETER.shape_errors(diameter), *ELLIPSE.shape_errors(self.ellipse_sigma_1),
             *RIM_TILT.shape_errors(self.rim_tilt_sigma_rad), *CAMERA_ERROR.shape_errors(self.camera_height_sigma_m),
+            *refraction_errors(self.air),
         )  # fmt: skip
 
     def shape_slopes_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """In closed form; see `Terrain`. Zero from inside the wall."""
         shape = np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))
         errors = self.shape_errors
-        return select_slopes(errors, slopes_of_round_crater(self, points_m, azimuths_rad) if errors else {}, shape)
+        slopes = slopes_of_round_crater(self, points_m, azimuths_rad) if errors else {}
+        if self.air is not None:
+            slopes |= refraction_slopes_rad(self.air, self.horizon_rad(points_m, azimuths_rad))
+        return select_slopes(errors, slopes, shape)
 
-    def with_shape(self, values: Array) -> DeformedCrater:
+    def with_shape(self, values: Array) -> Terrain:
         """The crater with these errors; see `Terrain`."""
         errors = errors_by_name(self.shape_errors, values)
-        return DeformedCrater(
+        refraction_1 = errors.pop("refraction_1", 0.0)
+        crater = DeformedCrater(
             name=self.name, site=self.site, search_radius_m=self.search_radius_m,
             diameter_m=self.diameter_m * (1.0 + errors.pop("diameter_1", 0.0)),
             depth_m=self.depth_m * (1.0 + errors.pop("depth_1", 0.0)),
             camera_height_m=self.camera_height_m + errors.pop("camera_height_m", 0.0), **errors,
         )  # fmt: skip
+        return with_refraction_error(crater, refraction_1)
 
     def facts(self) -> dict[str, Any]:
         """Diameter and depth, as JSON values."""

@@ -14,6 +14,7 @@ from startrack.terrain.derived_maps import DeformedMap, HorizonInterpolator
 from startrack.terrain.ground import cell_posts, post_positions
 from startrack.terrain.horizon_table import AZIMUTH_BINS, HorizonSigma
 from startrack.terrain.protocol import HorizonPosts, Terrain
+from startrack.terrain.refracted import refraction_errors, refraction_slopes_rad, with_refraction_error
 from startrack.terrain.shape import (
     BIAS,
     CAMERA_ERROR,
@@ -74,7 +75,7 @@ class HeightMap(TracedMap):
             *BIAS.shape_errors(self.common_sigma_rad), *STRETCH.shape_errors(self.stretch_sigma_1),
             *vertical_fact(self.site.body).shape_errors(self.vertical_sigma_rad),
             *CAMERA_ERROR.shape_errors(self.camera_height_sigma_m),
-            *REFRACTION.shape_errors(self.terrestrial_refraction_sigma_1),
+            *REFRACTION.shape_errors(self.terrestrial_refraction_sigma_1), *refraction_errors(self.air),
         )  # fmt: skip
 
     def shape_slopes_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
@@ -90,11 +91,13 @@ class HeightMap(TracedMap):
             "vertical_north_rad": np.cos(azimuths_rad), "camera_height_m": -(1.0 / distance) * flat,
             "terrestrial_refraction_1": distance / (2 * self.ground.radius_m) * flat,
         }  # fmt: skip
-        return select_slopes(self.shape_errors, slopes, np.shape(tan))
+        return select_slopes(self.shape_errors, slopes | refraction_slopes_rad(self.air, np.arctan(tan)), np.shape(tan))
 
-    def with_shape(self, values: Array) -> DeformedMap:
+    def with_shape(self, values: Array) -> Terrain:
         """The ground with these errors; see `Terrain`."""
-        return DeformedMap(self, **errors_by_name(self.shape_errors, values))
+        errors = errors_by_name(self.shape_errors, values)
+        refraction_1 = errors.pop("refraction_1", 0.0)
+        return with_refraction_error(DeformedMap(self, **errors), refraction_1)
 
     def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """From the height of the single post that makes the horizon: sigma cos^2 H / its distance."""

@@ -14,6 +14,7 @@ from startrack.chain import Located, Outcome, Settings, locate
 from startrack.core.types import Array, BadInput
 from startrack.frames import LOWEST_PREDICTED_RAD, Air, Site
 from startrack.rendering import Scene, Series, render
+from startrack.simulation import simulate_rays
 from startrack.terrain import Cylinder, terrain_from_dict
 
 SITE = Site("earth", np.radians(-30.24), np.radians(-70.75), 2200.0)
@@ -88,6 +89,35 @@ def test_stars_low_in_the_air_are_no_evidence() -> None:
     low = light.elevation_rad < LOWEST_PREDICTED_RAD
     assert low.sum() > 20
     assert not light.usable[low].any()
+
+
+def test_stars_that_the_air_dims_are_not_hidden() -> None:
+    hazy = SITE.with_air({"extinction_mag": 0.5})  # beyond clear air: at 12 degrees 2.3 magnitudes
+    scene, exposure = picture(103, replace(CRATER, site=hazy))
+    outcome = solve(exposure, CRATER)
+    assert isinstance(outcome, Located), outcome.message
+    assert nees(outcome, miss_m(outcome, scene)) < EVERY_CHI2_2DOF
+    light = outcome.light
+    above = light.elevation_rad - scene.horizon_rad(light.azimuth_rad)
+    low = light.usable & (above > np.radians(0.5)) & (light.elevation_rad < np.radians(20.0))
+    assert low.sum() > 100
+    assert np.count_nonzero(light.llr[low] < -3.0) <= 0.01 * low.sum()  # would be a skyline where there is none
+    clear, _ = picture(103)
+    dimmed = scene.dimmed_mag(np.zeros(1), np.array([[0.0, 0.0, 1.0]])), clear.dimmed_mag(np.zeros(1), np.eye(3)[2:])
+    assert (dimmed[0][0], dimmed[1][0]) == pytest.approx((0.5, 0.2), rel=1e-3)
+
+
+def test_simulated_stars_are_dimmed_as_those_of_a_picture() -> None:
+    scene, exposure = picture(104)
+    outcome = solve(exposure, CRATER)
+    assert isinstance(outcome, Located), outcome.message
+    rays = simulate_rays(scene, load_catalog(), CRATER, rng=np.random.default_rng(1))
+    shown = {int(star): k for k, star in enumerate(outcome.light.star)}
+    pairs = np.array([(shown[int(s)], k) for k, s in enumerate(rays.light.star) if int(s) in shown])
+    bright = outcome.light.expected_e[pairs[:, 0]] > 50 * np.median(outcome.light.sigma_e)
+    ratio = np.log(rays.light.expected_e[pairs[bright, 1]] / outcome.light.expected_e[pairs[bright, 0]])
+    assert np.abs(ratio).max() < 0.25
+    assert abs(np.median(ratio)) < 0.05
 
 
 @pytest.mark.slow

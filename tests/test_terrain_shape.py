@@ -13,6 +13,7 @@ from test_terrain_files import HILL, hill, terrain_file
 
 from startrack.core.files import data_dir
 from startrack.core.types import BadInput
+from startrack.frames import Site
 from startrack.localization.shared_errors import SharedErrors
 from startrack.simulation import draw_ground
 from startrack.simulation.ground_errors import ErringGround
@@ -302,3 +303,35 @@ def test_drawn_ground_of_a_map_has_one_bias():
     assert np.std(risen) == pytest.approx(1e-3, rel=0.15)
     rough = draw_ground(replace(truth, height_sigma_m=1.0), rng=rng)
     assert isinstance(rough, ErringGround) and np.isfinite(rough.horizon_rad(point, AZIMUTHS)).all()
+
+
+def on_earth(**air: float) -> Cylinder:
+    site = Site("earth", 0.7, 0.2, 1500.0)
+    return Cylinder(diameter_m=9000.0, depth_m=900.0, camera_height_m=2.0, site=site.with_air(air or None))
+
+
+def test_the_error_of_refraction_is_one_of_every_ground_below_air():
+    (error,) = (one for one in on_earth().shape_errors if one.sigma > 0.0)
+    assert (error.name, error.fact, error.sigma, error.is_stated) == ("refraction_1", "refraction_sigma_1", 0.035, True)
+    assert "refraction_1" not in [one.name for one in uncertain().shape_errors]
+    assert on_earth(pressure_hpa=840.0, temperature_c=3.0).shape_errors[-1].sigma == 0.005
+    assert on_earth(refraction_sigma_1=0.02).shape_errors[-1].sigma == 0.02
+    assert "refraction_1" not in [one.name for one in on_earth(pressure_hpa=0.0).shape_errors]
+
+
+def test_stars_that_are_raised_more_are_a_skyline_that_is_lower():
+    crater = on_earth()
+    values = np.array([0.04 if one.name == "refraction_1" else 0.0 for one in crater.shape_errors])
+    ground, air = crater.with_shape(values), crater.air
+    points = PLACES[:, None]
+    horizon = crater.horizon_rad(points, AZIMUTHS)
+    slopes = crater.shape_slopes_rad(points, AZIMUTHS)[values > 0][0]
+    # 4 % more pressure raise the stars by 4 % more: a star at the skyline of the map is seen above it.
+    denser = replace(air, pressure_hpa=1.04 * air.pressure_hpa)
+    raised = denser.apparent_rad(air.true_rad(horizon)) - horizon
+    np.testing.assert_allclose(ground.horizon_rad(points, AZIMUTHS), horizon - raised, atol=np.radians(1.0 / 3600))
+    np.testing.assert_allclose(0.04 * slopes, -raised, atol=np.radians(1.0 / 3600))
+    low, high = ground.horizon_bounds_rad(points, np.full((3, 1), 30.0), AZIMUTHS)
+    assert np.all((low <= ground.horizon_rad(points, AZIMUTHS)) & (ground.horizon_rad(points, AZIMUTHS) <= high))
+    assert ground.near(points[0, 0], 10.0, AZIMUTHS) is ground
+    assert ground.shape_errors == ()

@@ -2,7 +2,14 @@
 
 from startrack.evidence.double_exposure import check_single_skyline
 from startrack.evidence.expected_stars import expect_stars
-from startrack.evidence.flux_scale import FluxScale, expected_flux_scale, fit_flux_scale, flux_scale
+from startrack.evidence.flux_scale import (
+    SCALE_SNR,
+    SCALE_STARS,
+    FluxScale,
+    expected_flux_scale,
+    fit_flux_scale,
+    flux_scale,
+)
 from startrack.evidence.photometry import (
     SURE_SIGMAS,
     Photometry,
@@ -49,6 +56,8 @@ __all__ = [
     "CLIP_SHIFT_PX",
     "DECIDABLE_SNR",
     "NEEDED_SECTORS",
+    "SCALE_SNR",
+    "SCALE_STARS",
     "SEEN_LLR",
     "SURE_SIGMAS",
     "DamagedResponse",

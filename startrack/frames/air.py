@@ -102,6 +102,11 @@ class Air:
     def _table(self) -> _Table:
         return _table_of(self.pressure_hpa, self.temperature_c, self.humidity_1, self.wavelength_um, self.height_m)
 
+    @property
+    def rendered_extinction_mag(self) -> float:
+        """Magnitudes per airmass of rendered images: the stated ones, else those of clear air."""
+        return USUAL_EXTINCTION_MAG if self.extinction_mag is None else self.extinction_mag
+
     def apparent_rad(self, true_rad: ArrayLike) -> Array:
         """Apparent elevations (...) [rad] of sources beyond the air at the elevations `true_rad` (...).
 

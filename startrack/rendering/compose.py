@@ -90,7 +90,9 @@ def truth_of(scene: Scene) -> Truth:
         R_cam_icrs=scene.R_cam_icrs,
         sources=sources,
         xy_px=xy_px[inside],
-        flux_e=flux_e(scene.sensor, sources.v_mag, off_axis_rad(rays_cam[inside]), scene.exposure_s),
+        flux_e=flux_e(
+            scene.sensor, scene.dimmed_mag(sources.v_mag, rays_enu), off_axis_rad(rays_cam[inside]), scene.exposure_s
+        ),
         hidden=~is_above_terrain(scene, rays_enu),
     )
 

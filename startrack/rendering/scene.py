@@ -10,6 +10,7 @@ import numpy as np
 
 from startrack.camera import Camera, Sensor
 from startrack.core.types import Array, BadInput, Body, Bools, Ints, Stars, Value, array, rotation, vector
+from startrack.frames import airmass, azel_from_rays
 from startrack.terrain import Terrain
 
 AZIMUTHS = 1 << 16  # of the skyline: 0.0055 degrees, a sixteenth of a pixel of the widest fisheye
@@ -40,6 +41,7 @@ class Scene(Value):
     R_enu_icrs: Array = rotation()  # at mid-exposure
     sky_rotvec_rad: Array = vector(default=0.0)  # rotation vector in enu of the stars from start to end
     exposure_s: float
+    extinction_mag: float = 0.0  # by which the air dims stars and bodies, per airmass; 0: no air
     sky_v_mag_arcsec2: float | None  # diffuse light of the sky per square arcsecond; None: a black sky
     sky_gradient: float  # s: the sky is 1 + s cos(elevation) cos(azimuth - sky_gradient_azimuth_rad) of that
     sky_gradient_azimuth_rad: float
@@ -64,6 +66,12 @@ class Scene(Value):
         if self.camera.sensor is None:
             raise BadInput("bad_calibration", f"camera {self.camera.name} has no [sensor]: nothing to render with")
         return self.camera.sensor
+
+    def dimmed_mag(self, v_mag: Array, rays_enu: Array) -> Array:
+        """Magnitudes (n,) of sources of `v_mag` (n,) in apparent directions `rays_enu` (n, 3), below the air."""
+        if self.extinction_mag == 0.0:
+            return v_mag
+        return np.asarray(v_mag + self.extinction_mag * airmass(azel_from_rays(rays_enu)[1]))
 
     @property
     def R_cam_icrs(self) -> Array:

@@ -126,6 +126,7 @@ class Series:
             R_enu_icrs=R_enu_icrs(site, time),
             sky_rotvec_rad=sky_rotvec_rad(site, time, exposure_s),
             exposure_s=exposure_s,
+            extinction_mag=0.0 if site.air is None else site.air.rendered_extinction_mag,
             sky_v_mag_arcsec2=self.sky_v_mag_arcsec2,
             sky_gradient=self.sky_gradient,
             sky_gradient_azimuth_rad=self.sky_gradient_azimuth_rad,

@@ -58,6 +58,7 @@ def add_sources(image_e: Array, scene: Scene) -> None:
     parts += [_body_points(body, max(scene.camera.focal_px)) for body in scene.bodies]
     rays_icrs, v_mag = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     rays_enu = rays_icrs @ scene.R_enu_icrs.T
+    v_mag = scene.dimmed_mag(v_mag, rays_enu)
     rotations = _step_rotations(scene)
     limit_rad = scene.camera.max_angle_rad + float(np.linalg.norm(scene.sky_rotvec_rad))
     nearby = off_axis_rad(rays_enu @ scene.R_cam_enu.T) <= limit_rad

@@ -10,10 +10,18 @@ from datetime import datetime
 
 import numpy as np
 
-from startrack.catalog import StarCatalog, apparent_stars
+from startrack.catalog import StarCatalog, airmass_at, apparent_stars
 from startrack.chain import CERTAIN_PROBABILITY, StarRays, mask_unpredictable
 from startrack.core.types import TIME_SIGMA_S, Array, BadInput, Bools, Ints
-from startrack.evidence import Skyline, StarEvidence, expect_stars, expected_flux_scale
+from startrack.evidence import (
+    SCALE_SNR,
+    SCALE_STARS,
+    Skyline,
+    StarEvidence,
+    expect_stars,
+    expected_flux_scale,
+    fit_flux_scale,
+)
 from startrack.exposure import combine_masks
 from startrack.frames import R_enu_icrs, azel_from_rays, off_axis_rad
 from startrack.localization import clock_at
@@ -70,19 +78,29 @@ def simulate_rays(
     pixel_e2 = float(_pixel_variance_e2(scene, ray, np.ones(1, dtype=np.bool_))[0])
     typical_e = float(np.sqrt(pixel_e2 * noise_area_px(sensor.psf_sigma_px)))
     zero_mag = 2.5 * float(np.log10(sensor.zero_point_e_per_s * scene.exposure_s))
+    rays_icrs = scene.stars.rays_icrs[shining]
+    shown_mag = scene.dimmed_mag(v_mag + error_mag, rays_icrs @ scene.R_enu_icrs.T)
+    light_e = flux_e(sensor, shown_mag, angle_rad, scene.exposure_s)
+    bright = light_e > SCALE_SNR * typical_e
     scale = expected_flux_scale(zero_mag, typical_e, v_mag, error_mag)
+    if terrain.air is not None and np.count_nonzero(bright) > SCALE_STARS:
+        rays_enu, noise_e = rays_icrs[bright] @ scene.R_enu_icrs.T, np.full(np.count_nonzero(bright), typical_e)
+        scale = fit_flux_scale(
+            light_e[bright], noise_e, v_mag[bright], rays_icrs[bright] @ scene.R_cam_icrs.T, camera,
+            airmass_at(rays_enu, site),
+        )  # fmt: skip
     stars, R_enu = apparent_stars(catalog, when, site), R_enu_icrs(site, when)
     found = expect_stars(
         camera, stars, list(scene.bodies), scene.R_cam_icrs, R_enu, scale, psf_sigma_px=sensor.psf_sigma_px,
         noise_e=typical_e, mask=combine_masks(None, camera.mask, camera.size_px),
+        air=airmass_at(stars.rays_icrs @ R_enu.T, site),
     )  # fmt: skip
     true = np.asarray(stars.rays_icrs[found.star] @ scene.R_enu_icrs.T)  # directions at the true time
     above = _height_above(true, skyline)
     sure = np.where(above > 0, CERTAIN_PROBABILITY, 1.0 - CERTAIN_PROBABILITY)
     visible = np.where(np.abs(above) < UNDECIDED_RAD, 0.5, sure)[found.measurable]
     variance = _pixel_variance_e2(scene, true, above > 0)[found.measurable]
-    xy_px, _ = camera.project(scene.stars.rays_icrs[shining] @ scene.R_cam_icrs.T)
-    light_e = flux_e(sensor, v_mag + error_mag, angle_rad, scene.exposure_s)
+    xy_px, _ = camera.project(rays_icrs @ scene.R_cam_icrs.T)
     light = Starlight(xy_px, light_e, sensor.psf_sigma_px).measure(
         found.sources(visible), variance, sensor.gain_e_per_adu * (sensor.saturation_adu - sensor.bias_adu), rng=rng
     )

@@ -13,13 +13,12 @@ from scipy.special import expit
 from scipy.stats import norm
 from star_painter import cramer_rao, paint
 
-from startrack.catalog import airmass
 from startrack.core.smooth_image import SmoothImage
 from startrack.core.types import Body, Detections, Stars
 from startrack.evidence import FluxScale, StarEvidence, StarPhotometry, fit_flux_scale, flux_scale
 from startrack.evidence.photometry import Photometry, Sources, half_width, measure
 from startrack.evidence.star_evidence import CAP, visibility_llr
-from startrack.frames import azel_from_rays
+from startrack.frames import airmass, azel_from_rays
 
 SIZE, VARIANCE, READ_NOISE = 1024, 100.0, 2.5
 SCATTER = 0.05

@@ -11,8 +11,10 @@ from test_localization_ground import simulate_rays
 from test_localization_shape import evidence_at
 
 from startrack.core.types import Array, Clock, Evidence, Fix, NotLocated
-from startrack.frames import R_enu_icrs, Site, azel_from_rays, sky_rotvec_rad
+from startrack.frames import R_enu_icrs, Site, azel_from_rays, sky_rotvec_rad, ut1_sigma_s
+from startrack.frames.orientation import _earth_orientation
 from startrack.localization import ExactPosterior
+from startrack.localization.clock import clock_at as clock_of_site
 from startrack.localization.clock import clock_matters, turn_evidence
 from startrack.terrain import HeightMap, Terrain, load_terrain
 
@@ -146,3 +148,23 @@ def test_a_time_beyond_its_stated_error_is_refused(ground: HeightMap, hours: flo
 def is_inside(fix: Fix, place_m: Array) -> bool:
     """Whether a place (2,) is within the circle of 99.9 % of a single position."""
     return not fix.ambiguous and float(np.linalg.norm(fix.position_enu_m[:2] - place_m)) < fix.radius999_m
+
+
+def test_a_date_beyond_the_table_of_the_earths_rotation_widens_the_clock() -> None:
+    earth, moon = SITES["earth"], SITES["shackleton"]
+    assert clock_of_site(earth, datetime(2024, 6, 1, tzinfo=UTC), 0.5).sigma_s == 0.5
+    last = datetime(1858, 11, 17, tzinfo=UTC) + timedelta(days=float(_earth_orientation()[-1, 0]))
+    assert ut1_sigma_s(last) == 0.0
+    later = [clock_of_site(earth, last + timedelta(days=days), 0.5).sigma_s for days in (100, 3000)]
+    np.testing.assert_allclose(later, np.hypot(0.5, [0.1, 3.0]))
+    assert clock_of_site(moon, last + timedelta(days=3000), 0.5).sigma_s == 0.5
+
+
+def test_the_earths_rotation_beyond_its_table_is_as_wrong_as_stated() -> None:
+    # The table itself shows it: from each of its days the last value is held, and compared with what came.
+    days, _, _, ut1_s = _earth_orientation().T
+    drift = np.concatenate([[0.0], np.cumsum(np.diff(ut1_s) - np.round(np.diff(ut1_s)))])  # without the leap seconds
+    for ahead in (365, 1095):
+        came = drift[ahead:] - drift[:-ahead]
+        stated = ut1_sigma_s(datetime(1858, 11, 17, tzinfo=UTC) + timedelta(days=float(days[-1]) + ahead))
+        assert 0.3 < np.sqrt(np.mean(np.square(came))) / stated < 2.0

@@ -33,7 +33,7 @@ from startrack.frames.directions import (
     turn_azel,
     wahba,
 )
-from startrack.frames.orientation import R_mcmf_icrs, barycentric_state, et_s
+from startrack.frames.orientation import R_mcmf_icrs, barycentric_state, et_s, ut1_sigma_s
 from startrack.frames.site import (
     MOON_RADIUS_M,
     R_enu_fixed,
@@ -56,5 +56,6 @@ __all__ = [
     "angle_between_rad", "as_utc", "azel_from_rays", "barycentric_state", "enu_from_latlon", "et_s", "format_utc",
     "heading_pitch_roll_from_R_body_enu", "latlon_from_enu", "length_xy", "nearest_rotation", "observer_state",
     "observer_velocity_m_s", "off_axis_rad", "parse_utc", "position_fixed_m", "quat_xyzw_from_R", "rays_from_azel",
-    "seconds_since_2000", "sky_rotvec_rad", "sphere_radius_m", "tum_line", "turn_azel", "turn_sky", "wahba",
+    "seconds_since_2000", "sky_rotvec_rad", "sphere_radius_m", "tum_line", "turn_azel", "turn_sky", "ut1_sigma_s",
+    "wahba",
 ]  # fmt: skip

@@ -24,6 +24,8 @@ import numpy as np
 from startrack.core.types import Array, BadInput
 from startrack.frames.time import format_utc, seconds_since_2000
 
+# By how much UT1 drifts from a value that is held, RMS in the table: 1.5 ms a day from 1973 on, 0.8 from 2000 on.
+UT1_DRIFT_S_PER_DAY = 1e-3
 EARTH_SPIN_RAD_S = 7.292115e-5  # nominal mean angular velocity, IERS Conventions (2010), table 1.2
 # Package to install, its module, file inside it. A later kernel overrides an earlier one.
 _KERNELS = (
@@ -86,8 +88,8 @@ def R_itrs_icrs(time: datetime) -> Array:
     """Rotation (3, 3) from ICRS axes (GCRS) to the Earth-fixed frame ITRS at `time`.
 
     Within the installed IERS table (1973 to a year ahead of its release) good to a milliarcsecond or so. Outside it
-    the nearest UT1 - UTC and polar motion are held: about 2 arcsec of Earth rotation one year beyond, and at most 15
-    arcsec as long as leap seconds keep |UT1 - UTC| below 0.9 s. Nothing is downloaded.
+    the nearest UT1 - UTC and polar motion are held: about 2 arcsec of Earth rotation one year beyond; see
+    `ut1_sigma_s`. Nothing is downloaded.
 
     Raises:
         BadInput: "no_time" outside the years that the ephemeris covers.
@@ -100,6 +102,17 @@ def R_itrs_icrs(time: datetime) -> Array:
     # TDB serves as TT: they differ by 2 ms at most, and only precession and nutation see it.
     tt_days, ut1_days = et_s(time) / erfa.DAYSEC, (utc_s + ut1_minus_utc_s) / erfa.DAYSEC
     return erfa.c2t06a(erfa.DJ00, tt_days, erfa.DJ00, ut1_days, pole_x_rad, pole_y_rad)
+
+
+def ut1_sigma_s(time: datetime) -> float:
+    """Standard deviation [s] of the Earth's rotation in R_itrs_icrs, as an error of the clock; 0 within the IERS table.
+
+    Beyond it the last UT1 - UTC of the table is held, and a day differs from 86,400 s by what nobody can foretell.
+    """
+    import erfa
+
+    beyond_days = erfa.DJM00 + seconds_since_2000(time) / erfa.DAYSEC - float(_earth_orientation()[-1, 0])
+    return UT1_DRIFT_S_PER_DAY * max(beyond_days, 0.0)
 
 
 def _earth_orientation_at(mjd: float) -> tuple[float, float, float]:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from datetime import datetime
+from math import hypot
 
 import numpy as np
 
 from startrack.core.types import Array, Clock, Evidence, NotLocated
-from startrack.frames import Air, R_from_rotvec, Site, sky_rotvec_rad, turn_sky
+from startrack.frames import Air, R_from_rotvec, Site, sky_rotvec_rad, turn_sky, ut1_sigma_s
 from startrack.localization.horizon_bias import LinearSolution, at_likeliest_bias
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.search import (
@@ -42,8 +43,11 @@ MOST_TIMES, TIME_NATS = 3, 12.0  # that are sampled; less likely ones than the b
 def clock_at(site: Site, time_utc: datetime, sigma_s: float, is_stated: bool = True) -> Clock:
     """The clock of directions at a `site` at the stated `time_utc` of an exposure, which is right to `sigma_s`.
 
-    is_stated: whether somebody states `sigma_s`; where it is a default, the clock may be grossly wrong.
+    is_stated: whether somebody states `sigma_s`; where it is a default, the clock may be grossly wrong. On the Earth
+    the error of its rotation beyond the IERS table counts as one of the clock.
     """
+    if site.body == "earth":
+        sigma_s = hypot(sigma_s, ut1_sigma_s(time_utc))
     return Clock(
         turn_rad_s=sky_rotvec_rad(site, time_utc, TURN_S) / TURN_S, sigma_s=sigma_s,
         gross_probability=0.0 if is_stated else GROSS_PROBABILITY,

@@ -74,7 +74,12 @@ def march(
     eye = up_of(point_m[:1], point_m[1:])[0] + eye_m
     found = []
     for azimuth in azimuths:
-        up = up_of(point_m[0] + s * np.sin(azimuth), point_m[1] + s * np.cos(azimuth))
-        tan = (up - eye) / s + coefficient * s / (2 * 6_371_000.0)
-        found.append((np.nanmax(tan), s[np.nanargmax(tan)], s[np.isfinite(tan)].max()))
+        here, end_m = s, 0.0
+        for _ in range(2):  # once more in small steps about the crest: it may be a kink
+            up = up_of(point_m[0] + here * np.sin(azimuth), point_m[1] + here * np.cos(azimuth))
+            tan = (up - eye) / here + coefficient * here / (2 * 6_371_000.0)
+            best, end_m = int(np.nanargmax(tan)), max(end_m, here[np.isfinite(tan)].max())
+            top = tan[best], here[best], end_m
+            here = np.linspace(here[max(best - 1, 0)], here[min(best + 1, len(here) - 1)], 201)
+        found.append(top)
     return np.array(found).T

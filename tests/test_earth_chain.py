@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from startrack.camera import load_camera
+from startrack.camera import REFRACTION_CONTAINED, camera_from_dict, camera_to_dict, load_camera
 from startrack.catalog import load_catalog
-from startrack.chain import Located, Outcome, Settings, locate
+from startrack.chain import Located, Outcome, Refused, Settings, locate
 from startrack.core.types import Array, BadInput
 from startrack.frames import LOWEST_PREDICTED_RAD, Air, Site
 from startrack.rendering import Scene, Series, render
@@ -131,3 +131,13 @@ def test_errors_on_the_earth_agree_with_their_covariance() -> None:
     errors, all_nees = np.array(found).T
     assert errors.mean() < 5.0  # the Moon's frames: 2.5
     assert 1.0 < all_nees.mean() < 3.0
+
+
+def test_a_lens_that_contains_the_refraction_is_refused_below_air() -> None:
+    _, exposure = picture(105)
+    camera = replace(load_camera("fisheye-2048"), refraction=REFRACTION_CONTAINED)
+    assert camera_from_dict(camera_to_dict(camera)).refraction == REFRACTION_CONTAINED
+    outcome = locate(exposure, camera, CRATER, load_catalog(), SETTINGS)
+    assert isinstance(outcome, Refused)
+    assert outcome.reason == "bad_calibration"
+    assert "calibrate with --site" in outcome.message

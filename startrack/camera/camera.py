@@ -44,6 +44,7 @@ class Camera:
     sensor: Sensor | None = None
     covariance_order: tuple[str, ...] = ()
     covariance: Array | None = None
+    refraction: str = ""  # of the Earth's air: "contained" in the lens, or "taken out"; empty: not known
     mask: str | Mask | None = None  # path of the file, or the mask, of pixels that never show the sky
 
     @property

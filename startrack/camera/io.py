@@ -21,6 +21,7 @@ UNIT_QUATERNION_1 = 1e-3  # largest error of the length
 MIN_SIGMA = 1e-15  # of a parameter, px or 1; smaller ones count as zero
 CORRELATION_ROUNDING_1 = 1e-6  # of correlations: asymmetry and negative eigenvalues up to this are rounding
 MAX_PARAMETERS = 32
+REFRACTION_REMOVED, REFRACTION_CONTAINED = "taken out", "contained"
 CAMERA_PARAMETERS = ("fx", "fy", "cx", "cy", "p1", "p2")  # beside those of the lens
 SENSOR = Table(closed=True, keys={
     "zero_point_e_per_s": Number(low=1e-6, high=1e15, required=True,
@@ -72,6 +73,8 @@ def camera_keys(lens: type[Lens] | None = None) -> Table:
                                            description="beyond this the lens is not known; default: max_angle_deg"),
             "mirrored": Flag(default=False),
             "mask": Text(description="8-bit image of this size, relative to this file: pixels below 128 do not count"),
+            "refraction": Choice(values=(REFRACTION_REMOVED, REFRACTION_CONTAINED),
+                                 description="of the Earth's air: contained in a lens calibrated without a site"),
             "decentring": List(each=Number(low=-1, high=1), count=2, description="p1, p2 of a decentred lens"),
             "mount": MOUNT,
             "sensor": SENSOR,
@@ -128,6 +131,8 @@ def camera_to_dict(camera: Camera) -> dict[str, Any]:
         "calibrated_angle_deg": float(np.degrees(camera.calibrated_angle_rad)),
         "mirrored": camera.mirrored,
     }
+    if camera.refraction:
+        d["refraction"] = camera.refraction
     if isinstance(camera.mask, str):
         d["mask"] = camera.mask
     if camera.decentring:
@@ -168,6 +173,7 @@ def _camera(values: dict[str, Any], default_name: str, folder: Path) -> Camera:
     return Camera(
         **{key: values[key] for key in ("size_px", "focal_px", "centre_px", "mirrored")},
         name=values.get("name", default_name),
+        refraction=values.get("refraction", ""),
         max_angle_rad=max_angle,
         calibrated_angle_rad=calibrated,
         lens=lens,

@@ -8,7 +8,7 @@ from datetime import datetime
 
 import numpy as np
 
-from startrack.camera import Camera
+from startrack.camera import REFRACTION_CONTAINED, Camera
 from startrack.catalog import StarCatalog, apparent_bodies, apparent_stars
 from startrack.chain.stages import Detected, Identified, Inputs, Oriented, Settings, extend
 from startrack.core.compilation import announce_compilation
@@ -22,10 +22,17 @@ from startrack.terrain import Terrain, site_of_terrain
 
 
 def check_inputs(inputs: Inputs) -> None:
-    """Raises BadInput no_time, bad_terrain or size_mismatch for `inputs` that cannot be solved together."""
+    """Raises BadInput no_time, bad_terrain, bad_calibration, size_mismatch: `inputs` that do not go together."""
     exposure, camera = inputs.exposure, inputs.camera
     if inputs.terrain is not None:
         require_time_and_site(exposure, inputs.terrain)
+    has_air = inputs.terrain is not None and inputs.terrain.air is not None
+    if camera is not None and camera.refraction == REFRACTION_CONTAINED and has_air:
+        raise BadInput(
+            "bad_calibration",
+            f"camera {camera.name} was calibrated without a site: its lens contains the refraction of the air, which "
+            "would count twice: calibrate with --site LAT,LON[,M]",
+        )
     if camera is not None and exposure.size_px != camera.size_px:
         raise BadInput(
             "size_mismatch",

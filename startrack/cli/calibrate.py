@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from startrack.applications import calibration
-from startrack.camera import SENSOR, load_camera, save_camera
+from startrack.camera import REFRACTION_REMOVED, SENSOR, load_camera, save_camera
 from startrack.catalog import load_catalog
 from startrack.cli.camera_files import (
     check_camera_output,
@@ -109,7 +109,7 @@ def verify(args: argparse.Namespace) -> int:
                 camera, site = load_camera(named), site_of(args, [exposure])
                 file = resolve_named(named, "calib", "no_calibration")
                 refraction = value_in_record(file, "lens", "refraction")  # None: not known whether with a site
-                known = None if refraction is None else bool(refraction == calibration.REFRACTION_REMOVED)
+                known = None if refraction is None else bool(refraction == REFRACTION_REMOVED)
                 found = calibration.verify(exposure, camera, load_catalog(), site, file_has_site=known)
                 outcome = calibration.verify_dict(found), calibration.verify_line(found)
             except NoSolution as cause:

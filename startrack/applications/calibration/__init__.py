@@ -7,7 +7,6 @@ from startrack.applications.calibration.board import Board, calibrate_board
 from startrack.applications.calibration.initial_states import initial_state
 from startrack.applications.calibration.photometry import KnownSensor
 from startrack.applications.calibration.record import (
-    REFRACTION_REMOVED,
     board_dict,
     board_line,
     calibration_dict,
@@ -23,8 +22,7 @@ from startrack.estimation.lens_fit import fit_lens
 from startrack.estimation.normal_equations import observations
 
 __all__ = [
-    "REFRACTION_REMOVED", "Board", "Calibration", "KnownSensor", "Verification", "board_dict", "board_line",
-    "calibrate", "calibrate_board", "calibration_dict", "camera_properties", "camera_summary", "count_steps",
-    "fit_lens", "initial_state", "observations", "refusal_dict", "summary", "verify", "verify_dict", "verify_line",
-    "write_report",
+    "Board", "Calibration", "KnownSensor", "Verification", "board_dict", "board_line", "calibrate", "calibrate_board",
+    "calibration_dict", "camera_properties", "camera_summary", "count_steps", "fit_lens", "initial_state",
+    "observations", "refusal_dict", "summary", "verify", "verify_dict", "verify_line", "write_report",
 ]  # fmt: skip

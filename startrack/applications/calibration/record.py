@@ -11,14 +11,13 @@ from startrack.applications.calibration.acceptance import CheckedCamera, star_co
 from startrack.applications.calibration.board import BoardCalibration
 from startrack.applications.calibration.photometry import photometry_dict
 from startrack.applications.calibration.run import Calibration
-from startrack.camera import Camera, camera_to_dict
+from startrack.camera import REFRACTION_REMOVED, Camera, camera_to_dict
 from startrack.core.errors import Reason
 from startrack.core.types import Array
 from startrack.estimation.lens_fit import LensFit
 from startrack.frames import format_utc, quat_xyzw_from_R
 
 CALIBRATION_FORMAT = "startrack.calibration/1"
-REFRACTION_REMOVED = "taken out"
 MAP_ANGLES = 10
 
 

@@ -19,7 +19,7 @@ from startrack.applications.calibration.acceptance import (
 from startrack.applications.calibration.photometry import KnownSensor, Photometry, measure_photometry
 from startrack.applications.calibration.shared_errors import widen_covariance
 from startrack.applications.calibration.static_parts import find_obstructions, remove_static_sources
-from startrack.camera import Camera
+from startrack.camera import REFRACTION_CONTAINED, REFRACTION_REMOVED, Camera
 from startrack.catalog import StarCatalog
 from startrack.core.runner import map_in_threads
 from startrack.core.types import Array, BadInput, Bools, Exposure, Identification, NoSolution, NotIdentified
@@ -112,7 +112,10 @@ def calibrate(
     _identify_all(run, frames)
     joint, same = _fit_jointly(run)
     joint = widen_covariance(joint)
-    fitted = replace(joint.fit.camera, name=name, max_angle_rad=_max_angle_rad(joint.fit.camera, camera, fov_rad))
+    fitted = replace(
+        joint.fit.camera, name=name, max_angle_rad=_max_angle_rad(joint.fit.camera, camera, fov_rad),
+        refraction=_refraction(site),
+    )  # fmt: skip
     joint = replace(joint, fit=replace(joint.fit, camera=fitted))
     progress("measuring throughput and sensor")
     photometry = measure_photometry(joint, known_sensor or KnownSensor())
@@ -127,6 +130,13 @@ def calibrate(
         photometry=photometry,
         obstructed=find_obstructions(joint, same) if mask is None else None,
     )
+
+
+def _refraction(site: Site | None) -> str:
+    """The `refraction` of a camera that pictures from a `site` have calibrated; empty where there is no air."""
+    if site is None:
+        return REFRACTION_CONTAINED
+    return "" if site.air is None else REFRACTION_REMOVED
 
 
 def count_steps(images: int) -> int:

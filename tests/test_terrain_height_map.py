@@ -13,7 +13,7 @@ import pytest
 from map_helpers import polar_stereographic
 
 from startrack.core.errors import NotLocated
-from startrack.core.types import Evidence
+from startrack.core.types import SECTORS, Evidence
 from startrack.frames import Site, enu_from_latlon, latlon_from_enu
 from startrack.localization import ExactPosterior
 from startrack.localization.horizon_bias import LinearSolution, lower_evidence
@@ -189,6 +189,35 @@ def test_bounds_do_not_depend_on_what_was_traced_before(shackleton):
         assert np.array_equal(again, fresh[:, some])
         del terrain.table.__dict__["box_memory"]
         assert np.array_equal(terrain.horizon_bounds_rad(centres, half, azimuths, turn), fresh)
+
+
+def test_bounds_in_sectors_are_those_of_single_ones(shackleton):
+    """Looked up row by row, and from memory, they are the same as one by one, on every level of the table."""
+    terrain, rng = replace(shackleton, search_radius_m=150.0), np.random.default_rng(7)
+    azimuths = (2 * np.arange(SECTORS) + 1) * np.pi / SECTORS
+    for half in (2.0, 20.0, 60.0, 150.0):
+        centres = rng.uniform(-60, 60, (30, 2))
+        rows = np.array(terrain.horizon_bounds_rad(centres[:, None], np.array(half), azimuths, np.pi / SECTORS))
+        each = np.broadcast_to(np.pi / SECTORS, (30, SECTORS))
+        assert np.array_equal(terrain.horizon_bounds_rad(centres[:, None], np.array(half), azimuths, each), rows)
+        again = terrain.horizon_bounds_rad(centres[::-1, None], np.array(half), azimuths, np.pi / SECTORS)
+        assert np.array_equal(np.array(again)[:, ::-1], rows)
+        inside = (2 * rng.random((30, SECTORS)) - 1) * np.pi / SECTORS
+        places = centres[:, None] + rng.uniform(-half, half, (30, SECTORS, 2))
+        horizon = terrain.without_table().horizon_rad(places, azimuths + inside)
+        seen = np.asarray(terrain.allowed(places))
+        assert np.all((rows[0] <= horizon + 1e-6) | ~seen) and np.all((horizon <= rows[1] + 1e-6) | ~seen)
+
+
+def test_a_raised_camera_sees_what_it_sees_without_the_table(shackleton):
+    """A first sight line from the table of the camera before it was raised changes nothing but the time."""
+    terrain, rng = replace(shackleton, search_radius_m=150.0, camera_height_sigma_m=0.1), np.random.default_rng(8)
+    terrain.prepare()
+    raised = terrain.with_shape(np.where([one.name == "camera_height_m" for one in terrain.shape_errors], 0.7, 0.0))
+    places, azimuths = rng.uniform(-100, 100, (2000, 2)), rng.uniform(0, 2 * np.pi, 2000)
+    found = raised.horizon_rad(places, azimuths)
+    assert found == pytest.approx(raised.without_table().horizon_rad(places, azimuths), abs=2e-6)
+    assert np.abs(found - terrain.horizon_rad(places, azimuths)).max() > 1e-5
 
 
 def test_the_table_is_kept_and_found_again_by_content(shackleton):

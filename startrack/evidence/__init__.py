@@ -31,6 +31,7 @@ from startrack.evidence.sky_light import (
 from startrack.evidence.sky_pixels import pixels_near_skyline
 from startrack.evidence.sky_step import (
     BAND_PX,
+    SKYLINE_POINTS,
     Horizon,
     Skyline,
     SkyStep,
@@ -59,6 +60,7 @@ __all__ = [
     "SCALE_SNR",
     "SCALE_STARS",
     "SEEN_LLR",
+    "SKYLINE_POINTS",
     "SURE_SIGMAS",
     "DamagedResponse",
     "FluxScale",

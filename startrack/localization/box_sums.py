@@ -59,9 +59,18 @@ class PrefixSums:
         low, high = terrain.horizon_bounds_rad(boxes, np.array(half_m), middle, np.pi / count)
         require_bounds(terrain, low, high)
         map_sigma = terrain.max_horizon_sigma_rad(boxes, half_m, middle, np.pi / count)
-        margin = CERTAIN_SIGMAS * np.hypot(self.sigma_rad, map_sigma)
         first, last = np.empty((2, *low.shape), dtype=np.int64)
-        _find_open(self.key, self.ends, low - margin, high + margin, first, last)
+        sigma = np.array(np.broadcast_to(map_sigma, low.shape), dtype=np.float64)
+        _find_open(
+            self.key,
+            self.ends,
+            np.ascontiguousarray(low),
+            np.ascontiguousarray(high),
+            sigma,
+            self.sigma_rad,
+            first,
+            last,
+        )
         return first, last
 
     def sums(self, first: Ints, last: Ints) -> tuple[Array, Array, Array]:
@@ -81,14 +90,18 @@ class PrefixSums:
 
 
 @njit(cache=True, nogil=True)
-def _find_open(key, ends, low, high, first, last) -> None:  # type: ignore[no-untyped-def]
-    """Fill first and last (n, sectors) with the rays of each sector from `low` to `high` (n, sectors) [rad]."""
+def _find_open(key, ends, low, high, map_sigma, sigma, first, last) -> None:  # type: ignore[no-untyped-def]
+    """Fill first and last (n, sectors) with the rays of each sector that may be between `low` and `high` [rad].
+
+    Beyond these (n, sectors) by sigmas of the map (n, sectors) and of the rays' edges (sectors,).
+    """
     for n in range(len(low)):
         begin = 0
         for s in range(len(ends)):
             end = ends[s]
+            margin = CERTAIN_SIGMAS * np.sqrt(sigma[s] * sigma[s] + map_sigma[n, s] * map_sigma[n, s])
             for side in range(2):
-                wanted = (high[n, s] if side else low[n, s]) + SECTOR_STEP * s
+                wanted = (high[n, s] + margin if side else low[n, s] - margin) + SECTOR_STEP * s
                 a, b = begin, end
                 while a < b:
                     middle = (a + b) >> 1

@@ -71,7 +71,7 @@ class Hypothesis:
         """How much later the true time is than the stated one, in the mean."""
         return float(self.found.share @ self.values[:: self.copies, -1]) + self.model.errors.later_s
 
-    @property
+    @cached_property
     def suits_map(self) -> bool:
         """Whether the map's skyline explains the rows far better than any other one does, so that no time does."""
         shift = self.model.shift_of(self.found.share @ self.found.points)
@@ -116,9 +116,12 @@ def sample_gross_errors(plain: Hypothesis, references_m: Array) -> list[Hypothes
 def sample_gross_error(
     plain: Hypothesis, other: SkylineModel, references_m: Array, rounds: Sequence[int] = GROSS_ROUNDS
 ) -> list[Hypothesis]:
-    """The hypothesis `other` of one gross error; of the clock on real ground there may be several times."""
-    clock = _gross_clock(other)
-    if clock is not None and not plain.suits_map:
+    """The hypothesis `other` of one gross error; of the clock on real ground there may be several times.
+
+    Those are sampled in rounds of their own; see `clock_of_other_times`.
+    """
+    clock = clock_of_other_times(plain, other)
+    if clock is not None:
         return _sample_other_times(plain, other, clock, references_m)
     modes = _gross_modes(plain, other)
     rounds = [len(modes) * count for count in rounds]
@@ -136,10 +139,15 @@ def _sample_other_times(plain: Hypothesis, model: SkylineModel, clock: Clock, re
     return found
 
 
-def _gross_clock(model: SkylineModel) -> Clock | None:
-    """The clock where the gross error is its, on real ground: there the skyline is not linear in it."""
-    clock, listed = model.errors.clock, model.errors.listed
-    return clock if listed[-1].fact == model.gross and not model.terrain.axisymmetric else None
+def clock_of_other_times(plain: Hypothesis, other: SkylineModel) -> Clock | None:
+    """The clock where the gross error of `other` is its, and times are tried that are apart from each other.
+
+    That is on real ground, where the skyline is not linear in it, and where the map does not explain the rows so well
+    that no time does better.
+    """
+    clock, listed = other.errors.clock, other.errors.listed
+    is_tried = listed[-1].fact == other.gross and not other.terrain.axisymmetric and not plain.suits_map
+    return clock if is_tried else None
 
 
 def _sample_settled_time(plain: Hypothesis, model: SkylineModel, clock: Clock, references_m: Array) -> Hypothesis:

@@ -16,6 +16,7 @@ from startrack.core.types import TIME_SIGMA_S, Array, BadInput, Bools, Ints
 from startrack.evidence import (
     SCALE_SNR,
     SCALE_STARS,
+    SKYLINE_POINTS,
     Skyline,
     StarEvidence,
     expect_stars,
@@ -30,7 +31,7 @@ from startrack.rendering import Scene, flux_e, sky_e_per_s, sky_gradient
 from startrack.simulation.starlight import Starlight
 from startrack.terrain import Terrain
 
-EXACT_RAD = np.radians(2.0)  # from the skyline; farther, its elevations at one azimuth in 3 arcmin decide
+EXACT_RAD = np.radians(2.0)  # from the skyline; farther, its elevations at one azimuth in 15 arcmin decide
 UNDECIDED_RAD = np.radians(0.2)  # from the skyline: here the visibility of a neighbour is not known
 
 
@@ -69,7 +70,7 @@ def simulate_rays(
         raise BadInput("no_time", "the time of the scene is not known")
     camera, when = scene.camera, time_utc or scene.time_utc
     sensor, site = scene.sensor, terrain.site
-    skyline = Skyline.trace(scene.position_enu_m[:2], ground)
+    skyline = Skyline.trace(scene.position_enu_m[:2], ground, SKYLINE_POINTS)
     shining, angle_rad = _shining_stars(scene, ground, skyline)
     v_mag, error_mag = scene.stars.v_mag[shining], scene.v_error_mag[shining]
     # Noise of a star's flux halfway between the axis and the edge of the view.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.core.kernels import njit
+from startrack.core.kernels import REORDERED_SUMS, njit
 from startrack.core.types import Array
 from startrack.evidence import Photometry, Sources, half_width, neighbour_profiles, order_by_cell, profiles_of
 from startrack.psf import pixel_profile
@@ -69,15 +69,16 @@ def _collect(
     order, first, columns = order_by_cell(others_px, (int(size_px[1]), int(size_px[0])), reach_px)
     number = np.full(len(order), -1) if square_weight is None else order
     squares = np.zeros(len(order)) if square_weight is None else square_weight[order]
-    found = np.empty((len(xy_px), 5))
+    found, beyond = np.empty((len(xy_px), 5)), int(reach_px) + 2
+    profiles = np.pad(neighbour_profiles(sigma_px), ((0, 0), (beyond, beyond)))
     collect_light(
         xy_px, others_px[order], number, weight[order], squares, first, columns, reach_px, reach_px,
-        half_width(sigma_px), neighbour_profiles(sigma_px), found,
+        half_width(sigma_px), profiles, found,
     )  # fmt: skip
     return np.ascontiguousarray(found.T)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS)
 def collect_light(
     xy_px, others_px, number, weight, square_weight, first, columns, side_px, reach_px, radius, table, found
 ) -> None:  # fmt: skip
@@ -88,19 +89,20 @@ def collect_light(
     (P - mean(P)) / S with S = sum P (P - mean(P)). Columns: the parts of the others' light that they collect, times
     `weight`; the variance that each of their electrons adds, times `weight`; the squares of the parts, times
     `square_weight`; the variance that each electron of the star itself adds; and S. Positions in px, none negative.
+    Profiles of the `table` are 0 as far from their middle as a stamp of another star reaches.
     """
     across, down, centre = profiles_of(xy_px, table)
     others_across, others_down, others_centre = profiles_of(others_px, table)
-    half, side, rows = table.shape[1] // 2, 2 * radius + 1, (len(first) - 1) // columns
-    in_x, in_y = np.empty(3), np.empty(3)
+    side, rows = 2 * radius + 1, (len(first) - 1) // columns
+    first_place = table.shape[1] // 2 - radius
     for i in range(len(xy_px)):
-        _sum_along(across, i, across, i, half - radius, side, half, radius, in_x)
-        _sum_along(down, i, down, i, half - radius, side, half, radius, in_y)
-        total = in_x[0] * in_y[0]
+        light_x, profile_x, square_x = _sum_along(across, i, across, i, first_place, side, first_place)
+        light_y, profile_y, square_y = _sum_along(down, i, down, i, first_place, side, first_place)
+        total = light_x * light_y
         middle = total / side**2
-        strength = in_x[1] * in_y[1] - middle * total
-        found[i, :3] = 0.0
-        found[i, 3] = (in_x[2] * in_y[2] - 2 * middle * in_x[1] * in_y[1] + middle**2 * total) / strength**2
+        strength = profile_x * profile_y - middle * total
+        collected, shot, squares = 0.0, 0.0, 0.0
+        found[i, 3] = (square_x * square_y - 2 * middle * profile_x * profile_y + middle**2 * total) / strength**2
         found[i, 4] = strength
         column, row = int(xy_px[i, 0] / side_px), int(xy_px[i, 1] / side_px)
         for cell_row in range(max(row - 1, 0), min(row + 2, rows)):
@@ -109,28 +111,30 @@ def collect_light(
             for j in range(start, stop):
                 dx, dy = others_px[j, 0] - xy_px[i, 0], others_px[j, 1] - xy_px[i, 1]
                 if dx * dx + dy * dy <= reach_px * reach_px and number[j] != i:
-                    left = half - radius + centre[i, 0] - others_centre[j, 0]
-                    top = half - radius + centre[i, 1] - others_centre[j, 1]
-                    _sum_along(across, i, others_across, j, left, side, half, radius, in_x)
-                    _sum_along(down, i, others_down, j, top, side, half, radius, in_y)
-                    light, with_profile = in_x[0] * in_y[0], in_x[1] * in_y[1]
+                    left = first_place + centre[i, 0] - others_centre[j, 0]
+                    top = first_place + centre[i, 1] - others_centre[j, 1]
+                    light_x, profile_x, square_x = _sum_along(across, i, others_across, j, left, side, first_place)
+                    light_y, profile_y, square_y = _sum_along(down, i, others_down, j, top, side, first_place)
+                    light, with_profile = light_x * light_y, profile_x * profile_y
                     part = (with_profile - middle * light) / strength
-                    noise = in_x[2] * in_y[2] - 2 * middle * with_profile + middle**2 * light
-                    found[i, 0] += weight[j] * part
-                    found[i, 1] += weight[j] * noise / strength**2
-                    found[i, 2] += square_weight[j] * part * part
+                    noise = square_x * square_y - 2 * middle * with_profile + middle**2 * light
+                    collected += weight[j] * part
+                    shot += weight[j] * noise / strength**2
+                    squares += square_weight[j] * part * part
+        found[i, 0], found[i, 1], found[i, 2] = collected, shot, squares
 
 
 @njit(inline="always")
-def _sum_along(own, i, others, j, start, side, half, radius, sums) -> None:
-    """Write sums (3,) over a stamp along one axis: the profile of star j alone, times star i's, times its square.
+def _sum_along(own, i, others, j, start, side, first):
+    """Sums over a stamp along one axis: the profile of star j alone, times star i's, times its square.
 
-    The stamp begins at the place `start` of the profile of star j, which is 0 beyond its 2 `half` + 1 places.
+    The stamp begins at the place `first` of star i's profile, and at `start` of star j's.
     """
     light, with_profile, with_square = 0.0, 0.0, 0.0
-    for c in range(max(0, -start), min(side, 2 * half + 1 - start)):
-        p, q = float(own[i, half - radius + c]), float(others[j, start + c])
+    row, at, other_row, other_at = np.uint64(i), np.uint64(first), np.uint64(j), np.uint64(start)
+    for c in range(np.uint64(side)):
+        p, q = float(own[row, at + c]), float(others[other_row, other_at + c])
         light += q
         with_profile += p * q
         with_square += p * p * q
-    sums[0], sums[1], sums[2] = light, with_profile, with_square
+    return light, with_profile, with_square

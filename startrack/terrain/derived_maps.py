@@ -13,7 +13,9 @@ from startrack.core.types import Array
 from startrack.frames import R_from_rotvec
 from startrack.terrain.horizon_kernel import interpolate
 from startrack.terrain.protocol import ForwardingTerrain, HorizonPosts, Terrain
-from startrack.terrain.traced_map import TracedMap, flatten_rays
+from startrack.terrain.rays import rows_of_rays
+from startrack.terrain.table_cache import TABLES_IN_MEMORY
+from startrack.terrain.traced_map import TracedMap
 
 TILT_ROUNDS = 2  # of the azimuth towards that of the turned skyline: each leaves a thousandth of the difference
 SETTLED_RAD = 1e-8  # of the azimuth: a change of 2 milliarcsec needs no further round
@@ -56,6 +58,7 @@ class DeformedMap(ForwardingTerrain):
         raised = replace(self.whole, camera_height_m=self.camera_height_m, terrestrial_refraction_1=refraction_1)
         same = self.whole.ground
         raised.__dict__["ground"] = same._replace(sag_per_m=refraction_1 / (2 * same.radius_m))
+        raised.__dict__["_similar_table"] = TABLES_IN_MEMORY.get(self.whole.table_key)
         return raised
 
     def without_table(self) -> DeformedMap:
@@ -71,13 +74,15 @@ class DeformedMap(ForwardingTerrain):
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation [rad], traced; see `Terrain`."""
         found = self._level_rad(self._raised.horizon_rad(points_m, azimuths_rad))
-        if not self._tilt_rad:
-            return found
-        azimuths = np.broadcast_to(azimuths_rad, found.shape)
+        return self._turned_rad(points_m, azimuths_rad, found) if self._tilt_rad else found
+
+    def _turned_rad(self, points_m: Array, azimuths_rad: Array, about_rad: Array) -> Array:
+        """The horizon after the turn (...); before it, at the same azimuths, it stands at about `about_rad` (...)."""
+        azimuths, found = np.broadcast_to(azimuths_rad, about_rad.shape), about_rad
         own = np.array(azimuths)
         for _ in range(TILT_ROUNDS):
             step = (azimuths - self._turn(own, found)[0] + np.pi) % (2 * np.pi) - np.pi
-            if np.abs(step).max(initial=0.0) < SETTLED_RAD:
+            if found is not about_rad and np.abs(step).max(initial=0.0) < SETTLED_RAD:
                 break
             own += step
             found = self._level_rad(self._raised.horizon_rad(points_m, own))
@@ -112,7 +117,11 @@ class DeformedMap(ForwardingTerrain):
     def horizon_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
         """Those of the map, with the horizon of this ground; see `Terrain`."""
         posts = self.whole.horizon_posts(point_m, azimuths_rad)
-        return replace(posts, horizon_rad=self.horizon_rad(point_m, azimuths_rad))
+        if self._tilt_rad:
+            found = self._turned_rad(point_m, azimuths_rad, self._level_rad(posts.horizon_rad))
+        else:
+            found = self.horizon_rad(point_m, azimuths_rad)
+        return replace(posts, horizon_rad=found)
 
     def ground_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
         """Those of the map, with the horizon of this ground; see `Terrain`."""
@@ -163,12 +172,14 @@ class HorizonInterpolator(ForwardingTerrain):
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation [rad]; see `Terrain`."""
-        shape, points, azimuths = flatten_rays(points_m, azimuths_rad)
+        shape, points, azimuths = rows_of_rays(points_m, azimuths_rad)
         column = np.minimum(np.searchsorted(self.azimuths_rad, azimuths), len(self.azimuths_rad) - 1)
-        inside = np.abs(points - self.centre_m).max(axis=-1) <= self.half_m * (1 + 1e-9)
-        inside &= self.azimuths_rad[column] == azimuths
-        found = np.empty(len(column))
+        near = np.abs(points - self.centre_m).max(axis=-1) <= self.half_m * (1 + 1e-9)
+        prepared = self.azimuths_rad[column] == azimuths
+        found = np.empty((len(points), azimuths.shape[1]))
         interpolate(self.whole.ground, self.nodes, points, column, found)
-        if not inside.all():
-            found[~inside] = self.whole.horizon_rad(points[~inside], azimuths[~inside])
+        if not (near.all() and prepared.all()):
+            point, azimuth = np.nonzero(~(near[:, None] & prepared))
+            own = np.broadcast_to(azimuths, found.shape)[point, azimuth]
+            found[point, azimuth] = self.whole.horizon_rad(points[point], own)
         return found.reshape(shape)

@@ -280,7 +280,10 @@ def bilinear(nodes, k, x, y):
 
 @njit(cache=True, nogil=True)
 def interpolate(ground, near, points, column, found):
-    """Fill found (n,) with the horizon [rad] at points (n, 2) and columns (n,); near: `derived_maps.Nodes`."""
+    """Fill found (n, m) with the horizon [rad] at points (n, 2) and columns (n, m), or (1, m) for all points.
+
+    near: `derived_maps.Nodes`.
+    """
     nodes, per_height, middle, east, north, half = near
     scale = (nodes.shape[1] - 1) / (2 * half)
     up = np.empty(1)
@@ -288,5 +291,7 @@ def interpolate(ground, near, points, column, found):
         if k == 0 or points[k, 0] != points[k - 1, 0] or points[k, 1] != points[k - 1, 1]:
             surfaces(ground, points[k : k + 1], up)
         x, y = (points[k, 0] - east + half) * scale, (points[k, 1] - north + half) * scale
-        c = column[k]
-        found[k] = np.arctan(bilinear(nodes, c, x, y) - (up[0] - middle) * per_height[c])
+        row = min(k, len(column) - 1)
+        for m in range(found.shape[1]):
+            c = column[row, m]
+            found[k, m] = np.arctan(bilinear(nodes, c, x, y) - (up[0] - middle) * per_height[c])

@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.kernels import njit
-from startrack.core.types import Array
+from startrack.core.types import SECTORS, Array, Bools
 from startrack.terrain.ground import merge_blocks
+from startrack.terrain.rays import rows_of_rays
 
 AZIMUTH_BINS = 360  # azimuths; the localizer's sectors are 1.5 degrees wide
 DISTANCE_STEP_M = 4.0
@@ -28,10 +28,9 @@ FARTHEST = np.iinfo(np.uint16).max
 NOT_KNOWN_M, HIGHEST_M = np.iinfo(np.int16).min, np.iinfo(np.int16).max  # range of fields that hold heights
 NEAREST_M = 50.0  # sigmas do not distinguish crests closer by
 SLOTS = 2**18  # boxes and azimuths that are kept: 15 MB; a draw on Shackleton's floor traces 20,000 to 110,000
-BOX_NUMBERS = 5  # of a box and its azimuths
+SECTOR_SLOTS = 2**14  # boxes whose bounds in all sectors are kept: 63 MB; a draw there looks 6000 up
 NEW = np.uint64(np.iinfo(np.uint64).max)  # a NaN, which no box has
 MIX, SHIFT = np.uint64(0xBF58_476D_1CE4_E5B9), np.uint64(29)  # of a hash
-Trace = Callable[..., None]  # of centres, half sides, azimuths, their half widths; fills low and high
 
 
 @dataclass(frozen=True)
@@ -54,35 +53,34 @@ class Square:
 
 
 class BoxMemory:
-    """Bounds of the horizon over boxes that were traced before: images and draws of one place ask for them again.
+    """Bounds of the horizon over boxes that were asked for before: images and draws of one place do so again.
 
     The search cuts its square at the same lines for every image. It bounds the same parts of sectors in the same boxes,
-    and under the sky of one time the same stars, too. What is kept is what was traced, bit for bit; later bounds
+    and under the sky of one time the same stars, too. What is kept is what was computed, bit for bit; later bounds
     replace earlier ones in the slots.
     """
 
-    def __init__(self) -> None:
-        self._keys, self._bounds = np.full((SLOTS, BOX_NUMBERS), NEW), np.empty((SLOTS, 2))
+    def __init__(self, slots: int, numbers: int, azimuths: int) -> None:
+        """`numbers` are those of a box (and its azimuths, where they differ); of each, bounds at so many `azimuths`."""
+        self._shape = slots, numbers, azimuths
+        self._keys, self._bounds = np.full((slots, numbers), NEW), np.empty((slots, 2, azimuths))
         self._lock = Lock()
 
-    def __reduce__(self) -> tuple[type[BoxMemory], tuple[()]]:
-        return BoxMemory, ()  # another process traces for itself
+    def __reduce__(self) -> tuple[type[BoxMemory], tuple[int, int, int]]:
+        return BoxMemory, self._shape  # another process computes for itself
 
-    def fill(
-        self, trace: Trace, centres: Array, half: Array, azimuths: Array, turn: Array, low: Array, high: Array
-    ) -> None:
-        """Fill low and high (n,) for boxes at centres (n, 2), azimuths and their half widths (n,).
+    def fill(self, numbers: Array, low: Array, high: Array, compute: Callable[[Bools], Array]) -> None:
+        """Fill low and high (n, azimuths) for boxes of `numbers` (n, numbers).
 
-        `trace` fills those that are not kept.
+        `compute` gives those (2, k, azimuths) of the boxes that are not kept, of which it takes a mask (n,).
         """
-        keys = np.column_stack([centres, half, azimuths, turn]).view(np.uint64)
+        keys = np.ascontiguousarray(numbers).view(np.uint64)
         missing = np.empty(len(low), dtype=np.bool_)
         with self._lock:
             _recall(self._keys, self._bounds, keys, low, high, missing)
         if not missing.any():
             return
-        results = np.empty((2, np.count_nonzero(missing)))
-        trace(centres[missing], half[missing], azimuths[missing], turn[missing], *results)
+        results = compute(missing)
         low[missing], high[missing] = results
         with self._lock:
             _keep(self._keys, self._bounds, keys[missing], *results)
@@ -106,8 +104,20 @@ class HorizonTable:
 
     @cached_property
     def box_memory(self) -> BoxMemory:
-        """Bounds over small boxes that were traced with this table before."""
-        return BoxMemory()
+        """Bounds over small boxes that were traced with this table before: centre, half side, azimuth, its turn."""
+        return BoxMemory(SLOTS, 5, 1)
+
+    @cached_property
+    def sector_memory(self) -> BoxMemory:
+        """Bounds in the localizer's sectors over boxes that were looked up before: centre and half side."""
+        return BoxMemory(SECTOR_SLOTS, 3, SECTORS)
+
+    @cached_property
+    def tangents(self) -> Array:
+        """(65536,) tan of the table's elevations; infinite at the zenith and the nadir."""
+        found = np.tan(np.arange(FARTHEST + 1) * ANGLE_STEP_RAD - np.pi / 2)
+        found[0], found[round(np.pi / ANGLE_STEP_RAD) :] = -np.inf, np.inf
+        return found
 
     @cached_property
     def pyramid(self) -> list[tuple[NDArray[np.uint16], NDArray[np.uint16]]]:
@@ -152,16 +162,14 @@ class HorizonSigma:
         reach_m = self.table.square.reach_m
         n, side = len(most), 2 * reach_m / len(most)
         steps = 2 + int(2 * azimuth_half_rad * AZIMUTH_BINS / (2 * np.pi)) if azimuth_half_rad > 0 else 1
-        corners = np.array([centres_m + half_m * (1 - 1e-9) * np.array(signs) for signs in product((1, -1), repeat=2)])
+        turns = np.linspace(-azimuth_half_rad, azimuth_half_rad, steps) * (1 - 1e-9)
+        shape, centres, azimuths = rows_of_rays(centres_m, azimuths_rad)
+        bins = np.floor((azimuths[..., None] + turns) / (2 * np.pi) * AZIMUTH_BINS).astype(np.int64) % AZIMUTH_BINS
+        corners = np.stack([centres - half_m * (1 - 1e-9), centres + half_m * (1 - 1e-9)], axis=1)
         cells = np.clip((corners + reach_m) / side, 0, n - 1).astype(np.int64)
-        if (cells == cells[0]).all():  # boxes of the search lie within blocks
-            cells = cells[:1]
-        found = np.zeros(np.broadcast_shapes(np.shape(centres_m)[:-1], np.shape(azimuths_rad)))
-        for turn in np.linspace(-azimuth_half_rad, azimuth_half_rad, steps) * (1 - 1e-9):
-            b = np.floor((np.asarray(azimuths_rad) + turn) / (2 * np.pi) * AZIMUTH_BINS).astype(np.int64) % AZIMUTH_BINS
-            for cell in cells:
-                found = np.maximum(found, most[cell[..., 0], cell[..., 1], b])
-        return found
+        found = np.empty((len(centres), azimuths.shape[1]))
+        _largest_of_cells(most, cells, bins, found)
+        return found.reshape(shape)
 
     @cached_property
     def blocks_rad(self) -> list[Array]:
@@ -203,27 +211,50 @@ def quantize_fields(found: Array) -> NDArray[np.uint16]:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _slot(keys, k):  # type: ignore[no-untyped-def]
+def _slot(keys, k, slots):  # type: ignore[no-untyped-def]
     mixed = keys[k, 0] * MIX
-    for number in range(1, BOX_NUMBERS):
+    for number in range(1, keys.shape[1]):
         mixed = ((mixed ^ (mixed >> SHIFT)) + keys[k, number]) * MIX
-    return (mixed ^ (mixed >> SHIFT)) % np.uint64(SLOTS)
+    return (mixed ^ (mixed >> SHIFT)) % np.uint64(slots)
 
 
 @njit(cache=True, nogil=True)
 def _recall(kept, bounds, keys, low, high, missing):  # type: ignore[no-untyped-def]
     for k in range(len(low)):
-        s = _slot(keys, k)
+        s = _slot(keys, k, len(kept))
         missing[k] = False
-        for number in range(BOX_NUMBERS):
+        for number in range(keys.shape[1]):
             missing[k] |= kept[s, number] != keys[k, number]
-        low[k], high[k] = bounds[s, 0], bounds[s, 1]
+        if not missing[k]:
+            for a in range(low.shape[1]):
+                low[k, a], high[k, a] = bounds[s, 0, a], bounds[s, 1, a]
 
 
 @njit(cache=True, nogil=True)
 def _keep(kept, bounds, keys, low, high):  # type: ignore[no-untyped-def]
     for k in range(len(low)):
-        s = _slot(keys, k)
-        for number in range(BOX_NUMBERS):
+        s = _slot(keys, k, len(kept))
+        for number in range(keys.shape[1]):
             kept[s, number] = keys[k, number]
-        bounds[s, 0], bounds[s, 1] = low[k], high[k]
+        for a in range(low.shape[1]):
+            bounds[s, 0, a], bounds[s, 1, a] = low[k, a], high[k, a]
+
+
+@njit(cache=True, nogil=True)
+def _largest_of_cells(values, cells, bins, found):  # type: ignore[no-untyped-def]
+    """Fill found (n, m) with the largest values (a, a, bins) at the corners of boxes, their cells (n, 2, 2) given.
+
+    `bins` (n, m, turns) are those of the azimuths; (1, m, turns): of all boxes.
+    """
+    for k in range(len(found)):
+        row = min(k, len(bins) - 1)
+        if k > 0 and len(bins) == 1 and (cells[k] == cells[k - 1]).all():
+            found[k] = found[k - 1]
+            continue
+        for m in range(found.shape[1]):
+            most = 0.0
+            for i in range(cells[k, 1, 0] - cells[k, 0, 0] + 1):
+                for j in range(cells[k, 1, 1] - cells[k, 0, 1] + 1):
+                    for b in bins[row, m]:
+                        most = max(most, values[cells[k, 0, 0] + i, cells[k, 0, 1] + j, b])
+            found[k, m] = most

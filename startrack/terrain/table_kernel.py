@@ -19,58 +19,21 @@ from startrack.terrain.horizon_table import (
 )
 
 BIN_RAD = 2 * np.pi / AZIMUTH_BINS
+MIDDLES_RAD = (np.arange(AZIMUTH_BINS) + 0.5) * BIN_RAD
+SINES, COSINES = np.sin(MIDDLES_RAD), np.cos(MIDDLES_RAD)
 TOUCHING = 1e-9  # of a cell or a bin: what only touches it does not count
 
 
-@njit(cache=True, nogil=True)
-def sector_bounds(values, lows, highs, across, reach, east, north, half, low_up, high_up, azimuth, turn):
-    """Bounds of the elevation over a box and the azimuths within `turn`; lows, highs: of the level that fits.
-
-    Boxes smaller than a cell take the lines and points of the cells they touch, larger ones the bounds of the level's
-    blocks.
-    """
-    n = lows.shape[0]
-    side = 2 * reach / n
-    fine = n == across and half < 0.5 * side
-    i0 = min(max(int(np.floor((east - half + reach) / side + TOUCHING)), 0), n - 1)
-    i1 = min(max(int(np.ceil((east + half + reach) / side - TOUCHING)) - 1, i0), n - 1)
-    j0 = min(max(int(np.floor((north - half + reach) / side + TOUCHING)), 0), n - 1)
-    j1 = min(max(int(np.ceil((north + half + reach) / side - TOUCHING)) - 1, j0), n - 1)
-    first = int(np.floor((azimuth - turn) / BIN_RAD + TOUCHING))
-    last = max(int(np.ceil((azimuth + turn) / BIN_RAD - TOUCHING)) - 1, first)
-    last = min(last, first + AZIMUTH_BINS - 1)
-    low, high = np.inf, -np.inf
-    for i in range(i0, i1 + 1):
-        for j in range(j0, j1 + 1):
-            for k in range(first, last + 1):
-                b = k % AZIMUTH_BINS
-                if not fine:
-                    below = lows[i, j, b] * ANGLE_STEP_RAD - np.pi / 2
-                    above = highs[i, j, b] * ANGLE_STEP_RAD - np.pi / 2
-                else:
-                    middle = (b + 0.5) * BIN_RAD
-                    sin_a, cos_a = np.sin(middle), np.cos(middle)
-                    v = values[i * across + j, b]
-                    along = (east - (2 * i + 1) * side / 2 + reach) * sin_a
-                    along += (north - (2 * j + 1) * side / 2 + reach) * cos_a
-                    wide = half * (abs(sin_a) + abs(cos_a))
-                    aside = (east - (2 * i + 1) * side / 2 + reach) * cos_a
-                    aside -= (north - (2 * j + 1) * side / 2 + reach) * sin_a
-                    below, above = _bounds_by_line(v, along, abs(aside), wide, low_up, high_up, 0.5 * side)
-                low, high = min(low, below), max(high, above)
-    return low, high
-
-
 @njit(cache=True, nogil=True, inline="always")
-def _bounds_by_line(v, along, aside, wide, low_up, high_up, cell_half):
-    """Bounds of the elevation, seen from `along` -+ `wide` along the ray from the cell's middle, and so far aside."""
-    below, above = v[0] * ANGLE_STEP_RAD - np.pi / 2, v[1] * ANGLE_STEP_RAD - np.pi / 2
+def _bounds_by_line(v, tangents, along, aside, wide, low_up, high_up, cell_half):
+    """Bounds of tan H, seen from `along` -+ `wide` along the ray from the cell's middle, and so far aside."""
+    below, above = tangents[v[0]], tangents[v[1]]
     cos_turn = np.cos(BIN_RAD / 2)
     height = np.int64(v[6])
     height = height - 65_536 if height > 32_767 else height
     near, far = v[2] * DISTANCE_STEP_M - along - wide, v[3] * DISTANCE_STEP_M - along - wide
     if v[3] < FARTHEST and v[2] > 0 and near > 0.0:  # 0: such ground stands behind the cell's middle, too
-        tan = np.tan(v[5] * ANGLE_STEP_RAD - np.pi / 2)
+        tan = tangents[v[5]]
         rise, tan_turn = v[9] * RISE_STEP, np.tan(BIN_RAD / 2)
         width = aside + wide + 2 * cell_half * tan_turn
         top0 = height + tan * v[2] * DISTANCE_STEP_M - low_up + rise * (width + v[2] * DISTANCE_STEP_M * tan_turn)
@@ -79,7 +42,7 @@ def _bounds_by_line(v, along, aside, wide, low_up, high_up, cell_half):
             top0 / near if top0 > 0.0 else top0 * cos_turn / (near + 2 * wide),
             top1 / far if top1 > 0.0 else top1 * cos_turn / (far + 2 * wide),
         )
-        above = min(above, np.arctan(top))
+        above = min(above, top)
     point = np.int64(v[8])
     point = point - 65_536 if point > 32_767 else point
     s = v[7] * DISTANCE_STEP_M
@@ -87,9 +50,9 @@ def _bounds_by_line(v, along, aside, wide, low_up, high_up, cell_half):
         # The point reckons with the whole cell's width aside, of which the box takes up a part.
         over = point - high_up + v[10] * RISE_STEP * max(cell_half - aside - wide, 0.0)
         if over > 0.0:
-            below = max(below, np.arctan(over * cos_turn / (s + DISTANCE_STEP_M - along + wide)))
+            below = max(below, over * cos_turn / (s + DISTANCE_STEP_M - along + wide))
         elif s - along - wide > 0.0:
-            below = max(below, np.arctan(over / (s - along - wide)))
+            below = max(below, over / (s - along - wide))
     return below, max(above, below)
 
 
@@ -115,8 +78,11 @@ def look_up(values, across, reach, east, north, azimuth, out):
 
 
 @njit(cache=True, nogil=True)
-def horizons(ground, values, across, reach, camera_height, points, azimuths, tan, at, edge):
-    """Fill tan, at and edge (n,) with the horizon of each point at its azimuth; across = 0: there is no table."""
+def horizons(ground, values, across, reach, camera_height, is_own, points, azimuths, tan, at, edge):
+    """Fill tan, at and edge (n,) with the horizon of each point at its azimuth; across = 0: there is no table.
+
+    From a table that is not the map's own (`is_own`), but of a similar one, only first sight lines are taken.
+    """
     near = np.array([0.0, FAR_M, 0.0])
     up = 0.0
     one = np.empty(1)
@@ -126,6 +92,8 @@ def horizons(ground, values, across, reach, camera_height, points, azimuths, tan
             up = one[0] + camera_height
         if across > 0:
             look_up(values, across, reach, points[k, 0], points[k, 1], azimuths[k], near)
+            if not is_own:
+                near[0], near[1] = 0.0, FAR_M
         tan[k], at[k], edge[k] = horizon(
             ground, points[k, 0], points[k, 1], up, np.sin(azimuths[k]), np.cos(azimuths[k]), near[0], near[1], near[2]
         )
@@ -163,20 +131,53 @@ def box_bounds(ground, values, across, reach, camera_height, centres, half, azim
 
 
 @njit(cache=True, nogil=True)
-def many_sector_bounds(
-    ground, values, lows, highs, across, reach, camera_height, centres, half, azimuths, turn, low, high
+def sector_bounds(
+    ground, values, lows, highs, across, reach, camera_height, tangents, azimuths, turn, centres, half, low, high
 ):
-    """Fill low and high (n,) [rad] with `sector_bounds`."""
-    lowest, highest = 0.0, 0.0
+    """Fill low and high (n, m) [rad] with bounds over boxes at centres (n, 2), and azimuths (n, m) within `turn`.
+
+    Azimuths and turn (1, m) are those of all boxes. lows, highs: of the level that fits. Boxes smaller than a cell take
+    the lines and points of the cells they touch, larger ones the bounds of the level's blocks.
+    """
+    n = lows.shape[0]
+    side = 2 * reach / n
+    low_up, high_up = 0.0, 0.0
     for k in range(len(low)):
-        new = k == 0 or centres[k, 0] != centres[k - 1, 0] or centres[k, 1] != centres[k - 1, 1]
-        if half[k] < reach / across and (new or half[k] != half[k - 1]):
-            _, lowest, highest, _, _ = box_height_bounds(ground, centres[k, 0], centres[k, 1], half[k], False)
-            lowest, highest = lowest + camera_height, highest + camera_height
-        low[k], high[k] = sector_bounds(
-            values, lows, highs, across, reach, centres[k, 0], centres[k, 1], half[k], lowest, highest, azimuths[k],
-            turn[k],
-        )  # fmt: skip
+        east, north, wide = centres[k, 0], centres[k, 1], half[k]
+        fine = n == across and wide < 0.5 * side
+        new = k == 0 or east != centres[k - 1, 0] or north != centres[k - 1, 1] or wide != half[k - 1]
+        if fine and new:
+            _, low_up, high_up, _, _ = box_height_bounds(ground, east, north, wide, False)
+            low_up, high_up = low_up + camera_height, high_up + camera_height
+        i0 = min(max(int(np.floor((east - wide + reach) / side + TOUCHING)), 0), n - 1)
+        i1 = min(max(int(np.ceil((east + wide + reach) / side - TOUCHING)) - 1, i0), n - 1)
+        j0 = min(max(int(np.floor((north - wide + reach) / side + TOUCHING)), 0), n - 1)
+        j1 = min(max(int(np.ceil((north + wide + reach) / side - TOUCHING)) - 1, j0), n - 1)
+        row = min(k, len(azimuths) - 1)
+        for m in range(low.shape[1]):
+            first = int(np.floor((azimuths[row, m] - turn[row, m]) / BIN_RAD + TOUCHING))
+            last = max(int(np.ceil((azimuths[row, m] + turn[row, m]) / BIN_RAD - TOUCHING)) - 1, first)
+            last = min(last, first + AZIMUTH_BINS - 1)
+            least, most = FARTHEST, 0
+            tan_low, tan_high = np.inf, -np.inf
+            for i in range(i0, i1 + 1):
+                for j in range(j0, j1 + 1):
+                    for bin_number in range(first, last + 1):
+                        b = bin_number % AZIMUTH_BINS
+                        if fine:
+                            from_east, from_north = east - (i + 0.5) * side + reach, north - (j + 0.5) * side + reach
+                            below, above = _bounds_by_line(
+                                values[i * across + j, b], tangents, from_east * SINES[b] + from_north * COSINES[b],
+                                abs(from_east * COSINES[b] - from_north * SINES[b]),
+                                wide * (abs(SINES[b]) + abs(COSINES[b])), low_up, high_up, 0.5 * side,
+                            )  # fmt: skip
+                            tan_low, tan_high = min(tan_low, below), max(tan_high, above)
+                        else:
+                            least, most = min(least, lows[i, j, b]), max(most, highs[i, j, b])
+            if fine:
+                low[k, m], high[k, m] = np.arctan(tan_low), np.arctan(tan_high)
+            else:
+                low[k, m], high[k, m] = least * ANGLE_STEP_RAD - np.pi / 2, most * ANGLE_STEP_RAD - np.pi / 2
 
 
 @njit(cache=True, nogil=True)

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass
-from functools import cache, cached_property
-from itertools import pairwise
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
-from startrack.core.runner import count_cores
-from startrack.core.types import Array, BadInput
+from startrack.core.types import SECTORS, Array, BadInput, Bools
 from startrack.frames import Site
 from startrack.terrain.earth_projection import EarthProjection
 from startrack.terrain.ground import Ground, ground_up_m, pack_maps
@@ -22,6 +18,7 @@ from startrack.terrain.horizon_kernel import surfaces
 from startrack.terrain.horizon_table import AZIMUTH_BINS, FIELDS, HorizonTable, Square
 from startrack.terrain.protocol import Progress, Terrain
 from startrack.terrain.raster import Projection, Raster
+from startrack.terrain.rays import flatten, flatten_rays, rows_of_rays
 from startrack.terrain.table_cache import (
     TABLES_IN_MEMORY,
     discard_table,
@@ -29,16 +26,17 @@ from startrack.terrain.table_cache import (
     load_or_build_table,
     path_of_table,
 )
-from startrack.terrain.table_kernel import box_bounds, horizons, many_sector_bounds
+from startrack.terrain.table_kernel import box_bounds, horizons, sector_bounds
+from startrack.terrain.threads import run_in_threads
 
 CELL_M = 200.0  # cells of the table are no wider
 MAX_CELLS_ACROSS = 128
 REACH_RADII = 1.15  # of the search radius: so far is searched, to notice that the camera left the area
 SLOPE_STEP_M = 5.0
-MIN_RAYS_FOR_THREADS = 1500  # fewer take less time than starting threads
-MAX_THREADS = 8
 POINT_M, WIDE_RAD = 1.0, np.radians(2.0)  # boxes up to this half side are points: bounds that are wider are traced
 MAX_TRACED_TURN_RAD = 0.25 * 2 * np.pi / AZIMUTH_BINS  # half widths of azimuths: bounds over wider ones are looked up
+SECTOR_AZIMUTHS_RAD = (2 * np.arange(SECTORS) + 1)[None] * np.pi / SECTORS  # the localizer's, (1, SECTORS)
+SECTOR_TURN_RAD = np.pi / SECTORS
 NO_VALUES = np.zeros((0, AZIMUTH_BINS, FIELDS), dtype=np.uint16)
 
 
@@ -61,6 +59,7 @@ class TracedMap(Terrain):
     highest_beyond_m: float = -np.inf  # ground off the maps is no higher, nor than their highest post; as their heights
     finest_m = 0.45  # no height map is more accurate
     _uses_table = True  # traces begin at the horizon's distance of a table in memory
+    _similar_table: HorizonTable | None = None  # of a map much like this one: it tells about where horizons stand
 
     def __post_init__(self) -> None:
         if not self.maps:
@@ -159,7 +158,9 @@ class TracedMap(Terrain):
         shape, points, azimuths = flatten_rays(points_m, azimuths_rad)
         found = np.empty((3, len(azimuths)))
         table = TABLES_IN_MEMORY.get(self.table_key) if self._uses_table else None
-        _run_in_threads(horizons, self._kernel_arguments(table), (points, azimuths, *found))
+        similar = self._similar_table if self._uses_table and table is None else None
+        fixed = (*self._kernel_arguments(table or similar), similar is None)
+        run_in_threads(horizons, fixed, (points, azimuths, *found))
         tan, distance, edge = found.reshape(3, *shape)
         return tan, distance, edge
 
@@ -171,11 +172,16 @@ class TracedMap(Terrain):
         self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
     ) -> tuple[Array, Array]:
         """Bounds of the horizon over boxes [rad]: from the table, and for single rays and small boxes by tracing."""
+        if np.ndim(half_m) == np.ndim(azimuth_half_rad) == 0 and half_m > POINT_M:
+            shape, centres, azimuths = rows_of_rays(centres_m, azimuths_rad)
+            if azimuth_half_rad >= MAX_TRACED_TURN_RAD or half_m >= self.table.square.half_m:
+                found = self._bounds_of_sectors(centres, float(half_m), azimuths, float(azimuth_half_rad))
+                return found[0].reshape(shape), found[1].reshape(shape)
         shape = np.broadcast_shapes(
             np.shape(centres_m)[:-1], np.shape(half_m), np.shape(azimuths_rad), np.shape(azimuth_half_rad)
         )
-        centres = _flatten(centres_m, (*shape, 2)).reshape(-1, 2)
-        half, azimuths, turn = (_flatten(a, shape).ravel() for a in (half_m, azimuths_rad, azimuth_half_rad))
+        centres = flatten(centres_m, (*shape, 2)).reshape(-1, 2)
+        half, azimuths, turn = (flatten(a, shape).ravel() for a in (half_m, azimuths_rad, azimuth_half_rad))
         low, high = np.empty((2, len(half)))
         traced = (turn < MAX_TRACED_TURN_RAD) & (half < self.table.square.half_m)
         if traced.all():
@@ -186,7 +192,7 @@ class TracedMap(Terrain):
             if half[0] <= POINT_M and wide.any():
                 some = [a[wide] for a in (centres, half, azimuths, turn)]
                 results = np.empty((2, len(some[0])))
-                _run_in_threads(box_bounds, self._kernel_arguments(self.table), (*some, *results))
+                run_in_threads(box_bounds, self._kernel_arguments(self.table), (*some, *results))
                 low[wide], high[wide] = results
         else:
             parts = [(self._look_up_bounds, ~traced & (half == kind)) for kind in np.unique(half[~traced])]
@@ -200,14 +206,47 @@ class TracedMap(Terrain):
 
     def _trace_bounds(self, *arrays: Array) -> None:
         """Bounds over small boxes: centres (n, 2), half sides, azimuths and their half widths; results low, high."""
-        fixed = self._kernel_arguments(self.table)
-        self.table.box_memory.fill(lambda *some: _run_in_threads(box_bounds, fixed, some), *arrays)
+        *boxes, low, high = arrays
+
+        def trace(missing: Bools) -> Array:
+            found = np.empty((2, np.count_nonzero(missing)))
+            run_in_threads(box_bounds, self._kernel_arguments(self.table), (*(one[missing] for one in boxes), *found))
+            return found[:, :, None]
+
+        self.table.box_memory.fill(np.column_stack(boxes), low[:, None], high[:, None], trace)
 
     def _look_up_bounds(self, *arrays: Array) -> None:
         """Bounds from the table over boxes of one size; arrays as in `_trace_bounds`."""
+        centres, half, azimuths, turn, low, high = arrays
+        each = azimuths[:, None], turn[:, None], centres, half, low[:, None], high[:, None]
+        run_in_threads(sector_bounds, self._look_up_arguments(float(half[0])), each)
+
+    def _bounds_of_sectors(self, centres: Array, half_m: float, azimuths: Array, turn_rad: float) -> Array:
+        """Bounds (2, n, m) from the table over boxes of one size at centres (n, 2), and azimuths (1, m) or (n, 1)."""
+        found = np.empty((2, len(centres), azimuths.shape[1]))
+        numbers = np.column_stack([centres, np.full(len(centres), half_m)])
+
+        def look_up(which: Bools) -> Array:
+            some = np.ascontiguousarray(numbers[which])
+            results = np.empty((2, len(some), azimuths.shape[1]))
+            own = azimuths if len(azimuths) == 1 else azimuths[which]
+            fixed, each = self._look_up_arguments(half_m), (own, np.full_like(own, turn_rad))
+            boxes = np.ascontiguousarray(some[:, :2]), np.ascontiguousarray(some[:, 2]), *results
+            if len(own) == 1:
+                run_in_threads(sector_bounds, (*fixed, *each), boxes)
+            else:
+                run_in_threads(sector_bounds, fixed, (*each, *boxes))
+            return results
+
+        if turn_rad == SECTOR_TURN_RAD and np.array_equal(azimuths, SECTOR_AZIMUTHS_RAD):
+            self.table.sector_memory.fill(numbers, found[0], found[1], look_up)
+            return found
+        return look_up(np.ones(len(centres), dtype=np.bool_))
+
+    def _look_up_arguments(self, half_m: float) -> tuple[Any, ...]:
+        """The first arguments of `sector_bounds` for boxes of this half side."""
         ground, values, *square = self._kernel_arguments(self.table)
-        level = self.table.pyramid[self.table.level_for(float(arrays[1][0]))]
-        _run_in_threads(many_sector_bounds, (ground, values, *level, *square), arrays)
+        return ground, values, *self.table.pyramid[self.table.level_for(half_m)], *square, self.table.tangents
 
     def _kernel_arguments(self, table: HorizonTable | None) -> tuple[Any, ...]:
         """The first arguments of kernels: maps, table, number of its cells and half its side, height of the camera."""
@@ -240,38 +279,3 @@ class TracedMap(Terrain):
         line = np.linspace(-half_m, half_m, 65)
         points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
         return not np.isnan(ground_up_m(self.site, self.maps, points)).any()
-
-
-def flatten_rays(points_m: Array, azimuths_rad: Array) -> tuple[tuple[int, ...], Array, Array]:
-    """The shape of points (..., 2) broadcast with azimuths (...), and its n points (n, 2) and azimuths (n,)."""
-    shape = np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))
-    return shape, _flatten(points_m, (*shape, 2)).reshape(-1, 2), _flatten(azimuths_rad, shape).ravel()
-
-
-def _flatten(a: Any, shape: tuple[int, ...]) -> Array:
-    """The values of `a`, broadcast to the shape, in one contiguous array of their own: kernels have one layout."""
-    return np.array(np.broadcast_to(np.asarray(a, dtype=np.float64), shape), order="C")
-
-
-def _run_in_threads(function: Any, fixed: tuple[Any, ...], arrays: tuple[Array, ...]) -> None:
-    """Call the function with the fixed arguments and parts of the arrays, on all cores where rays are many."""
-    n, cores = len(arrays[-1]), min(count_cores(), MAX_THREADS)
-    if n < MIN_RAYS_FOR_THREADS or cores == 1:
-        function(*fixed, *arrays)
-        return
-    ends = np.linspace(0, n, cores + 1).astype(int)
-    own, *others = [[a[i:j] for a in arrays] for i, j in pairwise(ends)]
-    running = [_thread_pool().submit(function, *fixed, *part) for part in others]
-    function(*fixed, *own)
-    for future in running:
-        future.result()
-
-
-@cache
-def _thread_pool() -> ThreadPoolExecutor:
-    """Threads beside the calling one, kept: each start takes as long as a thousand rays."""
-    return ThreadPoolExecutor(MAX_THREADS)
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_thread_pool.cache_clear)  # threads are not copied

@@ -229,6 +229,7 @@ def turned_models(model: SkylineModel, clock: Clock) -> list[SkylineModel]:
     """The model at the likeliest times of a gross error of its `clock`, far enough from the stated one."""
     turn = float(np.linalg.norm(clock.turn_rad_s))
     count = int(np.ceil(GROSS_REACH_SIGMAS * clock.gross_sigma_s * turn / (0.5 * TIME_STEP_RAD)))
+    count = min(count, MOST_SCANNED // 2)  # 16 degrees to each side: beyond any on the Moon, an hour on the Earth
     later_s = np.arange(-count, count + 1) * 0.5 * TIME_STEP_RAD / turn
     fits = np.array([_fit(turned_model(model, later, is_rough=True)) for later in later_s])
     fits -= 0.5 * np.square(later_s / clock.gross_sigma_s)

@@ -90,11 +90,12 @@ def test_lights_brighter_than_the_stars_do_not_matter_at_the_attitude_itself(mon
 @pytest.mark.parametrize("name", ["near-wall.png", "tilted.png", "lowell-2018-08-06.fits.bz2"])
 def test_images_have_the_same_names(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     exposure, catalog = read_exposure(SAMPLES / name), load_catalog()
-    lost = identify(exposure, load_camera_input(exposure.camera), catalog)
+    camera = load_camera_input(exposure.camera)
+    lost = identify(exposure, camera, catalog)
     forbid_lost_in_space(monkeypatch)
     for off_deg in (0.05, 5.0):
         near = NearAttitude.of(turned(lost.attitude.R_cam_icrs, off_deg))
-        found = identify(exposure, lost.camera, catalog, Settings(near_attitude=near))
+        found = identify(exposure, camera, catalog, Settings(near_attitude=near))
         assert_same_names(found.identification, lost.identification)
         turn = found.attitude.R_cam_icrs @ lost.attitude.R_cam_icrs.T
         assert angle_between_rad(turn[0], [1.0, 0.0, 0.0]) < 1e-9

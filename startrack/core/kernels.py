@@ -16,23 +16,41 @@ choose_cache_folder()
 discard_stale_kernels()
 
 import numba  # noqa: E402 - it reads where its cache lies when it loads
-from llvmlite.binding import add_symbol, parse_bitcode  # noqa: E402
+from llvmlite.binding import Linkage, add_symbol, parse_bitcode  # noqa: E402
 from numba.core.caching import FunctionCache  # noqa: E402
 from numba.core.codegen import JITCodeLibrary  # noqa: E402
+from numba.core.registry import CPUDispatcher  # noqa: E402
 from numba.core.runtime._nrt_python import c_helpers  # noqa: E402
 
 REORDERED_SUMS = {"reassoc", "contract", "nsz"}  # as `fastmath`: lets the compiler sum several pixels at a time
+PYTHON_WRAPPER = "_ZN7cpython"  # begin of the name by which Python calls
 REACH, CDF_STEPS = 8.0, 4096  # of `normal_cdf`: standard deviations on either side, and steps of the table
 TABLE = np.array([0.5 * erfc(-x / sqrt(2.0)) for x in np.linspace(-REACH, REACH, CDF_STEPS + 1)])
 
 
-class LazyLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """Machine code from a cache. Only compilation of a caller parses its bitcode: half of 4 ms."""
+class KernelLibrary(JITCodeLibrary):  # type: ignore[misc]
+    """Machine code of a kernel, which calls no other library: the same whether compiled here or loaded from a cache.
+
+    Of code from a cache only compilation of a caller parses the bitcode: half of 4 ms.
+    """
 
     _bitcode: bytes | None = None
 
+    def _finalize_final_module(self) -> None:
+        """Make the functions of other libraries in this one internal, once it is optimised, and make the code.
+
+        Otherwise the kernel would call those of their own library where this process has compiled it. They were
+        optimised apart from it: sums of reordered terms are rounded otherwise.
+        """
+        functions = [one for one in self._final_module.functions if not one.is_declaration]
+        if any(one.name.startswith(PYTHON_WRAPPER) for one in functions):
+            for function in functions:
+                if function.linkage == Linkage.linkonce_odr:
+                    function.linkage = Linkage.internal
+        super()._finalize_final_module()
+
     @classmethod
-    def _unserialize(cls, codegen: Any, state: Any) -> LazyLibrary:
+    def _unserialize(cls, codegen: Any, state: Any) -> KernelLibrary:
         name, _, (object_code, bitcode) = state
         self = cls(codegen, name)
         self.enable_object_caching()
@@ -42,7 +60,7 @@ class LazyLibrary(JITCodeLibrary):  # type: ignore[misc]
         return self
 
     def get_pointer_to_function(self, name: str) -> int:
-        """The address of a function of the library; of those from a cache all that are asked for are there."""
+        """The address of a function of the library, 0 where there is none of that name."""
         if self._bitcode is None:
             return int(super().get_pointer_to_function(name))
         return int(self._codegen._engine.get_function_address(name))
@@ -56,8 +74,8 @@ class LazyLibrary(JITCodeLibrary):  # type: ignore[misc]
 
 @cache
 def prepare_loading(codegen: Any) -> None:
-    """Have a `codegen` load lazy libraries, and tell LLVM where the functions of numba's runtime are."""
-    codegen._library_class = LazyLibrary
+    """Have a `codegen` make and load libraries of kernels, and tell LLVM where the functions of numba's runtime are."""
+    codegen._library_class = KernelLibrary
     for name, address in c_helpers.items():
         add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
 
@@ -72,13 +90,28 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
             return self._load_overload(sig, target_context)
 
 
-def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """numba's decorator with its `options`; kernels with `cache` are kept in a KernelCache."""
+class InnerKernel(CPUDispatcher):  # type: ignore[misc]
+    """A kernel that only kernels call: no code reads Python's arguments, which takes longer to compile than a loop."""
+
+    def __call__(self, *args: Any) -> Any:
+        """Refuse; without that code the call would end the process."""
+        raise TypeError(f"{self.py_func.__name__} is called by kernels only; Python may call its `py_func`")
+
+
+def njit(*, inner: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """numba's decorator with its `options`; kernels with `cache` are kept in a KernelCache, `inner`: an InnerKernel.
+
+    All kernels release the GIL, and divide by zero as numpy does. numba compiles the functions of its own that a
+    kernel uses, as np.empty, once for all kernels of equal options.
+    """
+    common = {"no_cfunc_wrapper": True, "no_cpython_wrapper": inner, "nogil": True, "error_model": "numpy"} | options
 
     def decorate(function: Callable[..., Any]) -> Any:
-        kernel = numba.njit(no_cfunc_wrapper=True, **options)(function)  # type: ignore[call-overload]
+        kernel = numba.njit(**common)(function)  # type: ignore[call-overload]
         if options.get("cache"):
             kernel._cache = KernelCache(function)
+        if inner:
+            kernel.__class__ = InnerKernel
         return kernel
 
     return decorate
@@ -91,7 +124,7 @@ def read_only(array: NDArray[Any]) -> NDArray[Any]:
     return view
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, inline="always")
 def normal_cdf(x):  # type: ignore[no-untyped-def]
     """The normal distribution function Phi(x) by linear interpolation of a table, to 5e-7."""
     at = (min(max(x, -REACH), REACH) + REACH) * (CDF_STEPS / (2 * REACH))

@@ -34,7 +34,7 @@ def join_columns(columns: Sequence[bytes]) -> bytes:
     return bytes(_join(np.frombuffer(b"".join(columns), np.uint8), np.append(0, ends[:-1])))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _join(lines, at):
     """The rows (bytes,) of columns whose `lines` (bytes,) begin `at` (columns,) each."""
     rows, to = np.empty_like(lines), 0
@@ -50,7 +50,7 @@ def _join(lines, at):
     return rows
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _number_lines(values, digits, is_general):
     """The characters (bytes,) of the values, a line break after each: %.<digits>g where `is_general`, else f."""
     out, at = np.empty(LINE_CHARACTERS * len(values), np.uint8), 0
@@ -68,7 +68,7 @@ def _number_lines(values, digits, is_general):
     return out[:at]
 
 
-@njit()
+@njit(inner=True)
 def _scaled(value, power):
     """value * 10**power, rounded to an integer: half to even, as of the exact product."""
     scale = 10.0 ** abs(power)
@@ -83,7 +83,7 @@ def _scaled(value, power):
     return np.int64(low) + (1 if up else 0)
 
 
-@njit()
+@njit(inner=True)
 def _product_error(a, b, product):
     """a b - product, exactly (Dekker 1971)."""
     high_a, high_b = _high_half(a), _high_half(b)
@@ -91,14 +91,14 @@ def _product_error(a, b, product):
     return ((high_a * high_b - product) + high_a * low_b + low_a * high_b) + low_a * low_b
 
 
-@njit()
+@njit(inner=True)
 def _high_half(x):
     """The upper 26 bits of a number (Veltkamp)."""
     large = 134217729.0 * x
     return large - (large - x)
 
 
-@njit()
+@njit(inner=True)
 def _write_general(out, at, value, digits):
     """Write as %.<digits>g; the end."""
     if value == 0:
@@ -125,7 +125,7 @@ def _write_general(out, at, value, digits):
     return at
 
 
-@njit()
+@njit(inner=True)
 def _write_fixed(out, at, whole, decimals):
     """Write whole / 10**decimals with that many decimals; the end."""
     rest, end, power = np.uint64(whole), at + decimals + 1, np.uint64(10**decimals)

@@ -86,7 +86,7 @@ def _median_and_spread(ordered: Image) -> tuple[Image, Image]:
     return np.float32(0.5) * (ordered[:, middle - 1] + ordered[:, middle]), ordered @ _scale_weights()
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _fill_blocks(image, side, first, part_steps, blocks):  # type: ignore[no-untyped-def]
     """Fill blocks (rows, columns, BLOCK_PX, BLOCK_PX) with those of an image, from the row of blocks `first` on.
 

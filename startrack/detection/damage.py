@@ -171,7 +171,7 @@ def fill_masked(image: Image, masked: Bools) -> Image:
     return filled
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _fill_from_blocks(image, masked, good, source) -> None:  # type: ignore[no-untyped-def]
     """Replace masked pixels of the image by those of the block `source` (2, rows, columns), one after another."""
     height, width = image.shape

@@ -23,7 +23,7 @@ SQRT_2PI = math.sqrt(2.0 * math.pi)
 ERF_SCALE, A1, A2, A3, A4, A5 = float(ERF_T), *(float(a) for a in ERF_COEFFICIENTS)
 
 
-@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
+@njit(cache=True, fastmath=REORDERED_SUMS)
 def fit_stamps(
     data, variance, usable, signal, signal_error, which, start_px, sigma_px, per_unit, model_error, rounds, surround,
     xy_px, values, covariance,
@@ -103,14 +103,14 @@ def _read_stamp(data, variance, usable, signal, signal_error, k, i, pixels) -> N
             pixels[2, p] = ONE if usable[k, p] else ZERO
 
 
-@njit(inline="always")
+@njit(inner=True, fastmath=REORDERED_SUMS)
 def bell_curve(sigma_px, radius):
     """exp(-x^2 / 2 sigma^2) at x = 1/2, 3/2, ..., as far as a stamp's edge is from a source at its other edge [px]."""
     at = (np.arange(5 * radius + 2) + 0.5) / max(sigma_px, NARROWEST_PX)
     return np.exp(-0.5 * at * at)
 
 
-@njit(inline="always")
+@njit(inner=True, fastmath=REORDERED_SUMS)
 def fill_profile(profile, slope, axis, offset, sigma_px, bell) -> None:
     """Row `axis`: the pixel-integrated Gaussian and its derivative by the offset, as `psf.pixel_profile_single`.
 
@@ -238,7 +238,7 @@ def _judge(pixels, shape, side, flux, level, per_unit, model_error, surround, va
     values[5], values[6], values[7] = above, norm, own
 
 
-@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
+@njit(cache=True, fastmath=REORDERED_SUMS)
 def sum_neighbours(star, offset_px, flux, sigma_px, variance, limit_sigma, last, signal, changed) -> None:
     """Fill signal (k, s, s) with the light of sources in the stamps of the k different stars among `star` (m,).
 

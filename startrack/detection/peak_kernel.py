@@ -16,7 +16,7 @@ PEAK_FIELDS = 6  # of a peak: column, row, height, offsets of its top in x and y
 ZERO, ONE, HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 
 
-@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
+@njit(cache=True, fastmath=REORDERED_SUMS)
 def find_maxima(
     image, background, noise, side, found, per_unit, found_error, taps, beside, level_factor, lowest, dead, margin
 ):  # fmt: skip
@@ -38,9 +38,9 @@ def find_maxima(
     filtered = np.zeros((3, (width + CHUNK_PX - 1) // CHUNK_PX * CHUNK_PX), np.float32)
     squares, columns = (height + COARSE_PX - 1) // COARSE_PX, (width + COARSE_PX - 1) // COARSE_PX
     column, means = np.zeros(COARSE_PX * columns, np.float32), np.empty((squares, columns), np.float32)
-    levels, filled = np.zeros((3, COARSE_PX * columns), np.float32), 0
+    levels, filled = np.zeros((3, COARSE_PX * columns), np.float32), np.int64(0)  # 0 alone: a type of its own
     padded, mean = np.empty(columns + 2 * beside, np.float32), np.empty(columns, np.float32)
-    peaks, count = np.empty((0, PEAK_FIELDS)), 0
+    peaks, count = np.empty((0, PEAK_FIELDS)), np.int64(0)
     for y in range(height + lag):
         if y < height:
             line = filtered[y % 3, :width] if lag == 0 else lines[y % (lag + 1), reach : reach + width]
@@ -77,7 +77,7 @@ def find_maxima(
     return peaks[:count]
 
 
-@njit(nogil=True)
+@njit(inner=True)
 def _add_clipped(line, column):
     """Add the values of a row to those of a row of squares.
 
@@ -88,7 +88,7 @@ def _add_clipped(line, column):
         column[x] += line[x] if abs(line[x]) <= limit else ZERO
 
 
-@njit(nogil=True)
+@njit(inner=True)
 def _take_means(column, rows, width, means):
     """Fill means (w,) from sums over `rows`, at the border of what there is; the sums become zero."""
     last = len(means) - 1
@@ -101,7 +101,7 @@ def _take_means(column, rows, width, means):
     column[:] = ZERO
 
 
-@njit(nogil=True)
+@njit(inner=True)
 def _average(means, row, beside, factor, padded, out):
     """Fill out (w,) with the average of means (h, w) over `beside` squares on each side, times a factor.
 
@@ -132,7 +132,7 @@ def _mirror(at, length):
     return at if at < length else 2 * length - 1 - at
 
 
-@njit(nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
+@njit(inner=True, fastmath=REORDERED_SUMS)
 def _filter_in_x(line, taps, out):
     """Fill out (W,) with the line (W + 2 m,) filtered."""
     reach, width = len(taps) - 1, len(out)
@@ -151,7 +151,7 @@ def _filter_in_x(line, taps, out):
             )
 
 
-@njit(nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
+@njit(inner=True, fastmath=REORDERED_SUMS)
 def _filter_in_y(across, row, taps, level_above, level_below, part, out):
     """Fill out (W,) with the rows about `row`, which lie in `across` (2 m + 1, W) in turn, filtered, above the level.
 
@@ -175,7 +175,7 @@ def _filter_in_y(across, row, taps, level_above, level_below, part, out):
             out[x] += one * (a[x] + e[x]) + two * (b[x] + f[x]) + three * (c[x] + g[x]) + four * (d[x] + h[x])
 
 
-@njit(nogil=True)
+@njit(inner=True)
 def _widen(values, out):
     """Fill out (COARSE_PX n,) by linear interpolation between the middles of squares with these values (n,)."""
     last = len(values) - 1
@@ -186,7 +186,7 @@ def _widen(values, out):
             out[j * COARSE_PX + k] = own + (at * (after - own) if at > ZERO else at * (own - before))
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(inner=True)
 def _add_peaks(before, own, after, row, lowest, dead, first, stop, peaks, count):
     """Add the maxima of a row from column `first` to before `stop`; return the new number of peaks.
 

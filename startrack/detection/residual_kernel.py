@@ -10,7 +10,7 @@ from startrack.core.smooth_image import Image, SmoothImage
 from startrack.core.types import Ints
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def convert_counts(pixels_adu, recorded_adu, gain, bias_e, highest_adu, image, saturated):
     """Fill image (H, W) [e], unless it has no rows, and mark in saturated (H, W) the counts from `highest_adu` on.
 
@@ -35,7 +35,7 @@ def convert_counts(pixels_adu, recorded_adu, gain, bias_e, highest_adu, image, s
                     line[x] = counts[x] * gain - biases[x]
 
 
-@njit(nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
+@njit(inner=True, fastmath=REORDERED_SUMS)
 def fill_row(image, background, noise, side, found, per_unit, found_error, y, line):
     """Fill line (W,) with row y of the image: light above the background in units of the noise.
 
@@ -57,14 +57,14 @@ def fill_row(image, background, noise, side, found, per_unit, found_error, y, li
             line[x] = (light[x] - (below_b[x] * rest + above_b[x] * part)) / sigma
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def fill_residuals(image, background, noise, side, found, per_unit, found_error, out):
     """Fill out (H, W) with all rows; the other arguments are those of `fill_row`."""
     for y in range(len(out)):
         fill_row(image, background, noise, side, found, per_unit, found_error, y, out[y])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _fill_stamps(image, background, noise, side, centres, light, variance):
     """Fill light and variance (n, s, s) around the pixels `centres` (n, 2); the other arguments: `fill_row`."""
     width = light.shape[1]

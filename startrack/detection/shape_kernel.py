@@ -11,7 +11,7 @@ from startrack.core.kernels import REORDERED_SUMS, njit
 from startrack.detection.fit_kernel import LEAST, ONE, ZERO, bell_curve, fill_profile
 
 
-@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
+@njit(cache=True, fastmath=REORDERED_SUMS)
 def compare_shapes(
     data, variance, usable, which, offset_px, flux, level, width_px, per_unit, model_error, stripe, ends, misfit, edge
 ) -> None:  # fmt: skip
@@ -70,7 +70,7 @@ def _most_explained(weight, moment, stripe, ends, sums):
     return most
 
 
-@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
+@njit(cache=True, fastmath=REORDERED_SUMS)
 def fill_squared_residuals(
     data, variance, offset_px, flux, level, covariance, sigma_px, model_error, faint, most, signal, squared, relative,
     lit,
@@ -110,7 +110,7 @@ def fill_squared_residuals(
             relative[i, p] /= max(math.sqrt(total / data.shape[1]), 1e-30)
 
 
-@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS, error_model="numpy")
+@njit(cache=True, fastmath=REORDERED_SUMS)
 def explain_by_widths(data, weights, offset_px, widths_px, explained, variance):
     """Fill explained (n, m): how much a star of each width on a constant level reduces chi^2 of the stamps (n, s^2).
 

@@ -11,7 +11,7 @@ from startrack.core.kernels import njit
 REACH_SIGMAS = 39.0  # beyond, exp(-z^2 / 2) is zero
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def add_steps(total, temper, lowest, step, column, place, sigma, weight, passed, nothing):  # type: ignore[no-untyped-def]
     """Add the log-likelihood of steps of light (k,), sorted by column, times `temper` to `total` (columns, n).
 
@@ -40,7 +40,7 @@ def add_steps(total, temper, lowest, step, column, place, sigma, weight, passed,
             total[c, i] += temper * (log(mixture[i]) if low <= i < high else log(nothing))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def pass_messages(likelihood, forward, ratio, weight, jump):  # type: ignore[no-untyped-def]
     """Messages (columns, n) that reach each column from those before it, in the order `forward` or against it.
 

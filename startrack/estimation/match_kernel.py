@@ -11,7 +11,7 @@ DIMMED_MAG = 1.6  # and at most this much fainter: haze, branches, the edge of t
 PX_PER_MAG = 0.6  # distance with the same cost as a difference of one magnitude
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def pair_mutually(detection, star, cost, agrees):  # type: ignore[no-untyped-def]
     """Ascending indices of the pairs (k,) of least finite cost of their star and, where they agree, their detection.
 
@@ -42,7 +42,7 @@ def pair_mutually(detection, star, cost, agrees):  # type: ignore[no-untyped-def
     return kept[:k]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def compare_pairs(detection, star, distance, v_mag, v_sigma_mag, measured_mag, saturated):  # type: ignore[no-untyped-def]
     """`brightness_misfit` (k,) and `one_to_one_pairs` (m,) of CandidatePairs; all arguments are (k,)."""
     misfit, cost = np.empty(len(star)), np.empty(len(star))
@@ -56,7 +56,7 @@ def compare_pairs(detection, star, distance, v_mag, v_sigma_mag, measured_mag, s
     return misfit, pair_mutually(detection, star, cost, misfit < 1.0)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def count_alike(v_mag, measured_mag, dimmed_mag):  # type: ignore[no-untyped-def]
     """Number of pairs of a star (n,) and an ascending measured magnitude (m,) that agree; fast where stars ascend."""
     count, first, last, m = 0, 0, 0, len(measured_mag)

@@ -14,7 +14,7 @@ LONGEST_STEP = 0.1  # radians, logarithm of the focal length, distortion
 RIDGE = 1e-12  # on the diagonal of the normal equations, whose diagonal is 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True)
 def fit_pinhole(xy_px, rays_icrs, centre_px, mirror, sigma_px, steps, is_distorted, R, lens):
     """Gauss-Newton steps of the attitude `R` (3, 3) and of `lens`: focal length [px], distortion. Both are changed.
 
@@ -52,7 +52,7 @@ def fit_pinhole(xy_px, rays_icrs, centre_px, mirror, sigma_px, steps, is_distort
         R[:] = _rotation(step[2:]) @ R  # behind the logarithm of the focal length and the distortion
 
 
-@njit(error_model="numpy")
+@njit(inner=True)
 def _solve(normal, right):
     """Solve symmetric equations, of which the lower triangle counts, in place: the result is in `right` (n,)."""
     n = len(right)
@@ -78,7 +78,7 @@ def _solve(normal, right):
     right *= unit
 
 
-@njit(error_model="numpy")
+@njit(inner=True)
 def _rotation(vector):
     """The rotation matrix of a rotation vector (3,) (Rodrigues)."""
     angle = math.sqrt(vector @ vector)

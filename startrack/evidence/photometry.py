@@ -97,7 +97,7 @@ def order_by_cell(xy_px: Array, shape: tuple[int, ...], side_px: float) -> tuple
     return np.argsort(cell * len(cell) + np.arange(len(cell))), first, columns  # of different numbers: stable and fast
 
 
-@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS)
+@njit(cache=True, fastmath=REORDERED_SUMS)
 def measure_sources(
     image, background, noise, dead, background_side, noise_side, xy_px, flux_e, fraction_sigma, visible, first, columns,
     reach_px, side_px, radius, profiles, measured, usable,

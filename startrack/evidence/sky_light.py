@@ -175,7 +175,7 @@ def _is_sharp(sky: SkyLight, sectors: Bools) -> bool:
     return nats(sky.edge_px) > nats(RAMP_PX) + SHARP_NATS
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _score_shifts(height, llr, extended, edge, log):
     """Fill log (SECTORS, shifts) with the log-likelihoods of a skyline shifted by SHIFTS_PX."""
     for i in range(log.shape[0]):
@@ -187,7 +187,7 @@ def _score_shifts(height, llr, extended, edge, log):
             log[i, m] = total
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _sum_cells(sector, height, light, scale, covered, level, slope, variance, correlation, edge, clip, sums, scales):
     """Add up sums (SECTORS, LEVELS, 3) of l, c and c times the height; scales (SECTORS, 2): pixels, their scale."""
     half = 0.5 * sums.shape[1] * CELL_PX

@@ -114,7 +114,7 @@ def _leave_out_stars(band: Bools, detections: Detections, stars: StarPhotometry)
     _clear_disks(band, np.rint(np.clip(xy_px[bright], -1e6, 1e6)).astype(np.int64), radius.astype(np.int64))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _clear_disks(mask, xy_px, radius_px):
     """Clear the pixels of a mask (H, W) within `radius_px` (n,) of the pixels (n, 2).
 
@@ -252,7 +252,7 @@ def _smooth(values: Array, sectors: float) -> Array:
     return np.asarray(smooth)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _sum_sides(side, sector, height, light, level, slope, limit, sums):
     """Add up sums (2, 6, SECTORS): count, h, h^2, and with the residual q: q, q h, q^2, of pixels within the limits."""
     for k in range(len(side)):

@@ -218,7 +218,7 @@ def _px_per_rad(camera: Camera, angle_rad: Array) -> Array:
     return np.asarray(np.sqrt(camera.focal_px[0] * camera.focal_px[1]) * camera.lens.slope(angle_rad))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _interpolate_circle(values, found):  # type: ignore[no-untyped-def]
     """Replace the azimuths (n,) [rad] in `found` by values (m,), given at even steps from azimuth 0 on."""
     m = len(values)

@@ -39,7 +39,7 @@ def decode_rows(
     return samples if channels == 1 else samples.reshape(height, width, channels)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def unfilter(rows, pixel_bytes, sample_bytes, samples):
     """Undo the filters of the `rows` (H, 1 + bytes) and write the samples (H, n); False where a filter is unknown.
 
@@ -66,7 +66,7 @@ def unfilter(rows, pixel_bytes, sample_bytes, samples):
     return known
 
 
-@njit(nogil=True)
+@njit(inner=True)
 def _undo(filtered, kind, pixel_bytes, above, row):
     """Fill the `row` whose filtered bytes follow the first of `filtered`, below the row `above`."""
     for x in range(len(filtered) - 1):
@@ -83,7 +83,7 @@ def _undo(filtered, kind, pixel_bytes, above, row):
         row[x + pixel_bytes] = np.uint8(np.int64(filtered[x + 1]) + guess)
 
 
-@njit(nogil=True)
+@njit(inner=True)
 def _paeth(left, up, corner):
     """Of three bytes the one nearest to left + up - corner."""
     to_left, to_up, to_corner = abs(up - corner), abs(left - corner), abs(left + up - 2 * corner)
@@ -93,7 +93,7 @@ def _paeth(left, up, corner):
     return nearest
 
 
-@njit(nogil=True)
+@njit(inner=True)
 def _undo_mean_16(filtered, above, row, samples):
     """As `_undo` for the mean of 16-bit samples, which are written too: two chains of bytes in registers.
 

@@ -81,7 +81,7 @@ def refine_attitude(sources: Sources, hypothesis: AttitudeHypothesis) -> Attitud
     return AttitudeMatch(refined, pairs, matched, named, inlier, variance, stars.v_mag[:complete][visible])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def distances_in_gate(xy_px, px, inside):  # type: ignore[no-untyped-def]
     """Distances (k,) of detections (k, 2) and predicted stars (k, 2); infinite beyond GATE_PX and outside the frame."""
     distance = np.empty(len(px))
@@ -93,7 +93,7 @@ def distances_in_gate(xy_px, px, inside):  # type: ignore[no-untyped-def]
     return distance
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def rotate_by_inliers(which, detection, distance, variance_px2, rays_cam, rays_icrs, R):  # type: ignore[no-untyped-def]
     """Which of the pairs `which` (m,) are no outliers (m,), their variance (m,), their attitude, its change from `R`.
 
@@ -124,7 +124,7 @@ def rotate_by_inliers(which, detection, distance, variance_px2, rays_cam, rays_i
     return agree, variance, refined, np.abs(refined - R).max()
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def name_matches(which, detection, distance, misfit, variance_px2, agree, variance):  # type: ignore[no-untyped-def]
     """`inlier` and `named` (m,) of AttitudeMatch, of the pairs `which` (m,), of which some `agree` (m,)."""
     inlier, named = np.empty(len(which), np.bool_), np.empty(len(which), np.bool_)

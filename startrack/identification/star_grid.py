@@ -46,7 +46,7 @@ class StarGrid:
         return Neighbours(pairs[0][:k], pairs[1][:k], pairs[2][:k], len(self._cells[-1]))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def bin_stars(rays, cells):  # type: ignore[no-untyped-def]
     """The begin of each cell (`cells`^3 + 1,) in the list of stars (n,) by cells, which keeps their order."""
     cell = np.empty(len(rays), np.int64)
@@ -65,7 +65,7 @@ def bin_stars(rays, cells):  # type: ignore[no-untyped-def]
     return first, star
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def find_stars(rays, chord, cells, first, star, star_rays, of_ray, of_star, apart):  # type: ignore[no-untyped-def]
     """The number k of pairs of a ray (m, 3) and a star closer than the chord; see `bin_stars`.
 
@@ -94,7 +94,7 @@ def _cell_of(coordinate, cells):  # type: ignore[no-untyped-def]
     return min(max(int((coordinate + 1.0) * (0.5 * cells)), 0), cells - 1)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def rotation_between(cam, icrs, weight):  # type: ignore[no-untyped-def]
     """R_cam_icrs (3, 3) that minimises sum weight |cam - R icrs|^2 over the rays (k, 3), as `wahba` does."""
     profile, total = np.zeros((3, 3)), 0.0
@@ -106,7 +106,7 @@ def rotation_between(cam, icrs, weight):  # type: ignore[no-untyped-def]
     return _rotation_of(profile, total)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def settle_rotation(cam, icrs, hit, squared_radius):  # type: ignore[no-untyped-def]
     """R_cam_icrs of the pairs that it places within the radius, and which these are (k,).
 

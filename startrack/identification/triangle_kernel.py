@@ -7,7 +7,7 @@ import numpy as np
 from startrack.core.kernels import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def sides_of_few(rays, fresh, longest):  # type: ignore[no-untyped-def]
     """Triples (m, 3) of a few dozen rays (n, 3) with sides below `longest` and a vertex from index `fresh` on.
 
@@ -36,7 +36,7 @@ def sides_of_few(rays, fresh, longest):  # type: ignore[no-untyped-def]
     return vertices[:m], sides[:m]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def are_same_handed(one, other):  # type: ignore[no-untyped-def]
     """Which of the triples of rays (m, 3, 3) have triple products of the same sign."""
     same = np.empty(len(one), np.bool_)
@@ -53,7 +53,7 @@ def _triple_product(rays):  # type: ignore[no-untyped-def]
     return rays[0, 0] * x + rays[0, 1] * y + rays[0, 2] * z
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def keep_closest(sides, known, row, found, tolerance, most):  # type: ignore[no-untyped-def]
     """The pairs of a row of the `sides` (m, 3) and a triangle of the `known` (n, 3) that PatternIndex.candidates gives.
 

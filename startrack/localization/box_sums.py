@@ -89,7 +89,7 @@ class PrefixSums:
         return box, np.repeat(first.ravel(), count) + step
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _find_open(key, ends, low, high, map_sigma, sigma, first, last) -> None:  # type: ignore[no-untyped-def]
     """Fill first and last (n, sectors) with the rays of each sector that may be between `low` and `high` [rad].
 
@@ -181,7 +181,7 @@ class BoxAverage:
         return found
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _average(key, integral, starts, epsilon, sector, low, high, found):  # type: ignore[no-untyped-def]
     """Fill found (n,) with the log-likelihoods of boxes with horizon bounds low, high (n, m) in sectors (m,)."""
     least = max(epsilon, 1e-300)
@@ -194,7 +194,7 @@ def _average(key, integral, starts, epsilon, sector, low, high, found):  # type:
         found[n] = total
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inner=True)
 def _integral(key, integral, starts, s, elevation):  # type: ignore[no-untyped-def]
     """The sector's integral at an elevation, linear between the keys."""
     first, last = starts[s], starts[s + 1] - 1

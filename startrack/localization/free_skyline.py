@@ -26,7 +26,7 @@ def free_log_likelihood(profiles: Profiles, shift: Array) -> float:
     return float(np.logaddexp.reduce(logs)) - log(len(logs))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _emissions(profiles, shift, heights):
     """Likelihoods (SECTORS, heights) of skylines at heights above the map's."""
     found = np.empty((len(shift), len(heights)))
@@ -36,7 +36,7 @@ def _emissions(profiles, shift, heights):
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _pass(likelihood, heights, cells, rough):
     """Log-likelihood of one pass around the circle, with steps of a mean size `rough` to either side.
 
@@ -65,7 +65,7 @@ def _pass(likelihood, heights, cells, rough):
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _spread(values, heights, rough):
     """Sums (n,) over j of values[j] exp(-|heights[i] - heights[j]| / rough)."""
     n = len(values)

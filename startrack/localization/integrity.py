@@ -83,7 +83,7 @@ def _sector_logs(model: SkylineModel, parameters: Array, offsets: Array, clear: 
     return clear_logs(model.seen.profiles, shifts, clear), prior + model.basis.log_prior(moved[:, 2:])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def clear_logs(profiles, shifts, clear):
     found = np.empty(shifts.T.shape)
     fill_clear_emissions(profiles, shifts.T.copy(), found)

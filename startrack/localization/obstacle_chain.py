@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from startrack.core.kernels import njit
+from startrack.core.kernels import REORDERED_SUMS, njit
 from startrack.core.types import SECTORS, Array, Ints
 from startrack.localization.skyline_profiles import Profiles, cell_at, integral_to, log_at
 
@@ -51,7 +51,7 @@ class Levels(NamedTuple):
     table: Array  # (SECTORS, STATES - 1, NODES), float32
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def prepare_levels(profiles, reach):
     """Emissions (SECTORS, STATES - 1, NODES) of the risen states at shifts up to `reach` (SECTORS,)."""
     table, to = np.zeros((len(reach), STATES - 1, NODES), dtype=np.float32), np.empty(len(LEVELS_RAD))
@@ -68,7 +68,7 @@ def prepare_levels(profiles, reach):
     return table
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inner=True)
 def risen_emission(profiles, s, shift, j):
     """Likelihood of a sector whose skyline stands in level j above the map's, which is higher by `shift`."""
     if j == STATES - 1:
@@ -78,13 +78,13 @@ def risen_emission(profiles, s, shift, j):
     return (1.0 - WRONG_SECTOR) * mean + WRONG_SECTOR
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inner=True)
 def clear_emission(profiles, s, shift):
     """Likelihood of a sector whose skyline is the map's."""
     return (1.0 - WRONG_SECTOR) * exp(log_at(profiles, s, shift)) + WRONG_SECTOR
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def emissions(profiles, shift):
     """Likelihoods (SECTORS, STATES) at shifts (SECTORS,) of the map's skyline."""
     found = np.empty((len(shift), STATES))
@@ -95,7 +95,7 @@ def emissions(profiles, shift):
     return found
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+@njit(cache=True, fastmath=REORDERED_SUMS)
 def chain_log_likelihoods(profiles, levels, moves, shifts, cut, closing, found):
     """Fill found (n,) with the log-likelihoods at shifts (n, SECTORS) of the map's skyline.
 
@@ -175,7 +175,7 @@ def chain_log_likelihoods(profiles, levels, moves, shifts, cut, closing, found):
                 found[first + p] = top + log(exp(value - top) + exp(found[first + p] - top))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inner=True)
 def fill_clear_emissions(profiles, shifts, found):
     """Fill found (SECTORS, n) with `clear_emission` at shifts (SECTORS, n).
 
@@ -207,7 +207,7 @@ def transitions(moves: Moves = MOVES) -> Array:
     return T
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _smooth(e, T):
     """Posterior (SECTORS, STATES) by two rounds forward and backward: the second has forgotten where it began."""
     sectors, states = e.shape

@@ -88,7 +88,7 @@ def row_limits(evidence: Evidence) -> tuple[Array, Array]:
     return least, most
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def row_contribution(llr, extended, margin, sigma):  # type: ignore[no-untyped-def]
     """Contribution of a row `margin` [rad] above the horizon, whose edge has the width sigma [rad]; 0: hard.
 
@@ -106,14 +106,14 @@ def row_contribution(llr, extended, margin, sigma):  # type: ignore[no-untyped-d
     return value
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def add_contributions(point, sector, llr, extended, margin, sigma, sums):  # type: ignore[no-untyped-def]
     """Add to sums (n, sectors) the contributions of pairs (m,) of a point and a row."""
     for k in range(len(llr)):
         sums[point[k], sector[k]] += row_contribution(llr[k], extended[k], margin[k], sigma[k])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def soft_ceilings(elevation, llr, extended, sigma, ends, found):  # type: ignore[no-untyped-def]
     """Fill found (sectors,) with the largest sum of contributions of a sector's rows above one level skyline.
 
@@ -142,7 +142,7 @@ def soft_ceilings(elevation, llr, extended, sigma, ends, found):  # type: ignore
         found[s] = best
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inner=True)
 def _level_sum(elevation, llr, extended, sigma, first, last, horizon):  # type: ignore[no-untyped-def]
     """Sum of contributions of the rows from first to last where the skyline is level at that elevation."""
     total = 0.0

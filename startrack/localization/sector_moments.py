@@ -37,7 +37,7 @@ def measure_moments(profiles: Profiles) -> SectorMoments:
     return SectorMoments(mean, np.maximum(variance, LEAST_SIGMA_RAD**2))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _fill_moments(profiles, reach, mean, variance):
     for s in range(len(mean)):
         last = profiles.first[s + 1] - 1

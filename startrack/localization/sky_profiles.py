@@ -68,7 +68,7 @@ def _average_over_map(values: Array, sigma_knots: Array) -> Array:
     return averaged
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _fill_averages(values, cubics, fine, sigma_knots, averaged):
     """Fill averaged (m, knots) from cubics (m, 4, knots - 1) taken at `fine` (m,) points between two knots."""
     knots = values.shape[1]
@@ -93,7 +93,7 @@ def _fill_averages(values, cubics, fine, sigma_knots, averaged):
             averaged[m, j] = top + np.log(max(mean, LEAST_LIKELIHOOD))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _fill_profiles(elevation, llr, extended, sigma, first, last, low, step, values):
     """Fill values (m, knots) with sums of l V + c V (1 - V) / 2 over the rows from first to last (m,)."""
     for m in range(len(first)):

@@ -81,7 +81,7 @@ def _sky_knots(rows: Evidence, above_rad: Array, which: Ints) -> tuple[Array, Ar
     return low, step, cell, values
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _cubic(values, at):
     """Value between the knots of a uniform grid; constant beyond its ends."""
     knots = len(values)
@@ -94,7 +94,7 @@ def _cubic(values, at):
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _fill_cells(above, llr, starts, sky_low, sky_step, cell, sky_values):
     """Cells between the stars of a sector, and of equal width where the sky's light shows the skyline."""
     sectors, knots = len(starts) - 1, sky_values.shape[1]
@@ -142,7 +142,7 @@ def _fill_cells(above, llr, starts, sky_low, sky_step, cell, sky_values):
     return _integrate(first, x[:n].copy(), left[:n].copy(), right[:n].copy(), bend[:n].copy())
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inner=True)
 def _integrate(first, x, left, right, bend):
     """The cells with `free`, the guide and the integral; each cell by Simpson's rule."""
     sectors = len(first) - 1
@@ -164,7 +164,7 @@ def _integrate(first, x, left, right, bend):
     return first, x, left, right, bend, integral, free, _guide_to(first, x)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inner=True)
 def _guide_to(first, x):
     """The `guide`: the cell (SECTORS, 2 GUIDE + 1) that holds each of its heights."""
     found = np.empty((len(first) - 1, 2 * GUIDE + 1), dtype=np.int32)
@@ -178,7 +178,7 @@ def _guide_to(first, x):
     return found
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, inline="always")
 def cell_at(x, guide, s, height):
     """The cell of a sector that holds a height, or the nearest one."""
     u = copysign(sqrt(abs(height) * (1.0 / HIGH_RAD)), height)
@@ -190,7 +190,7 @@ def cell_at(x, guide, s, height):
     return k
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def log_at(profiles, s, height):
     """F - R of a sector at a height."""
     if height >= HIGH_RAD:
@@ -201,7 +201,7 @@ def log_at(profiles, s, height):
     return value - profiles.free[s]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def integral_to(profiles, s, height):
     """Integral of exp(F - R) of a sector up to a height; constant beyond the window's ends, where none is."""
     if height >= HIGH_RAD:
@@ -212,7 +212,7 @@ def integral_to(profiles, s, height):
     return profiles.integral[k] + u * (profiles.integral[k + 1] - profiles.integral[k])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _average_over_map(profiles, sigma, bins):
     """The cells with exp F averaged over a normal error of the map's skyline (SECTORS,); far off it stays as it is."""
     weights, whole, cells = np.empty(len(bins) - 1), 0.0, np.zeros(len(bins), dtype=np.int64)
@@ -269,7 +269,7 @@ def _average_over_map(profiles, sigma, bins):
     return _integrate(first, x[:n].copy(), left[:n].copy(), right[:n].copy(), bend[:n].copy())
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inner=True)
 def _mean_over(profiles, s, height, sigma, bins, weights, cells):
     """Logarithm of the mean of exp F over a normal error about a height.
 

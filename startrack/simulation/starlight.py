@@ -78,7 +78,7 @@ def _collect(
     return np.ascontiguousarray(found.T)
 
 
-@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS)
+@njit(cache=True, fastmath=REORDERED_SUMS)
 def collect_light(
     xy_px, others_px, number, weight, square_weight, first, columns, side_px, reach_px, radius, table, found
 ) -> None:  # fmt: skip

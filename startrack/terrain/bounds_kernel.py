@@ -32,7 +32,7 @@ KINK_M = 0.02  # by which a traced ray may miss a kink of the ground: NUDGE_M ti
 STEP_PARTS = 4  # of a step, whose slopes are taken one by one
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, inline="always")
 def _most_tan(above, s, reach, cos_turn):
     """Largest tan of a height above the lowest camera, at s from the middle of the box."""
     if above > 0.0:
@@ -42,13 +42,13 @@ def _most_tan(above, s, reach, cos_turn):
     return tan
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, inline="always")
 def _least_tan(above, s, reach, cos_turn):
     under = above / (s - reach) if s > reach else LOWEST_TAN
     return above * cos_turn / (s + reach) if above > 0.0 else under
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inner=True)
 def _step_bounds(s0, s1, s2, z0, z1, z2, slack, low_up, high_up, reach, cos_turn):
     """Most tan of the ground of a step, least tan of it, and the distance and height of the latter.
 
@@ -78,7 +78,7 @@ def _step_bounds(s0, s1, s2, z0, z1, z2, slack, low_up, high_up, reach, cos_turn
     return top, bottom, bottom_s, bottom_z
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def bounds(
     ground, east, north, height, up, low_up, high_up, slope_e, slope_n, half, sin_a, cos_a, turn, start_m, end_m,
     hint_m, tilt_to_crest, found,

@@ -141,7 +141,7 @@ class Cylinder(Crater):
         return -np.minimum(rho, 1e12)[:, None] * u, self.radius_m
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _horizons_of_circle(points, sines, cosines, radius, wall):  # type: ignore[no-untyped-def]
     """Elevations (n, m) [rad] of a rim `wall` above points (n, 2), at azimuths (m,) by their sines and cosines."""
     found = np.empty((len(points), len(sines)))

@@ -17,7 +17,7 @@ TOUCH_MARGIN = 0.02  # of a cell: more than maps bend over a step
 BOX_STEPS = 8  # steps along each side of a box
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, inline="always")
 def steepness(slopes, at, unit, d_column, d_row):
     """Most rise per metre in a block and its neighbours, going (d_column, d_row) per metre."""
     a, b = abs(d_column), abs(d_row)
@@ -32,7 +32,7 @@ def steepness(slopes, at, unit, d_column, d_row):
     return unit * (abs(a - b) * straight + min(a, b) * slanted)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, inline="always")
 def level_of(levels, m, post_m, radius, width, e, n):
     """Lowest level whose blocks' neighbours reach `width` to the side."""
     shift = SHIFT_HEIGHT_M * np.sqrt(e * e + n * n) / radius  # how far 1 km of height moves a place on the map
@@ -43,7 +43,7 @@ def level_of(levels, m, post_m, radius, width, e, n):
     return level
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inner=True)
 def slope_range(heights, posts, m, column, row, d_column, d_row, begin, end, to_column, to_row, width):
     """Least and most rise per metre to the side in a band; (1, -1) where it leaves the map or touches many cells.
 
@@ -84,7 +84,7 @@ def slope_range(heights, posts, m, column, row, d_column, d_row, begin, end, to_
     return least, most
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inner=True)
 def box_height_bounds(ground, east, north, half, tilted):
     """Height in enu of the ground in the middle of a box, the lowest and highest anywhere in it, and two slopes.
 

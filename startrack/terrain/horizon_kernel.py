@@ -71,7 +71,7 @@ def _choose_map_cell(grid, m, east, north, up):
     return _cell_by_projection if grid.ndim == 2 else _cell_by_polynomials
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, inline="always")
 def locate(grid, posts, east, north, up):
     """Finest map that reaches a place, and (column, row) there; map -1 where none does."""
     found, column, row = -1, 0.0, 0.0
@@ -83,7 +83,7 @@ def locate(grid, posts, east, north, up):
     return found, column, row
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, inline="always")
 def height_at(heights, posts, m, column, row):
     columns = posts[m, 2]
     i, j = int(row), int(column)
@@ -94,7 +94,7 @@ def height_at(heights, posts, m, column, row):
     return top + down * (bottom - top)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inner=True)
 def surface_place(grid, posts, heights, radius, east, north, guess):
     """As `surface`, and where on the maps that is: the map, -1 where none reaches, column and row."""
     level2 = east * east + north * north
@@ -110,13 +110,13 @@ def surface_place(grid, posts, heights, radius, east, north, guess):
     return up, (m, column, row)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inner=True)
 def surface(grid, posts, heights, radius, east, north, guess):
     """Height in enu of the ground at (east, north); the guess where no map reaches."""
     return surface_place(grid, posts, heights, radius, east, north, guess)[0]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, inline="always")
 def height_on_line(heights, posts, radius, place, d_column, d_row, east, north, sin_a, cos_a, s):
     """Height in enu of the ground at s along the ray from `place` (map, column, row), which is at (east, north).
 
@@ -128,7 +128,7 @@ def height_on_line(heights, posts, radius, place, d_column, d_row, east, north, 
     return np.sqrt(r * r - e * e - n * n) - radius
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, inline="always")
 def exit_of(column, row, d_column, d_row, level):
     """Distance to the edge of the block of a level that holds (column, row), going d_column, d_row per metre."""
     size = 1 << level
@@ -145,12 +145,12 @@ def exit_of(column, row, d_column, d_row, level):
     return max(s, 0.0) + NUDGE_M
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, inline="always")
 def block_at(blocks, m, level, column, row):
     return blocks[m, level, 0] + (int(row) >> level) * blocks[m, level, 2] + (int(column) >> level)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, inline="always")
 def best_in_step(tan, at, s0, s2, z0, z1, z2):
     """The better of (tan, at) and the highest of the parabola through three heights above the camera."""
     half = 0.5 * (s2 - s0)
@@ -173,7 +173,7 @@ def best_in_step(tan, at, s0, s2, z0, z1, z2):
     return tan, at
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def horizon(ground, east, north, up, sin_a, cos_a, start_m, end_m, hint_m):
     """tan of the horizon, the distance it stands at, and the distance at which the maps end or have a void (1e9: not
     reached).
@@ -259,7 +259,7 @@ def horizon(ground, east, north, up, sin_a, cos_a, start_m, end_m, hint_m):
     return tan, at, edge
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def surfaces(ground, points, up):
     """Fill up (n,) with the height in enu of the ground at points (n, 2)."""
     grid, heights, posts, _, _, _, _, _, _, _, radius, _, _ = ground
@@ -268,7 +268,7 @@ def surfaces(ground, points, up):
         up[k] = surface(grid, posts, heights, radius, points[k, 0], points[k, 1], z)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, inline="always")
 def bilinear(nodes, k, x, y):
     """Azimuth k's value at (x, y) [steps from the first node]; beyond the nodes it goes on as at the edge."""
     across = nodes.shape[1]
@@ -278,7 +278,7 @@ def bilinear(nodes, k, x, y):
     return west + (x - i) * (east - west)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def interpolate(ground, near, points, column, found):
     """Fill found (n, m) with the horizon [rad] at points (n, 2) and columns (n, m), or (1, m) for all points.
 

@@ -210,7 +210,7 @@ def quantize_fields(found: Array) -> NDArray[np.uint16]:
     return np.stack(fields, axis=-1).astype(np.uint16)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, inline="always")
 def _slot(keys, k, slots):  # type: ignore[no-untyped-def]
     mixed = keys[k, 0] * MIX
     for number in range(1, keys.shape[1]):
@@ -218,7 +218,7 @@ def _slot(keys, k, slots):  # type: ignore[no-untyped-def]
     return (mixed ^ (mixed >> SHIFT)) % np.uint64(slots)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _recall(kept, bounds, keys, low, high, missing):  # type: ignore[no-untyped-def]
     for k in range(len(low)):
         s = _slot(keys, k, len(kept))
@@ -230,7 +230,7 @@ def _recall(kept, bounds, keys, low, high, missing):  # type: ignore[no-untyped-
                 low[k, a], high[k, a] = bounds[s, 0, a], bounds[s, 1, a]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _keep(kept, bounds, keys, low, high):  # type: ignore[no-untyped-def]
     for k in range(len(low)):
         s = _slot(keys, k, len(kept))
@@ -240,7 +240,7 @@ def _keep(kept, bounds, keys, low, high):  # type: ignore[no-untyped-def]
             bounds[s, 0, a], bounds[s, 1, a] = low[k, a], high[k, a]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _largest_of_cells(values, cells, bins, found):  # type: ignore[no-untyped-def]
     """Fill found (n, m) with the largest values (a, a, bins) at the corners of boxes, their cells (n, 2, 2) given.
 

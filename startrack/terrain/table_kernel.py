@@ -24,7 +24,7 @@ SINES, COSINES = np.sin(MIDDLES_RAD), np.cos(MIDDLES_RAD)
 TOUCHING = 1e-9  # of a cell or a bin: what only touches it does not count
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, inline="always")
 def _bounds_by_line(v, tangents, along, aside, wide, low_up, high_up, cell_half):
     """Bounds of tan H, seen from `along` -+ `wide` along the ray from the cell's middle, and so far aside."""
     below, above = tangents[v[0]], tangents[v[1]]
@@ -56,7 +56,7 @@ def _bounds_by_line(v, tangents, along, aside, wide, low_up, high_up, cell_half)
     return below, max(above, below)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inner=True)
 def look_up(values, across, reach, east, north, azimuth, out):
     """Between which distances the horizon stands from a point, and about where [m]; (0, 1e9, 0) off the table."""
     side = 2 * reach / across
@@ -77,7 +77,7 @@ def look_up(values, across, reach, east, north, azimuth, out):
             out[2] = max(v[4] * DISTANCE_STEP_M - along, 0.0)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def horizons(ground, values, across, reach, camera_height, is_own, points, azimuths, tan, at, edge):
     """Fill tan, at and edge (n,) with the horizon of each point at its azimuth; across = 0: there is no table.
 
@@ -99,7 +99,7 @@ def horizons(ground, values, across, reach, camera_height, is_own, points, azimu
         )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def box_bounds(ground, values, across, reach, camera_height, centres, half, azimuths, turn, low, high):
     """Fill low and high (n,) [rad] with bounds over small boxes and narrow azimuths, traced anew."""
     near, around, found = np.empty(3), np.empty(3), np.empty(11)
@@ -130,7 +130,7 @@ def box_bounds(ground, values, across, reach, camera_height, centres, half, azim
         low[k], high[k] = np.arctan(found[0]), np.arctan(found[1])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inner=True)
 def sector_bounds(
     ground, values, lows, highs, across, reach, camera_height, tangents, azimuths, turn, centres, half, low, high
 ):
@@ -180,7 +180,7 @@ def sector_bounds(
                 low[k, m], high[k, m] = least * ANGLE_STEP_RAD - np.pi / 2, most * ANGLE_STEP_RAD - np.pi / 2
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def fill_cells(ground, centres, half, camera_height, sin_a, cos_a, turn, found):
     """Fill found (cells, azimuths, 11) with `bounds` of each cell and azimuth."""
     for k in range(len(centres)):

@@ -16,6 +16,7 @@ import pytest
 from startrack.core import compilation
 from startrack.core.runner import Runner
 from startrack.core.types import Evidence, NotLocated
+from startrack.detection.residual_kernel import fill_row
 from startrack.localization import posterior
 from startrack.terrain import load_terrain
 
@@ -40,21 +41,54 @@ kernel(1.0)
 kernel(1)
 """
 
+PEAKS = """
+import hashlib
+import numpy as np
+from startrack.detection.peak_kernel import find_maxima
 
-def run_script(script: Path, cache: Path) -> str:
+rng, single = np.random.default_rng(4), np.float32
+image = rng.normal(100.0, 10.0, (256, 256)).astype(single)
+background, noise = rng.uniform(90.0, 110.0, (4, 256)).astype(single), rng.uniform(9.0, 11.0, (4, 256)).astype(single)
+none, taps = np.zeros((0, 256), single), np.exp(-0.25 * np.arange(9) ** 2).astype(single)
+peaks = find_maxima(
+    image, background, noise, 64, none, single(1.0), single(0.0), taps, 2, single(1.0), single(2.0),
+    np.zeros((0, 256), bool), 8,
+)
+print(len(peaks), hashlib.sha256(peaks.tobytes()).hexdigest())
+"""
+
+
+def run_script(script: Path, cache: Path) -> tuple[str, str]:
+    """What it prints on stdout and on stderr."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(cache)}
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, env=environment)
-    assert (done.returncode, done.stdout) == (0, "")
-    return done.stderr
+    assert done.returncode == 0, done.stderr
+    return done.stdout, done.stderr
 
 
 def test_compiling_is_announced_once_and_loading_is_not(tmp_path):
     script = tmp_path / "first_use.py"
     script.write_text(FIRST_USE)
-    assert run_script(script, tmp_path / "cache").splitlines() == [
+    out, log = run_script(script, tmp_path / "cache")
+    assert out == ""
+    assert log.splitlines() == [
         "compiling what this command uses first: about 10 s, for height maps 20 s; kept on disk"
     ]
-    assert run_script(script, tmp_path / "cache") == ""
+    assert run_script(script, tmp_path / "cache") == ("", "")
+
+
+def test_a_kernel_gives_the_same_bytes_compiled_and_loaded(tmp_path):
+    """Its sums of reordered terms are those of its own library's code, in the process that compiles its parts too."""
+    script = tmp_path / "peaks.py"
+    script.write_text(PEAKS)
+    compiled, loaded = (run_script(script, tmp_path / "cache")[0] for _ in range(2))
+    assert int(compiled.split()[0]) > 100
+    assert compiled == loaded
+
+
+def test_python_calls_no_inner_kernel():
+    with pytest.raises(TypeError, match="fill_row is called by kernels only"):
+        fill_row(1.0)
 
 
 def compile_beside_another(folder: str) -> int:

@@ -24,6 +24,7 @@ from startrack.core.compilation import announce_compilation, is_compiled
 from startrack.core.errors import BadInput
 from startrack.core.files import is_path
 from startrack.core.runner import count_cores
+from startrack.core.table_text import column_lines, join_columns
 from startrack.core.types import Evidence, Exposure, NotLocated
 from startrack.estimation.observations import OdometryErrors
 from startrack.frames import Site, parse_utc
@@ -40,10 +41,10 @@ LOADERS: dict[str, Callable[[str], object]] = {  # of the files among these fact
 RAYS = 360  # of the fix that compiles the kernels: one a degree above the skyline and one below
 COMPILE = (
     f"import sys, {__name__} as images; images.compile_measurement(); "
-    "images.compile_kernels(images.load_terrain(sys.argv[1]))"
+    "images.compile_kernels(images.load_terrain(sys.argv[1])); images.compile_tables()"
 )
-LISTED_STARS = 300  # in the sky that is identified for that
 OFFSET_RAD = 0.01  # of these rays from the skyline
+DARK_PX = 64  # side of the picture that is measured for that
 
 
 def read(path: str, args: argparse.Namespace) -> Exposure:
@@ -163,31 +164,31 @@ def compile_kernels(terrain: Terrain) -> None:
 
 
 def compile_measurement() -> None:
-    """Compile the kernels of identification and photometry, by a list of stars and a dark picture."""
-    from startrack.catalog import load_catalog
+    """Compile the kernel of photometry, by a dark picture."""
     from startrack.core.smooth_image import SmoothImage
     from startrack.core.types import Detections
     from startrack.evidence import Sources, measure
-    from startrack.identification import identify_centroids
 
-    camera, stars = load_camera("fisheye-2048"), load_catalog().at(None, None)
-    xy_px, inside = camera.project(stars.rays_icrs[:LISTED_STARS])
-    xy_px, v_mag = xy_px[inside], stars.v_mag[:LISTED_STARS][inside]
-    identify_centroids(xy_px, camera=camera, flux=10 ** (-0.4 * v_mag), stars=stars)
-    none, ones, dark = np.zeros(0), np.ones(len(xy_px)), np.zeros(camera.size_px[::-1], np.float32)
+    none, ones, dark = np.zeros(0), np.ones(1), np.zeros((DARK_PX, DARK_PX), np.float32)
     picture = Detections(
         xy_px=np.zeros((0, 2)), covariance_px2=np.zeros((0, 2, 2)), flux_e=none, snr=none, flux_sigma_e=none,
         saturated=none > 0, psf_sigma_px=1.0, image_e=dark, dead=dark > 0,
         background=SmoothImage.of(dark), noise=SmoothImage.of(dark + 1),
     )  # fmt: skip
-    measure(picture, Sources(xy_px=xy_px, flux_e=ones, fraction_sigma=ones, visible=ones))
+    measure(picture, Sources(xy_px=np.full((1, 2), DARK_PX / 2), flux_e=ones, fraction_sigma=ones, visible=ones))
+
+
+def compile_tables() -> None:
+    """Compile the kernels that write tables, by a table of one number."""
+    join_columns([column_lines("%.3f", np.ones(1))])
 
 
 @cache
 def compile_beside(reference: str) -> subprocess.Popen[bytes] | None:
     """The process that compiles the kernels of a fix on the terrain at `reference`, beside this one; None if compiled.
 
-    It halves the wait at the first use: numba compiles on one core.
+    It nearly halves the wait at the first use: numba compiles on one core. This process meanwhile compiles detection
+    and identification.
     """
     if is_compiled() or count_cores() == 1:
         return None

@@ -130,7 +130,7 @@ def box_bounds(ground, values, across, reach, camera_height, centres, half, azim
         low[k], high[k] = np.arctan(found[0]), np.arctan(found[1])
 
 
-@njit(cache=True, inner=True)
+@njit(cache=True)
 def sector_bounds(
     ground, values, lows, highs, across, reach, camera_height, tangents, azimuths, turn, centres, half, low, high
 ):

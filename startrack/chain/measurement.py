@@ -186,7 +186,7 @@ def _photometry(
 
 
 def mask_unpredictable(light: StarPhotometry, terrain: Terrain) -> StarPhotometry:
-    """The photometry without evidence where the terrain is not known, and of stars low in the Earth's air."""
+    """The photometry `light` without evidence where the `terrain` is not known, and of stars low in the air."""
     rays = light.azimuth_rad, light.elevation_rad
     if terrain.air is not None:
         light = light.mask_stars(np.where(light.elevation_rad < LOWEST_PREDICTED_RAD, LOW_IN_AIR, ""))

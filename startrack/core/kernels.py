@@ -21,6 +21,7 @@ from numba.core.caching import FunctionCache  # noqa: E402
 from numba.core.codegen import JITCodeLibrary  # noqa: E402
 from numba.core.registry import CPUDispatcher  # noqa: E402
 from numba.core.runtime._nrt_python import c_helpers  # noqa: E402
+from numba.extending import overload  # noqa: E402, F401 - for kernels that choose code by types
 
 REORDERED_SUMS = {"reassoc", "contract", "nsz"}  # as `fastmath`: lets the compiler sum several pixels at a time
 PYTHON_WRAPPER = "_ZN7cpython"  # begin of the name by which Python calls

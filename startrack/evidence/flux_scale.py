@@ -65,8 +65,8 @@ def flux_scale(
     """The scale by the bright identified stars, measured as all stars are: at their predicted pixels.
 
     A lens or a width of the PSF that differs over the image takes light from a star that is measured there.
-    `matches` are indices (n,) of `detections` and those (n,) of their `stars`; `R_cam_icrs` (3, 3) is the attitude;
-    `air` (len(stars),) are the airmasses, None without air.
+    `matches` are indices (n,) of `detections` and those (n,) of their `stars`; `R_cam_icrs` (3, 3) is the attitude of
+    the `camera`; `air` (len(stars),) are the airmasses, None without air.
     """
     d, s = matches
     trusted = (detections.snr[d] > SCALE_SNR) & ~detections.saturated[d] & (stars.v_sigma_mag[s] < 0.1)
@@ -95,7 +95,7 @@ def _measure_alone(detections: Detections, xy_px: Array, flux_e: Array) -> Array
 def fit_flux_scale(
     flux_e: Array, sigma_e: Array, v_mag: Array, rays_cam: Array, camera: Camera, air: Array | None = None
 ) -> FluxScale:
-    """The scale that fits fluxes (n,) with their noise (n,) of stars of `v_mag` (n,) in directions (n, 3).
+    """The scale that fits `flux_e` (n,), with noise `sigma_e` (n,), of stars of `v_mag` (n,) in `rays_cam` (n, 3).
 
     The `camera` has the throughput of the lens; `air` (n,) are airmasses, None without air.
     """

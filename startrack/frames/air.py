@@ -127,18 +127,24 @@ class Air:
         )
 
     def refract(self, rays_icrs: Array, R_enu_icrs: Array) -> Array:
-        """Apparent directions (..., 3), ICRS axes, of sources in the directions `rays_icrs` (..., 3) without air."""
+        """Apparent directions (..., 3), ICRS axes, of sources in the directions `rays_icrs` (..., 3) without air.
+
+        `R_enu_icrs` (3, 3) has the vertical.
+        """
         azimuth, elevation = azel_from_rays(rays_icrs @ R_enu_icrs.T)
         return np.asarray(rays_from_azel(azimuth, self.apparent_rad(elevation)) @ R_enu_icrs)
 
     def straighten(self, rays_icrs: Array, R_enu_icrs: Array) -> Array:
-        """The inverse of `refract`."""
+        """Inverse of `refract`: directions from apparent `rays_icrs` (..., 3), with the vertical of `R_enu_icrs` (3, 3)."""
         azimuth, elevation = azel_from_rays(rays_icrs @ R_enu_icrs.T)
         return np.asarray(rays_from_azel(azimuth, self.true_rad(elevation)) @ R_enu_icrs)
 
 
 def turn_sky(azimuth_rad: Array, elevation_rad: Array, R: Array, air: Air | None) -> tuple[Array, Array]:
-    """Apparent directions (n,), (n,) [rad] of stars after a turn `R` (3, 3) in enu of the sky beyond the `air`."""
+    """Apparent directions (n,), (n,) [rad] of stars after a turn `R` (3, 3) in enu of the sky beyond the `air`.
+
+    They were seen at `azimuth_rad` (n,) and `elevation_rad` (n,).
+    """
     if air is None:
         return turn_azel(azimuth_rad, elevation_rad, R)
     azimuth, elevation = turn_azel(azimuth_rad, air.true_rad(elevation_rad), R)

@@ -105,7 +105,7 @@ def R_itrs_icrs(time: datetime) -> Array:
 
 
 def ut1_sigma_s(time: datetime) -> float:
-    """Standard deviation [s] of the Earth's rotation in R_itrs_icrs, as an error of the clock; 0 within the IERS table.
+    """Standard deviation [s] of the Earth's rotation at `time` in R_itrs_icrs, as a clock's error; 0 in the IERS table.
 
     Beyond it the last UT1 - UTC of the table is held, and a day differs from 86,400 s by what nobody can foretell.
     """

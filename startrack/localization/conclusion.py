@@ -111,7 +111,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
     clear = best.model.states(parameters)[:, 0]
     if not ambiguous and radius95 > USELESS_FRACTION * terrain.search_radius_m:
         raise NotLocated(_useless_text(whole))
-    require_map_in_view(best.model, parameters, clear)
+    require_map_in_view(best.model, clear)
     integrity = None
     if not best.model.seen.rows.is_first_look:
         require_files(found, parameters, clear)

@@ -8,31 +8,22 @@ import numpy as np
 
 from startrack.core.types import Array, Blocked, NotLocated
 from startrack.localization.free_skyline import free_log_likelihood
-from startrack.localization.hypothesis import (
-    GROSS_ROUNDS,
-    Hypothesis,
-    clock_of_other_times,
-    sample_gross_error,
-)
-from startrack.localization.obstacle_chain import emissions
+from startrack.localization.hypothesis import GROSS_ROUNDS, Hypothesis, sample_gross_error
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel
 
 WRONG_FACT_NATS = 3.0  # by which a gross error of a stated fact must explain the rows better: 1 of 100 clean skies
 MOST_BLOCKED = 0.5  # of the skyline that the rows show: where more is on no map, another place may explain them as well
 WIDE_SHAPE = 0.4  # relative range of a wrong map's steepness: a free skyline is compared with a map of any of them
-SHOWN_RATIO = 10.0  # of the likelihoods of an obstacle and of the map, from which a sector shows the obstacle
 FEW_ROUNDS = GROSS_ROUNDS[:1]  # points by which facts are screened: of 34 frames refused with GROSS_ROUNDS it leaves 32
 
 
-def require_map_in_view(model: SkylineModel, parameters: Array, clear: Array) -> None:
+def require_map_in_view(model: SkylineModel, clear: Array) -> None:
     """Raises NotLocated (inconsistent_evidence) where most of the skyline of a `model` is on no map.
 
-    `clear` (SECTORS,) is the probability that the map's skyline shows at `parameters` (2 + a,). A sector counts where
-    its own rows show something else: an obstacle may go on behind sectors without rows.
+    `clear` (SECTORS,) is the probability that the map's skyline shows.
     """
-    likelihood = emissions(model.seen.profiles, model.shift_of(parameters))
-    hidden = Blocked(1.0 - clear).whole & (likelihood.max(axis=1) > SHOWN_RATIO * likelihood[:, 0])
+    hidden = Blocked(1.0 - clear).whole
     if np.average(hidden, weights=model.seen.moments.information) > MOST_BLOCKED:
         raise NotLocated(
             f"something on no map hides {360.0 * hidden.mean():.0f} degrees of the skyline, or terrain, time or "
@@ -93,7 +84,7 @@ def weigh_wrong_facts(found: Sequence[Hypothesis]) -> Iterator[tuple[str, float]
             if len(other.basis):
                 doubted = sample_gross_error(plain, other, best.around.reference_m[None], rounds)
                 better = _log_evidence(doubted) - by_files
-            if better < 0.0 or clock_of_other_times(plain, other) is not None:  # times have rounds of their own
+            if better < 0.0:
                 break
         yield fact, better
 

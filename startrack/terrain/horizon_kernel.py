@@ -15,9 +15,8 @@ from __future__ import annotations
 
 # mypy: disable-error-code="no-untyped-def"
 import numpy as np
-from numba.extending import overload
 
-from startrack.core.kernels import njit
+from startrack.core.kernels import njit, overload
 
 FIRST_COEFFICIENT = 3  # of a map of the Earth in its numbers
 LOWEST_TAN = -50.0

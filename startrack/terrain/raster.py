@@ -55,7 +55,7 @@ class Projection:
         return PROJECTION_NAMES[self.kind]
 
     def units_per_m(self, latitude_rad: float) -> tuple[float, float]:
-        """Map units of a metre on the ground along x and y at a latitude; of azimuthal projections at the centre."""
+        """Map units of a metre on the ground along x and y at `latitude_rad`; of azimuthal maps at the centre."""
         if self.kind == EQUIRECTANGULAR:
             return self.scale / float(np.cos(latitude_rad)), self.scale_y
         return self.scale, self.scale

@@ -135,7 +135,7 @@ class Air:
         return np.asarray(rays_from_azel(azimuth, self.apparent_rad(elevation)) @ R_enu_icrs)
 
     def straighten(self, rays_icrs: Array, R_enu_icrs: Array) -> Array:
-        """Inverse of `refract`: directions from apparent `rays_icrs` (..., 3), with the vertical of `R_enu_icrs` (3, 3)."""
+        """Inverse of `refract`, of apparent `rays_icrs` (..., 3); `R_enu_icrs` (3, 3) has the vertical."""
         azimuth, elevation = azel_from_rays(rays_icrs @ R_enu_icrs.T)
         return np.asarray(rays_from_azel(azimuth, self.true_rad(elevation)) @ R_enu_icrs)
 

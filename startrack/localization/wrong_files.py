@@ -8,7 +8,12 @@ import numpy as np
 
 from startrack.core.types import Array, Blocked, NotLocated
 from startrack.localization.free_skyline import free_log_likelihood
-from startrack.localization.hypothesis import GROSS_ROUNDS, Hypothesis, sample_gross_error
+from startrack.localization.hypothesis import (
+    GROSS_ROUNDS,
+    Hypothesis,
+    clock_of_other_times,
+    sample_gross_error,
+)
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel
 
@@ -84,7 +89,7 @@ def weigh_wrong_facts(found: Sequence[Hypothesis]) -> Iterator[tuple[str, float]
             if len(other.basis):
                 doubted = sample_gross_error(plain, other, best.around.reference_m[None], rounds)
                 better = _log_evidence(doubted) - by_files
-            if better < 0.0:
+            if better < 0.0 or clock_of_other_times(plain, other) is not None:  # times have rounds of their own
                 break
         yield fact, better
 

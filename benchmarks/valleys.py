@@ -31,7 +31,7 @@ from startrack.catalog import apparent_bodies, load_catalog
 from startrack.chain import Located, locate
 from startrack.core.runner import count_cores
 from startrack.core.types import Array
-from startrack.frames import Site, azel_from_rays, rays_from_azel
+from startrack.frames import R_enu_icrs, Site, azel_from_rays, rays_from_azel
 from startrack.rendering import Series
 from startrack.terrain import HeightMap, Raster, Terrain
 from startrack.terrain.earth_projection import EarthProjection
@@ -45,7 +45,8 @@ SKY_MAG = 21.5
 YEAR, DAYS = datetime(2026, 1, 1, tzinfo=UTC), 365
 NIGHT_RAD, TWILIGHT_RAD = np.radians(-18.0), np.radians([-14.0, -11.0])  # elevations of the Sun
 MOON_RAD, DARK_RAD = np.radians([15.0, 60.0]), np.radians(-5.0)  # elevations of the Moon, up and down
-REST_EXPOSURES, REST_EVERY_S = 12, 327.0  # an hour
+REST_EVERY_S = 327.0  # twelve exposures an hour
+RADIUS999_SIGMAS = 3.717  # of a circle in two dimensions
 SEED = 29
 
 
@@ -81,15 +82,13 @@ def draw_time(site: Site, rng: Rng, *, sun_rad: tuple[float, float], moon_rad: t
     """A time with Sun and Moon at elevations in these ranges."""
     while True:
         when = YEAR + timedelta(days=float(rng.uniform(0, DAYS)))
-        at = {one.name: float(azel_of(one.ray_icrs, site, when)[1]) for one in apparent_bodies(site, when)[:9]}
+        at = {one.name: float(azel_of(one.ray_icrs, site, when)[1]) for one in apparent_bodies(site, when)}
         if sun_rad[0] <= at["Sun"] <= sun_rad[1] and moon_rad[0] <= at["Moon"] <= moon_rad[1]:
             return when
 
 
 def azel_of(ray_icrs: Array, site: Site, when: datetime) -> tuple[Array, Array]:
     """Azimuth and elevation [rad] of a direction."""
-    from startrack.frames import R_enu_icrs
-
     return azel_from_rays(R_enu_icrs(site, when) @ ray_icrs)
 
 
@@ -153,6 +152,7 @@ class Case:
     sun_rad: tuple[float, float] = (-np.pi / 2, float(NIGHT_RAD))
     moon_rad: tuple[float, float] = (-np.pi / 2, float(DARK_RAD))
     is_sky: bool = False
+    exposures: int = 1  # at rest, in one posterior
 
 
 CASES = {
@@ -163,7 +163,7 @@ CASES = {
     "twilight": Case(None, light=twilight, sun_rad=tuple(TWILIGHT_RAD), is_sky=True),
     "city glow": Case(None, light=city, is_sky=True),
     "thin cloud": Case(None, light=thin_cloud, is_sky=True),
-    "an hour at rest": Case(0.6),
+    "an hour at rest": Case(0.6, exposures=12),
 }
 
 
@@ -189,18 +189,17 @@ def locate_frame(job: tuple[str, int]) -> tuple[str, float, float, float]:
     when = draw_time(stated.site, rng, sun_rad=case.sun_rad, moon_rad=case.moon_rad)
     ground: Terrain = draw_ground(_terrain(0.0), case.post_m, rng) if case.post_m else _terrain(0.0)
     ground = trees(ground, place_m, rng) if case.has_trees else ground
-    frames = REST_EXPOSURES if name == "an hour at rest" else 1
     series = Series(
         camera=_camera(), terrain=ground, catalog=load_catalog(), seed=int(rng.integers(1 << 30)), time_utc=when,
         east_m=float(place_m[0]), north_m=float(place_m[1]), sky_v_mag_arcsec2=SKY_MAG,
-        every_s=REST_EVERY_S if frames > 1 else None,
+        every_s=REST_EVERY_S if case.exposures > 1 else None,
     )  # fmt: skip
     outcomes = []
-    for k in range(frames):
+    for k in range(case.exposures):
         scene, noise = series.scene(k, f"frame-{k:03d}")
         exposure, _, _ = expose(scene, Hazard(light=case.light), noise)
         outcomes.append(locate(exposure, _camera(), stated, load_catalog()))
-    if frames == 1:
+    if case.exposures == 1:
         one = outcomes[0]
         if not isinstance(one, Located) or one.fix.ambiguous:
             print(f"{name} {number}: {one.reason}: {one.message}", flush=True)
@@ -209,7 +208,9 @@ def locate_frame(job: tuple[str, int]) -> tuple[str, float, float, float]:
     shared = TrackErrors.of(stated, None, True)
     observed = [observe_frame(one, shared) for one in outcomes]
     _, position, covariance = positions_at_rest(observed, stated, shared)
-    return "ok", *_score(position[-1] - place_m, covariance[-1], np.sqrt(13.8 * np.linalg.eigvalsh(covariance[-1])[1]))
+    return "ok", *_score(
+        position[-1] - place_m, covariance[-1], RADIUS999_SIGMAS * np.sqrt(np.linalg.eigvalsh(covariance[-1])[1])
+    )
 
 
 def _score(off_m: Array, covariance_m2: Array, radius_m: float) -> tuple[float, float, float]:
@@ -230,7 +231,7 @@ def main() -> None:
     with ProcessPoolExecutor(count_cores()) as pool:
         for name in args.case:
             case = CASES[name]
-            count = args.skies if case.is_sky else args.rests if "rest" in name else args.frames
+            count = args.skies if case.is_sky else args.rests if case.exposures > 1 else args.frames
             found = list(pool.map(locate_frame, [(name, k) for k in range(count)]))
             errors, nees, parts = (np.array([one[k] for one in found if one[0] == "ok"]) for k in (1, 2, 3))
             rows.append([name, f"{len(errors)} of {count}", *7 * [""]])

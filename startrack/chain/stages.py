@@ -44,7 +44,7 @@ from startrack.terrain import Terrain
 
 EVIDENCE_SOURCES = ("both", "stars", "sky")  # of a position; "sky" begins with a fix by the stars
 UNKNOWN_TIME_SIGMA_RAD = np.radians(60 / 3600)  # aberration and proper motion left out
-SHOWN_CHANGE_PX = 0.1
+SHOWN_CHANGE_PX = 0.1  # of the lens, from which a warning states it
 STAGES = ("read", "detect", "identify", "attitude", "evidence", "locate")  # keys of `timing_ms`
 T = TypeVar("T")
 

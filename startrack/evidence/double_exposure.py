@@ -3,8 +3,8 @@
 Where it moved and kept its attitude among the stars, both parts show one sky above two skylines. A star above both
 shines with all its light, one above a single skyline with the part of the exposure in which that was there, and one
 below both not at all. A single skyline dims stars only within a narrow band, the same all around, where it is soft
-(trees, haze, blur). (The light of the sky has two
-steps then; it does not decide here, as dust, glare and the ground's own light make steps, too.)
+(trees, haze, blur). (The light of the sky has two steps then; it does not decide here, as dust, glare and the ground's
+own light make steps, too.)
 
 "Two positions and the parts of the exposure there" is compared with "one position", and with "each star between the
 skylines is visible or hidden, without a rule": an obstacle, a wrong map or a wrong time hides stars, but dims none.

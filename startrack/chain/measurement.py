@@ -84,13 +84,13 @@ def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
     `site` is where the camera stands, for the aberration. Returns `oriented` itself where nothing changes: also with
     stars that are not the whole shipped catalogue, which are a choice of the caller's.
     """
-    if not np.array_equal(oriented.stars.hip, load_catalog().hip):
-        return oriented
     found, when = oriented.identification, oriented.exposure.time_utc
+    if when is None or not has_deep_catalog() or not np.array_equal(oriented.stars.hip, load_catalog().hip):
+        return oriented
     R_cam_icrs = oriented.attitude_fit.attitude.R_cam_icrs
     scale = flux_scale(oriented.detections, oriented.camera, oriented.stars, (found.detection, found.star), R_cam_icrs)
     limiting_mag = scale.zero_mag - 2.5 * np.log10(SURE_SIGMAS * filtered_noise_e(oriented.detections))
-    if when is None or limiting_mag < COMPLETE_V_MAG or not has_deep_catalog():
+    if limiting_mag < COMPLETE_V_MAG:
         return oriented
     deep = load_deep_catalog()
     return replace(

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the command: more threads sum in another order
+
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

@@ -27,9 +27,10 @@ SNIPPET = re.compile(
 )
 EXIT_CODE = re.compile(r"#.*\bexit code (\d)")
 TIME_TAKEN = re.compile(r"  \d+\.\d s(?= with files$|$)|computed in \d+\.\d s")
-NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
+NUMBER = re.compile(r"[-±]?\d+(?:\.\d+)?")
 LEAST_TOLERANCE = 0.011
 COUNT_TOLERANCE = 0.002
+RADIUS_TOLERANCE = 0.1  # of "±3.1 m": sampled, to 3 % (one sigma), by points that another processor may round otherwise
 
 
 @dataclass(frozen=True)
@@ -155,10 +156,11 @@ def same_line(now: str, then: str) -> bool:
     if NUMBER.sub("#", now) != NUMBER.sub("#", then):
         return False
     pairs = zip(NUMBER.findall(now), NUMBER.findall(then), strict=True)
-    return all(abs(float(one) - float(other)) <= last_digit(other) for one, other in pairs)
+    return all(abs(float(one.lstrip("±")) - float(other.lstrip("±"))) <= tolerance(other) for one, other in pairs)
 
 
-def last_digit(number: str) -> float:
-    """The tolerance of a number as a page shows it; of counts a part, because of objects at the edge of a threshold."""
-    decimals = number.partition(".")[2]
-    return max(1.1 * 10.0 ** -len(decimals), LEAST_TOLERANCE, 0.0 if decimals else COUNT_TOLERANCE * abs(float(number)))
+def tolerance(number: str) -> float:
+    """How far from the `number` of a page another may be; of counts a part, for objects at the edge of a threshold."""
+    decimals, value = number.partition(".")[2], abs(float(number.lstrip("±")))
+    part = RADIUS_TOLERANCE if number.startswith("±") else 0.0 if decimals else COUNT_TOLERANCE
+    return max(1.1 * 10.0 ** -len(decimals), LEAST_TOLERANCE, part * value)

@@ -46,7 +46,10 @@ def test_a_path_is_enough(solution):
 def test_an_array_with_camera_terrain_and_astropy_time_gives_the_same(solution):
     exposure = read_exposure(IMAGE)
     pixels = exposure.pixels_adu.astype(np.uint16)
-    again = startrack.locate(pixels, camera=exposure.camera, terrain=exposure.terrain, time=solution.time.tai)
+    again = startrack.locate(
+        pixels, camera=exposure.camera, terrain=exposure.terrain, time=solution.time.tai,
+        time_sigma=exposure.time_sigma_s,
+    )  # fmt: skip
     np.testing.assert_allclose(again.position_m, solution.position_m, atol=1e-6)
 
 

@@ -117,6 +117,7 @@ def test_locate_gives_the_fix_of_the_same_image_in_a_file(drive, located, tmp_pa
     assert usage.value.code == 2
 
 
+@pytest.mark.slow
 def test_a_batch_of_a_bag_is_resumed(drive, located, tmp_path, capsys):
     command = ["batch", str(drive), "--image-topic", "/cam", *flags(drive, tmp_path, located), "-j", "1", "--json"]
     assert main(command) == 5

@@ -119,6 +119,7 @@ def test_a_later_signal_drops_the_images_in_progress_and_writes_the_tables(tmp_p
     assert len(list(out.glob("*.fix.json"))) < 40
 
 
+@pytest.mark.slow
 def test_a_closed_pipe_ends_the_batch_early(many_frames, tmp_path):
     with start_batch(many_frames, "-D", str(tmp_path / "out"), "-j", "1", "--json", "--no-plots") as process:
         assert process.stdout is not None and process.stderr is not None
@@ -149,6 +150,7 @@ def test_with_json_nothing_else_is_printed(tmp_path, capsys):
     assert "2 images: 2 refused" in streams.err
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_the_batch_with_one_message(tmp_path):
     """A limit on file sizes simulates the full disk: after it is lifted, the same command continues."""
     frames(tmp_path / "images", 4)

@@ -138,6 +138,7 @@ def test_a_run_of_some_images_gives_the_tables_of_all(folder, monkeypatch):
     assert table(folder) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "text",
     ['{"foo": 1}', '{"image": "01.png", "status": "ok", "reason": null}', "[]", '{"image": 1, "status": {}}'],

@@ -131,6 +131,7 @@ def test_a_batch_of_other_images_is_not_replaced_without_overwrite(tmp_path, cap
     assert (out / "results.ecsv").read_bytes() != before[out / "results.ecsv"]
 
 
+@pytest.mark.slow
 def test_a_folder_that_grew_or_changed_in_part_is_still_the_same(tmp_path):
     images, out = frames(tmp_path / "images", 3), tmp_path / "out"
     assert batch(tmp_path / "images", "-D", out) == 5

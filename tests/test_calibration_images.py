@@ -66,6 +66,7 @@ def test_its_stars_are_those_that_were_named_without_startrack(cold_calibration)
     assert np.mean(frame.sky.stars.hip[matched.star][both] == names[nearest[both]]) >= 0.995
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("signs", "hours"), [((1, 1), 0), ((1, -1), 0), ((-1, 1), 0), ((1, 1), 3)], ids=["right", "lon", "lat", "time"]
 )
@@ -91,6 +92,7 @@ def test_chance_gives_no_such_number_of_matches(cold_calibration):
     assert joint_log_p_value(cold_calibration.joint) < np.log(1e-100)
 
 
+@pytest.mark.slow
 def test_the_mirror_image_is_solved_and_reported_as_mirrored(exposure):
     flipped = replace(exposure, pixels_adu=exposure.pixels_adu[:, ::-1].copy())
     found = calibrate([flipped], load_catalog().brighter_than(7.0), camera=load_camera("lowell-ldt"), site=SITE)
@@ -280,6 +282,7 @@ def test_a_refused_file_is_asked_for_the_site_that_it_was_made_with(cold_calibra
     assert replace(found, change_px=0.1).message == ""
 
 
+@pytest.mark.slow
 def test_verify_finds_what_the_record_states(written_files, exposure, tmp_path, capsys):
     """The lens of the photograph is scaled so that it must be refused; the site in the record decides on the advice."""
     camera = load_camera(written_files / "new.toml")

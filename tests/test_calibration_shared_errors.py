@@ -71,6 +71,7 @@ def test_with_a_flex_from_night_to_night_the_sigma_of_a_change_is_sound() -> Non
     assert 0.5 < np.sqrt(np.mean(np.square(after))) < 1.5
 
 
+@pytest.mark.slow
 def test_clean_frames_get_the_floor_and_nothing_else() -> None:
     ratios = []
     for seed in range(20):

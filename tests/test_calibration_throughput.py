@@ -55,6 +55,7 @@ def calibration(frames):
     return calibrate(frames[0], load_catalog().brighter_than(8.0), camera=rough)
 
 
+@pytest.mark.slow
 def test_the_lens_is_the_true_one(calibration):
     assert calibration.accepted, calibration.failed_checks
     moved = difference_px(CAMERA, calibration.camera, cap_grid(calibration.camera.calibrated_angle_rad))

@@ -31,6 +31,7 @@ def test_a_wrong_range_is_wrong_usage(text: str) -> None:
         fields_of_view_rad(text, 3.0, 280.0)
 
 
+@pytest.mark.slow
 def test_a_photograph_is_identified_within_a_range(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["identify", LOWELL, "-D", str(tmp_path), "--no-plots", "--fov"]
     assert main([*words, "120..200", "--json"]) == 0

@@ -55,6 +55,7 @@ def test_a_drive_has_frames_truth_and_odometry_that_agree(folder):
     np.testing.assert_allclose(increments[:, 0], 25, atol=3)  # nose forward
 
 
+@pytest.mark.slow
 def test_the_errors_of_the_odometry_are_those_of_the_flags_and_the_seed(folder):
     for out, flags in {
         "exact": ["--odometry-sigma", "0", "--odometry-floor", "0"],

@@ -278,6 +278,7 @@ def test_images_of_another_camera_are_refused(drive, tmp_path, capsys):
     assert json.loads((tmp_path / "out" / "track.json").read_text())["counts"]["frames"] == FRAMES - 1
 
 
+@pytest.mark.slow
 def test_followed_images_wait_for_their_odometry(drive, tmp_path):
     live, growing = tmp_path / "live", tmp_path / "odometry.tum"
     live.mkdir()
@@ -308,6 +309,7 @@ def test_followed_images_wait_for_their_odometry(drive, tmp_path):
     assert "3 used" in rest
 
 
+@pytest.mark.slow
 def test_followed_odometry_that_ends_within_a_line_waits(drive, tracked, tmp_path):
     lines = (drive / "frames" / "odometry.tum").read_text().splitlines(keepends=True)
     for torn in (lines[-1][:-1], lines[-1][:-3], "1900000000 1.0 2.0", "1900000000 1.0 2.0\n", "190"):

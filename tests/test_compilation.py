@@ -77,6 +77,7 @@ def test_compiling_is_announced_once_and_loading_is_not(tmp_path):
     assert run_script(script, tmp_path / "cache") == ("", "")
 
 
+@pytest.mark.slow
 def test_a_kernel_gives_the_same_bytes_compiled_and_loaded(tmp_path):
     """Its sums of reordered terms are those of its own library's code, in the process that compiles its parts too."""
     script = tmp_path / "peaks.py"

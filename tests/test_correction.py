@@ -112,6 +112,7 @@ def nees(result: Any, truth: Any) -> float:
     return float(error @ np.linalg.solve(result.fix.covariance_m2, error))
 
 
+@pytest.mark.slow
 def test_a_corrected_frame_gives_the_position_and_the_photometry_of_the_clean_one(night):
     catalog, known = load_catalog().brighter_than(7.0), night.known
     corrected = correct_exposure(night.recorded, dark=night.dark, flat=night.flat)

@@ -39,6 +39,7 @@ def error_m(fix: Fix, scene: Scene) -> float:
     return float(np.hypot(*(fix.position_enu_m - scene.position_enu_m)[:2]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steeper", [-0.02, -0.004, 0.004, 0.02])
 def test_a_depth_that_no_file_states_is_estimated_by_the_stars(series: Series, steeper: float):
     shown = 0

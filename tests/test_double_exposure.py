@@ -128,6 +128,7 @@ def test_a_frame_without_unexplained_sources_is_not_searched(scene: Scene, sky_e
     assert find_second_field(found.detections, found.camera, found.stars, found.identification) is None
 
 
+@pytest.mark.slow
 def test_moves_are_found_in_photometry_and_single_skylines_pass(scene: Scene, catalog: StarCatalog) -> None:
     assert scene.terrain is not None
     rng = np.random.default_rng(5)

@@ -81,6 +81,7 @@ def test_a_terrain_file_states_the_air() -> None:
         terrain_from_dict(file | {"body": "moon"})
 
 
+@pytest.mark.slow
 def test_stars_low_in_the_air_are_no_evidence() -> None:
     flat = replace(CRATER, depth_m=150.0, diameter_m=2e4)  # the rim stands 0.85 degrees high
     _, exposure = picture(102, flat, east_m=0.0, north_m=0.0)
@@ -107,6 +108,7 @@ def test_stars_that_the_air_dims_are_not_hidden() -> None:
     assert (dimmed[0][0], dimmed[1][0]) == pytest.approx((0.5, 0.2), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_simulated_stars_are_dimmed_as_those_of_a_picture() -> None:
     scene, exposure = picture(104)
     outcome = solve(exposure, CRATER)

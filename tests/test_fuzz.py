@@ -68,6 +68,7 @@ def replace_key(file: dict, path: str, value: object) -> dict:
     return file | ({table: file.get(table, {}) | {key: value}} if table else {key: value})
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(path=st.sampled_from(PATHS_OF["camera"]), value=VALUES)
 def test_any_value_of_a_camera_file_is_used_or_refused(path, value):

@@ -129,6 +129,7 @@ def test_without_a_camera_file_the_lens_is_found(two_frames, catalog, painted):
     assert np.median(np.abs(difference)) < 0.05
 
 
+@pytest.mark.slow
 def test_the_real_skyline_follows_hills_and_trees(photographed):
     elevation, sigma = np.degrees(photographed.elevation_rad), np.degrees(photographed.sigma_rad)
     assert photographed.known.sum() > 200

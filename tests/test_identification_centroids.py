@@ -36,6 +36,7 @@ def test_without_fluxes_the_order_of_the_list_is_enough() -> None:
     assert len(found.detection) > 0.7 * np.count_nonzero(truth.star >= 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False], ids=["fluxes", "order"])
 def test_a_field_of_view_is_enough(known: bool) -> None:
     truth = frame(NARROW, 3, limit=7.5, hidden=0.0)

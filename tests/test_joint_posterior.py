@@ -243,6 +243,7 @@ SITE = Site("moon", np.radians(-89.66), np.radians(129.78))
 TIME = datetime(2030, 6, 3, 4, 5, 6, tzinfo=UTC)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("own_cache")
 @pytest.mark.parametrize("name", ["shackleton-thesis", "shackleton"])
 def test_slopes_of_the_clock_are_those_of_turned_rows(name: str) -> None:

@@ -175,6 +175,7 @@ def test_settings_refuse_what_is_no_localizer(given: Any, error: type[Exception]
 SMALL = replace(TERRAIN, diameter_m=400.0, depth_m=60.0, search_radius_m=200.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("terrain", [SMALL, TERRAIN], ids=["small", "thesis"])
 @pytest.mark.parametrize("seed", range(3))
 def test_exact_posterior_equals_brute_force(seed: int, terrain: Cylinder) -> None:

@@ -64,7 +64,7 @@ def simulate_rays(at_m: np.ndarray, n: int, sigma_rad: float, rng: np.random.Gen
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 6))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 6))])
 def test_any_small_problem_agrees_with_the_grid(seed: int) -> None:
     """The whole floor, so that no other place is left out."""
     rng = np.random.default_rng(seed)

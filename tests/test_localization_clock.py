@@ -78,6 +78,7 @@ def test_the_usual_clock_changes_nothing() -> None:
     assert clock_matters(clock_at(SITES["earth"], 1.0), terrain)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma_s", [600.0, 2 * HOUR_S])
 def test_in_a_round_crater_the_position_lies_on_an_arc(sigma_s: float) -> None:
     """Against a slow mixture: the posterior at each of many times, weighted by the prior."""
@@ -104,6 +105,7 @@ def test_in_a_round_crater_the_position_lies_on_an_arc(sigma_s: float) -> None:
     assert fix.clock.sigma_s == pytest.approx(sigma_s, rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset_s", [-HOUR_S, 4 * HOUR_S])
 def test_on_real_ground_the_time_is_found_with_the_position(ground: HeightMap, offset_s: float) -> None:
     place = np.array([50.0, -90.0])

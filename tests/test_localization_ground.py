@@ -41,6 +41,7 @@ def simulate_rays(terrain: HeightMap, place: Array, rng: np.random.Generator, ra
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_between_traced_points_the_horizon_is_the_traced_one_and_bounds_hold(shackleton):
     rng = np.random.default_rng(1)
     azimuth = np.sort(rng.uniform(0, 2 * np.pi, 60))
@@ -126,6 +127,7 @@ def test_no_allowed_ground_is_given_up(shackleton):
         ExactPosterior()(evidence, replace(limited, most_slope_rad=0.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma_rad", [0.0, 0.001])
 def test_posterior_on_ground_equals_a_plain_grid(shackleton, sigma_rad):
     rng = np.random.default_rng(3)

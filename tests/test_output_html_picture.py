@@ -51,6 +51,7 @@ def painted(w: Window) -> None:
     w.wait_for(f"!{VIEW}.waiting && {VIEW}.box !== undefined")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize(("name", "size"), [("one.html", DESKTOP), ("one.html", SMALL), ("report.html", SMALL)])
 def test_axe_finds_nothing(window, axe, name, size, scheme):
@@ -66,6 +67,7 @@ def test_axe_finds_nothing(window, axe, name, size, scheme):
         assert w.has_no_overflow()
 
 
+@pytest.mark.slow
 def test_axe_finds_a_fault(window, axe):
     """A page that is made worse is found to be so: the rules reach what they are to check."""
     w = window()

@@ -148,6 +148,7 @@ def test_a_camera_without_a_sensor_is_refused():
     assert caught.value.reason == "bad_calibration"
 
 
+@pytest.mark.slow
 def test_a_draw_depends_on_seed_and_place_only():
     """Neither other places nor their order change it; another seed and another number do."""
     terrain, camera = load_terrain("shackleton-thesis"), load_camera("fisheye-2048")

@@ -158,6 +158,7 @@ def test_table_3_1_is_within_the_bars(small_run):
     assert values["ours"]["magnitude_8"]["mean_m"] <= 4.0
 
 
+@pytest.mark.slow
 def test_ours_is_near_the_middle_of_the_exact_cell():
     """Not in it: the posterior takes one star in 400 for a wrong one, which gives cells beside it some weight."""
     sky, cylinder = Sky.draw(0, 1), crater()
@@ -256,6 +257,7 @@ def contents(folder):
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.is_file()}
 
 
+@pytest.mark.slow
 def test_any_number_of_workers_gives_the_same_bytes(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("startrack.applications.reproduction.QUICK", TINY)
     for jobs in ("1", "2"):

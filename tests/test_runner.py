@@ -39,6 +39,7 @@ def outcomes(runner: Runner[str, tuple[str, int]], names: list[str]) -> dict[str
     return dict(done)
 
 
+@pytest.mark.slow
 def test_a_task_that_kills_its_process_costs_the_others_nothing():
     names = [f"{number:02d}" for number in range(60)]
     names[5], names[40] = "05-deadly", "40-deadly"

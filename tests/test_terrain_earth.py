@@ -126,6 +126,7 @@ def test_horizons_of_flat_ground_are_those_of_ipw():
         assert np.mean(np.abs(found - by_ipw)[same] < 0.05) > 0.95
 
 
+@pytest.mark.slow
 def test_bounds_hold_every_horizon_of_a_box_under_refraction():
     terrain = on_earth(in_projection("EPSG:32616", 75.0), terrestrial_refraction_1=0.8, search_radius_m=150.0)
     rng = np.random.default_rng(6)

@@ -122,6 +122,7 @@ def test_far_crests_are_found_with_the_table_too():
     assert np.abs(there.horizons(np.zeros(2), azimuths)[0] - before).max() < 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("half", "turn"), [(60.0, np.radians(0.75)), (10.0, 0.0), (1.0, 0.0)])
 def test_bounds_hold_the_horizons_of_small_steps(shackleton, half, turn):
     small = replace(shackleton, search_radius_m=150.0)
@@ -142,6 +143,7 @@ def test_bounds_hold_the_horizons_of_small_steps(shackleton, half, turn):
     assert np.median(high - low) < np.radians(0.02 * half + 0.3 * (turn > 0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("half", [0.01, 1.5])
 def test_bounds_of_sectors_hold_near_a_crest(half):
     """Ground that makes the horizon stands on either side of the middle of a table's cell."""
@@ -158,6 +160,7 @@ def test_bounds_of_sectors_hold_near_a_crest(half):
         assert np.all(horizon <= high + 1e-5)
 
 
+@pytest.mark.slow
 def test_the_bounds_of_a_rough_map_hold_in_every_cell():
     rng, line = np.random.default_rng(5), 20.0 * (np.arange(300) - 149.5)
     rough = np.cumsum(np.cumsum(rng.normal(size=(300, 300)), axis=0), axis=1) * 0.05 + rng.normal(size=(300, 300))
@@ -265,6 +268,7 @@ def test_of_two_that_need_a_table_one_makes_it(shackleton, monkeypatch):
     assert [p.suffix for p in path.parent.iterdir() if p.stem == path.stem] == [".npz"]
 
 
+@pytest.mark.slow
 def test_each_variant_of_a_terrain_keeps_its_own_table(shackleton):
     table = shackleton.table
     higher = replace(shackleton, camera_height_m=30.0, search_radius_m=200.0)

@@ -292,6 +292,7 @@ def test_drawn_ground_errs_as_the_file_states():
     assert draw_ground(exact, rng=rng) is exact
 
 
+@pytest.mark.slow
 def test_drawn_ground_of_a_map_has_one_bias():
     truth, rng, point = (
         map_with(stretch_sigma_1=0.0, vertical_sigma_rad=0.0),

@@ -261,6 +261,7 @@ def test_exposures_at_rest_are_one_posterior():
     assert 0.7 < np.mean(nees) < 4.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("apart_m", [200.0, 1000.0])
 def test_a_camera_that_moved_is_not_at_rest(apart_m):
     """Nothing slips at rest: of many images that which moved is left out, and of two or four there is no majority."""

@@ -147,6 +147,7 @@ def test_the_lens_is_found_with_the_stars(case: str, wrong_by: float) -> None:
     assert np.linalg.norm(px - again, axis=1)[known].max() < 1.0
 
 
+@pytest.mark.slow
 def test_noise_is_refused_in_bounded_time() -> None:
     rng = np.random.default_rng(5)
     for n, fov in ((40, 180), (300, 15)):
@@ -239,6 +240,7 @@ def test_the_proximity_mask_equals_a_search() -> None:
     assert near.sky_fraction == pytest.approx(400 * (1 - np.cos(np.radians(1.5))) / 2, rel=0.08)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "lists"), [("equisolid, mirrored", 30), ("70 degrees", 12), ("20 degrees", 12)])
 def test_the_attitude_sigma_is_right_with_a_lens_from_the_same_stars(name: str, lists: int) -> None:
     camera, picture_of, fov = LENSES[name]

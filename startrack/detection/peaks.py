@@ -21,6 +21,7 @@ MAX_STAMP_PIXELS = 2_500_000  # of all candidates together: bounds time and memo
 MAX_BLOBS = 1000  # saturated; the largest
 OWN_RESIDUE_SIGMAS = 1.5
 ONE_PIXEL_FRACTION = 0.15  # of a peak's light beside it; a star of 0.45 px has 0.18
+SIDES_PX, EDGE_FRACTION = 3, 0.5  # off a peak; by how much more of its light one side may have than another
 
 
 @dataclass(frozen=True)
@@ -71,15 +72,21 @@ def nearest_pixels(xy_px: Array, shape: tuple[int, int], margin: int) -> Ints:
 
 
 def bright_pixels(frame: Frame, lowest: float, most: int) -> Ints:
-    """Pixels (n, 2) brighter than `lowest` sigma and than their neighbours: the highest, none at the border.
+    """Pixels (n, 2) brighter than `lowest` sigma and than their neighbours: the highest, none near the border.
 
-    Hot pixels, none of whose neighbours is bright too, are left out.
+    Left out are hot pixels, none of whose neighbours is bright too, and peaks at the edge of a bright sky, on one side
+    of which there is more light than on another.
     """
     pixels, height, *_ = _peaks_above(frame, lowest, ONE_TAP)
-    light, _ = frame.cut_light(pixels, 1)
-    beside = np.maximum(light[:, 1, ::2].max(axis=1), light[:, ::2, 1].max(axis=1))
-    pixels, height = (values[beside > np.float32(ONE_PIXEL_FRACTION) * light[:, 1, 1]] for values in (pixels, height))
-    return pixels[np.argsort(-height, kind="stable")[:most]]
+    last, r = np.array([frame.shape[1], frame.shape[0]]) - 1, SIDES_PX
+    inside = ((pixels >= r) & (pixels <= last - r)).all(axis=1)
+    pixels, height = pixels[inside], height[inside]
+    light, _ = frame.cut_light(pixels, r)
+    peak, sides = light[:, r, r], [light[:, :: 2 * r].mean(axis=2), light[:, :, :: 2 * r].mean(axis=1)]
+    beside = np.maximum(light[:, r, r - 1 : r + 2 : 2].max(axis=1), light[:, r - 1 : r + 2 : 2, r].max(axis=1))
+    is_star = beside > np.float32(ONE_PIXEL_FRACTION) * peak
+    is_star &= np.ptp(np.concatenate(sides, axis=1), axis=1) < np.float32(EDGE_FRACTION) * peak
+    return pixels[is_star][np.argsort(-height[is_star], kind="stable")[:most]]
 
 
 def _squares_beside(width_px: int) -> int:

@@ -110,7 +110,9 @@ def measure_sky_light(pixels: SkyPixels, horizon: Horizon) -> SkyLight:
         edge_px = _widened(width_px)
         shift, sigma, misfit = _shifts(height_px, llr, extended, edge_px)
         before, informed = width_px, np.isfinite(sigma)
-        width_px = pixels.edge_px * _softness(height_px[informed] - shift[informed, None], llr[informed], extended[informed], pixels.edge_px)
+        width_px = pixels.edge_px * _softness(
+            height_px[informed] - shift[informed, None], llr[informed], extended[informed], pixels.edge_px
+        )
         if width_px == before:
             break
     seen = scale[:, 0] > 0

@@ -21,7 +21,7 @@ LAST_HALF_M = {False: SMALL_BOX_M, True: FINEST_M}  # of the last boxes, looked 
 # How many boxes are kept at each level, and whether the horizons of small boxes are traced. Looked-up horizons rank
 # most positions right. Beside near crests they are too wide: of 9 positions on Shackleton's floor and walls they miss
 # 2, where traced ones rank the true box among the first 70 at every level.
-BEAMS = ((32, False), (80, True), (200, True))
+BEAMS = ((32, False), (80, True), (200, True), (500, True))
 SCORED, CLOSER = 8, 4  # of the last boxes, row by row; of these, at each smaller size
 EXPLAINED_NATS = -0.57  # mean over the sectors with rows; true positions: -0.10 to -0.52, the best false one: -0.62
 LAST_STEP_M, CLIMB_NATS = 1.0, 1.0  # of a climb; what it must gain to go on in steps of the same size

@@ -75,6 +75,20 @@ def test_bright_pixels_are_those_of_stars_not_hot_ones() -> None:
     assert sorted(map(tuple, bright_pixels(frame, 8.0, 10).tolist())) == sorted(positions)
 
 
+def test_bright_pixels_are_not_those_at_the_edge_of_a_bright_sky() -> None:
+    image = np.random.default_rng(5).normal(0, 1, (200, 300)).astype(np.float32)
+    image[:, 150:] += 30  # as the background misses it there
+    positions = [(40, 50), (220, 150)]
+    for x, y in positions:
+        image[y - 1 : y + 2, x - 1 : x + 2] += 15
+        image[y, x] += 20
+    zero, one = (SmoothImage.of(np.full_like(image, value)) for value in (0, 1))
+    frame = Frame(image, zero, one, None, SourceNoise(per_unit=0.0))
+    found = {tuple(one) for one in bright_pixels(frame, 8.0, 500).tolist()}
+    assert found >= set(positions)
+    assert not any(148 <= x <= 152 for x, _ in found)
+
+
 def test_skew_noise_raises_the_threshold_and_wide_stars_lower_it() -> None:
     usual = detection_threshold(5.42, 1.25, 0.088)
     assert usual == pytest.approx(5.42, abs=0.03)

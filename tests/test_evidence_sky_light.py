@@ -134,6 +134,18 @@ def test_shifts_of_the_skyline_are_found_within_their_sigmas(step_e: float, grou
     assert 0.3 < np.mean(np.square(np.array(off) / sigma_with_levels)[known]) < 1.1
 
 
+@pytest.mark.parametrize("softness", [1.0, 1.5, 2.0])
+def test_a_soft_edge_below_a_noisy_sky_is_found_where_it_is(softness: float) -> None:
+    """The dark ground has less noise than the sky: taken to be sharper, the edge is found 0.1 px too low."""
+    rng = np.random.default_rng(11)
+    pixels = paint_pixels(rng, 90.0, edge_px=softness * EDGE_PX)
+    sky_noise = 5 * NOISE_E * (pixels.height_px > softness * EDGE_PX) * rng.normal(size=len(pixels.light_e))
+    found = sky_of(replace(pixels, light_e=pixels.light_e + sky_noise))
+    assert found.edge_px == pytest.approx(np.hypot(softness * EDGE_PX, CELL_PX / np.sqrt(12)), rel=0.1)
+    sigma = found.shift_sigma_px / np.sqrt(SECTORS)
+    assert abs(found.shift_px.mean()) < 4 * sigma.mean() + 0.02
+
+
 def test_a_skyline_far_from_the_predicted_one_is_found_roughly() -> None:
     """Pixels between both skylines are taken for outliers: the shift is too small, by a part of it."""
     rng = np.random.default_rng(18)

@@ -23,8 +23,8 @@ SURE_SIGMAS = 5.0  # from here on chance is excluded: two in a million
 CLIPPED_SIGMAS = 4.0  # of values about a fit, in a round
 OUTLIER_VARIANCES = np.float32(SURE_SIGMAS**2)
 MODEL_VARIANCE = np.float32(0.05**2)  # of a star's squared light, pixel by pixel: the real PSF is no Gaussian
-# Of the flux, where the background misses the level by the noise of a pixel: beside a bright sky, which ends within some
-# pixels, stars came out 0.15 to 0.4 sigma off by each sigma that it missed.
+# Of the flux, where the background misses the level by the noise of a pixel: beside the end of a bright sky stars were
+# off by 0.15 to 0.4 sigma for each sigma that it missed.
 LEVEL_VARIANCE = np.float32(0.3**2)
 MAX_MASKED_PX = 6  # a stamp with more deviant pixels is not a star on a smooth background
 PROFILE_SIGMAS = 6.0  # half width of a neighbour's profile: 1e-9 of its light lies beyond

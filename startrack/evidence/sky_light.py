@@ -18,7 +18,7 @@ import numpy as np
 
 from startrack.core.kernels import njit, normal_cdf
 from startrack.core.statistics import relative_weights, robust_sigma
-from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Bools, Evidence, sector_of
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Bools, Evidence, Ints, sector_of
 from startrack.evidence.photometry import SURE_SIGMAS
 from startrack.evidence.sky_pixels import CLIP_SIGMAS, GROUND, LEVEL_SECTORS, SKY, SkyLevels, SkyPixels, measure_levels
 from startrack.evidence.sky_step import Horizon
@@ -52,6 +52,7 @@ class SkyLight:
     llr: Array  # (SECTORS, LEVELS)
     extended_nats: Array  # (SECTORS, LEVELS)
     edge_px: float
+    fades: bool  # over more than the edge of a skyline
     shift_px: Array  # (SECTORS,) how much higher than predicted the skyline stands
     shift_sigma_px: Array  # (SECTORS,) infinite where the sector is not covered
     misfit_nats: Array  # (SECTORS,) by which the best cells exceed the best skyline
@@ -98,21 +99,14 @@ def measure_sky_light(pixels: SkyPixels, horizon: Horizon) -> SkyLight:
     levels = measure_levels(pixels, sector)
     width_px = pixels.edge_px
     for _ in range(EDGE_ROUNDS):
-        sums = np.zeros((SECTORS, LEVELS, 3))
-        scale = np.zeros((SECTORS, 2))
-        _sum_cells(
-            sector, pixels.height_px, pixels.light_e, pixels.px_per_rad, levels.covered, levels.level_e,
-            levels.slope_e, np.square(levels.noise_e) * levels.correlation, levels.correlation, width_px, CLIP_SIGMAS,
-            sums, scale,
-        )  # fmt: skip
-        llr, extended = sums[..., 0], sums[..., 1]
-        height_px = sums[..., 2] / np.where(extended > 0, extended, 1.0)
+        cells, scale = _sum_pixels(pixels, sector, levels, width_px)
+        height_px, llr, extended = cells
         edge_px = _widened(width_px)
-        shift, sigma, misfit = _shifts(height_px, llr, extended, edge_px)
-        before, informed = width_px, np.isfinite(sigma)
-        width_px = pixels.edge_px * _softness(
-            height_px[informed] - shift[informed, None], llr[informed], extended[informed], pixels.edge_px
-        )
+        shift, sigma, misfit = _shifts(*cells, edge_px)
+        informed, before = np.isfinite(sigma), width_px
+        if informed.any():
+            shifted = height_px[informed] - shift[informed, None], llr[informed], extended[informed]
+            width_px = pixels.edge_px * _softness(*shifted, pixels.edge_px)
         if width_px == before:
             break
     seen = scale[:, 0] > 0
@@ -125,13 +119,30 @@ def measure_sky_light(pixels: SkyPixels, horizon: Horizon) -> SkyLight:
         llr=llr,
         extended_nats=extended,
         edge_px=edge_px,
+        fades=width_px >= SOFTNESS[-1] * pixels.edge_px,
         shift_px=np.where(seen, shift, 0.0),
         shift_sigma_px=np.where(seen, sigma, np.inf),
         misfit_nats=misfit,
     )
 
 
-def _widened(width_px: float | Array) -> Any:
+def _sum_pixels(
+    pixels: SkyPixels, sector: Ints, levels: SkyLevels, width_px: float
+) -> tuple[tuple[Array, Array, Array], Array]:
+    """Cells' heights, l and c (SECTORS, LEVELS) of `pixels` (n,) beside an edge of that width; see `_sum_cells`.
+
+    Besides the number of pixels of each sector and the sum of their scales (SECTORS, 2).
+    """
+    sums, scale = np.zeros((SECTORS, LEVELS, 3)), np.zeros((SECTORS, 2))
+    _sum_cells(
+        sector, pixels.height_px, pixels.light_e, pixels.px_per_rad, levels.covered, levels.level_e, levels.slope_e,
+        np.square(levels.noise_e) * levels.correlation, levels.correlation, width_px, CLIP_SIGMAS, sums, scale,
+    )  # fmt: skip
+    llr, extended, moment = np.moveaxis(sums, -1, 0)
+    return (moment / np.where(extended > 0, extended, 1.0), llr, extended), scale
+
+
+def _widened(width_px: Any) -> Any:
     """Width of an edge in cells, whose pixels spread over their height."""
     return np.sqrt(np.square(width_px) + CELL_PX**2 / 12)
 
@@ -193,9 +204,9 @@ def sectors_with_step(sky: SkyLight) -> Bools:
 
 
 def _is_sharp(sky: SkyLight, sectors: Bools) -> bool:
-    """Whether the step explains the cells of the sectors better than a wide ramp, by far."""
+    """Whether the step is that of a skyline, and explains the cells of the sectors better than a wide ramp, by far."""
     cells = sky.height_px[sectors] - sky.shift_px[sectors, None], sky.llr[sectors], sky.extended_nats[sectors]
-    return _nats(*cells, sky.edge_px) > _nats(*cells, RAMP_PX) + SHARP_NATS
+    return not sky.fades and _nats(*cells, sky.edge_px) > _nats(*cells, RAMP_PX) + SHARP_NATS
 
 
 @njit(cache=True)

@@ -26,8 +26,8 @@ LEAST_SIGMA_PX = 1e-3  # of a term
 # Of a term of a calibrated lens, from night to night: beyond what one calibration can know of it. Positions by four
 # nights outside the calibration of an all-sky camera erred by 0.8 m an axis where 0.1 px is 0.8 m.
 NIGHT_SIGMA_PX = 0.1
-# Of a term of a calibrated lens, with the stars of the image: two lens models, fitted to the same stars of six nights of
-# that camera, differ by 0.01 to 0.06 px at skylines.
+# Of a term of a calibrated lens, with the stars of the image: two lens models, fitted to the same stars of six nights
+# of that camera, differ by 0.01 to 0.06 px at skylines.
 MODEL_SIGMA_PX = 0.03
 OFFSET_STARS = 10
 

@@ -60,7 +60,7 @@ def test_mean_and_variance_are_those_of_the_photometry_of_pixels():
     drawn = starlight.measure(sources, np.full(len(shines), VARIANCE_E2), SATURATION_E, rng=NoNoise())  # type: ignore[arg-type]
     assert drawn.flux_e == pytest.approx(real.flux_e, abs=0.05)  # noise: 37 e
     for name in ("variance_e2", "own_shot", "neighbour_variance_e2"):
-        assert getattr(drawn, name) == pytest.approx(getattr(real, name), rel=2e-3, abs=0.02), name
+        assert getattr(drawn, name) == pytest.approx(getattr(real, name), rel=5e-3, abs=0.02), name
     assert drawn.usable.all()
 
 

@@ -29,6 +29,7 @@ from startrack.terrain.shape import (
 from startrack.terrain.traced_map import TracedMap
 
 COMMON_PER_POST = 3.0
+BETWEEN_POSTS = 2.0 / 3.0  # RMS of the bilinear mean of independent errors at four posts, over a cell, in that of a post
 GLARE, OFF_MAP = "glare of a lit rim", "ground off the map"
 Sectors = tuple[tuple[float, float], ...]  # azimuth ranges [rad], each from the first eastward to the second
 
@@ -70,11 +71,16 @@ class HeightMap(TracedMap):
 
     @cached_property
     def shape_errors(self) -> tuple[ShapeError, ...]:  # type: ignore[override]
-        """Bias, stretch, tilt, height of the camera, refraction. The bias needs the table of horizons."""
+        """Bias, stretch, tilt, height of the camera, refraction. The bias needs the table of horizons.
+
+        The camera stands as much too high as the ground between four posts is.
+        """
+        stated_m = CAMERA_ERROR.sigma if self.camera_height_sigma_m is None else self.camera_height_sigma_m
+        camera_sigma_m = float(np.hypot(stated_m, BETWEEN_POSTS * self.height_sigma_m))
         return (
             *BIAS.shape_errors(self.common_sigma_rad), *STRETCH.shape_errors(self.stretch_sigma_1),
             *vertical_fact(self.site.body).shape_errors(self.vertical_sigma_rad),
-            *CAMERA_ERROR.shape_errors(self.camera_height_sigma_m),
+            *CAMERA_ERROR.shape_errors(camera_sigma_m),
             *REFRACTION.shape_errors(self.terrestrial_refraction_sigma_1), *refraction_errors(self.air),
         )  # fmt: skip
 

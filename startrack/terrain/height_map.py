@@ -29,7 +29,7 @@ from startrack.terrain.shape import (
 from startrack.terrain.traced_map import TracedMap
 
 COMMON_PER_POST = 3.0
-BETWEEN_POSTS = 2.0 / 3.0  # RMS of the bilinear mean of independent errors at four posts, over a cell, in that of a post
+BETWEEN_POSTS = 2.0 / 3.0  # RMS over a cell of the bilinear mean of independent errors at four posts, in that of one
 GLARE, OFF_MAP = "glare of a lit rim", "ground off the map"
 Sectors = tuple[tuple[float, float], ...]  # azimuth ranges [rad], each from the first eastward to the second
 

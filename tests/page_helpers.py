@@ -27,10 +27,12 @@ SNIPPET = re.compile(
 )
 EXIT_CODE = re.compile(r"#.*\bexit code (\d)")
 TIME_TAKEN = re.compile(r"  \d+\.\d s(?= with files$|$)|computed in \d+\.\d s")
-NUMBER = re.compile(r"[-±]?\d+(?:\.\d+)?")
+NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
+ERROR = re.compile(r"± ?(\d+(?:\.\d+)?)")
+RADII = re.compile(r"\s*(one sigma|[\d.]+ % within|protected) ")
 LEAST_TOLERANCE = 0.011
 COUNT_TOLERANCE = 0.002
-RADIUS_TOLERANCE = 0.1  # of "±3.1 m": sampled, to 3 % (one sigma), by points that another processor may round otherwise
+SAMPLED = 0.1  # of its error, by which a sampled value may differ: its points, rounded otherwise, make 3 %
 
 
 @dataclass(frozen=True)
@@ -152,15 +154,18 @@ def lines_of(text: str) -> list[str]:
 
 
 def same_line(now: str, then: str) -> bool:
-    """Equal but for the last digits of the numbers."""
+    """Equal but for the last digits of the numbers, and a part of the error that the line states."""
     if NUMBER.sub("#", now) != NUMBER.sub("#", then):
         return False
-    pairs = zip(NUMBER.findall(now), NUMBER.findall(then), strict=True)
-    return all(abs(float(one.lstrip("±")) - float(other.lstrip("±"))) <= tolerance(other) for one, other in pairs)
+    slack = SAMPLED * max(map(float, ERROR.findall(then)), default=0.0)
+    part = SAMPLED if RADII.match(then) else 0.0
+    pairs = [(float(one), other) for one, other in zip(NUMBER.findall(now), NUMBER.findall(then), strict=True)]
+    return all(
+        abs(one - float(other)) <= max(last_digit(other), slack, part * abs(float(other))) for one, other in pairs
+    )
 
 
-def tolerance(number: str) -> float:
-    """How far from the `number` of a page another may be; of counts a part, for objects at the edge of a threshold."""
-    decimals, value = number.partition(".")[2], abs(float(number.lstrip("±")))
-    part = RADIUS_TOLERANCE if number.startswith("±") else 0.0 if decimals else COUNT_TOLERANCE
-    return max(1.1 * 10.0 ** -len(decimals), LEAST_TOLERANCE, part * value)
+def last_digit(number: str) -> float:
+    """The tolerance of a number as a page shows it; of counts a part, because of objects at the edge of a threshold."""
+    decimals = number.partition(".")[2]
+    return max(1.1 * 10.0 ** -len(decimals), LEAST_TOLERANCE, 0.0 if decimals else COUNT_TOLERANCE * abs(float(number)))

@@ -32,7 +32,7 @@ ERROR = re.compile(r"± ?(\d+(?:\.\d+)?)")
 RADII = re.compile(r"\s*(one sigma|[\d.]+ % within|protected) ")
 LEAST_TOLERANCE = 0.011
 COUNT_TOLERANCE = 0.002
-SAMPLED = 0.1  # of its error, by which a sampled value may differ: its points, rounded otherwise, make 3 %
+SAMPLED = 0.2  # of its error, by which a sampled value may differ: its points, rounded otherwise, make 3 to 5 %
 
 
 @dataclass(frozen=True)

@@ -88,6 +88,7 @@ def test_a_folder_in_place_of_a_companion_is_named(tmp_path, capsys):
     assert "bad_image" in line and "00.annotated.png: cannot be replaced" in line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["00.fix.json", "manifest.json"])
 @pytest.mark.parametrize("kind", ["pipe", "full folder", "deep JSON"])
 def test_a_batch_does_not_hang_or_fail_on_what_is_no_result(tmp_path, capsys, kind, name):

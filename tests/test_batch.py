@@ -215,6 +215,7 @@ def test_several_processes_and_a_second_run_give_the_same_bytes(night, batch_out
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*.fix.json")} == before
 
 
+@pytest.mark.slow
 def test_only_missing_or_incomplete_results_are_repeated(night, batch_output):
     out = night / "torn"
     shutil.copytree(batch_output, out)

@@ -59,6 +59,7 @@ def test_a_pipe_is_no_image_and_a_link_to_nothing_is_one(tmp_path):
     assert locate_image(task_of(tmp_path / "pipe.png", tmp_path))[0]["reason"] == "bad_image"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", ["\n", "\0"])
 def test_an_image_deleted_during_the_run_is_refused_alone(tmp_path, monkeypatch, end):
     frames(tmp_path / "images", 2)

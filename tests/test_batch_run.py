@@ -58,6 +58,7 @@ def many_frames(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wishes", "to_the_group", "why"),
     [
@@ -142,6 +143,7 @@ def test_a_closed_pipe_ends_the_image_commands_early(many_frames, tmp_path):
     assert process.returncode == 5
 
 
+@pytest.mark.slow
 def test_with_json_nothing_else_is_printed(tmp_path, capsys):
     frames(tmp_path / "images", 2)
     assert main(["batch", str(tmp_path / "images"), "-D", str(tmp_path / "out"), "-j", "1", "--json"]) == 5

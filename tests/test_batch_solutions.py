@@ -73,6 +73,7 @@ def break_the_image(folder: Path) -> None:
     (folder / "images" / SOLVED).write_bytes(b"not a picture")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spoil", [lose_the_camera, lose_the_sidecar, break_the_image])
 @pytest.mark.parametrize("flags", [(), ("-O",)])
 def test_an_unusable_input_keeps_the_earlier_solution(folder, capsys, spoil, flags):

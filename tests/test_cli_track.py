@@ -266,6 +266,7 @@ def test_an_image_counts_once(drive, tmp_path, capsys):
     assert json.loads((tmp_path / "out" / "track.json").read_text())["counts"]["frames"] == 1
 
 
+@pytest.mark.slow
 def test_images_of_another_camera_are_refused(drive, tmp_path, capsys):
     frames = tmp_path / "frames"
     shutil.copytree(drive / "frames", frames)

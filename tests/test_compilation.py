@@ -66,6 +66,7 @@ def run_script(script: Path, cache: Path) -> tuple[str, str]:
     return done.stdout, done.stderr
 
 
+@pytest.mark.slow
 def test_compiling_is_announced_once_and_loading_is_not(tmp_path):
     script = tmp_path / "first_use.py"
     script.write_text(FIRST_USE)
@@ -105,6 +106,7 @@ def compile_beside_another(folder: str) -> int:
     return os.getpid()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("announced", "level", "lines"), [(False, 0, 1), (True, 0, 0), (False, logging.ERROR, 0)])
 def test_two_processes_announce_once(tmp_path, capfd, monkeypatch, announced, level, lines):
     """And not at all where their parent has, or where it is quiet."""

@@ -112,6 +112,7 @@ def test_nights_are_combined(two_frames, catalog, painted):
     assert found.skyline.known.sum() >= painted.known.sum() - 10
 
 
+@pytest.mark.slow
 def test_an_overcast_night_is_left_out_and_alone_refused(overcast, two_frames, catalog):
     frames, left_out = orient_frames([overcast, two_frames[0]], catalog, SITE, camera=CAMERA, fov_rad=None)
     assert [frame.name for frame in frames] == ["frame-1"]

@@ -160,6 +160,7 @@ def test_a_common_error_is_reported_and_not_taken_for_a_wrong_map(shackleton):
     assert np.linalg.norm(fix.position_enu_m[:2] - [50.0, -90.0]) < fix.radius999_m
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gross_probability", [0.0, 0.01])
 def test_a_sky_turned_by_a_wrong_clock_is_refused_or_its_time_is_found(shackleton, gross_probability):
     """Two hours off: found where the clock is not stated, so that it may be grossly wrong, and refused where it is."""

@@ -52,6 +52,7 @@ def test_the_posterior_is_the_product_with_the_prior(sigmas: float) -> None:
     assert not fix.ambiguous
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("terrain", [CRATER, ThreeMethods(CRATER)], ids=["disks", "bounds"])
 def test_the_prior_weighs_hard_edges_too(terrain: Terrain) -> None:
     """Against a grid weighed by hand."""

@@ -15,6 +15,8 @@ from html_helpers import DESKTOP, NASTY, PHONE, SMALL, Window, results_in
 
 from startrack.output import Found, page_text, results_under, write_page
 
+pytestmark = pytest.mark.slow
+
 REAL = {"small": (6010.0, -2507.0)}
 
 
@@ -218,7 +220,6 @@ def test_words_beside_the_axes_keep_apart(window, size):
     assert min(room for one in rooms for room in one) > 4
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", [DESKTOP, PHONE])
 def test_the_skyline_of_the_image_is_shown_twice(window, size):
     """On the panorama and enlarged: each point has its elevation with sigma, source and height above the map's."""

@@ -12,6 +12,8 @@ from html_helpers import DESKTOP, NASTY, SMALL, Window, results_in
 from startrack.catalog import proper_name_designations, star_names
 from startrack.output import page_text, result_at, results_under
 
+pytestmark = pytest.mark.slow
+
 READ_TWICE = "willReadFrequently"  # a hint of Chromium where a test reads a canvas more than once
 VIEW = "document.querySelector('#detail .stage canvas').view"
 
@@ -51,7 +53,6 @@ def painted(w: Window) -> None:
     w.wait_for(f"!{VIEW}.waiting && {VIEW}.box !== undefined")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize(("name", "size"), [("one.html", DESKTOP), ("one.html", SMALL), ("report.html", SMALL)])
 def test_axe_finds_nothing(window, axe, name, size, scheme):
@@ -67,7 +68,6 @@ def test_axe_finds_nothing(window, axe, name, size, scheme):
         assert w.has_no_overflow()
 
 
-@pytest.mark.slow
 def test_axe_finds_a_fault(window, axe):
     """A page that is made worse is found to be so: the rules reach what they are to check."""
     w = window()

@@ -108,6 +108,7 @@ def test_the_light_of_the_sky_makes_the_fix_better(bright: Frame, by_source: dic
     assert [found.sky_unused for found in by_source.values()] == ["", "", ""]
 
 
+@pytest.mark.slow
 def test_a_lens_that_is_not_quite_its_file_keeps_the_truth_in_the_circle(bright: Frame, catalog: StarCatalog) -> None:
     """The principal point is wrong by a third of a pixel: stars near the skyline show it."""
     found = locate(bright, catalog, replace(CAMERA, centre_px=(511.8, 511.35)))

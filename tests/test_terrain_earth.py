@@ -38,6 +38,7 @@ def on_earth(*maps: Raster, **changes) -> HeightMap:
     return HeightMap(site=SITE, maps=maps, **given | changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "raster",
     [jacksboro, lambda: in_projection("EPSG:32616", 75.0), lambda: in_projection("EPSG:3088", 60.0)],

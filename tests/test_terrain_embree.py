@@ -14,6 +14,7 @@ from startrack.terrain import load_terrain
 pytest.importorskip("embreex", reason="there are no wheels of embreex for every machine")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "half_m"), [("shackleton", 13_500.0), ("kepler", 6_000.0)])
 def test_horizons_are_those_of_embree(name, half_m, monkeypatch):
     monkeypatch.setattr(sys, "path", [*sys.path, str(Path(__file__).parent.parent / "benchmarks")])

@@ -16,6 +16,8 @@ from startrack.applications.tracking.write import track_page
 from startrack.estimation.trajectory import radius_holding
 from startrack.output import png_bytes
 
+pytestmark = pytest.mark.slow
+
 PICTURE = png_bytes(np.full((40, 60, 3), 90, dtype=np.uint8))
 TITLE = 'A drive & </script><i>"more"</i>'
 

@@ -87,6 +87,7 @@ def test_an_image_refused_before_its_second_fix_has_no_position(case: str) -> No
     require_no_position(pipeline.locate(changed, small_camera(), crater, catalog_to(7.0)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("part", "sky_v_mag"), [(0.03, 22.0), (0.1, 19.5), (0.5, 19.5)])
 def test_an_image_refused_after_its_second_fix_has_no_position(part: float, sky_v_mag: float) -> None:
     require_no_position(solve(deeper(part), sky_v_mag=sky_v_mag))

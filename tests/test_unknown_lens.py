@@ -162,6 +162,7 @@ def test_too_few_stars_are_refused_at_once() -> None:
         identify_unknown_lens(detections(np.arange(12.0).reshape(6, 2) * 80, np.ones(6)), SIZE, np.pi, sky())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "ra_deg", "dec_deg", "arcsec"),
     [("narrow-alt40-azi-45.csv", 172.3676, 57.6493, 8), ("narrow-alt60-azi135.csv", 286.4356, 28.9442, 8)],
@@ -178,6 +179,7 @@ def test_narrow_photographs_agree_with_two_other_solvers(
         assert not found.camera.mirrored
 
 
+@pytest.mark.slow
 def test_an_overcast_photograph_is_refused() -> None:
     with pytest.raises(NotIdentified, match="better than chance"):
         identify_unknown_lens(photograph_detections("overcast.csv"), (1392, 1040), np.pi, sky())

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from startrack.core.kernels import read_only
 from startrack.core.smooth_image import Image
-from startrack.core.types import Array, Ints
+from startrack.core.types import Array, Bools, Ints
 from startrack.detection.frame import Frame, radius_for
 from startrack.detection.peak_kernel import COARSE_PX, PAIRS, find_maxima
 from startrack.psf import filter_kernel
@@ -66,9 +66,14 @@ def find_peaks(frame: Frame, sigma: float, lowest: float, most: int, known: Arra
     )
 
 
-def nearest_pixels(xy_px: Array, shape: tuple[int, int], margin: int) -> Ints:
+def nearest_pixels(xy_px: Array | Ints, shape: tuple[int, int], margin: int) -> Ints:
     """The pixels (n, 2) nearest to positions (n, 2) that lie `margin` inside a frame of this shape (H, W)."""
     return np.clip(np.rint(xy_px).astype(np.int64), margin, np.array([shape[1], shape[0]]) - 1 - margin)
+
+
+def lie_inside(pixels: Ints, shape: tuple[int, int], margin: int) -> Bools:
+    """Whether pixels (n, 2) lie `margin` inside a frame of this shape (H, W)."""
+    return np.asarray((nearest_pixels(pixels, shape, margin) == pixels).all(axis=1))
 
 
 def bright_pixels(frame: Frame, lowest: float, most: int) -> Ints:
@@ -78,8 +83,8 @@ def bright_pixels(frame: Frame, lowest: float, most: int) -> Ints:
     of which there is more light than on another.
     """
     pixels, height, *_ = _peaks_above(frame, lowest, ONE_TAP)
-    last, r = np.array([frame.shape[1], frame.shape[0]]) - 1, SIDES_PX
-    inside = ((pixels >= r) & (pixels <= last - r)).all(axis=1)
+    r = SIDES_PX
+    inside = lie_inside(pixels, frame.shape, r)
     pixels, height = pixels[inside], height[inside]
     light, _ = frame.cut_light(pixels, r)
     peak, sides = light[:, r, r], [light[:, :: 2 * r].mean(axis=2), light[:, :, :: 2 * r].mean(axis=1)]

@@ -9,7 +9,7 @@ import numpy as np
 from startrack.core.types import Array, Bools, Ints
 from startrack.detection.fit import FIT_ROUNDS_AGAIN, PointFits, Stamps, fit_points
 from startrack.detection.frame import Frame, Pixels, radius_for
-from startrack.detection.peaks import bright_pixels, find_peaks
+from startrack.detection.peaks import bright_pixels, find_peaks, lie_inside
 
 WIDTH_SNR = 12.0  # of the sources from which the width is measured
 WIDTH_TOLERANCE = 0.12  # a measured PSF that differs by more than this fraction from the expected one replaces it
@@ -93,8 +93,7 @@ def guess_psf_width(prepare: Callable[[float], Frame], sigma: float) -> float:
         sigma = guess
     for _ in range(WIDTH_ROUNDS):
         radius = radius_for(sigma)
-        last = np.array([frame.shape[1], frame.shape[0]]) - 1
-        centres = pixels[((pixels >= radius) & (pixels <= last - radius)).all(axis=1)]
+        centres = pixels[lie_inside(pixels, frame.shape, radius)]
         if not len(centres):
             break
         data, variance = frame.cut_light(centres, radius)

@@ -75,12 +75,10 @@ class HeightMap(TracedMap):
 
         The camera stands as much too high as the ground between four posts is.
         """
-        stated_m = CAMERA_ERROR.sigma if self.camera_height_sigma_m is None else self.camera_height_sigma_m
-        camera_sigma_m = float(np.hypot(stated_m, BETWEEN_POSTS * self.height_sigma_m))
         return (
             *BIAS.shape_errors(self.common_sigma_rad), *STRETCH.shape_errors(self.stretch_sigma_1),
             *vertical_fact(self.site.body).shape_errors(self.vertical_sigma_rad),
-            *CAMERA_ERROR.shape_errors(camera_sigma_m),
+            *CAMERA_ERROR.shape_errors(self.camera_height_sigma_m, beside=BETWEEN_POSTS * self.height_sigma_m),
             *REFRACTION.shape_errors(self.terrestrial_refraction_sigma_1), *refraction_errors(self.air),
         )  # fmt: skip
 

@@ -53,9 +53,13 @@ class Fact(Prior):
     meaning: str  # for those who are asked for it
     limits: Number  # of the value in the file
 
-    def shape_errors(self, stated: float | None) -> list[ShapeError]:
-        """Those of the errors that count; `stated` is the sigma in the unit of the errors, None where it is not."""
+    def shape_errors(self, stated: float | None, beside: float = 0.0) -> list[ShapeError]:
+        """Those of the errors that count; `stated` is the sigma in the unit of the errors, None where it is not.
+
+        `beside` is the sigma of an independent error with the same effect.
+        """
         sigma, probability = (self.sigma, self.gross_probability) if stated is None else (float(stated), 0.0)
+        sigma = float(np.hypot(sigma, beside))
         return [
             ShapeError(
                 name=name, fact=self.key, sigma=sigma, gross_probability=probability, gross_sigma=self.gross_sigma,

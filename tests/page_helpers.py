@@ -159,10 +159,12 @@ def same_line(now: str, then: str) -> bool:
         return False
     slack = SAMPLED * max(map(float, ERROR.findall(then)), default=0.0)
     part = SAMPLED if RADII.match(then) else 0.0
-    pairs = [(float(one), other) for one, other in zip(NUMBER.findall(now), NUMBER.findall(then), strict=True)]
-    return all(
-        abs(one - float(other)) <= max(last_digit(other), slack, part * abs(float(other))) for one, other in pairs
-    )
+
+    def differ_little(one: str, other: re.Match[str]) -> bool:
+        by_line = slack if then.startswith(" m", other.end()) else 0.0  # lengths alone are sampled
+        return abs(float(one) - float(other[0])) <= max(last_digit(other[0]), by_line, part * abs(float(other[0])))
+
+    return all(map(differ_little, NUMBER.findall(now), NUMBER.finditer(then)))
 
 
 def last_digit(number: str) -> float:

@@ -122,6 +122,7 @@ def test_a_result_is_a_rough_attitude(
     forbid_lost_in_space(monkeypatch)
     assert main([*words, str(tmp_path / "second"), "--near-attitude", str(file)]) == 0
     assert json.loads(capsys.readouterr().out)["matches"] == first["matches"]
+    assert main(["track", words[1], "-D", str(tmp_path / "track"), "--near-attitude", str(file), "-q"]) == 0
 
 
 @pytest.mark.parametrize(
@@ -131,7 +132,7 @@ def test_a_result_is_a_rough_attitude(
      ('{"attitude": {"quat_xyzw_cam_icrs": [0, 0, 0, 0]}}', "holds no attitude"),
      ('{"attitude": {"quat_xyzw_cam_icrs": [0, 0, 0, 1]}, "provenance": {"time_utc": "noon"}}', "holds no attitude")],
 )  # fmt: skip
-@pytest.mark.parametrize("command", ["identify", "locate", "batch"])
+@pytest.mark.parametrize("command", ["identify", "locate", "batch", "track"])
 def test_a_file_without_attitude_is_bad_input(
     command: str, text: str | None, cause: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -99,7 +99,7 @@ COMMANDS = (
                 flag("frames FRAMES", "images, one folder, or one ROS bag", nargs="+"),
                 flags.TOPIC, *flags.FACTS, flags.TERRAIN,
             ),
-            "method": (flags.EVIDENCE,),
+            "method": (flags.EVIDENCE, flags.NEAR_ATTITUDE),
             "motion between the images (without: each is alone but for shared errors)": (
                 flag("--odometry FILE", "TUM text, or a ROS bag"),
                 flag("--odometry-topic TOPIC", "of a bag with several"),

@@ -19,7 +19,7 @@ from startrack.applications.tracking import FrameStore, ObservedFrame, Odometry,
 from startrack.catalog import load_catalog
 from startrack.chain import Settings
 from startrack.cli.console import progress, worst_code
-from startrack.cli.images import compile_kernels, flag_facts, odometry_errors, prepare_reference
+from startrack.cli.images import compile_kernels, flag_facts, near_attitude_of, odometry_errors, prepare_reference
 from startrack.core.errors import EXIT_BAD_INPUT, EXIT_REFUSED, EXIT_STOPPED, BadInput, BadOutput, exit_code_of
 from startrack.core.files import make_folder, printable
 from startrack.core.types import Exposure
@@ -39,8 +39,8 @@ def run(args: argparse.Namespace) -> int:
             "bad_image", f"{out} holds a track that this command did not write: choose another -D, or give -O"
         )
     session = TrackSession(
-        store=FrameStore(out / STORE), settings=Settings(evidence_sources=args.evidence), facts=flag_facts(args),
-        odometry_errors=odometry_errors(args),
+        store=FrameStore(out / STORE), facts=flag_facts(args), odometry_errors=odometry_errors(args),
+        settings=Settings(evidence_sources=args.evidence, near_attitude=near_attitude_of(args)),
     )  # fmt: skip
     track = TrackRun(args, session)
     (track.follow if args.follow else track.take_all)()

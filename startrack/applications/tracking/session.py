@@ -176,7 +176,7 @@ class TrackSession:
         alone = replace(shared, gross=frozenset())  # with the facts that the image itself shows
         clock = None if shared.listed.clock is None else shared.listed.clock.turn_rad_s.tolist()
         errors = [repr(shared.listed.listed), alone.names, alone.sigma.tolist(), clock]
-        others = self.settings.evidence_sources, sorted(files.items()), errors
+        others = self.settings.evidence_sources, self.settings.near_attitude, sorted(files.items()), errors
         job = job_sha256(path, exposure.sha256, self.facts, *others)
         return hashlib.sha256(f"{exposure.name} {job}".encode()).hexdigest()[:32]
 

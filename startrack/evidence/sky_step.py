@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
-from startrack.core.kernels import njit
+from startrack.core.circle import interpolate_circle
 from startrack.core.smooth_image import SmoothImage
 from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Bools, Detections, Ints
@@ -56,9 +56,7 @@ class Skyline:
         return cls(terrain.horizon_rad(np.asarray(position_m)[None, :], azimuth))
 
     def __call__(self, azimuth_rad: Array) -> Array:
-        found = np.array(azimuth_rad, dtype=np.float64, order="C")
-        _interpolate_circle(np.ascontiguousarray(self.elevation_rad), found.reshape(-1))
-        return found
+        return interpolate_circle(self.elevation_rad, azimuth_rad)
 
     def raised(self, by_rad: Array) -> Skyline:
         """The skyline higher by `by_rad` (n,) [rad], at the middles of n equal sectors from north eastward."""
@@ -216,19 +214,6 @@ def _px_per_rad_at(azimuth_rad: Array, elevation_rad: Array, camera: Camera, R_c
 def _px_per_rad(camera: Camera, angle_rad: Array) -> Array:
     """Scale of the image away from its centre at angles off the axis (n,) [rad]."""
     return np.asarray(np.sqrt(camera.focal_px[0] * camera.focal_px[1]) * camera.lens.slope(angle_rad))
-
-
-@njit(cache=True)
-def _interpolate_circle(values, found):  # type: ignore[no-untyped-def]
-    """Replace the azimuths (n,) [rad] in `found` by values (m,), given at even steps from azimuth 0 on."""
-    m = len(values)
-    for k in range(len(found)):
-        at = found[k] * (m / (2 * np.pi))
-        if at < 0.0 or at >= m:
-            at %= m
-        low = min(int(at), m - 1)
-        part = at - low
-        found[k] = (1.0 - part) * values[low] + part * values[low + 1 if low + 1 < m else 0]
 
 
 def _grouped_median(light_e: NDArray[np.float32]) -> tuple[float, float]:

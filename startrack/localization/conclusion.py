@@ -234,6 +234,8 @@ def _restart_points(whole: Posterior, explored: Explored, dropped_probability: f
     order = np.argsort(-one.found.log_weight)[:SUPPORT]
     points, log = one.found.points[order, :2], one.found.log_weight[order]
     spread = np.sqrt(max(float(np.linalg.eigvalsh(moments(points, relative_weights(log))[1])[1]), 1e-6))
+    has_tried = explored.has_tried_times or any(plain.tries_times for plain in whole.hypotheses if not plain.gross)
     return explored._replace(
-        centres_m=points, half_m=0.5 * spread, log_likelihood=log, dropped_probability=dropped_probability
-    )
+        centres_m=points, half_m=0.5 * spread, log_likelihood=log, dropped_probability=dropped_probability,
+        has_tried_times=has_tried,
+    )  # fmt: skip

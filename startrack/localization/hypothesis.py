@@ -78,6 +78,17 @@ class Hypothesis:
         by_map = float(self.model.log_likelihood_of(shift[None])[0])
         return free_log_likelihood(self.model.seen.profiles, shift) < by_map - DOUBTFUL_NATS
 
+    @property
+    def tries_times(self) -> bool:
+        """Whether times are tried that are apart from each other, unless an earlier fix from the image tried them.
+
+        That is on real ground, where the skyline is not linear in the clock's error, and where the map does not explain
+        the rows so well that no time does better.
+        """
+        support = self.model.seen.rows.support
+        has_tried = support is not None and support.has_tried_times
+        return not (has_tried or self.model.terrain.axisymmetric or self.suits_map)
+
 
 def sample_hypothesis(model: SkylineModel, references_m: Array, modes: Sequence[Gaussian], **how: Any) -> Hypothesis:
     """A hypothesis sampled, as `sample` is told `how`, where its reference is the nearest of all (g, 2)."""
@@ -140,14 +151,9 @@ def _sample_other_times(plain: Hypothesis, model: SkylineModel, clock: Clock, re
 
 
 def clock_of_other_times(plain: Hypothesis, other: SkylineModel) -> Clock | None:
-    """The clock where the gross error of `other` is its, and times are tried that are apart from each other.
-
-    That is on real ground, where the skyline is not linear in it, and where the map does not explain the rows so well
-    that no time does better.
-    """
+    """The clock where the gross error of `other` is its, and times are tried that are apart from each other."""
     clock, listed = other.errors.clock, other.errors.listed
-    is_tried = listed[-1].fact == other.gross and not other.terrain.axisymmetric and not plain.suits_map
-    return clock if is_tried else None
+    return clock if listed[-1].fact == other.gross and plain.tries_times else None
 
 
 def _sample_settled_time(plain: Hypothesis, model: SkylineModel, clock: Clock, references_m: Array) -> Hypothesis:

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from startrack.core.circle import interpolate_circle
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, ImageErrors
 from startrack.localization.sector_moments import SectorMoments, measure_moments
 from startrack.localization.shared_errors import SharedErrors
@@ -95,8 +96,7 @@ class SectorRows:
     def above_rad(self) -> Array:
         """(n,) how far the rows stand above the skyline at the reference."""
         rows, terrain = self.rows, self.around.terrain
-        line, around = self.around.skyline_rad, np.linspace(0.0, 2 * np.pi, SAMPLES + 1)
-        above = rows.elevation_rad - np.interp(rows.azimuth_rad, around, np.append(line, line[0]))
+        above = rows.elevation_rad - interpolate_circle(self.around.skyline_rad, rows.azimuth_rad)
         if not terrain.axisymmetric and not self.is_rough:  # crests are narrower than the samples
             near = np.flatnonzero(np.abs(above) < TRACED_RAD)
             traced = terrain.horizon_rad(self.around.reference_m[None], rows.azimuth_rad[near])

@@ -46,6 +46,7 @@ class Explored(NamedTuple):
     log_dropped: float  # logarithm of a bound of the mass [m2] that was dropped
     search: str  # "proven" or "beam"
     dropped_probability: float | None = None  # of an earlier fix with these points; None: by `log_dropped`
+    has_tried_times: bool = False  # whether an earlier fix with these points tried other times
 
 
 def log_sum(values: Array) -> float:

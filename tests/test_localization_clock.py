@@ -13,7 +13,7 @@ from test_localization_shape import evidence_at
 from startrack.core.types import Array, Clock, Evidence, Fix, NotLocated
 from startrack.frames import R_enu_icrs, Site, azel_from_rays, sky_rotvec_rad, ut1_sigma_s
 from startrack.frames.orientation import _earth_orientation
-from startrack.localization import ExactPosterior
+from startrack.localization import ExactPosterior, hypothesis
 from startrack.localization.clock import clock_at as clock_of_site
 from startrack.localization.clock import clock_matters, turn_evidence
 from startrack.terrain import HeightMap, Terrain, load_terrain
@@ -145,6 +145,22 @@ def test_a_time_beyond_its_stated_error_is_refused(ground: HeightMap, hours: flo
     with pytest.raises(NotLocated, match="time") as refusal:
         ExactPosterior()(rows, exact)
     assert refusal.value.reason == "inconsistent_evidence"
+
+
+def test_other_times_are_tried_once_an_image(ground: HeightMap, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[Clock] = []
+    monkeypatch.setattr(hypothesis, "DOUBTFUL_NATS", np.inf)  # no map explains the rows well enough
+    monkeypatch.setattr(hypothesis, "turned_models", lambda model, clock: tried.append(clock) or [])
+    place_m = np.array([120.0, -80.0])
+    clock = clock_of_site(SITES["shackleton"], TIME, 1.0, is_stated=False)
+    rows = replace(simulate_rays(ground, place_m, np.random.default_rng(3), 3000, 0.0), clock=clock)
+    first = ExactPosterior()(rows, ground)
+    assert len(tried) == 1
+    again = ExactPosterior()(replace(rows, support=first.samples), ground)
+    assert len(tried) == 1
+    off_m = np.linalg.norm(again.position_enu_m - first.position_enu_m)
+    assert off_m < 0.1 * first.radius95_m
+    assert again.radius95_m == pytest.approx(first.radius95_m, rel=0.1)
 
 
 def is_inside(fix: Fix, place_m: Array) -> bool:

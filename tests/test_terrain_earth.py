@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import lzma
+import struct
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -291,6 +293,34 @@ def test_a_stated_geoid_tilts_the_ground():
     tan = np.tan(plain.horizon_rad(np.zeros(2), azimuths))
     wanted = np.radians(20 / 3600) * np.array([1.0, -1.0]) / (1 + tan**2)
     assert change == pytest.approx(wanted, abs=3e-6)
+
+
+def grid_of_geoid(path: Path, slope_arcsec: tuple[float, float]) -> Path:
+    """A grid (GTX) of two degrees about SITE: -30 m there, with this slope to the east and the north."""
+    latitude_deg, longitude_deg = np.degrees([SITE.latitude_rad, SITE.longitude_rad])
+    line = np.linspace(-1.0, 1.0, 41)
+    metres = 6_378_137.0 * np.radians(line)
+    rise = np.tan(np.radians(np.array(slope_arcsec) / 3600.0))
+    heights = -30.0 + rise[0] * metres * np.cos(SITE.latitude_rad) + rise[1] * metres[:, None]
+    head = struct.pack(">4d2i", latitude_deg - 1, longitude_deg - 1, 0.05, 0.05, 41, 41)
+    path.write_bytes(head + heights.astype(">f4").tobytes())
+    return path
+
+
+def test_import_states_the_geoid_of_a_grid(tmp_path, capsys):
+    write_map(tmp_path / "utm.tif", in_projection("EPSG:32616", 75.0))
+    words = ["terrain", "import", str(tmp_path / "utm.tif"), "-o", str(tmp_path / "mine.toml"), "--radius", "400"]
+    words += ["--latitude", str(PLACE_DEG[0]), "--longitude", str(PLACE_DEG[1]), "-q", "--geoid"]
+    assert main([*words, "no_such_grid.tif"]) == 4
+    assert "projsync --file no_such_grid.tif" in capsys.readouterr().err
+    far = grid_of_geoid(tmp_path / "far.gtx", (0.0, 0.0)).read_bytes()
+    (tmp_path / "far.gtx").write_bytes(struct.pack(">2d", 10.0, 10.0) + far[16:])
+    assert main([*words, str(tmp_path / "far.gtx")]) == 4
+    assert "does not reach the origin" in capsys.readouterr().err
+    assert main([*words, str(grid_of_geoid(tmp_path / "geoid.gtx", (20.0, -8.0)))]) == 0
+    stated = tomllib.loads((tmp_path / "mine.toml").read_text())["dem"]
+    assert stated["geoid_m"] == pytest.approx(-30.0, abs=0.01)
+    assert stated["geoid_slope_arcsec"] == pytest.approx([20.0, -8.0], abs=0.2)
 
 
 BAD = [

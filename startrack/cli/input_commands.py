@@ -189,6 +189,8 @@ COMMANDS = (
                             "--highest-beyond M", "ground off the maps is no higher (default: 8850 on the Earth; on "
                             "the Moon the highest of the maps)", float,
                         ),
+                        flag("--geoid GRID", "of PROJ, above which the maps count heights: a name that it finds, as "
+                             "us_nga_egm96_15.tif, or a file"),
                     ),
                     "output": (
                         flag("-o --output NAME.toml", "the terrain file", required=True), flags.OVERWRITE, flags.JSON,

@@ -13,7 +13,9 @@ import numpy as np
 from startrack.core.errors import BadOutput, length_text
 from startrack.core.files import check_output, data_dir
 from startrack.core.types import BadInput
+from startrack.frames import Site
 from startrack.terrain.earth_projection import EARTH_MEAN_RADIUS_M
+from startrack.terrain.geoid import geoid_at
 from startrack.terrain.height_map import HeightMap
 from startrack.terrain.io import terrain_from_dict
 from startrack.terrain.map_comparison import compare_with_finest, crest_angle_rad_per_m
@@ -76,7 +78,7 @@ def import_maps(
     maps: Sequence[str | Path], output: str | Path, *, latitude_rad: float, longitude_rad: float,
     half_m: Sequence[float], radius_m: float, scale: Sequence[float] = (), offset_m: Sequence[float] = (),
     height_sigma_m: float | None = None, compare: Sequence[str | Path] = (), camera_height_m: float = 1.5,
-    highest_beyond_m: float | None = None, overwrite: bool = False,
+    highest_beyond_m: float | None = None, geoid_grid: str | None = None, overwrite: bool = False,
 ) -> ImportedTerrain:  # fmt: skip
     """Write the terrain file `output` and, beside it, a crop of each map: NAME-1.tif, the finest, and so on.
 
@@ -85,7 +87,8 @@ def import_maps(
     of single posts [m]; None measures it where a finer map covers a part of the map that makes the horizon: one of the
     `maps`, of the files `compare`, or a shipped one; else it is estimated from the map's roughness, with the published
     error of products that are known. camera_height_m: above the ground [m]. highest_beyond_m: ground off the maps is no
-    higher; None: as `io.KEYS` says. overwrite: replace existing files.
+    higher; None: as `io.KEYS` says. geoid_grid: of PROJ, from which heights of the maps count (None: their geoid is not
+    known). overwrite: replace existing files.
 
     Raises BadInput bad_terrain, BadOutput of `output`; nothing is then written.
     """
@@ -131,10 +134,26 @@ def import_maps(
         at = crops[0].row_column(np.array(latitude_rad), np.array(longitude_rad))
         values["origin"]["height_m"] = float(np.nan_to_num(np.round(crops[0].sample(at))))
         values["air"] = {"terrestrial_refraction": REFRACTION_1, REFRACTION.key: REFRACTION.sigma}
+    if geoid_grid is not None:
+        values["dem"] |= _geoid_values(geoid_grid, values)
     _write_terrain(output, values, errors, dict(zip(files, crops, strict=True)))
     warnings = [*errors.warnings, *spacing_warnings(crops, radius_m), *_place_warnings(crops, values)]
     warnings += smoothness_warnings(rim, errors.height_sigma_m)
     return ImportedTerrain(path=output, errors=errors, warnings=warnings)
+
+
+def _geoid_values(grid: str, values: dict[str, Any]) -> dict[str, Any]:
+    """The keys of [dem] that state the geoid at the origin of a terrain file's `values`, by a `grid` of PROJ.
+
+    Raises BadInput (bad_terrain).
+    """
+    if values["body"] != "earth":
+        raise BadInput("bad_terrain", "heights above a geoid are those of maps of the Earth")
+    at = values["origin"]
+    geoid = geoid_at(grid, Site("earth", *np.radians([at["latitude_deg"], at["longitude_deg"]]), at["height_m"]))
+    return {
+        "geoid_m": round(geoid.height_m, 3), "geoid_slope_arcsec": [round(slope, 3) for slope in geoid.slope_arcsec],
+    }  # fmt: skip
 
 
 def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, crops: dict[Path, Raster]) -> None:

@@ -66,3 +66,24 @@ def test_a_prediction_is_a_map_in_the_projection_of_the_terrain(folder):
         lon, lat = file.xy(file.height // 2, file.width // 2)
         assert (lat, lon) == pytest.approx(PLACE_DEG, abs=1e-4)
         assert np.isfinite(file.read(1)).any()
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_a_track_is_better_than_its_first_image(folder, moves):
+    terrain, drive = str(folder / "ground.toml"), folder / f"drive-{moves}"
+    way = ["--every", "327"]
+    if moves:
+        (folder / "way.csv").write_text("east_m,north_m\n-600,150\n-480,250\n")
+        way += ["--path", str(folder / "way.csv"), "--speed", "0.1"]
+    else:
+        way += ["--east", "-600", "--north", "150"]
+    assert main(["render", "-t", terrain, "-n", "4", "--seed", "6", *way, *TIME, "-D", str(drive), "-q"]) == 0
+    motion = ["--odometry", str(drive / "odometry.tum")] if moves else ["--at-rest"]
+    assert main(["track", str(drive), *motion, "-D", str(drive / "out"), "-q"]) == 0
+    frames = json.loads((drive / "out" / "track.json").read_text())["frames"]
+    assert [one["status"] for one in frames] == ["used"] * 4
+    for one in frames:
+        truth = json.loads((drive / one["image"].replace(".png", ".truth.json")).read_text())["position"]
+        error_m = np.hypot(one["east_m"] - truth["east_m"], one["north_m"] - truth["north_m"])
+        assert error_m < 1.5 * one["radius95_m"]
+        assert one["radius95_m"] < frames[0]["filtered_radius95_m"]

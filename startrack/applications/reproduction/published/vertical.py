@@ -1,0 +1,40 @@
+"""The local vertical on a sphere: its direction at a position, its measurement with a tilt, the position that it gives.
+
+Source: the description of celestial navigation in Kua 2008, section 2.1.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from startrack.core.types import Array
+from startrack.frames import R_enu_fixed, R_from_rotvec, Site, enu_from_latlon, sphere_radius_m
+
+RADIANS_OF_ARCSEC = float(np.pi / 648_000.0)
+AXIS_BY_MEAN = float(np.sqrt(2.0 / np.pi))  # standard deviation of an axis over the mean length of two (Rayleigh)
+
+
+def vertical_at(position_m: Array, site: Site) -> Array:
+    """Direction (3,) of the vertical at `position_m` (2,) on the sphere of a `site`, in the site's enu."""
+    level = np.asarray(position_m) / sphere_radius_m(site)
+    return np.append(level, np.sqrt(1.0 - level @ level))
+
+
+def position_of_vertical(vertical: Array, site: Site) -> Array:
+    """Position (2,) [m] in the enu of a `site` where the vertical has the direction `vertical` (3,) in that enu.
+
+    The stars and the clock give the attitude in the frame of the Moon; there a vertical is a latitude and a longitude.
+    """
+    x, y, z = vertical @ R_enu_fixed(site)
+    latitude, longitude = np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)
+    return np.asarray(enu_from_latlon(site, latitude, longitude, site.height_m)[:2])
+
+
+def tilt_vertical(vertical: Array, tilt_rad: Array) -> Array:
+    """The `vertical` (3,) turned by `tilt_rad` (2,) about east and north, as an inclinometer with that error has it."""
+    return np.asarray(R_from_rotvec(np.append(tilt_rad, 0.0)) @ vertical)
+
+
+def draw_tilt_rad(rng: np.random.Generator, mean_arcsec: float) -> Array:
+    """A tilt (2,) [rad] about east and north with normal components; its length is `mean_arcsec` in the mean."""
+    return rng.standard_normal(2) * (mean_arcsec * AXIS_BY_MEAN * RADIANS_OF_ARCSEC)

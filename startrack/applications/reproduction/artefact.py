@@ -45,6 +45,7 @@ class Size:
     sweep_skies: int  # per magnitude and per aspect ratio
     sweep_per_sky: int
     traverses: int
+    compared_per_sky: int  # by every method that the thesis names
 
     def limit_our_positions(self, most: int) -> Size:
         """This size with our method on at most `most` positions per starfield, ten times as many in figure 3.10."""
@@ -52,8 +53,8 @@ class Size:
         return replace(self, **per_sky, ours_one_sky=min(self.ours_one_sky, 10 * most))
 
 
-QUICK = Size("quick", 10, 500, 60, 60, 10, 5_000, 500, 5, 12, 10)
-FULL = Size("full", 10, 10_000, 10_000, 1_000, 500, 100_000, 100_000, 10, 100, 100)
+QUICK = Size("quick", 10, 500, 60, 60, 10, 5_000, 500, 5, 12, 10, 2)
+FULL = Size("full", 10, 10_000, 10_000, 1_000, 500, 100_000, 100_000, 10, 100, 100, 20)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from startrack.applications.reproduction.artefact import Context
+from startrack.applications.reproduction.comparison import compare_places
 from startrack.applications.reproduction.simulator import (
     ASPECT_RATIO,
     MAGNITUDE,
@@ -34,8 +35,12 @@ FIX_SOURCES = (  # their content is part of a chunk's key
     "localization/*.py", "terrain/cylinder.py", "applications/reproduction/simulator.py",
     "applications/reproduction/methods.py",
 )  # fmt: skip
+COMPARED_SOURCES = (  # of the chunks of all methods too
+    "applications/reproduction/comparison.py", "applications/reproduction/published/*.py", "evidence/sky_step.py",
+)  # fmt: skip
 KUA, OURS, BOUND = "kua", "ours", "bound"  # the thesis's two steps; ours; the limit for a perfect list
-FIXES_PER_CHUNK = {KUA: 1000, OURS: 100, BOUND: 200}  # about a second of work
+ALL_METHODS = "all"  # that the thesis names, with `compare_places`
+FIXES_PER_CHUNK = {KUA: 1000, OURS: 100, BOUND: 200, ALL_METHODS: 5}  # a second to ten of work
 ERROR_OF = {KUA: ("hull_m", "refined_m"), OURS: ("fix_m",), BOUND: ("centroid_m",)}
 ANSWERED = {KUA: "settled", OURS: "located"}
 
@@ -59,7 +64,8 @@ class Task:
     @property
     def key(self) -> str:
         """Of its chunk."""
-        return settings_digest(FIX_SOURCES, asdict(self))
+        more = COMPARED_SOURCES if self.method == ALL_METHODS else ()
+        return settings_digest(FIX_SOURCES + more, asdict(self))
 
 
 def tasks_of(method: str, seed: int, sky: int, count: int, **settings: Any) -> list[Task]:
@@ -83,8 +89,10 @@ def compute_chunk(task: Task) -> Chunk:
     the method.
 
     kua: `hull_m`, `refined_m` (n, 2), `settled` (n,). ours: `located` (n,), and of the located ones `fix_m` (m, 2).
-    bound: `centroid_m` (n, 2).
+    bound: `centroid_m` (n, 2). all: see `compare_places`.
     """
+    if task.method == ALL_METHODS:
+        return compare_places(task.seed, task.sky, task.start, task.stop)
     sky, cylinder = Sky.draw(task.seed, task.sky, task.magnitude), crater(task.aspect_ratio)
     points, radius_m = sky.project_to_rim_plane(cylinder), cylinder.radius_m
     truth = draw_positions(task.seed, task.sky, task.start, task.stop)

@@ -1,0 +1,176 @@
+"""Every method that the thesis names, at the same places: `COMPARED` by name, what each is given, and their answers."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from startrack.applications.reproduction.published.cozman_krotkov import locate_by_posterior
+from startrack.applications.reproduction.published.malay import draw_readings, locate_at_rest
+from startrack.applications.reproduction.published.sigel_wettergreen import locate_by_inclinometer
+from startrack.applications.reproduction.published.skylines import MapGrid, dark_skyline, lit_skyline, traced_grid
+from startrack.applications.reproduction.published.talluri_aggarwal import locate_by_four_bearings
+from startrack.applications.reproduction.simulator import (
+    PERFECT,
+    SHACKLETON,
+    Sky,
+    Stream,
+    crater,
+    draw_positions,
+    visible_stars,
+)
+from startrack.core.chunk_store import Chunk
+from startrack.core.types import Array, Bools, Evidence, MeasuredSkyline, NotLocated
+from startrack.localization import ExactPosterior, PseudoGradient, descend, hull_position
+from startrack.terrain import Cylinder
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One place in the thesis's crater with all that can be measured there, each drawn when it is first used."""
+
+    seed: int
+    sky_number: int
+    number: int  # of the place
+
+    @cached_property
+    def terrain(self) -> Cylinder:
+        return crater()
+
+    @cached_property
+    def sky(self) -> Sky:
+        return Sky.draw(self.seed, self.sky_number)
+
+    @cached_property
+    def truth_m(self) -> Array:
+        """The place (2,) [m]."""
+        return draw_positions(self.seed, self.sky_number, self.number, self.number + 1)[0]
+
+    @cached_property
+    def points_m(self) -> Array:
+        """The stars (n, 2) [m] on the plane of the rim."""
+        return self.sky.project_to_rim_plane(self.terrain)
+
+    @cached_property
+    def seen(self) -> Bools:
+        """The stars (n,) in sight."""
+        return visible_stars(self.points_m, self.truth_m, self.terrain.radius_m)
+
+    @cached_property
+    def evidence(self) -> Evidence:
+        return PERFECT.evidence(self.sky, self.seen)
+
+    @cached_property
+    def grid(self) -> MapGrid:
+        return traced_grid(self.terrain)
+
+    @cached_property
+    def fix_m(self) -> Array:
+        """Position (2,) [m] by startrack. Raises NotLocated."""
+        return ExactPosterior()(self.evidence, self.terrain).position_enu_m[:2]
+
+    @cached_property
+    def lit(self) -> MeasuredSkyline:
+        return lit_skyline(self.truth_m, self.terrain, self.draws(Stream.LIT))
+
+    @cached_property
+    def dark(self) -> MeasuredSkyline:
+        """Raises NotLocated where startrack has no position: then it measures no skyline either."""
+        return dark_skyline(self.evidence, self.fix_m, self.terrain)
+
+    def draws(self, stream: Stream) -> np.random.Generator:
+        """Random numbers of a `stream` for this place."""
+        return np.random.default_rng([self.seed, stream, self.sky_number, self.number])
+
+
+@dataclass(frozen=True)
+class ComparedMethod:
+    """A method, what it is given, its published figure, and its function of a scene, which may raise NotLocated."""
+
+    name: str
+    sees: str
+    heading: str
+    clock: str
+    vertical: str
+    prior: str
+    published: str
+    locate: Callable[[Scene], Array]  # position (2,) [m]
+
+
+LIT = ("lit skyline", "given", "no", "given", "the map")
+DARK = ("skyline by stars", "stars", "yes", "stars", "the map")
+STARS = ("stars", "stars", "yes", "stars", "the map")
+TILTED = ("stars", "stars", "yes", "measured", "none")
+COMPARED = {  # startrack first: the skyline by stars stands on its fix, whose time is its own
+    "startrack": ComparedMethod("startrack", *STARS, "", lambda scene: scene.fix_m),
+    "sigel-wettergreen": ComparedMethod(
+        "Sigel and Wettergreen", *TILTED, "1.2 km",
+        lambda scene: locate_by_inclinometer(scene.truth_m, SHACKLETON, scene.draws(Stream.TILT))[0],
+    ),
+    "malay": ComparedMethod(
+        "Malay et al.", *TILTED, "400 m",
+        lambda scene: locate_at_rest(draw_readings(scene.truth_m, SHACKLETON, scene.draws(Stream.REST)), SHACKLETON),
+    ),
+    "talluri-aggarwal-lit": ComparedMethod(
+        "Talluri and Aggarwal", *LIT, "26 m, with noise 55 m",
+        lambda scene: locate_by_four_bearings(scene.lit, scene.terrain, scene.grid),
+    ),
+    "talluri-aggarwal-dark": ComparedMethod(
+        "Talluri and Aggarwal", *DARK, "",
+        lambda scene: locate_by_four_bearings(scene.dark, scene.terrain, scene.grid),
+    ),
+    "cozman-krotkov-lit": ComparedMethod(
+        "Cozman and Krotkov", *LIT, "hundreds of m", lambda scene: locate_by_posterior(scene.lit, scene.grid).mean_m
+    ),
+    "cozman-krotkov-dark": ComparedMethod(
+        "Cozman and Krotkov", *DARK, "", lambda scene: locate_by_posterior(scene.dark, scene.grid).mean_m
+    ),
+    "kua-hull": ComparedMethod(
+        "Kua 2008, hull and circle", *STARS, "637 m",
+        lambda scene: hull_position(scene.points_m[scene.seen], scene.terrain.wall_m, scene.terrain.radius_m),
+    ),
+    "kua-pseudo-gradient": ComparedMethod(
+        "Kua 2008, pseudo-gradient", *STARS, "34.2 m", lambda scene: _descend_from_hull(scene)
+    ),
+}  # fmt: skip
+
+
+def _descend_from_hull(scene: Scene) -> Array:
+    """Where the thesis's descent ends, settled or not."""
+    method = PseudoGradient()
+    first = hull_position(scene.points_m[scene.seen], scene.terrain.wall_m, scene.terrain.radius_m)
+    end, _ = descend(scene.points_m, scene.seen, first, scene.terrain.radius_m, method.gain, method.most_steps)
+    return end
+
+
+def compare_places(seed: int, sky: int, start: int, stop: int) -> Chunk:
+    """Answers at places number `start` to `stop` - 1 of a `sky`, in the order of COMPARED.
+
+    `truth_m` (n, 2), `position_m` (n, methods, 2), NaN where a method refuses, and `seconds` (1, methods) of processor
+    time for the methods: without the skylines, which they are given, and the grid, which is traced once a process.
+    """
+    scenes = [Scene(seed, sky, number) for number in range(start, stop)]
+    positions = np.full((len(scenes), len(COMPARED), 2), np.nan)
+    seconds = np.zeros((1, len(COMPARED)))
+    _answer(COMPARED["startrack"], Scene(seed, sky, start))  # compiles and loads before the clock starts
+    for k, scene in enumerate(scenes):
+        _ = scene.grid, scene.seen, scene.evidence, scene.lit
+        for j, method in enumerate(COMPARED.values()):
+            began = time.thread_time()
+            positions[k, j] = _answer(method, scene)
+            seconds[0, j] += time.thread_time() - began
+            if np.isfinite(positions[k, 0, 0]):
+                _ = scene.dark
+    return {"truth_m": np.stack([scene.truth_m for scene in scenes]), "position_m": positions, "seconds": seconds}
+
+
+def _answer(method: ComparedMethod, scene: Scene) -> Array:
+    """The position (2,) [m] by a `method`; NaN where it refuses."""
+    try:
+        return method.locate(scene)
+    except NotLocated:
+        return np.full(2, np.nan)

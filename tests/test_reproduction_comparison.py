@@ -1,0 +1,76 @@
+"""All methods at the same places: the chunks, the table and its statistics."""
+
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from startrack.applications.reproduction import QUICK, Context, fix_store, write_artefact
+from startrack.applications.reproduction.comparison import COMPARED, Scene, compare_places
+from startrack.applications.reproduction.method_table import ComparedErrors, method_table
+from startrack.applications.reproduction.methods import ALL_METHODS, KUA, Task, compute_chunk
+from startrack.applications.reproduction.simulator import draw_positions
+from startrack.cli.console import Progress
+from startrack.core.types import NotLocated
+
+FEW = replace(QUICK, skies=2, compared_per_sky=2)
+
+
+@contextmanager
+def hide_progress(what, total):
+    yield Progress()
+
+
+@pytest.fixture(scope="module")
+def chunk():
+    return compare_places(0, 1, 0, 3)
+
+
+def test_the_places_are_those_of_the_other_tables(chunk):
+    np.testing.assert_array_equal(chunk["truth_m"], draw_positions(0, 1, 0, 3))
+    kua = compute_chunk(Task(KUA, 0, 1, 0, 3))
+    names = list(COMPARED)
+    np.testing.assert_array_equal(chunk["position_m"][:, names.index("kua-hull")], kua["hull_m"])
+    np.testing.assert_array_equal(chunk["position_m"][:, names.index("kua-pseudo-gradient")], kua["refined_m"])
+
+
+def test_a_place_is_the_same_in_any_chunk(chunk):
+    np.testing.assert_array_equal(compare_places(0, 1, 2, 3)["position_m"], chunk["position_m"][2:])
+    assert Task(ALL_METHODS, 0, 1, 0, 3).key != Task(ALL_METHODS, 1, 1, 0, 3).key
+
+
+def test_methods_without_a_fix_to_measure_from_refuse(monkeypatch):
+    def refuse(self, evidence, terrain):
+        raise NotLocated("nothing fits")
+
+    monkeypatch.setattr("startrack.applications.reproduction.comparison.ExactPosterior.__call__", refuse)
+    chunk = compare_places(0, 0, 0, 1)
+    refused = {name for name, one in zip(COMPARED, chunk["position_m"][0], strict=True) if np.isnan(one).all()}
+    assert refused == {"startrack"} | {name for name in COMPARED if name.endswith("-dark")}
+    with pytest.raises(NotLocated):
+        _ = Scene(0, 0, 0).dark
+
+
+def test_statistics_of_errors_with_a_refusal():
+    position = np.full((3, len(COMPARED), 2), np.nan)
+    position[:2, 0] = [[3.0, 4.0], [0.0, 1.0]]
+    found = ComparedErrors(np.zeros((3, 2)), position, np.zeros(len(COMPARED)))
+    one = found.statistics("startrack")
+    assert one["mean_m"] == one["median_m"] == 3.0 and one["mean_sigma_m"] == pytest.approx(2.0)
+    assert one["max_m"] == 5.0 and (one["count"], one["refused"]) == (2, 1)
+    assert found.statistics("kua-hull")["mean_m"] is None and found.statistics("kua-hull")["refused"] == 3
+
+
+def test_the_same_seed_gives_the_same_bytes(tmp_path):
+    def write(name):
+        with fix_store(tmp_path / name, jobs=1, progress=hide_progress) as store:
+            artefact = method_table(Context(FEW, 3, store))
+        return artefact, {
+            path.name: path.read_bytes() for path in write_artefact(artefact, tmp_path / name, plots=False)
+        }
+
+    artefact, one = write("one")
+    assert one == write("two")[1] and set(one) == {"methods.md", "methods.ecsv"}
+    assert all(method.name in artefact.text for method in COMPARED.values())
+    assert set(artefact.timing_ms) == set(COMPARED)

@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from startrack.applications.reproduction.published.cozman_krotkov import locate_by_posterior
+from startrack.applications.reproduction.published.kua_drive import draw_drive, locate_by_drive, outermost_stars
 from startrack.applications.reproduction.published.malay import draw_readings, locate_at_rest
 from startrack.applications.reproduction.published.sigel_wettergreen import locate_by_inclinometer
 from startrack.applications.reproduction.published.skylines import MapGrid, dark_skyline, lit_skyline, traced_grid
@@ -129,6 +130,10 @@ COMPARED = {  # startrack first: the skyline by stars stands on its fix, whose t
     "cozman-krotkov-dark": ComparedMethod(
         "Cozman and Krotkov", *DARK, "", lambda scene: locate_by_posterior(scene.dark, scene.grid).mean_m
     ),
+    "kua-drive": ComparedMethod(
+        "Kua's earlier work", "stars of a drive", "stars", "yes", "stars", "diameter", "800 m",
+        lambda scene: estimate_drive(scene)[0],
+    ),
     "kua-hull": ComparedMethod(
         "Kua 2008, hull and circle", *STARS, "637 m",
         lambda scene: hull_position(scene.points_m[scene.seen], scene.terrain.wall_m, scene.terrain.radius_m),
@@ -137,6 +142,15 @@ COMPARED = {  # startrack first: the skyline by stars stands on its fix, whose t
         "Kua 2008, pseudo-gradient", *STARS, "34.2 m", lambda scene: _descend_from_hull(scene)
     ),
 }  # fmt: skip
+
+
+def estimate_drive(scene: Scene) -> tuple[Array, float]:
+    """Position (2,) [m] at the end of a drive to the place of a `scene`, and depth of the crater [m], both by it."""
+    drive = draw_drive(scene.truth_m, scene.terrain.radius_m, scene.draws(Stream.DRIVE))
+    seen = [visible_stars(scene.points_m, stop, scene.terrain.radius_m) for stop in drive.positions_m]
+    vectors = [outermost_stars(scene.points_m[one], scene.terrain.wall_m) for one in seen]
+    positions, depth_m = locate_by_drive(vectors, drive.legs_m, scene.terrain.radius_m)
+    return positions[-1], depth_m
 
 
 def _descend_from_hull(scene: Scene) -> Array:

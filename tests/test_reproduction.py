@@ -215,7 +215,7 @@ def test_distances_between_changes_are_the_thesis_s():
 def test_each_table_and_figure_is_written(small_run, name):
     artefact, files = small_run[name]
     pictures = [path for path in files if path.suffix == ".png"]
-    assert len(pictures) == {"table3.1": 0, "methods": 0, "figB": 10, "fig3.10": 2}.get(name, 1)
+    assert len(pictures) == {"table3.1": 0, "methods": 2, "figB": 10, "fig3.10": 2}.get(name, 1)
     for path in pictures:
         with Image.open(path) as picture:
             picture.load()

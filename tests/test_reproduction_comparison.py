@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from startrack.applications.reproduction import QUICK, Context, fix_store, write_artefact
-from startrack.applications.reproduction.comparison import COMPARED, Scene, compare_places
-from startrack.applications.reproduction.method_table import ComparedErrors, method_table
+from startrack.applications.reproduction.comparison import COMPARED, ComparedErrors, compare_places
+from startrack.applications.reproduction.method_table import method_table
 from startrack.applications.reproduction.methods import ALL_METHODS, KUA, Task, compute_chunk
+from startrack.applications.reproduction.scene import Scene
 from startrack.applications.reproduction.simulator import draw_positions
 from startrack.cli.console import Progress
 from startrack.core.types import NotLocated
@@ -44,7 +45,7 @@ def test_methods_without_a_fix_to_measure_from_refuse(monkeypatch):
     def refuse(self, evidence, terrain):
         raise NotLocated("nothing fits")
 
-    monkeypatch.setattr("startrack.applications.reproduction.comparison.ExactPosterior.__call__", refuse)
+    monkeypatch.setattr("startrack.applications.reproduction.scene.ExactPosterior.__call__", refuse)
     chunk = compare_places(0, 0, 0, 1)
     refused = {name for name, one in zip(COMPARED, chunk["position_m"][0], strict=True) if np.isnan(one).all()}
     assert refused == {"startrack"} | {name for name in COMPARED if name.endswith("-dark")}
@@ -67,10 +68,10 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
         with fix_store(tmp_path / name, jobs=1, progress=hide_progress) as store:
             artefact = method_table(Context(FEW, 3, store))
         return artefact, {
-            path.name: path.read_bytes() for path in write_artefact(artefact, tmp_path / name, plots=False)
+            path.name: path.read_bytes() for path in write_artefact(artefact, tmp_path / name, plots=True)
         }
 
     artefact, one = write("one")
-    assert one == write("two")[1] and set(one) == {"methods.md", "methods.ecsv"}
+    assert one == write("two")[1] and set(one) == {"methods.md", "methods.ecsv", "methods.png", "methods.map.png"}
     assert all(method.name in artefact.text for method in COMPARED.values())
     assert set(artefact.timing_ms) == set(COMPARED)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from startrack.applications.reproduction.comparison import Scene, estimate_drive
+from startrack.applications.reproduction.comparison import estimate_drive
 from startrack.applications.reproduction.published.kua_drive import (
     DRIVE_M,
     ODOMETRY_SIGMA_1,
@@ -12,6 +12,7 @@ from startrack.applications.reproduction.published.kua_drive import (
     locate_by_drive,
     outermost_stars,
 )
+from startrack.applications.reproduction.scene import Scene
 from startrack.applications.reproduction.simulator import crater, draw_positions
 from startrack.core.types import MIDDLES_RAD, SECTORS, NotLocated
 from startrack.localization import hull_position

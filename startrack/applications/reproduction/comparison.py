@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -13,79 +13,12 @@ from startrack.applications.reproduction.published.cozman_krotkov import locate_
 from startrack.applications.reproduction.published.kua_drive import draw_drive, locate_by_drive, outermost_stars
 from startrack.applications.reproduction.published.malay import draw_readings, locate_at_rest
 from startrack.applications.reproduction.published.sigel_wettergreen import locate_by_inclinometer
-from startrack.applications.reproduction.published.skylines import MapGrid, dark_skyline, lit_skyline, traced_grid
 from startrack.applications.reproduction.published.talluri_aggarwal import locate_by_four_bearings
-from startrack.applications.reproduction.simulator import (
-    PERFECT,
-    SHACKLETON,
-    Sky,
-    Stream,
-    crater,
-    draw_positions,
-    visible_stars,
-)
+from startrack.applications.reproduction.scene import Scene
+from startrack.applications.reproduction.simulator import SHACKLETON, Stream, visible_stars
 from startrack.core.chunk_store import Chunk
-from startrack.core.types import Array, Bools, Evidence, MeasuredSkyline, NotLocated
-from startrack.localization import ExactPosterior, PseudoGradient, descend, hull_position
-from startrack.terrain import Cylinder
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """One place in the thesis's crater with all that can be measured there, each drawn when it is first used."""
-
-    seed: int
-    sky_number: int
-    number: int  # of the place
-
-    @cached_property
-    def terrain(self) -> Cylinder:
-        return crater()
-
-    @cached_property
-    def sky(self) -> Sky:
-        return Sky.draw(self.seed, self.sky_number)
-
-    @cached_property
-    def truth_m(self) -> Array:
-        """The place (2,) [m]."""
-        return draw_positions(self.seed, self.sky_number, self.number, self.number + 1)[0]
-
-    @cached_property
-    def points_m(self) -> Array:
-        """The stars (n, 2) [m] on the plane of the rim."""
-        return self.sky.project_to_rim_plane(self.terrain)
-
-    @cached_property
-    def seen(self) -> Bools:
-        """The stars (n,) in sight."""
-        return visible_stars(self.points_m, self.truth_m, self.terrain.radius_m)
-
-    @cached_property
-    def evidence(self) -> Evidence:
-        return PERFECT.evidence(self.sky, self.seen)
-
-    @cached_property
-    def grid(self) -> MapGrid:
-        return traced_grid(self.terrain)
-
-    @cached_property
-    def fix_m(self) -> Array:
-        """Position (2,) [m] by startrack. Raises NotLocated."""
-        return ExactPosterior()(self.evidence, self.terrain).position_enu_m[:2]
-
-    @cached_property
-    def lit(self) -> MeasuredSkyline:
-        return lit_skyline(self.truth_m, self.terrain, self.draws(Stream.LIT))
-
-    @cached_property
-    def dark(self) -> MeasuredSkyline:
-        """Raises NotLocated where startrack has no position: then it measures no skyline either."""
-        return dark_skyline(self.evidence, self.fix_m, self.terrain)
-
-    def draws(self, stream: Stream) -> np.random.Generator:
-        """Random numbers of a `stream` for this place."""
-        return np.random.default_rng([self.seed, stream, self.sky_number, self.number])
+from startrack.core.types import Array, NotLocated
+from startrack.localization import PseudoGradient, descend, hull_position
 
 
 @dataclass(frozen=True)
@@ -188,3 +121,34 @@ def _answer(method: ComparedMethod, scene: Scene) -> Array:
         return method.locate(scene)
     except NotLocated:
         return np.full(2, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedErrors:
+    """Errors of all methods at the same places, in the order of COMPARED."""
+
+    truth_m: Array  # (n, 2)
+    position_m: Array  # (n, methods, 2); NaN where a method refuses
+    ms_per_fix: Array  # (methods,) of processor time
+
+    def errors_m(self, name: str) -> Array:
+        """Errors (m,) [m] of the method `name` where it has an answer."""
+        offset = self.position_m[:, list(COMPARED).index(name)] - self.truth_m
+        return np.hypot(*offset[np.isfinite(offset[:, 0])].T)
+
+    def statistics(self, name: str) -> dict[str, Any]:
+        """Mean with its standard error, median, 95 % and largest of the errors [m], and the counts of a method.
+
+        None where nothing is known: of no answer, and the standard error of one.
+        """
+        errors = self.errors_m(name)
+        count, known = len(errors), len(errors) > 0
+        return {
+            "mean_m": float(errors.mean()) if known else None,
+            "mean_sigma_m": float(errors.std(ddof=1) / np.sqrt(count)) if count > 1 else None,
+            "median_m": float(np.median(errors)) if known else None,
+            "p95_m": float(np.quantile(errors, 0.95)) if known else None,
+            "max_m": float(errors.max()) if known else None,
+            "count": count,
+            "refused": len(self.truth_m) - count,
+        }

@@ -2,50 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from startrack.applications.reproduction.artefact import Artefact, Context, markdown_table
-from startrack.applications.reproduction.comparison import COMPARED, ComparedMethod
+from startrack.applications.reproduction.comparison import COMPARED, ComparedErrors, ComparedMethod
+from startrack.applications.reproduction.method_figures import answers_picture, cumulative_picture
 from startrack.applications.reproduction.methods import ALL_METHODS, tasks_of
-from startrack.core.types import Array
 from startrack.output import Column
 
 HEAD = ("method", "sees", "heading", "clock", "vertical", "prior", "mean (m)", "median (m)", "95 % (m)", "largest (m)",
         "refused", "published")  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class ComparedErrors:
-    """Errors of all methods at the same places, in the order of COMPARED."""
-
-    truth_m: Array  # (n, 2)
-    position_m: Array  # (n, methods, 2); NaN where a method refuses
-    ms_per_fix: Array  # (methods,) of processor time
-
-    def errors_m(self, name: str) -> Array:
-        """Errors (m,) [m] of the method `name` where it has an answer."""
-        offset = self.position_m[:, list(COMPARED).index(name)] - self.truth_m
-        return np.hypot(*offset[np.isfinite(offset[:, 0])].T)
-
-    def statistics(self, name: str) -> dict[str, Any]:
-        """Mean with its standard error, median, 95 % and largest of the errors [m], and the counts of a method.
-
-        None where nothing is known: of no answer, and the standard error of one.
-        """
-        errors = self.errors_m(name)
-        count, known = len(errors), len(errors) > 0
-        return {
-            "mean_m": float(errors.mean()) if known else None,
-            "mean_sigma_m": float(errors.std(ddof=1) / np.sqrt(count)) if count > 1 else None,
-            "median_m": float(np.median(errors)) if known else None,
-            "p95_m": float(np.quantile(errors, 0.95)) if known else None,
-            "max_m": float(errors.max()) if known else None,
-            "count": count,
-            "refused": len(self.truth_m) - count,
-        }
 
 
 def collect_compared(context: Context) -> ComparedErrors:
@@ -78,6 +46,7 @@ the processor time of no method, since a file must not depend on the machine: `-
         line=f"startrack {_number(statistics['startrack']['mean_m'])} m, best {COMPARED[best[1]].name} {best[0]:.1f} m",
         text=text,
         columns=_columns(statistics),
+        pictures={"methods": cumulative_picture(found), "methods.map": answers_picture(found)},
         values={
             "thesis": {name: method.published for name, method in COMPARED.items()},
             "reproduced": {name: one for name, one in statistics.items() if name != "startrack"},

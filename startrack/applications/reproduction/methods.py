@@ -36,7 +36,8 @@ FIX_SOURCES = (  # their content is part of a chunk's key
     "applications/reproduction/methods.py",
 )  # fmt: skip
 COMPARED_SOURCES = (  # of the chunks of all methods too
-    "applications/reproduction/comparison.py", "applications/reproduction/published/*.py", "evidence/sky_step.py",
+    "applications/reproduction/comparison.py", "applications/reproduction/scene.py",
+    "applications/reproduction/published/*.py", "evidence/sky_step.py",
 )  # fmt: skip
 KUA, OURS, BOUND = "kua", "ours", "bound"  # the thesis's two steps; ours; the limit for a perfect list
 ALL_METHODS = "all"  # that the thesis names, with `compare_places`

@@ -62,7 +62,7 @@ def locate_by_drive(vectors: list[Array], legs_m: Array, radius_m: float) -> tup
 
     `vectors` of each stop (k, 2) are those of `outermost_stars`, `legs_m` (stops - 1, 2) the odometry. Minimised are
     the distances of the stars' points from the rim, and of the legs from the odometry. Raises NotLocated where the
-    iteration does not settle.
+    iteration does not settle, or settles outside the crater.
     """
     from scipy.optimize import least_squares
 
@@ -76,8 +76,18 @@ def locate_by_drive(vectors: list[Array], legs_m: Array, radius_m: float) -> tup
         off_legs = (np.diff(positions, axis=0) - legs_m) / leg_sigma[:, None]
         return np.concatenate([off_rim / SKYLINE_SIGMA_M, off_legs.ravel()])
 
-    first = np.append(np.concatenate([np.zeros((1, 2)), np.cumsum(legs_m, axis=0)]).ravel(), 2 * START_DEPTH_1)
+    driven = np.concatenate([np.zeros((1, 2)), np.cumsum(legs_m, axis=0)])
+    start = np.mean([_fit_circle(2 * START_DEPTH_1 * radius_m * one, radius_m) for one in vectors] - driven, axis=0)
+    first = np.append((start + driven).ravel(), 2 * START_DEPTH_1)
     found = least_squares(residuals, first, x_scale=np.append(np.full(2 * stops, radius_m / 10), START_DEPTH_1))
-    if not found.success:
-        raise NotLocated("the least squares over depth and positions do not settle")
-    return found.x[:-1].reshape(stops, 2), float(found.x[-1] * radius_m)
+    positions = found.x[:-1].reshape(stops, 2)
+    if not found.success or found.x[-1] <= 0.0 or np.hypot(*positions.T).max() > radius_m:
+        raise NotLocated("the least squares over depth and positions do not settle in the crater")
+    return positions, float(found.x[-1] * radius_m)
+
+
+def _fit_circle(points_m: Array, radius_m: float) -> Array:
+    """Position (2,) [m] from which the points (n, 2) lie on the rim: the linear fit of Kua 2008, eq. 3.4 to 3.6."""
+    a = np.column_stack([np.ones(len(points_m)), -2 * points_m])
+    solution, *_ = np.linalg.lstsq(a, radius_m**2 - np.square(points_m).sum(axis=1), rcond=None)
+    return -solution[1:]

@@ -48,6 +48,10 @@ MOON_RAD, DARK_RAD = np.radians([15.0, 60.0]), np.radians(-5.0)  # elevations of
 REST_EVERY_S = 327.0  # twelve exposures an hour
 RADIUS999_SIGMAS = 3.717  # of a circle in two dimensions
 SEED = 29
+HEAD = [
+    "frames", "answered", "mean error, m", "median", "largest", "NEES", "beyond the 99.9 % circle", "beyond twice",
+    "wanted mean",
+]  # fmt: skip
 
 
 def jacksboro(height_sigma_m: float = 0.0) -> HeightMap:
@@ -240,12 +244,10 @@ def main() -> None:
                 rows[-1][2:8] = [*(f"{one:.2f}" for one in means), *(str(int((parts > k).sum())) for k in (1, 2))]
             rows[-1][8] = "" if case.wanted_m is None else f"<= {case.wanted_m:g}"
             print(*rows[-1], flush=True)
-    head = ["frames", "answered", "mean error, m", "median", "largest", "NEES"]
-    head += ["beyond the 99.9 % circle", "beyond twice", "wanted mean"]
-    body = table(head, rows)
-    print(body)
-    if not args.print_only:
-        write_section("Valleys of the Earth", "python benchmarks/valleys.py", ("numpy", "astropy", "matplotlib"), body)
+            if not args.print_only:
+                command = f"python benchmarks/valleys.py --frames {args.frames} --skies {args.skies} --rests {args.rests}"
+                write_section("Valleys of the Earth", command, ("numpy", "astropy", "matplotlib"), table(HEAD, rows))
+    print(table(HEAD, rows))
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain
 
 REACH_M = 300.0  # of a group of boxes about its best one, with one neighbourhood
-NEIGHBOURHOOD_SIGMAS = 16.0  # of a neighbourhood in which the posterior is sampled
+NEIGHBOURHOOD_SIGMAS, SMALLEST_M = 16.0, 1.0  # from the middle to the edge of a neighbourhood that is sampled
 MOST_GROUPS, MOST_MODES = 6, 4  # groups of boxes, and modes of a group
 MOST_BOXES = 160  # of a group, that the chain is computed at; and the points drawn from them
 FIRST_ROUNDS = ROUNDS[:4]  # that show whether a group of boxes is likely, and how wide the posterior is
@@ -134,7 +134,7 @@ def _sample_group(start: Start, references_m: Array, best: float, is_first: bool
     if plain.found.log_evidence < best - NATS:
         return plain
     mean, covariance = _moments_of(plain)
-    reach_m = max(NEIGHBOURHOOD_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1])), NEARBY_M)
+    reach_m = max(NEIGHBOURHOOD_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1])), SMALLEST_M)
     if model.terrain.axisymmetric or reach_m > 0.5 * model.around.half_m:
         return sample_at_start()
     is_own = (references_m == model.around.reference_m).all(axis=1)

@@ -245,7 +245,8 @@ def main() -> None:
             rows[-1][8] = "" if case.wanted_m is None else f"<= {case.wanted_m:g}"
             print(*rows[-1], flush=True)
             if not args.print_only:
-                command = f"python benchmarks/valleys.py --frames {args.frames} --skies {args.skies} --rests {args.rests}"
+                command = f"python benchmarks/valleys.py --frames {args.frames} --skies {args.skies}"
+                command += f" --rests {args.rests}"
                 write_section("Valleys of the Earth", command, ("numpy", "astropy", "matplotlib"), table(HEAD, rows))
     print(table(HEAD, rows))
 

@@ -13,6 +13,7 @@ from startrack.applications.reproduction.published.cozman_krotkov import locate_
 from startrack.applications.reproduction.published.kua_drive import draw_drive, locate_by_drive, outermost_stars
 from startrack.applications.reproduction.published.malay import draw_readings, locate_at_rest
 from startrack.applications.reproduction.published.sigel_wettergreen import locate_by_inclinometer
+from startrack.applications.reproduction.published.stein_medioni import locate_by_segments
 from startrack.applications.reproduction.published.talluri_aggarwal import locate_by_four_bearings
 from startrack.applications.reproduction.scene import Scene
 from startrack.applications.reproduction.simulator import SHACKLETON, Stream, visible_stars
@@ -57,6 +58,13 @@ COMPARED = {  # startrack first: the skyline by stars stands on its fix, whose t
         "Talluri and Aggarwal", *DARK, "",
         lambda scene: locate_by_four_bearings(scene.dark, scene.terrain, scene.grid),
     ),
+    "stein-medioni-lit": ComparedMethod(
+        "Stein and Medioni", "lit skyline", "rough", "no", "given", "the map", "300 to 600 m",
+        lambda scene: locate_by_segments(scene.rough, scene.grid, scene.table),
+    ),
+    "stein-medioni-dark": ComparedMethod(
+        "Stein and Medioni", *DARK, "", lambda scene: locate_by_segments(scene.dark, scene.grid, scene.table, 0.0)
+    ),
     "cozman-krotkov-lit": ComparedMethod(
         "Cozman and Krotkov", *LIT, "hundreds of m", lambda scene: locate_by_posterior(scene.lit, scene.grid).mean_m
     ),
@@ -98,14 +106,15 @@ def compare_places(seed: int, sky: int, start: int, stop: int) -> Chunk:
     """Answers at places number `start` to `stop` - 1 of a `sky`, in the order of COMPARED.
 
     `truth_m` (n, 2), `position_m` (n, methods, 2), NaN where a method refuses, and `seconds` (1, methods) of processor
-    time for the methods: without the skylines, which they are given, and the grid, which is traced once a process.
+    time for the methods: without the skylines, which they are given, and without the grid and its polygons, which are
+    made once a process.
     """
     scenes = [Scene(seed, sky, number) for number in range(start, stop)]
     positions = np.full((len(scenes), len(COMPARED), 2), np.nan)
     seconds = np.zeros((1, len(COMPARED)))
     _answer(COMPARED["startrack"], Scene(seed, sky, start))  # compiles and loads before the clock starts
     for k, scene in enumerate(scenes):
-        _ = scene.grid, scene.seen, scene.evidence, scene.lit
+        _ = scene.table, scene.seen, scene.evidence, scene.lit, scene.rough
         for j, method in enumerate(COMPARED.values()):
             began = time.thread_time()
             positions[k, j] = _answer(method, scene)

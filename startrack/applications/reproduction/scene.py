@@ -8,6 +8,11 @@ from functools import cached_property
 import numpy as np
 
 from startrack.applications.reproduction.published.skylines import MapGrid, dark_skyline, lit_skyline, traced_grid
+from startrack.applications.reproduction.published.stein_medioni import (
+    ROUGH_HEADING_RAD,
+    PolygonTable,
+    polygon_table,
+)
 from startrack.applications.reproduction.simulator import PERFECT, Sky, Stream, crater, draw_positions, visible_stars
 from startrack.core.types import Array, Bools, Evidence, MeasuredSkyline
 from startrack.localization import ExactPosterior
@@ -54,6 +59,10 @@ class Scene:
         return traced_grid(self.terrain)
 
     @cached_property
+    def table(self) -> PolygonTable:
+        return polygon_table(self.grid)
+
+    @cached_property
     def fix_m(self) -> Array:
         """Position (2,) [m] by startrack. Raises NotLocated."""
         return ExactPosterior()(self.evidence, self.terrain).position_enu_m[:2]
@@ -61,6 +70,12 @@ class Scene:
     @cached_property
     def lit(self) -> MeasuredSkyline:
         return lit_skyline(self.truth_m, self.terrain, self.draws(Stream.LIT))
+
+    @cached_property
+    def rough(self) -> MeasuredSkyline:
+        """The skyline in sunlight with a rough heading."""
+        draws = self.draws(Stream.HEADING)
+        return lit_skyline(self.truth_m, self.terrain, draws, ROUGH_HEADING_RAD * draws.standard_normal())
 
     @cached_property
     def dark(self) -> MeasuredSkyline:

@@ -20,9 +20,14 @@ END_WEIGHT = 1e-6  # of the first and the last shift: a larger one shows that no
 PROFILE_BLOCK = 4096  # positions traced at once
 
 
-def lit_skyline(truth_m: Array, terrain: Terrain, rng: np.random.Generator) -> MeasuredSkyline:
-    """The skyline at `truth_m` (2,) in sunlight, at the middles of all sectors, with one pixel of normal noise."""
-    elevation = terrain.horizon_rad(np.tile(truth_m, (SECTORS, 1)), MIDDLES_RAD)
+def lit_skyline(
+    truth_m: Array, terrain: Terrain, rng: np.random.Generator, heading_error_rad: float = 0.0
+) -> MeasuredSkyline:
+    """The skyline at `truth_m` (2,) in sunlight, at the middles of all sectors, with one pixel of normal noise.
+
+    A bearing b of it is the azimuth b + `heading_error_rad`.
+    """
+    elevation = terrain.horizon_rad(np.tile(truth_m, (SECTORS, 1)), MIDDLES_RAD + heading_error_rad)
     return MeasuredSkyline(
         azimuth_rad=MIDDLES_RAD,
         elevation_rad=elevation + LIT_SIGMA_RAD * rng.standard_normal(SECTORS),

@@ -56,7 +56,7 @@ def test_methods_without_a_fix_to_measure_from_refuse(monkeypatch):
 def test_statistics_of_errors_with_a_refusal():
     position = np.full((3, len(COMPARED), 2), np.nan)
     position[:2, 0] = [[3.0, 4.0], [0.0, 1.0]]
-    found = ComparedErrors(np.zeros((3, 2)), position, np.zeros(len(COMPARED)))
+    found = ComparedErrors(tuple(COMPARED), np.zeros((3, 2)), position, np.zeros(len(COMPARED)))
     one = found.statistics("startrack")
     assert one["mean_m"] == one["median_m"] == 3.0 and one["mean_sigma_m"] == pytest.approx(2.0)
     assert one["max_m"] == 5.0 and (one["count"], one["refused"]) == (2, 1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from startrack.applications.reproduction.published.malay import draw_readings, l
 from startrack.applications.reproduction.published.sigel_wettergreen import locate_by_inclinometer
 from startrack.applications.reproduction.published.stein_medioni import locate_by_segments
 from startrack.applications.reproduction.published.talluri_aggarwal import locate_by_four_bearings
-from startrack.applications.reproduction.scene import Scene
+from startrack.applications.reproduction.scene import THESIS_GROUND, Scene
 from startrack.applications.reproduction.simulator import SHACKLETON, Stream, visible_stars
 from startrack.core.chunk_store import Chunk
 from startrack.core.types import Array, NotLocated
@@ -34,6 +35,7 @@ class ComparedMethod:
     prior: str
     published: str
     locate: Callable[[Scene], Array]  # position (2,) [m]
+    needs_crater: bool = False  # the thesis's: it knows no other ground
 
 
 LIT = ("lit skyline", "given", "no", "given", "the map")
@@ -73,55 +75,67 @@ COMPARED = {  # startrack first: the skyline by stars stands on its fix, whose t
     ),
     "kua-drive": ComparedMethod(
         "Kua's earlier work", "stars of a drive", "stars", "yes", "stars", "diameter", "800 m",
-        lambda scene: estimate_drive(scene)[0],
+        lambda scene: estimate_drive(scene)[0], needs_crater=True,
     ),
     "kua-hull": ComparedMethod(
         "Kua 2008, hull and circle", *STARS, "637 m",
-        lambda scene: hull_position(scene.points_m[scene.seen], scene.terrain.wall_m, scene.terrain.radius_m),
+        lambda scene: hull_position(scene.points_m[scene.seen], scene.crater.wall_m, scene.crater.radius_m),
+        needs_crater=True,
     ),
     "kua-pseudo-gradient": ComparedMethod(
-        "Kua 2008, pseudo-gradient", *STARS, "34.2 m", lambda scene: _descend_from_hull(scene)
+        "Kua 2008, pseudo-gradient", *STARS, "34.2 m", lambda scene: _descend_from_hull(scene), needs_crater=True
     ),
 }  # fmt: skip
 
 
 def estimate_drive(scene: Scene) -> tuple[Array, float]:
     """Position (2,) [m] at the end of a drive to the place of a `scene`, and depth of the crater [m], both by it."""
-    drive = draw_drive(scene.truth_m, scene.terrain.radius_m, scene.draws(Stream.DRIVE))
-    seen = [visible_stars(scene.points_m, stop, scene.terrain.radius_m) for stop in drive.positions_m]
-    vectors = [outermost_stars(scene.points_m[one], scene.terrain.wall_m) for one in seen]
-    positions, depth_m = locate_by_drive(vectors, drive.legs_m, scene.terrain.radius_m)
+    drive = draw_drive(scene.truth_m, scene.crater.radius_m, scene.draws(Stream.DRIVE))
+    seen = [visible_stars(scene.points_m, stop, scene.crater.radius_m) for stop in drive.positions_m]
+    vectors = [outermost_stars(scene.points_m[one], scene.crater.wall_m) for one in seen]
+    positions, depth_m = locate_by_drive(vectors, drive.legs_m, scene.crater.radius_m)
     return positions[-1], depth_m
 
 
 def _descend_from_hull(scene: Scene) -> Array:
     """Where the thesis's descent ends, settled or not."""
     method = PseudoGradient()
-    first = hull_position(scene.points_m[scene.seen], scene.terrain.wall_m, scene.terrain.radius_m)
-    end, _ = descend(scene.points_m, scene.seen, first, scene.terrain.radius_m, method.gain, method.most_steps)
+    first = hull_position(scene.points_m[scene.seen], scene.crater.wall_m, scene.crater.radius_m)
+    end, _ = descend(scene.points_m, scene.seen, first, scene.crater.radius_m, method.gain, method.most_steps)
     return end
 
 
-def compare_places(seed: int, sky: int, start: int, stop: int) -> Chunk:
-    """Answers at places number `start` to `stop` - 1 of a `sky`, in the order of COMPARED.
+def methods_on(ground: str) -> dict[str, ComparedMethod]:
+    """The methods of COMPARED that can be used on a `ground`."""
+    return {name: one for name, one in COMPARED.items() if ground == THESIS_GROUND or not one.needs_crater}
+
+
+def compare_places(seed: int, sky: int, start: int, stop: int, ground: str = THESIS_GROUND) -> Chunk:
+    """Answers at places number `start` to `stop` - 1 of a `sky` on a `ground`, in the order of `methods_on` it.
 
     `truth_m` (n, 2), `position_m` (n, methods, 2), NaN where a method refuses, and `seconds` (1, methods) of processor
     time for the methods: without the skylines, which they are given, and without the grid and its polygons, which are
     made once a process.
     """
-    scenes = [Scene(seed, sky, number) for number in range(start, stop)]
-    positions = np.full((len(scenes), len(COMPARED), 2), np.nan)
-    seconds = np.zeros((1, len(COMPARED)))
-    _answer(COMPARED["startrack"], Scene(seed, sky, start))  # compiles and loads before the clock starts
+    scenes = [Scene(seed, sky, number, ground) for number in range(start, stop)]
+    methods = methods_on(ground)
+    positions, seconds = np.full((len(scenes), len(methods), 2), np.nan), np.zeros((1, len(methods)))
+    _warm_up(ground)
     for k, scene in enumerate(scenes):
         _ = scene.table, scene.seen, scene.evidence, scene.lit, scene.rough
-        for j, method in enumerate(COMPARED.values()):
-            began = time.thread_time()
+        for j, method in enumerate(methods.values()):
+            began = time.process_time()
             positions[k, j] = _answer(method, scene)
-            seconds[0, j] += time.thread_time() - began
+            seconds[0, j] += time.process_time() - began
             if np.isfinite(positions[k, 0, 0]):
                 _ = scene.dark
     return {"truth_m": np.stack([scene.truth_m for scene in scenes]), "position_m": positions, "seconds": seconds}
+
+
+@lru_cache(maxsize=2)
+def _warm_up(ground: str) -> None:
+    """Compile and load what startrack needs on a `ground`, once a process, before the clock starts."""
+    _answer(COMPARED["startrack"], Scene(0, 0, 0, ground))
 
 
 def _answer(method: ComparedMethod, scene: Scene) -> Array:
@@ -134,15 +148,16 @@ def _answer(method: ComparedMethod, scene: Scene) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ComparedErrors:
-    """Errors of all methods at the same places, in the order of COMPARED."""
+    """Errors of methods at the same places."""
 
+    names: tuple[str, ...]  # keys of COMPARED
     truth_m: Array  # (n, 2)
     position_m: Array  # (n, methods, 2); NaN where a method refuses
     ms_per_fix: Array  # (methods,) of processor time
 
     def errors_m(self, name: str) -> Array:
         """Errors (m,) [m] of the method `name` where it has an answer."""
-        offset = self.position_m[:, list(COMPARED).index(name)] - self.truth_m
+        offset = self.position_m[:, self.names.index(name)] - self.truth_m
         return np.hypot(*offset[np.isfinite(offset[:, 0])].T)
 
     def statistics(self, name: str) -> dict[str, Any]:

@@ -23,10 +23,10 @@ def cumulative_picture(found: ComparedErrors) -> Picture:
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
-        for k, name in enumerate(COMPARED):
+        for name in found.names:
             errors = np.sort(found.errors_m(name))
             share = np.arange(1, len(errors) + 1) / len(found.truth_m)
-            axes.step(errors, share, where="post", label=label_of(name), **_style(k))
+            axes.step(errors, share, where="post", label=label_of(name), **_style(name))
         axes.set(xscale="log", xlim=ERROR_RANGE_M, ylim=(0, 1), xlabel="position error (m)", ylabel="share of places")
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -38,8 +38,8 @@ def cumulative_picture(found: ComparedErrors) -> Picture:
     return Picture((9.0, 5.2), draw, caption)
 
 
-def answers_picture(found: ComparedErrors) -> Picture:
-    """The answers of all methods at one place, on the map."""
+def answers_picture(found: ComparedErrors, edge: str) -> Picture:
+    """The answers of all methods at one place, on the map; `edge` says what its circle is."""
     truth, answers = found.truth_m[PICTURED_PLACE], found.position_m[PICTURED_PLACE]
 
     def draw(figure: Figure) -> None:
@@ -48,19 +48,19 @@ def answers_picture(found: ComparedErrors) -> Picture:
         whole, near = figure.subplots(1, 2)
         whole.add_patch(Circle((0, 0), DIAMETER_M / 2e3, fill=False, color=EDGE_COLOUR))
         for axes in (whole, near):
-            for k, (name, answer) in enumerate(zip(COMPARED, answers, strict=True)):
-                style = _style(k)
+            for name, answer in zip(found.names, answers, strict=True):
+                style = _style(name)
                 axes.plot(*answer / 1e3, marker="s" if style["linestyle"] == "--" else "o", linestyle="", markersize=6,
                           color=style["color"], label=label_of(name))  # fmt: skip
             axes.plot(*truth / 1e3, "+", color=STAR, markersize=16, markeredgewidth=2, label="truth")
             axes.set(aspect="equal", xlabel="east (km)")
-        whole.set(ylabel="north (km)", title="the crater")
+        whole.set(ylabel="north (km)", title="all")
         near.set(title=f"{2 * INSET_M:.0f} m about the truth")
         for set_limits, middle in zip((near.set_xlim, near.set_ylim), truth / 1e3, strict=True):
             set_limits(middle - INSET_M / 1e3, middle + INSET_M / 1e3)
         near.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
 
-    caption = "The answers of all methods at one place; squares: from the skyline by stars. Green: the crater's edge."
+    caption = f"The answers of all methods at one place; squares: from the skyline by stars. Green: {edge}."
     return Picture((12.0, 4.8), draw, caption)
 
 
@@ -70,9 +70,10 @@ def label_of(name: str) -> str:
     return f"{method.name}, {method.sees}" if "skyline" in method.sees else method.name
 
 
-def _style(k: int) -> dict[str, Any]:
-    """Colour and line of method number `k`: both runs of a method have the same colour."""
-    methods = list(COMPARED.values())
-    names = list(dict.fromkeys(method.name for method in methods))
-    dashed = methods[k].sees == "skyline by stars"
-    return {"color": f"C{names.index(methods[k].name)}", "linestyle": "--" if dashed else "-"}
+def _style(name: str) -> dict[str, Any]:
+    """Colour and line of a method: both runs of one have the same colour."""
+    method, names = COMPARED[name], list(dict.fromkeys(method.name for method in COMPARED.values()))
+    return {
+        "color": f"C{names.index(method.name)}",
+        "linestyle": "--" if method.sees == "skyline by stars" else "-",
+    }

@@ -7,53 +7,72 @@ from typing import Any
 import numpy as np
 
 from startrack.applications.reproduction.artefact import Artefact, Context, markdown_table
-from startrack.applications.reproduction.comparison import COMPARED, ComparedErrors, ComparedMethod
+from startrack.applications.reproduction.comparison import COMPARED, ComparedErrors, ComparedMethod, methods_on
 from startrack.applications.reproduction.method_figures import answers_picture, cumulative_picture
-from startrack.applications.reproduction.methods import ALL_METHODS, tasks_of
+from startrack.applications.reproduction.methods import ALL_METHODS, Task, tasks_of
 from startrack.output import Column
 
+MAP_GROUND = "shackleton-rendered"  # the map itself is the ground: its errors are those of rounding
 HEAD = ("method", "sees", "heading", "clock", "vertical", "prior", "mean (m)", "median (m)", "95 % (m)", "largest (m)",
         "refused", "published")  # fmt: skip
 
 
-def collect_compared(context: Context) -> ComparedErrors:
-    """The errors of every method at the places of a context's size."""
+def method_table(context: Context) -> Artefact:
+    """The errors of every method that the thesis names, with what each is given and its published figure."""
     size = context.size
     tasks = [
         task for sky in range(size.skies) for task in tasks_of(ALL_METHODS, context.seed, sky, size.compared_per_sky)
     ]
-    chunks = list(context.store.chunks("all methods", tasks))
-    keys = ("truth_m", "position_m", "seconds")
-    truth, position, seconds = (np.concatenate([one[key] for one in chunks]) for key in keys)
-    return ComparedErrors(truth, position, 1e3 * seconds.sum(axis=0) / len(truth))
+    title, places = "Every method that the thesis names, at the same places", "places of the thesis's crater"
+    return _compare(context, "methods", tasks, title, places, "the crater's edge")
 
 
-def method_table(context: Context) -> Artefact:
-    """The errors of every method that the thesis names, with what each is given and its published figure."""
-    found = collect_compared(context)
-    statistics = {name: found.statistics(name) for name in COMPARED}
-    rows = [_cells(method, statistics[name]) for name, method in COMPARED.items()]
-    places = len(found.truth_m)
-    text = f"""Position error in metres at {places} places of the thesis's crater ({context.size.skies} starfields of \
-{context.size.compared_per_sky}), with the standard error of the mean. Seed {context.seed}. The table of numbers has \
-the processor time of no method, since a file must not depend on the machine: `--json` prints it.
+def map_table(context: Context) -> Artefact:
+    """The same on the map of Shackleton, by the methods that do not need a round crater."""
+    tasks = [
+        task
+        for sky in range(context.size.compared_on_map)
+        for task in tasks_of(ALL_METHODS, context.seed, sky, 1, ground=MAP_GROUND)
+    ]
+    title, places = "Methods that the thesis names on the map of Shackleton", "places of the map of Shackleton"
+    return _compare(context, "methods.shackleton", tasks, title, places, "the circle in which the places lie")
+
+
+def _compare(context: Context, name: str, tasks: list[Task], title: str, places: str, edge: str) -> Artefact:
+    """The table and figures `name` of the places of `tasks`."""
+    found = _collect(context, name, tasks)
+    statistics = {one: found.statistics(one) for one in found.names}
+    skies = len({task.sky for task in tasks})
+    rows = [_cells(COMPARED[one], of_method) for one, of_method in statistics.items()]
+    text = f"""Position error in metres at {len(found.truth_m)} {places}, under {skies} starfields, with the standard \
+error of the mean; thesis: chapter 2 for the published figures. Seed {context.seed}. The table of numbers has the \
+processor time of no method, since a file must not depend on the machine: `--json` prints it.
 
 {markdown_table(HEAD, rows)}"""
-    best = min((one["mean_m"], name) for name, one in statistics.items() if one["mean_m"] is not None)
+    best = min((one["mean_m"], key) for key, one in statistics.items() if one["mean_m"] is not None)
     return Artefact(
-        name="methods",
-        title="Every method that the thesis names, at the same places",
+        name=name,
+        title=title,
         line=f"startrack {_number(statistics['startrack']['mean_m'])} m, best {COMPARED[best[1]].name} {best[0]:.1f} m",
         text=text,
         columns=_columns(statistics),
-        pictures={"methods": cumulative_picture(found), "methods.map": answers_picture(found)},
+        pictures={name: cumulative_picture(found), f"{name}.map": answers_picture(found, edge)},
         values={
-            "thesis": {name: method.published for name, method in COMPARED.items()},
-            "reproduced": {name: one for name, one in statistics.items() if name != "startrack"},
+            "thesis": {one: COMPARED[one].published for one in found.names},
+            "reproduced": {key: one for key, one in statistics.items() if key != "startrack"},
             "ours": statistics["startrack"],
         },
-        timing_ms={name: float(one) for name, one in zip(COMPARED, found.ms_per_fix, strict=True)},
+        timing_ms={one: float(ms) for one, ms in zip(found.names, found.ms_per_fix, strict=True)},
     )
+
+
+def _collect(context: Context, what: str, tasks: list[Task]) -> ComparedErrors:
+    """The errors of every method at the places of `tasks`, which have the same ground."""
+    chunks = list(context.store.chunks(what, tasks))
+    keys = ("truth_m", "position_m", "seconds")
+    truth, position, seconds = (np.concatenate([one[key] for one in chunks]) for key in keys)
+    names = tuple(methods_on(tasks[0].ground))
+    return ComparedErrors(names, truth, position, 1e3 * seconds.sum(axis=0) / len(truth))
 
 
 def _cells(method: ComparedMethod, one: dict[str, Any]) -> list[str]:
@@ -75,7 +94,7 @@ def _columns(statistics: dict[str, dict[str, Any]]) -> tuple[Column, ...]:
     }  # fmt: skip
     rows = statistics.values()
     return (
-        Column("method", list(COMPARED), "string"),
+        Column("method", list(statistics), "string"),
         *(
             Column(key.removesuffix("_m"), [one[key] for one in rows], unit="m", form="%.3f", description=text)
             for key, text in keys.items()

@@ -14,6 +14,7 @@ import numpy as np
 
 from startrack.applications.reproduction.artefact import Context
 from startrack.applications.reproduction.comparison import compare_places
+from startrack.applications.reproduction.scene import THESIS_GROUND
 from startrack.applications.reproduction.simulator import (
     ASPECT_RATIO,
     MAGNITUDE,
@@ -37,7 +38,7 @@ FIX_SOURCES = (  # their content is part of a chunk's key
 )  # fmt: skip
 COMPARED_SOURCES = (  # of the chunks of all methods too
     "applications/reproduction/comparison.py", "applications/reproduction/scene.py",
-    "applications/reproduction/published/*.py", "evidence/sky_step.py",
+    "applications/reproduction/published/*.py", "evidence/sky_step.py", "terrain/*.py",
 )  # fmt: skip
 KUA, OURS, BOUND = "kua", "ours", "bound"  # the thesis's two steps; ours; the limit for a perfect list
 ALL_METHODS = "all"  # that the thesis names, with `compare_places`
@@ -58,6 +59,7 @@ class Task:
     magnitude: float = MAGNITUDE
     aspect_ratio: float = ASPECT_RATIO
     mistakes: Mistakes = PERFECT
+    ground: str = THESIS_GROUND  # of all methods
 
     def __len__(self) -> int:
         return self.stop - self.start
@@ -93,7 +95,7 @@ def compute_chunk(task: Task) -> Chunk:
     bound: `centroid_m` (n, 2). all: see `compare_places`.
     """
     if task.method == ALL_METHODS:
-        return compare_places(task.seed, task.sky, task.start, task.stop)
+        return compare_places(task.seed, task.sky, task.start, task.stop, task.ground)
     sky, cylinder = Sky.draw(task.seed, task.sky, task.magnitude), crater(task.aspect_ratio)
     points, radius_m = sky.project_to_rim_plane(cylinder), cylinder.radius_m
     truth = draw_positions(task.seed, task.sky, task.start, task.stop)

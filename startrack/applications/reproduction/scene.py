@@ -1,9 +1,9 @@
-"""One place in the thesis's crater, and what can be measured there: stars, skylines, random errors of instruments."""
+"""One place in the thesis's crater or on a map, and what can be measured there: stars, skylines, random errors."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -16,19 +16,27 @@ from startrack.applications.reproduction.published.stein_medioni import (
 from startrack.applications.reproduction.simulator import PERFECT, Sky, Stream, crater, draw_positions, visible_stars
 from startrack.core.types import Array, Bools, Evidence, MeasuredSkyline
 from startrack.localization import ExactPosterior
-from startrack.terrain import Cylinder
+from startrack.terrain import Cylinder, Terrain, load_terrain
+
+THESIS_GROUND = ""  # the thesis's crater
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """One place in the thesis's crater with all that can be measured there, each drawn when it is first used."""
+    """One place on a ground with all that can be measured there, each drawn when it is first used."""
 
     seed: int
     sky_number: int
     number: int  # of the place
+    ground: str = THESIS_GROUND  # or the name of a terrain
 
     @cached_property
-    def terrain(self) -> Cylinder:
+    def terrain(self) -> Terrain:
+        return terrain_of(self.ground)
+
+    @cached_property
+    def crater(self) -> Cylinder:
+        """The thesis's crater, for methods that know no other ground."""
         return crater()
 
     @cached_property
@@ -42,13 +50,16 @@ class Scene:
 
     @cached_property
     def points_m(self) -> Array:
-        """The stars (n, 2) [m] on the plane of the rim."""
-        return self.sky.project_to_rim_plane(self.terrain)
+        """The stars (n, 2) [m] on the plane of the rim of the thesis's crater."""
+        return self.sky.project_to_rim_plane(self.crater)
 
     @cached_property
     def seen(self) -> Bools:
         """The stars (n,) in sight."""
-        return visible_stars(self.points_m, self.truth_m, self.terrain.radius_m)
+        if self.ground == THESIS_GROUND:
+            return visible_stars(self.points_m, self.truth_m, self.crater.radius_m)
+        horizon = self.terrain.horizon_rad(np.tile(self.truth_m, (len(self.sky), 1)), self.sky.azimuth_rad)
+        return np.asarray(self.sky.elevation_rad > horizon)
 
     @cached_property
     def evidence(self) -> Evidence:
@@ -85,3 +96,9 @@ class Scene:
     def draws(self, stream: Stream) -> np.random.Generator:
         """Random numbers of a `stream` for this place."""
         return np.random.default_rng([self.seed, stream, self.sky_number, self.number])
+
+
+@lru_cache(maxsize=2)
+def terrain_of(ground: str) -> Terrain:
+    """The terrain of a `ground`, loaded once a process: what is computed on it is kept with it."""
+    return crater() if ground == THESIS_GROUND else load_terrain(ground)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from startrack.applications.reproduction import QUICK, Context, fix_store, write_artefact
-from startrack.applications.reproduction.comparison import COMPARED, ComparedErrors, compare_places
-from startrack.applications.reproduction.method_table import method_table
+from startrack.applications.reproduction.comparison import COMPARED, ComparedErrors, compare_places, methods_on
+from startrack.applications.reproduction.method_table import MAP_GROUND, method_table
 from startrack.applications.reproduction.methods import ALL_METHODS, KUA, Task, compute_chunk
 from startrack.applications.reproduction.scene import Scene
 from startrack.applications.reproduction.simulator import draw_positions
@@ -51,6 +51,21 @@ def test_methods_without_a_fix_to_measure_from_refuse(monkeypatch):
     assert refused == {"startrack"} | {name for name in COMPARED if name.endswith("-dark")}
     with pytest.raises(NotLocated):
         _ = Scene(0, 0, 0).dark
+
+
+def test_methods_of_a_round_crater_are_not_used_on_a_map():
+    assert set(COMPARED) - set(methods_on(MAP_GROUND)) == {"kua-drive", "kua-hull", "kua-pseudo-gradient"}
+    assert Task(ALL_METHODS, 0, 1, 0, 1, ground=MAP_GROUND).key != Task(ALL_METHODS, 0, 1, 0, 1).key
+
+
+@pytest.mark.slow
+def test_stars_on_a_map_are_in_sight_above_its_horizon():
+    scene = Scene(0, 0, 0, MAP_GROUND)
+    np.testing.assert_array_equal(scene.truth_m, Scene(0, 0, 0).truth_m)
+    for k in range(0, len(scene.sky), 100):
+        horizon = scene.terrain.horizon_rad(scene.truth_m[None], scene.sky.azimuth_rad[k : k + 1])
+        assert scene.seen[k] == (scene.sky.elevation_rad[k] > horizon[0])
+    assert np.hypot(*(scene.fix_m - scene.truth_m)) < 200.0
 
 
 def test_statistics_of_errors_with_a_refusal():

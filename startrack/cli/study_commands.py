@@ -143,7 +143,7 @@ COMMANDS = (
             ),
             "method": (
                 Either((
-                    flag("--quick", "fewer positions than the thesis, in about a minute (default)"),
+                    flag("--quick", "fewer positions than the thesis, in a few minutes (default)"),
                     flag("--full", "as in the thesis: 10 x 10,000, and 100,000 positions"),
                 )),
                 flag("--ours N", "our method on at most N positions per starfield, 10 N in figure 3.10",

@@ -134,8 +134,10 @@ def compare_places(seed: int, sky: int, start: int, stop: int, ground: str = THE
 
 @lru_cache(maxsize=2)
 def _warm_up(ground: str) -> None:
-    """Compile and load what startrack needs on a `ground`, once a process, before the clock starts."""
-    _answer(COMPARED["startrack"], Scene(0, 0, 0, ground))
+    """Compile and load what the methods need on a `ground`, once a process, before the clock starts."""
+    scene = Scene(0, 0, 0, ground)
+    for method in methods_on(ground).values():
+        _answer(method, scene)
 
 
 def _answer(method: ComparedMethod, scene: Scene) -> Array:

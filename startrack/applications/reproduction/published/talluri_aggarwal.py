@@ -31,12 +31,12 @@ def locate_by_four_bearings(skyline: MeasuredSkyline, terrain: Terrain, grid: Ma
 
 def positions_with_elevations(skyline: MeasuredSkyline, terrain: Terrain, points_m: Array) -> Bools:
     """Which cells of the grid `points_m` (n, 2) contain a position with the elevations seen at the four bearings."""
-    left, half_m = np.ones(len(points_m), dtype=bool), np.array(0.5 * MAP_STEP_M)
+    left, half_m = np.arange(len(points_m)), np.array(0.5 * MAP_STEP_M)
     for sector in cardinal_sectors(skyline):
-        low, high = terrain.horizon_bounds_rad(points_m, half_m, skyline.azimuth_rad[sector])
-        margin = PRUNING_SIGMAS * skyline.sigma_rad[sector]
-        left &= (low - margin <= skyline.elevation_rad[sector]) & (skyline.elevation_rad[sector] <= high + margin)
-    return left
+        low, high = terrain.horizon_bounds_rad(points_m[left], half_m, skyline.azimuth_rad[sector])
+        seen, margin = skyline.elevation_rad[sector], PRUNING_SIGMAS * skyline.sigma_rad[sector]
+        left = left[(low - margin <= seen) & (seen <= high + margin)]
+    return np.isin(np.arange(len(points_m)), left)
 
 
 def cardinal_sectors(skyline: MeasuredSkyline) -> Ints:

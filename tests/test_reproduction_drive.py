@@ -22,7 +22,7 @@ CRATER = crater()
 
 def test_a_drive_is_straight_ends_at_the_place_and_stays_inside():
     for k, place in enumerate(draw_positions(0, 0, 0, 50)):
-        drive = draw_drive(place, CRATER.radius_m, np.random.default_rng(k))
+        drive = draw_drive(place, CRATER.radius_m, rng=np.random.default_rng(k))
         np.testing.assert_array_equal(drive.positions_m[-1], place)
         assert np.hypot(*drive.positions_m.T).max() < CRATER.radius_m
         legs = np.diff(drive.positions_m, axis=0)
@@ -34,7 +34,7 @@ def test_a_drive_is_straight_ends_at_the_place_and_stays_inside():
 @pytest.mark.parametrize("number", range(3))
 def test_exact_skylines_give_the_exact_depth_and_positions(number):
     place = draw_positions(0, 0, number, number + 1)[0]
-    drive = draw_drive(place, CRATER.radius_m, np.random.default_rng(0))
+    drive = draw_drive(place, CRATER.radius_m, rng=np.random.default_rng(0))
     ways = np.stack([np.sin(MIDDLES_RAD), np.cos(MIDDLES_RAD)], axis=-1)
     horizons = [CRATER.horizon_rad(np.tile(stop, (SECTORS, 1)), MIDDLES_RAD) for stop in drive.positions_m]
     vectors = [ways / np.tan(one)[:, None] for one in horizons]

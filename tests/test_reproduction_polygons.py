@@ -85,9 +85,9 @@ def test_a_position_of_the_grid_has_the_most_votes_for_its_own_skyline(grid, tab
 def test_segments_find_the_position_and_a_turn_of_the_heading(grid, table):
     """Round craters do not show the heading: an error of it turns the answer about the middle."""
     for k, place in enumerate(PLACES):
-        exact = locate_by_segments(lit_skyline(place, CRATER, np.random.default_rng(k)), grid, table, 0.0)
+        exact = locate_by_segments(lit_skyline(place, CRATER, rng=np.random.default_rng(k)), grid, table, 0.0)
         assert np.hypot(*(exact - place)) < STEP_M
-        turned = lit_skyline(place, CRATER, np.random.default_rng(k), ROUGH_HEADING_RAD)
+        turned = lit_skyline(place, CRATER, ROUGH_HEADING_RAD, rng=np.random.default_rng(k))
         rough = locate_by_segments(turned, grid, table)
         assert abs(np.hypot(*rough) - np.hypot(*place)) < STEP_M
         assert np.hypot(*(rough - place)) < 4 * ROUGH_HEADING_RAD * np.hypot(*place) + STEP_M

@@ -38,7 +38,7 @@ def grid():
 
 @pytest.fixture(scope="module")
 def lit():
-    return [lit_skyline(place, CRATER, np.random.default_rng(k)) for k, place in enumerate(PLACES)]
+    return [lit_skyline(place, CRATER, rng=np.random.default_rng(k)) for k, place in enumerate(PLACES)]
 
 
 def distances(answers):

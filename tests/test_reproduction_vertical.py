@@ -37,7 +37,9 @@ def test_a_tilt_is_an_angle_from_the_vertical():
 
 
 def test_an_inclinometer_is_off_by_its_tilt():
-    answers = [locate_by_inclinometer(place, SHACKLETON, np.random.default_rng(k)) for k, place in enumerate(PLACES)]
+    answers = [
+        locate_by_inclinometer(place, SHACKLETON, rng=np.random.default_rng(k)) for k, place in enumerate(PLACES)
+    ]
     errors = np.array([np.hypot(*(answer - place)) for (answer, _), place in zip(answers, PLACES, strict=True)])
     tilts = np.array([np.hypot(*tilt) for _, tilt in answers]) / RADIANS_OF_ARCSEC
     np.testing.assert_allclose(errors / tilts, METRES_PER_ARCSEC, rtol=0.005)
@@ -45,7 +47,7 @@ def test_an_inclinometer_is_off_by_its_tilt():
 
 
 def test_a_rover_at_rest_is_off_by_its_tilt():
-    drawn = [draw_readings(place, SHACKLETON, np.random.default_rng(k)) for k, place in enumerate(PLACES)]
+    drawn = [draw_readings(place, SHACKLETON, rng=np.random.default_rng(k)) for k, place in enumerate(PLACES)]
     answers = np.array([locate_at_rest(readings, SHACKLETON) for readings in drawn])
     tilts = np.array([np.hypot(*readings.error_rad) for readings in drawn]) / RADIANS_OF_ARCSEC
     np.testing.assert_allclose(np.hypot(*(answers - PLACES).T) / tilts, METRES_PER_ARCSEC, rtol=0.005)

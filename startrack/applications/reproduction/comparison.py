@@ -46,11 +46,13 @@ COMPARED = {  # startrack first: the skyline by stars stands on its fix, whose t
     "startrack": ComparedMethod("startrack", *STARS, "", lambda scene: scene.fix_m),
     "sigel-wettergreen": ComparedMethod(
         "Sigel and Wettergreen", *TILTED, "1.2 km",
-        lambda scene: locate_by_inclinometer(scene.truth_m, SHACKLETON, scene.draws(Stream.TILT))[0],
+        lambda scene: locate_by_inclinometer(scene.truth_m, SHACKLETON, rng=scene.draws(Stream.TILT))[0],
     ),
     "malay": ComparedMethod(
         "Malay et al.", *TILTED, "400 m",
-        lambda scene: locate_at_rest(draw_readings(scene.truth_m, SHACKLETON, scene.draws(Stream.REST)), SHACKLETON),
+        lambda scene: locate_at_rest(
+            draw_readings(scene.truth_m, SHACKLETON, rng=scene.draws(Stream.REST)), SHACKLETON
+        ),
     ),
     "talluri-aggarwal-lit": ComparedMethod(
         "Talluri and Aggarwal", *LIT, "26 m, with noise 55 m",
@@ -90,7 +92,7 @@ COMPARED = {  # startrack first: the skyline by stars stands on its fix, whose t
 
 def estimate_drive(scene: Scene) -> tuple[Array, float]:
     """Position (2,) [m] at the end of a drive to the place of a `scene`, and depth of the crater [m], both by it."""
-    drive = draw_drive(scene.truth_m, scene.crater.radius_m, scene.draws(Stream.DRIVE))
+    drive = draw_drive(scene.truth_m, scene.crater.radius_m, rng=scene.draws(Stream.DRIVE))
     seen = [visible_stars(scene.points_m, stop, scene.crater.radius_m) for stop in drive.positions_m]
     vectors = [outermost_stars(scene.points_m[one], scene.crater.wall_m) for one in seen]
     positions, depth_m = locate_by_drive(vectors, drive.legs_m, scene.crater.radius_m)

@@ -80,13 +80,13 @@ class Scene:
 
     @cached_property
     def lit(self) -> MeasuredSkyline:
-        return lit_skyline(self.truth_m, self.terrain, self.draws(Stream.LIT))
+        return lit_skyline(self.truth_m, self.terrain, rng=self.draws(Stream.LIT))
 
     @cached_property
     def rough(self) -> MeasuredSkyline:
         """The skyline in sunlight with a rough heading."""
         draws = self.draws(Stream.HEADING)
-        return lit_skyline(self.truth_m, self.terrain, draws, ROUGH_HEADING_RAD * draws.standard_normal())
+        return lit_skyline(self.truth_m, self.terrain, ROUGH_HEADING_RAD * draws.standard_normal(), rng=draws)
 
     @cached_property
     def dark(self) -> MeasuredSkyline:

@@ -29,7 +29,7 @@ class Drive:
     legs_m: Array  # (STOPS - 1, 2)
 
 
-def draw_drive(end_m: Array, radius_m: float, rng: np.random.Generator) -> Drive:
+def draw_drive(end_m: Array, radius_m: float, *, rng: np.random.Generator) -> Drive:
     """A drive in a random direction that ends at `end_m` (2,) and begins inside the circle of `radius_m`."""
     while True:
         heading = rng.uniform(0.0, 2 * np.pi)

@@ -36,9 +36,9 @@ class RestReadings:
     error_rad: Array  # (2,) by which bias and averaged noise turn the vertical: the drawn truth, not an input
 
 
-def draw_readings(truth_m: Array, site: Site, rng: np.random.Generator) -> RestReadings:
+def draw_readings(truth_m: Array, site: Site, *, rng: np.random.Generator) -> RestReadings:
     """The readings at `truth_m` (2,): the bias, the platform's tilt and the noise are drawn."""
-    bias = draw_tilt_rad(rng, REST_TILT_ARCSEC) * LUNAR_GRAVITY_M_S2
+    bias = draw_tilt_rad(REST_TILT_ARCSEC, rng=rng) * LUNAR_GRAVITY_M_S2
     walk = np.cumsum(WALK_SIGMAS[2] * rng.standard_normal((REST_EPOCHS, 2)), axis=0)
     platform = np.radians(0.5) * rng.standard_normal(2) + walk
     stars = STAR_FIX_RAD * rng.standard_normal((REST_EPOCHS, 2))

@@ -21,10 +21,10 @@ from startrack.frames import Site
 INCLINOMETER_ARCSEC = 142.0  # mean error of the vertical: 1.2 km on the Moon (8.42 m per arcsecond)
 
 
-def locate_by_inclinometer(truth_m: Array, site: Site, rng: np.random.Generator) -> tuple[Array, Array]:
+def locate_by_inclinometer(truth_m: Array, site: Site, *, rng: np.random.Generator) -> tuple[Array, Array]:
     """Position (2,) [m] by one reading of the vertical at `truth_m` (2,), and the tilt (2,) [rad] that is drawn.
 
     Attitude and clock are taken as exact: they are good to arcseconds, and the Moon turns by half of one a second.
     """
-    tilt = draw_tilt_rad(rng, INCLINOMETER_ARCSEC)
+    tilt = draw_tilt_rad(INCLINOMETER_ARCSEC, rng=rng)
     return position_of_vertical(tilt_vertical(vertical_at(truth_m, site), tilt), site), tilt

@@ -21,7 +21,7 @@ PROFILE_BLOCK = 4096  # positions traced at once
 
 
 def lit_skyline(
-    truth_m: Array, terrain: Terrain, rng: np.random.Generator, heading_error_rad: float = 0.0
+    truth_m: Array, terrain: Terrain, heading_error_rad: float = 0.0, *, rng: np.random.Generator
 ) -> MeasuredSkyline:
     """The skyline at `truth_m` (2,) in sunlight, at the middles of all sectors, with one pixel of normal noise.
 

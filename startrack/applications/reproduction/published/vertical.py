@@ -35,6 +35,6 @@ def tilt_vertical(vertical: Array, tilt_rad: Array) -> Array:
     return np.asarray(R_from_rotvec(np.append(tilt_rad, 0.0)) @ vertical)
 
 
-def draw_tilt_rad(rng: np.random.Generator, mean_arcsec: float) -> Array:
+def draw_tilt_rad(mean_arcsec: float, *, rng: np.random.Generator) -> Array:
     """A tilt (2,) [rad] about east and north with normal components; its length is `mean_arcsec` in the mean."""
     return rng.standard_normal(2) * (mean_arcsec * AXIS_BY_MEAN * RADIANS_OF_ARCSEC)

@@ -83,7 +83,7 @@ def test_a_track_is_better_than_its_first_image(folder, moves):
     frames = json.loads((drive / "out" / "track.json").read_text())["frames"]
     assert [one["status"] for one in frames] == ["used"] * 4
     for one in frames:
-        truth = json.loads((drive / f"{one['image']}.truth.json").read_text())["position"]
+        truth = json.loads((drive / f"{one['image']}.truth.json").read_text())
         error_m = np.hypot(one["east_m"] - truth["east_m"], one["north_m"] - truth["north_m"])
         assert error_m < 1.5 * one["radius95_m"]
         assert one["radius95_m"] < frames[0]["filtered_radius95_m"]

@@ -11,6 +11,7 @@ at each post, which the map states. "trees": they raise 20 % of the skyline and 
 from __future__ import annotations
 
 import argparse
+import shlex
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -246,7 +247,7 @@ def main() -> None:
             print(*rows[-1], flush=True)
             if not args.print_only:
                 command = f"python benchmarks/valleys.py --frames {args.frames} --skies {args.skies}"
-                command += f" --rests {args.rests}"
+                command += f" --rests {args.rests} --case " + shlex.join(args.case[: len(rows)])
                 write_section("Valleys of the Earth", command, ("numpy", "astropy", "matplotlib"), table(HEAD, rows))
     print(table(HEAD, rows))
 

@@ -121,10 +121,8 @@ def test_the_stars_of_an_image_are_located_as_the_pipeline_locates_them(located:
     catalog = load_catalog().brighter_than(7.0)
     by_stars = locate(known.exposure, known.camera, known.terrain, catalog, settings)
     again = locate_rays(extend(by_stars, StarRays))
-    sampled_m = 0.05 * by_stars.fix.radius95_m  # the pipeline begins at the points of its first fix
-    assert again.fix.position_enu_m == pytest.approx(by_stars.fix.position_enu_m, abs=sampled_m)
-    level_m = by_stars.fix.integrity.protection_level_m
-    assert again.fix.integrity.protection_level_m == pytest.approx(level_m, rel=0.05)
+    assert again.fix.position_enu_m == pytest.approx(by_stars.fix.position_enu_m, abs=1e-9)
+    assert again.fix.integrity.protection_level_m == by_stars.fix.integrity.protection_level_m
 
 
 def test_a_scene_without_ground_or_time_is_refused(series: Series):

@@ -155,10 +155,8 @@ def test_a_black_sky_leaves_the_stars(catalog: StarCatalog) -> None:
     assert found.status == "ok" and found.evidence_source == "stars"
     assert "no step of light" in found.sky_unused
     stars = locate(frame, catalog, evidence_sources="stars")
-    sampled_m = 0.05 * stars.fix.radius95_m  # it begins at the points of the first fix
-    np.testing.assert_allclose(found.fix.position_enu_m, stars.fix.position_enu_m, atol=sampled_m)
-    variance_m2 = 0.1 * np.trace(stars.fix.covariance_m2)
-    np.testing.assert_allclose(found.fix.covariance_m2, stars.fix.covariance_m2, atol=variance_m2)
+    assert np.array_equal(found.fix.position_enu_m, stars.fix.position_enu_m)
+    assert np.array_equal(found.fix.covariance_m2, stars.fix.covariance_m2)
     alone = locate(frame, catalog, evidence_sources="sky")
     assert isinstance(alone, Refused)
     assert alone.reason == "insufficient_geometry" and "light of the sky" in alone.message

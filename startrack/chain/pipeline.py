@@ -90,7 +90,8 @@ def _refine(located: Located, is_newer: bool, settings: Settings) -> Located:
     if not by_stars:
         located = refine_by_sky_light(located, settings.localizer, settings.evidence_sources == "both")
     if located.sky is None and (is_newer or not by_stars):
-        support = None if located.fix.ambiguous else located.fix.samples
+        is_traced = not located.terrain.axisymmetric  # a round crater is searched again in no time
+        support = located.fix.samples if is_traced and not located.fix.ambiguous else None
         return fix_position(located, Located, settings.localizer, replace(located.evidence(), support=support))
     return located
 

@@ -28,6 +28,7 @@ COLMAP_COUNTS = {
 OPENCV_DISTORTION = "distortion_coefficients"
 OPENCV_COUNTS = 4, 5, 8, 12, 14  # of distortion coefficients of OpenCV's models
 OPENCV_HEAD = re.compile(r"\A\s*%YAML[: ]1\.0|!!opencv-matrix")  # which YAML itself does not have
+MAX_YAML_CHARS = 2**18  # the loader takes 3 s for 2^20
 Coefficients = tuple[float, ...] | None  # of a fisheye; None of a pinhole
 
 
@@ -257,8 +258,16 @@ def _read_yaml(text: str) -> dict[str, Any]:
     """The mapping of a YAML file. Raises ValueError if there is none."""
     import yaml
 
+    class Loader(yaml.SafeLoader):
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):  # a few of them are a file of any size
+                raise yaml.YAMLError("aliases (*name) are not read")
+            return super().compose_node(parent, index)
+
+    if len(text) > MAX_YAML_CHARS:
+        raise ValueError(f"more than {MAX_YAML_CHARS // 2**10} KiB")
     try:
-        value = yaml.safe_load(text)
+        value = yaml.load(text, Loader)
     except (yaml.YAMLError, RecursionError) as cause:
         raise ValueError(str(cause)) from cause
     if not isinstance(value, dict):

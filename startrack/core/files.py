@@ -19,8 +19,10 @@ PACKAGE = Path(__file__).resolve().parents[1]
 MAX_TEXT_BYTES = 2**20  # camera and terrain files have a few kilobytes
 MAX_CAUSE_CHARS = 200  # of a library's message
 MAX_STEM_BYTES = 200  # file systems take names of 255, and a suffix follows
-TIFF_COMPRESSIONS = {1, 8, 32773, 32946}  # none, deflate, PackBits, deflate: tifffile needs nothing more for these
 FULL_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}  # errors of writing that are not the path's
+MAX_KEY_PARTS = 16  # of a TOML key such as origin.latitude_deg
+_KEY_PART = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
+LONG_KEY = re.compile(rf"(?<![\w.-])(?:{_KEY_PART}[ \t]*+\.[ \t]*+){{{MAX_KEY_PARTS}}}")
 FOREIGN_CAMERA_SUFFIXES = ".yaml", ".yml", ".xml", ".txt"  # of other programs' camera files
 FilePath = str | os.PathLike[str]
 
@@ -105,6 +107,8 @@ def read_text(path: FilePath, reason: str, *, max_bytes: int = MAX_TEXT_BYTES) -
 
 def parse_toml(text: str, reason: str) -> dict[str, Any]:
     """The keys of a TOML text. Raises BadInput `reason` with one line of cause."""
+    if LONG_KEY.search(text):  # tomllib takes seconds for a key of thousands of parts
+        raise BadInput(reason, f"not a TOML file: a key of more than {MAX_KEY_PARTS} parts")
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as cause:  # TOMLDecodeError, huge integers, deeply nested lists

@@ -12,18 +12,23 @@ import gzip
 import math
 import re
 import warnings
+import zlib
+from collections.abc import Callable
 from io import BytesIO
 from typing import IO, Any
 
 import numpy as np
 
-from startrack.exposure.decoding import MAX_FILE_BYTES, Decoded, bad_image, check_size, grey_float32
+from startrack.exposure.decoding import Decoded, bad_image, check_size, grey_float32
 from startrack.exposure.facts import HEADER_KEYS
 
 BLOCK_BYTES = 2880
-MAX_HEADER_BYTES = 1000 * BLOCK_BYTES
+MAX_HEADER_BYTES = 1000 * BLOCK_BYTES  # of all units together: astropy takes 0.2 s for them
+MAX_BYTES_BESIDE = 2**26  # of the units beside the largest one
+MAX_PADDING_BYTES = 100 * BLOCK_BYTES  # zeros or blanks after the last unit
+MAX_TILES = 2**15  # of a tile-compressed image, by default one a row
 MAX_AXES, MAX_FIELDS = 99, 999  # largest legal is 999 for both; readers loop over them
-INTEGER_CARD = re.compile(rb"(NAXIS\d*|TFIELDS|BITPIX|PCOUNT|GCOUNT) *= *([+-]?\d+)")
+INTEGER_CARD = re.compile(rb"(Z?NAXIS\d*|ZTILE\d|TFIELDS|BITPIX|PCOUNT|GCOUNT) *= *([+-]?\d+)")
 GZIP, BZIP2 = b"\x1f\x8b", b"BZh"
 
 
@@ -38,12 +43,13 @@ def decode(raw: bytes) -> Decoded:
     with warnings.catch_warnings(record=True) as issued:
         warnings.simplefilter("always")
         raw = _inflate(raw)
-        _check_headers(raw)
         with fits.open(BytesIO(raw), memmap=False, checksum=True) as units:
             _check_complete(units, raw)
             unit = _only_image(units)
             shape = unit.shape[-2:]
             check_size(*shape[::-1])
+            if isinstance(unit, fits.CompImageHDU):
+                _check_deflated_tiles(raw)
             header = _metadata(units, unit)
             saturation = _saturation(unit.header)
             stored = np.asarray(unit.data)
@@ -56,59 +62,103 @@ def decode(raw: bytes) -> Decoded:
 
 
 def _inflate(raw: bytes) -> bytes:
-    """The FITS file itself, decompressed if it is compressed; a too large image is refused before that."""
+    """The FITS file itself, decompressed if it is compressed. Raises BadInput bad_image for what no picture needs.
+
+    Each unit is checked before its data are inflated, so that a small file cannot ask for much work.
+    """
     stream: IO[bytes]
     if raw.startswith(GZIP):
         stream = gzip.GzipFile(fileobj=BytesIO(raw))  # type: ignore[assignment]
     elif raw.startswith(BZIP2):
         stream = bz2.BZ2File(BytesIO(raw))
     else:
+        _check_units(lambda end: raw)
         return raw
-    head = b""
-    while len(head) < MAX_HEADER_BYTES and not _has_end(head[-BLOCK_BYTES:]):
-        block = stream.read(BLOCK_BYTES)
-        if not head and not block.startswith(b"SIMPLE  ="):
-            raise bad_image("compressed file without FITS data in it")
-        if len(block) < BLOCK_BYTES:
-            raise bad_image("truncated FITS: the file ends within its header")
-        head += block
-    _check_headers(head)
-    rest = stream.read(MAX_FILE_BYTES)
-    if stream.read(1):
-        raise bad_image(f"decompresses to more than {MAX_FILE_BYTES / 1e9:.1f} GB")
-    return head + rest
+    inflated = bytearray()
+
+    def inflate_to(end: int) -> bytearray:
+        inflated.extend(stream.read(max(end - len(inflated), 0)))
+        return inflated
+
+    if not inflate_to(BLOCK_BYTES).startswith(b"SIMPLE  ="):
+        raise bad_image("compressed file without FITS data in it")
+    _check_units(inflate_to)
+    return bytes(inflated)
 
 
-def _has_end(block: bytes) -> bool:
+def _check_units(read_to: Callable[[int], bytes | bytearray]) -> None:
+    """Refuse numbers of cards, units, axes, fields and bytes that a reader would loop over or allocate for minutes.
+
+    `read_to` returns the file, at least so many of its bytes.
+    """
+    at = header_bytes = 0
+    data_sizes: list[int] = []
+    while read_to(at + BLOCK_BYTES)[at : at + 8] in (b"SIMPLE  ", b"XTENSION"):
+        end = at
+        while not _has_end(read_to(end + BLOCK_BYTES)[end : end + BLOCK_BYTES]):
+            end += BLOCK_BYTES
+            if header_bytes + end - at > MAX_HEADER_BYTES:
+                break
+            if end >= len(read_to(end + BLOCK_BYTES)):
+                raise bad_image("truncated FITS: the file ends within a header")
+        end += BLOCK_BYTES
+        header_bytes += end - at
+        if header_bytes > MAX_HEADER_BYTES:
+            raise bad_image(f"FITS has more than {MAX_HEADER_BYTES / 1e6:.1f} MB of headers")
+        data_sizes.append(_data_bytes(read_to(end)[at:end], is_first=at == 0))
+        if (beside := sum(data_sizes) - max(data_sizes)) > MAX_BYTES_BESIDE:
+            raise bad_image(f"FITS holds {beside / 1e6:.0f} MB beside its largest unit; startrack reads single images")
+        at = end + -(-data_sizes[-1] // BLOCK_BYTES) * BLOCK_BYTES
+    if len(read_to(at + MAX_PADDING_BYTES + 1)) > at + MAX_PADDING_BYTES:
+        raise bad_image("damaged FITS: much follows the last unit that its headers declare")
+
+
+def _has_end(block: bytes | bytearray) -> bool:
     return any(block[at : at + 8] == b"END     " for at in range(0, len(block), 80))
 
 
-def _check_headers(raw: bytes) -> None:
-    """Refuse numbers of axes, fields and pixels that a reader would loop over or allocate for minutes.
+def _data_bytes(header: bytes | bytearray, *, is_first: bool) -> int:
+    """Size of the data that a complete `header` declares. Raises BadInput bad_image for sizes that no picture has."""
+    cards = (INTEGER_CARD.match(header, card, card + 80) for card in range(0, len(header), 80))
+    numbers = {match[1].decode(): int(match[2]) for match in cards if match}
+    axes, fields = numbers.get("NAXIS", 0), numbers.get("TFIELDS", 0)
+    if not 0 <= axes <= MAX_AXES or not 0 <= fields <= MAX_FIELDS:
+        raise bad_image(f"damaged FITS: NAXIS is {axes}, TFIELDS is {fields}")
+    sides = [numbers.get(f"NAXIS{n + 1}", 0) for n in range(axes)]
+    if is_first and axes >= 2:
+        check_size(sides[0], sides[1])
+    picture_px = 0 if fields else math.prod(sides)
+    if "ZNAXIS1" in numbers:  # a tile-compressed image: a row each tile
+        picture_px = numbers["ZNAXIS1"] * numbers.get("ZNAXIS2", 1)
+        check_size(numbers["ZNAXIS1"], numbers.get("ZNAXIS2", 1))
+        _check_tiles(numbers, picture_px)
+    values = numbers.get("GCOUNT", 1) * (numbers.get("PCOUNT", 0) + math.prod(sides)) if axes else 0
+    data_bytes = abs(numbers.get("BITPIX", 8)) // 8 * values
+    if not 0 <= data_bytes <= 8 * picture_px + MAX_BYTES_BESIDE:
+        raise bad_image(f"damaged FITS: a unit of {data_bytes} bytes for {picture_px} pixels")
+    return data_bytes
 
-    Checks header by header before a reader opens the file; stops at the first header that is not complete in `raw`.
-    """
-    at = 0
-    while raw[at : at + 8] in (b"SIMPLE  ", b"XTENSION"):
-        start, end = at, at
-        while not _has_end(raw[end : end + BLOCK_BYTES]):
-            end += BLOCK_BYTES
-            if end - start > MAX_HEADER_BYTES or end >= len(raw):
-                return
-        end += BLOCK_BYTES
-        cards = (INTEGER_CARD.match(raw, card, card + 80) for card in range(start, end, 80))
-        numbers = {match[1].decode(): int(match[2]) for match in cards if match}
-        axes, fields = numbers.get("NAXIS", 0), numbers.get("TFIELDS", 0)
-        if not 0 <= axes <= MAX_AXES or not 0 <= fields <= MAX_FIELDS:
-            raise bad_image(f"damaged FITS: NAXIS is {axes}, TFIELDS is {fields}")
-        sides = [numbers.get(f"NAXIS{n + 1}", 0) for n in range(axes)]
-        if start == 0 and axes >= 2:
-            check_size(sides[0], sides[1])
-        values = numbers.get("GCOUNT", 1) * (numbers.get("PCOUNT", 0) + math.prod(sides)) if axes else 0
-        data_bytes = abs(numbers.get("BITPIX", 8)) // 8 * values
-        if data_bytes < 0:
-            raise bad_image("damaged FITS: an extension of negative size")
-        at = end + -(-data_bytes // BLOCK_BYTES) * BLOCK_BYTES
+
+def _check_tiles(numbers: dict[str, int], picture_px: int) -> None:
+    """Refuse more tiles, or larger ones, than a tile-compressed picture needs; `numbers` by the keys of its header."""
+    tiles, tile_px = numbers.get("NAXIS2", 0), numbers.get("ZTILE1", numbers["ZNAXIS1"]) * numbers.get("ZTILE2", 1)
+    if not 0 <= tiles <= MAX_TILES or tile_px <= 0 or tiles * tile_px > 4 * picture_px + MAX_BYTES_BESIDE:
+        raise bad_image(f"damaged FITS: {tiles} tiles of {tile_px} pixels for a picture of {picture_px}")
+
+
+def _check_deflated_tiles(raw: bytes) -> None:
+    """Refuse a tile that inflates to more than its pixels: astropy inflates each one whole."""
+    from astropy.io import fits
+
+    with fits.open(BytesIO(raw), memmap=False, disable_image_compression=True) as units:
+        for unit in (unit for unit in units if "ZIMAGE" in unit.header):
+            header = unit.header
+            most = 8 * header.get("ZTILE1", header["ZNAXIS1"]) * header.get("ZTILE2", 1)
+            for column in (one for one in unit.columns if "P" in one.format or "Q" in one.format):
+                for cell in unit.data[column.name]:
+                    packed = np.asarray(cell).tobytes()
+                    if packed.startswith(GZIP) and len(zlib.decompressobj(31).decompress(packed, most + 1)) > most:
+                        raise bad_image("damaged FITS: a tile inflates to more than its pixels")
 
 
 def _only_image(units: Any) -> Any:

@@ -18,6 +18,8 @@ from startrack.exposure.decoding import Decoded, bad_image, check_size, exif_war
 from startrack.exposure.facts import facts_in_text
 
 START_OF_SCAN, END_OF_IMAGE = 0xDA, b"\xff\xd9"
+START_OF_SCAN_MARK = bytes((0xFF, START_OF_SCAN))
+MAX_SCANS = 64  # a progressive picture has about ten
 DECODED_ROWS = 512
 PARAMETERLESS = {0x01, *range(0xD0, 0xD8)}  # markers without a length: TEM and the restarts
 # If data are missing before the end marker, decoders fill the rest without a warning. These bytes, inserted there, show
@@ -35,6 +37,8 @@ def decode(raw: bytes) -> Decoded:
     check_size(*image.size)
     if image.mode not in ("L", "RGB"):
         raise bad_image(f"JPEG is {image.mode}; startrack reads plain grey or colour")
+    if raw.count(START_OF_SCAN_MARK) > MAX_SCANS:  # each is decoded over the whole picture
+        raise bad_image(f"JPEG has more than {MAX_SCANS} scans")
     end = raw.find(END_OF_IMAGE, _scan_start(raw))
     if end < 0:
         raise bad_image("truncated JPEG: the file ends before its end marker")

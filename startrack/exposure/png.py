@@ -22,6 +22,8 @@ from startrack.exposure.facts import HEADER_KEYS
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 COLOUR_TYPES = {0: "grey", 2: "colour", 3: "palette", 4: "grey with alpha", 6: "colour with alpha"}
 MAX_FACT_BYTES = 4096  # of one fact; a compressed chunk is not inflated beyond it
+MAX_CHUNKS = 200_000  # libpng's of 8 KiB for a colour picture of 200 Mpx and 16 bits: 146,000
+ADAM7 = (0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2)
 IHDR_END = len(SIGNATURE) + 12 + 13  # text is spliced in after the header chunk
 
 
@@ -33,7 +35,7 @@ def decode(raw: bytes) -> Decoded:
     import cv2
 
     announce_compilation()
-    from startrack.exposure.png_rows import DAMAGED, decode_rows
+    from startrack.exposure.png_rows import DAMAGED, decode_rows, inflate_rows
 
     header: dict[str, str] = {}
     warnings: tuple[str, ...] = ()
@@ -57,6 +59,7 @@ def decode(raw: bytes) -> Decoded:
             raise bad_image(f"PNG needs a feature that startrack does not know ({kind!r})")
     # Gamma, colour profile and orientation are left out: they cannot change the pixels.
     if interlaced:
+        inflate_rows(b"".join(picture), sum(_pass_bytes(width, height, depth * channels)))
         bare = b"".join((raw[:IHDR_END], chunk(b"IDAT", b"".join(picture)), chunk(b"IEND", b"")))
         stored: NDArray[Any] | None = cv2.imdecode(np.frombuffer(bare, np.uint8), cv2.IMREAD_UNCHANGED)
         if stored is None or stored.shape[:2] != (height, width) or stored.dtype.itemsize * 8 != depth:
@@ -81,7 +84,7 @@ def png_chunks(raw: bytes) -> Iterator[tuple[bytes, memoryview]]:
     """(kind, body) of each chunk of the PNG file `raw` up to IEND, lengths and checksums verified."""
     view = memoryview(raw)
     at = len(SIGNATURE)
-    while True:
+    for _ in range(MAX_CHUNKS):
         if at + 12 > len(raw):
             raise bad_image("truncated PNG: the file ends before its IEND chunk")
         (length,) = struct.unpack_from(">I", raw, at)
@@ -96,6 +99,7 @@ def png_chunks(raw: bytes) -> Iterator[tuple[bytes, memoryview]]:
             return
         yield kind, view[at + 8 : end]
         at = end + 4
+    raise bad_image(f"PNG has more than {MAX_CHUNKS} chunks")
 
 
 def _check_ihdr(body: memoryview) -> tuple[int, int, int, int, bool]:
@@ -110,6 +114,14 @@ def _check_ihdr(body: memoryview) -> tuple[int, int, int, int, bool]:
     if depth not in (8, 16):
         raise bad_image(f"PNG has {depth} bits a pixel; startrack reads 8 or 16")
     return width, height, depth, 3 if colour_type == 2 else 1, body[12] != 0
+
+
+def _pass_bytes(width: int, height: int, pixel_bits: int) -> Iterator[int]:
+    """Bytes of the seven passes of an interlaced picture: rows of whole bytes, each after the number of its filter."""
+    for x0, y0, dx, dy in ADAM7:
+        columns, rows = -(-(width - x0) // dx), -(-(height - y0) // dy)
+        if columns > 0 and rows > 0:
+            yield rows * (1 + columns * pixel_bits // 8)
 
 
 def _read_text(kind: bytes, body: bytes, header: dict[str, str]) -> None:

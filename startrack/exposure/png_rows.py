@@ -23,20 +23,28 @@ def decode_rows(
     """
     sample_bytes = depth // 8
     row_bytes = width * channels * sample_bytes
-    size = height * (row_bytes + 1)
-    stream = isal_zlib.decompressobj()
-    try:
-        data = stream.decompress(compressed, size + 1)
-    except isal_zlib.error as cause:  # type: ignore[misc]
-        raise bad_image(DAMAGED) from cause
-    if len(data) != size or not stream.eof:
-        raise bad_image(DAMAGED)
+    data = inflate_rows(compressed, height * (row_bytes + 1))
     dtype = np.float32 if channels == 1 else np.uint8 if depth == 8 else np.uint16
     samples = np.empty((height, width * channels), dtype=dtype)
     rows = np.frombuffer(data, np.uint8).reshape(height, row_bytes + 1)
     if not unfilter(rows, channels * sample_bytes, sample_bytes, samples):
         raise bad_image(DAMAGED)
     return samples if channels == 1 else samples.reshape(height, width, channels)
+
+
+def inflate_rows(compressed: bytes, size: int) -> bytes:
+    """The `size` bytes of filtered rows. Raises BadInput bad_image where the data are damaged, too short or too long.
+
+    No more than these bytes is inflated.
+    """
+    stream = isal_zlib.decompressobj()
+    try:
+        data: bytes = stream.decompress(compressed, size + 1)
+    except isal_zlib.error as cause:  # type: ignore[misc]
+        raise bad_image(DAMAGED) from cause
+    if len(data) != size or not stream.eof:
+        raise bad_image(DAMAGED)
+    return data
 
 
 @njit(cache=True)

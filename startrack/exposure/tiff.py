@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.files import TIFF_COMPRESSIONS
+from startrack.core.tiff_strips import TIFF_COMPRESSIONS, check_packed_strips
 from startrack.exposure.decoding import (
     Decoded,
     bad_image,
@@ -27,6 +27,7 @@ from startrack.exposure.facts import facts_in_text
 MOSAIC = 32803
 REFUSED = {0: "white-is-zero", 3: "palette", 4: "a mask", 5: "CMYK", 6: "YCbCr", 8: "CIELab"}  # by photometric type
 CHANNELS = {1: 1, 2: 3, MOSAIC: 1}  # 1: black is zero, 2: red, green, blue
+MAX_PAGES = 1000  # with reduced copies of the picture
 PREDICTORS = {1, 2}  # none, horizontal: tifffile has these itself
 NOWHERE = logging.NullHandler()  # added once
 READ = "integers of 8, 16 or 32 bits and floating point"
@@ -47,6 +48,7 @@ def decode(raw: bytes) -> Decoded:
         page = _only_page(tiff)
         _check_kind(page)
         _check_strips(page, len(raw))
+        check_packed_strips(page, BytesIO(raw))
         stored = _pixels(page, raw)
         orientation = page.tags.get(274)
         header, mosaic = facts_in_text(page.description), int(page.photometric) == MOSAIC
@@ -71,6 +73,8 @@ def _check_chain(tiff: Any, raw: bytes) -> None:
 
 
 def _only_page(tiff: Any) -> Any:
+    if len(tiff.pages) > MAX_PAGES:
+        raise bad_image(f"TIFF holds more than {MAX_PAGES} pictures; startrack reads files with one")
     full = [page for page in tiff.pages if not page.is_reduced]
     if len(full) != 1:
         raise bad_image(f"TIFF holds {len(full)} pictures; startrack reads files with one")

@@ -13,7 +13,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from startrack.core.files import MAX_CAUSE_CHARS, TIFF_COMPRESSIONS
+from startrack.core.files import MAX_CAUSE_CHARS
+from startrack.core.tiff_strips import TIFF_COMPRESSIONS, check_packed_strips
 from startrack.core.types import MAX_PIXELS, BadInput
 from startrack.terrain.earth_projection import FOOT_M, WGS84_CODE, EarthProjection, is_earth
 from startrack.terrain.map_writing import DEGREE, METRE, PROJECTION_CODES
@@ -75,6 +76,7 @@ def read_geotiff(path: Path) -> Stored | None:
         decoded = page.compression in TIFF_COMPRESSIONS and page.size <= MAX_PIXELS and len(page.shape) == 2
         if projection is None or not decoded or page.predictor == FLOATING_POINT:
             return None
+        check_packed_strips(page, file.filehandle)
         scale, offset = _gdal_scale(page.tags.valueof("GDAL_METADATA"))
         if "VerticalUnitsGeoKey" in keys and scale is None:
             scale = UNIT_CODES_M.get(int(keys["VerticalUnitsGeoKey"]))

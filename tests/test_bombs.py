@@ -1,0 +1,150 @@
+"""Small files that ask a reader for much work are refused before it is done."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import io
+import struct
+import zlib
+
+import numpy as np
+import pytest
+import tifffile
+from astropy.io import fits
+from PIL import Image
+
+from startrack.camera import load_camera
+from startrack.core.types import BadInput
+from startrack.exposure import read_exposure
+from startrack.exposure.png import SIGNATURE, chunk
+from startrack.terrain import load_terrain
+
+FRAME = np.random.default_rng(1).integers(0, 1000, (40, 60)).astype(np.uint16)
+ZEROS = bytes(10**7)
+
+
+def fits_bytes(*units):
+    file = io.BytesIO()
+    fits.HDUList([fits.PrimaryHDU(), *units]).writeto(file)
+    return file.getvalue()
+
+
+def cards(*lines):
+    text = "".join(line.ljust(80) for line in (*lines, "END"))
+    return text.ljust(-(-len(text) // 2880) * 2880).encode()
+
+
+IMAGE = fits_bytes(fits.ImageHDU(FRAME.astype(np.int16)))
+HEAD = "SIMPLE  =                    T", "BITPIX  =                   16"
+EMPTY = cards("XTENSION= 'IMAGE   '", "BITPIX  =                   16", "NAXIS   =                    0")
+
+
+def packed_tiff(strip, **tags):
+    """A deflated TIFF whose only strip is replaced by `strip`."""
+    file = io.BytesIO()
+    tifffile.imwrite(file, FRAME, compression="zlib", rowsperstrip=40, metadata=None)
+    raw = file.getvalue()
+    with tifffile.TiffFile(io.BytesIO(raw)) as tiff:
+        starts, counts = tiff.pages[0].tags[273], tiff.pages[0].tags[279]
+    raw = bytearray(raw)
+    raw[starts.valueoffset : starts.valueoffset + 4] = struct.pack("<I", len(raw))
+    raw[counts.valueoffset : counts.valueoffset + 4] = struct.pack("<I", len(strip))
+    return bytes(raw) + strip
+
+
+def many_pages(count):
+    one = struct.pack("<HHHII", 1, 256, 4, 1, 1)
+    return b"II*\0" + b"".join(struct.pack("<I", 8 + 18 * k) + one for k in range(count)) + bytes(4)
+
+
+def png(data, *chunks, interlaced=0):
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 60, 40, 16, 0, 0, 0, interlaced))
+    return SIGNATURE + header + b"".join(chunks) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+
+
+def bombed_tiles():
+    """A tile-compressed image whose rows inflate to much more than their pixels."""
+    with fits.open(io.BytesIO(fits_bytes(fits.CompImageHDU(FRAME.astype(np.int16), compression_type="GZIP_1"))),
+                   disable_image_compression=True) as units:  # fmt: skip
+        header = units[1].header
+    tiles = np.empty(40, object)
+    tiles[:] = [np.frombuffer(gzip.compress(ZEROS), np.uint8)] * 40
+    unit = fits.BinTableHDU.from_columns([fits.Column("COMPRESSED_DATA", "1PB()", array=tiles)])
+    unit.header.update({key: value for key, value in header.items() if key.startswith("Z")})
+    return fits_bytes(unit)
+
+
+def many_scans():
+    file = io.BytesIO()
+    Image.fromarray((FRAME // 4).astype(np.uint8)).save(file, "JPEG", progressive=True)
+    raw = file.getvalue()[:-2]
+    return raw + 100 * raw[raw.rfind(b"\xff\xda") :] + b"\xff\xd9"
+
+
+BOMBS = {
+    "axes.fits": (lambda: cards(*HEAD, "NAXIS   =            999999999", *["COMMENT"] * 40_000), "MB of headers"),
+    "units.fits": (lambda: fits_bytes() + 2000 * EMPTY, "MB of headers"),
+    "beside.fits": (lambda: IMAGE + fits_bytes(fits.ImageHDU(np.zeros((7000, 6000), np.int16)))[2880:] * 2,
+                    "MB beside its largest unit"),
+    "zeros.fits.gz": (lambda: gzip.compress(IMAGE + ZEROS), "much follows the last unit"),
+    "zeros.fits.bz2": (lambda: bz2.compress(IMAGE + ZEROS), "much follows the last unit"),
+    "header.fits.bz2": (lambda: bz2.compress(cards(*HEAD, *["COMMENT"] * 40_000)), "MB of headers"),
+    "tiles.fits.fz": (bombed_tiles, "inflates to more than its pixels"),
+    "small-tiles.fits.fz": (lambda: fits_bytes(fits.CompImageHDU(np.zeros((400, 100), np.int16), tile_shape=(1, 1))),
+                            "40000 tiles of 1 pixels"),
+    "deflate.tif": (lambda: packed_tiff(zlib.compress(ZEROS)), "inflates to more than its part"),
+    "pages.tif": (lambda: many_pages(5000), "more than 1000 pictures"),
+    "interlaced.png": (lambda: png(zlib.compress(ZEROS), interlaced=1), "cannot be decoded"),
+    "chunks.png": (lambda: png(b"", 250_000 * chunk(b"tEXt", b"a\0b")), "more than 200000 chunks"),
+    "scans.jpg": (many_scans, "more than 64 scans"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_picture_that_asks_for_much_work_is_refused(tmp_path, name):
+    make, cause = BOMBS[name]
+    path = tmp_path / name
+    path.write_bytes(make())
+    with pytest.raises(BadInput, match=cause):
+        read_exposure(path)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 3), (5, 9), (8, 8), (17, 33)])
+@pytest.mark.parametrize("colour", [False, True])
+def test_the_size_of_interlaced_rows_is_that_of_opencv(tmp_path, shape, colour):
+    """Pillow's own encoder writes no interlaced files: rows of zeros, of the length that the format states."""
+    import cv2
+
+    from startrack.exposure.png import _pass_bytes
+
+    size = sum(_pass_bytes(shape[1], shape[0], 48 if colour else 16))
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", shape[1], shape[0], 16, 2 if colour else 0, 0, 0, 1))
+    for change, ok in ((0, True), (-1, False)):
+        raw = SIGNATURE + header + chunk(b"IDAT", zlib.compress(bytes(size + change))) + chunk(b"IEND", b"")
+        path = tmp_path / f"{ok}.png"
+        path.write_bytes(raw)
+        if ok:
+            assert cv2.imdecode(np.frombuffer(raw, np.uint8), cv2.IMREAD_UNCHANGED).shape[:2] == shape
+            assert read_exposure(path).pixels_adu.shape == shape
+        else:
+            with pytest.raises(BadInput, match="cannot be decoded"):
+                read_exposure(path)
+
+
+@pytest.mark.parametrize("key", ["a." * 5000 + "b", '"a" . ' * 5000 + "b", "[" + "a." * 5000 + "b]"])
+@pytest.mark.parametrize("read", [load_camera, load_terrain])
+def test_a_key_of_many_parts_is_refused(tmp_path, key, read):
+    path = tmp_path / "a.toml"
+    path.write_text(key if key.startswith("[") else f"{key} = 1")
+    with pytest.raises(BadInput, match="more than 16 parts"):
+        read(path)
+
+
+def test_aliases_of_yaml_are_refused(tmp_path):
+    """Each line is nine times as long as the line before, once written out."""
+    lines = ["a0: &a0 [1]", *(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 12))]
+    path = tmp_path / "camera.yaml"
+    path.write_text("\n".join([*lines, "camera_matrix: {data: *a11}", "distortion_model: *a11"]))
+    with pytest.raises(BadInput, match="not a camera file"):
+        load_camera(path)

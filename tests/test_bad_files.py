@@ -7,10 +7,12 @@ import os
 import pickle
 import resource
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import chdir, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from batch_helpers import frames
 
 from startrack.cli.main import main
 from startrack.core.errors import BadInput, BadOutput, NotLocated
+from startrack.core.files import write_atomically
 from startrack.exposure import read_exposure
 from startrack.output import remove_companions, write_results
 
@@ -57,6 +60,11 @@ def put(path: Path, kind: str) -> None:
         os.mkfifo(path)
     elif kind == "folder":
         path.mkdir()
+    elif kind == "loop":
+        path.symlink_to(path.name)
+    elif kind == "socket":
+        with chdir(path.parent), socket.socket(socket.AF_UNIX) as server:  # paths of sockets are short
+            server.bind(path.name)
     elif kind == "full folder":
         path.mkdir()
         (path / "file").write_text("")
@@ -86,6 +94,102 @@ def test_a_folder_in_place_of_a_companion_is_named(tmp_path, capsys):
     assert main(["detect", str(image), "-D", str(tmp_path / "out")]) == BAD_INPUT
     (line,) = capsys.readouterr().out.splitlines()
     assert "bad_image" in line and "00.annotated.png: cannot be replaced" in line
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "socket", "loop"])
+@pytest.mark.parametrize("name", ["00.detections.json", "00.annotated.png"])
+def test_only_regular_files_are_replaced(tmp_path, capsys, kind, name):
+    """With advice that helps where -O is given too."""
+    (image,) = frames(tmp_path, 1)
+    path = tmp_path / "out" / name
+    put(path, kind)
+    before = path.lstat()
+    with time_limit(60):
+        assert main(["detect", str(image), "-D", str(tmp_path / "out"), "-O"]) == BAD_INPUT
+    (line,) = capsys.readouterr().out.splitlines()
+    assert f"{name}: cannot be replaced: it is no regular file; remove it, or write elsewhere" in line
+    assert "-O" not in line
+    assert path.lstat() == before
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "socket", "loop"])
+def test_a_sidecar_that_is_no_regular_file_is_named(tmp_path, kind):
+    (image,) = frames(tmp_path, 1)
+    image.with_suffix(".json").unlink(missing_ok=True)
+    put(image.with_suffix(".json"), kind)
+    with time_limit(60), pytest.raises(BadInput, match=r"00\.json: is no regular file") as refusal:
+        read_exposure(image)
+    assert refusal.value.reason == "bad_image"
+
+
+@pytest.mark.parametrize("key", ["camera", "terrain", "mask", "dark"])
+@pytest.mark.parametrize(
+    "value", ["/dev/zero", "../../../../../etc/passwd", "../pipe", "..", "loop.toml", "a\nb/c.toml"]
+)
+def test_a_sidecar_that_names_anything_else_is_refused_in_one_line(tmp_path, capsys, key, value):
+    """Paths outside its folder are read as any other: as a camera, a terrain or a picture, or not at all."""
+    (image,) = frames(tmp_path / "images", 1)
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "images" / "loop.toml").symlink_to("loop.toml")
+    facts = {"time_utc": "2030-01-01T00:00:00Z", "camera": "fisheye-2048", "terrain": "shackleton-thesis"}
+    image.with_suffix(".json").write_text(json.dumps(facts | {key: value}))
+    with time_limit(60):
+        code = main(["locate", str(image), "-D", str(tmp_path / "out"), "--no-plots"])
+    (line,) = capsys.readouterr().out.splitlines()
+    assert code == BAD_INPUT and line.isprintable() and "root:" not in line
+
+
+CONTROL = "a\nb\x1b[31m\x07c"
+
+
+@pytest.mark.parametrize("command", ["detect", "locate", "identify", "batch", "track", "calibrate", "horizon"])
+@pytest.mark.parametrize("content", ["picture", "other"])
+def test_control_characters_in_names_are_escaped(tmp_path, capsys, command, content):
+    """Whatever a command prints about an image, none of it moves the cursor, and a name stays in its line."""
+    (image,) = frames(tmp_path / "images", 1)
+    named = image.with_name(f"{CONTROL}.png")
+    image.rename(named)
+    named.with_suffix(".json").write_text(json.dumps({"time_utc": "2030-01-01T00:00:00Z", "camera": "fisheye-2048"}))
+    if content == "other":
+        named.write_bytes(b"no picture")
+    more = {"calibrate": ["--fov", "180", "-o", str(tmp_path / "c.toml")], "batch": ["-j", "1", "-v"],
+            "horizon": ["--fov", "180", "--site=34,-111", "-o", str(tmp_path / "h.csv")]}  # fmt: skip
+    source = named.parent if command == "batch" else named
+    folder = [] if command in ("calibrate", "horizon") else ["-D", str(tmp_path / "out")]
+    assert main([command, str(source), *folder, *more.get(command, [])]) != 0
+    printed = capsys.readouterr()
+    text = printed.out + printed.err
+    assert "a\\nb\\x1b[31m\\x07c" in text or "c.toml  refused no_stars" in text
+    assert all(line.isprintable() for line in text.splitlines()) and "\nb" not in text
+
+
+def test_writers_at_once_leave_a_whole_file(tmp_path):
+    """Of eight that write one file, one is last; a reader sees a whole file at any time, and no temporary one stays."""
+    path, texts = tmp_path / "a.json", [str(k).encode() * 100_000 for k in range(8)]
+    write_atomically(path, texts[0], overwrite=True)
+    with ThreadPoolExecutor(8) as pool:
+        writers = [pool.submit(write_atomically, path, text, overwrite=True) for text in texts for _ in range(10)]
+        seen = {path.read_bytes() for _ in range(100)}
+        for writer in writers:
+            writer.result()
+    assert {*seen, path.read_bytes()} <= {*texts}
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_locate_and_batch_state_the_same_paths(tmp_path):
+    """Of camera and terrain, named in a sidecar or by flags, from whatever folder the command runs."""
+    (image,) = frames(tmp_path / "images", 1)
+    for kind, name in (("calib", "fisheye-2048"), ("terrain", "shackleton-thesis")):
+        (tmp_path / f"{kind}.toml").write_bytes((ROOT / kind / f"{name}.toml").read_bytes())
+    named = {"camera": "../calib.toml", "terrain": "../images/../terrain.toml", "time_utc": "2030-01-01T00:00:00Z"}
+    image.with_suffix(".json").write_text(json.dumps(named))
+    with chdir(tmp_path):
+        main(["locate", "images/00.png", "-D", "one", "--no-plots", "-q"])
+        main(["batch", "images", "-D", "many", "--no-plots", "-j", "1", "-q"])
+    records = [json.loads((tmp_path / out / "00.fix.json").read_text())["provenance"] for out in ("one", "many")]
+    assert records[0] == records[1]
+    assert records[0]["camera"] == os.path.realpath(tmp_path / "calib.toml")
+    assert records[0]["terrain"] == os.path.realpath(tmp_path / "terrain.toml")
 
 
 @pytest.mark.slow
@@ -158,8 +262,9 @@ def test_a_full_disk_leaves_no_part_of_a_fix(located, tmp_path, largest_kb):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1024 * largest_kb, limits[1]))
     try:
-        with pytest.raises(BadInput, match=r"cannot be written \(File too large\)"):
+        with pytest.raises(BadInput, match=r"cannot be written \(File too large\)") as refusal:
             write_results(located.result, path)
+        assert (refusal.value.reason, refusal.value.reason.exit_code) == ("disk_full", BAD_INPUT)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert list(tmp_path.iterdir()) == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import re
@@ -13,7 +14,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from startrack.core import compilation
+from startrack.core import compilation, kernels
 from startrack.core.runner import Runner
 from startrack.core.types import Evidence, NotLocated
 from startrack.detection.residual_kernel import fill_row
@@ -42,6 +43,7 @@ kernel(1)
 """
 
 PEAKS = """
+import errno
 import hashlib
 import numpy as np
 from startrack.detection.peak_kernel import find_maxima
@@ -86,6 +88,40 @@ def test_a_kernel_gives_the_same_bytes_compiled_and_loaded(tmp_path):
     compiled, loaded = (run_script(script, tmp_path / "cache")[0] for _ in range(2))
     assert int(compiled.split()[0]) > 100
     assert compiled == loaded
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["nbi", "nbc"])
+def test_compiled_code_that_was_cut_short_is_made_anew(tmp_path, kind):
+    """With one line for all files and the same bytes; the run after it loads what it kept."""
+    script, cache = tmp_path / "peaks.py", tmp_path / "cache"
+    script.write_text(PEAKS)
+    before, _ = run_script(script, cache)
+    files = list(cache.rglob(f"*.{kind}"))
+    assert files
+    for file in files:
+        file.write_bytes(file.read_bytes()[:30])
+    out, log = run_script(script, cache)
+    assert out == before
+    assert log.splitlines() == [f"a file of compiled code was cut short: compiled anew ({cache})"]
+    assert run_script(script, cache) == (before, "")
+
+
+def test_compiled_code_that_the_disk_does_not_take_is_used_all_the_same(monkeypatch, caplog):
+    """A full disk, in the process that compiles."""
+
+    def no_space(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    kernel = kernels.njit(cache=True)(add_two)
+    monkeypatch.setattr(kernel._cache._cache_file, "save", no_space)
+    monkeypatch.setattr(kernels, "WARNED", set())
+    assert kernel(1.0) == 3.0
+    assert "cannot be kept (No space left on device)" in caplog.text
+
+
+def add_two(x):
+    return x + 2.0
 
 
 def test_python_calls_no_inner_kernel():

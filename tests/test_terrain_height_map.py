@@ -223,7 +223,7 @@ def test_a_raised_camera_sees_what_it_sees_without_the_table(shackleton):
     assert np.abs(found - terrain.horizon_rad(places, azimuths)).max() > 1e-5
 
 
-def test_the_table_is_kept_and_found_again_by_content(shackleton):
+def test_the_table_is_kept_and_found_again_by_content(shackleton, caplog):
     terrain = replace(shackleton, camera_height_m=1.7, search_radius_m=150.0)
     table = terrain.table
     key, path = terrain.table_key, terrain.table_path
@@ -243,6 +243,7 @@ def test_the_table_is_kept_and_found_again_by_content(shackleton):
     path.write_bytes(path.read_bytes()[:1000])
     cache.TABLES_IN_MEMORY.pop(key)
     assert cache.load_table(key, terrain.square) is None  # a damaged table is made again
+    assert f"{path} cannot be read (cut short?): made anew" in caplog.text
     cache.keep_table(key, table)
     assert cache.load_table(key, terrain.square) is table
 

@@ -103,6 +103,7 @@ def test_values_may_be_separated_by_tabs_and_rounded(tmp_path):
         ([*GOOD, GOOD[2]], "line 4: a second pose at the time 20.000000"),
         (["# head", GOOD[0], "10 nan 0 0 0 0 0 1", GOOD[2]], "line 3: a number is NaN or infinite"),
         ([GOOD[0], "10 0 0 inf 0 0 0 1"], "line 2: a number is NaN or infinite"),
+        ([GOOD[0], "10 1e300 0 0 0 0 0 1"], "line 2: a coordinate is larger than 1e\\+08 m"),
         ([GOOD[0], "10 1 0 0 0 0 0 0"], "line 2: the quaternion has the length 0, not 1"),
         ([GOOD[0], "10 1 0 0 0 0 1 1"], "line 2: the quaternion has the length 1.41"),
         ([GOOD[0], "10 1 0 0 0 0 1e300 1e300"], "line 2: the quaternion has the length inf"),

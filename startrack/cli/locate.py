@@ -22,7 +22,7 @@ from startrack.cli.flags import check_localizer
 from startrack.cli.images import check_fov, compile_beside, near_attitude_of, prepare_reference, read
 from startrack.cli.report import write_page_of_images
 from startrack.core.errors import INTERNAL_ERROR, BadInput, BadOutput
-from startrack.core.files import make_folder
+from startrack.core.files import make_folder, printable
 from startrack.core.types import Exposure, PositionPrior
 from startrack.exposure import split_bag_path
 from startrack.identification import WIDE_FIELD_RAD
@@ -91,9 +91,9 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve) -> int:
                 raise
             message = f"internal error: {type(cause).__name__}: {cause} (-v shows the traceback)"
             record = refusal_record(INTERNAL_ERROR, message, **first, image=name)
-            line = f"{name}  {message}"
+            line = f"{printable(name)}  {message}"
         for warning in () if args.quiet else record.get("warnings", ()):
-            print(f"{name}: {warning}", file=sys.stderr, flush=True)
+            print(f"{printable(name)}: {warning}", file=sys.stderr, flush=True)
         codes.add(print_outcome(args, record, line))
     return worst_code(codes)
 

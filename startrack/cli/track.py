@@ -94,7 +94,7 @@ class TrackRun:
                 bag = tracking.read_bag_exposures(first, self.args.image_topic, **self.session.facts)
                 sources = ((exposure.name, partial(self._add_exposure, exposure)) for exposure in bag)
             else:
-                sources = ((Path(path).name, partial(self._add, path)) for path in paths)
+                sources = ((printable(Path(path).name), partial(self._add, path)) for path in paths)
             for name, add in sources:
                 try:
                     add()
@@ -114,7 +114,7 @@ class TrackRun:
             for path in tracking.follow_images(
                 lambda: [image.path for image in images_under(folder, self.args.dir)],
                 self._add,
-                lambda path, cause: self._refuse(os.path.relpath(path, folder), cause),
+                lambda path, cause: self._refuse(printable(os.path.relpath(path, folder)), cause),
                 until_idle_s=self.args.until_idle,
             ):
                 self._update(path is not None)

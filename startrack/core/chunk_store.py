@@ -10,6 +10,7 @@ from contextlib import AbstractContextManager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
+from zipfile import is_zipfile
 
 import numpy as np
 
@@ -53,7 +54,7 @@ class ChunkStore(Runner[Task, Chunk]):
 
     def chunks(self, what: str, tasks: Sequence[Task]) -> Iterator[Chunk]:
         """The chunks of `what` in the order of the tasks; missing ones are computed. Raises RunStopped."""
-        missing = [task for task in tasks if not self._path(task).exists()]
+        missing = [task for task in tasks if not is_zipfile(self._path(task))]  # or cut short
         with self.progress(what, sum(map(len, missing))) as bar:
             for task, chunk in self.results(missing):
                 if isinstance(chunk, Died):

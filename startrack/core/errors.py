@@ -61,6 +61,10 @@ class Reason(StrEnum):
         "bad_odometry", EXIT_BAD_INPUT, "The odometry, or the path of a drive, cannot be used",
         "Correct what the message names; docs/track.md describes the files of odometry and the path of a drive.",
     )  # fmt: skip
+    DISK_FULL = (
+        "disk_full", EXIT_BAD_INPUT, "The disk is full, or takes no file of this size",
+        "Free space there, or write the results to another disk with -D; then run the same command again.",
+    )  # fmt: skip
     NO_CLUSTER = (
         "no_cluster", EXIT_BAD_INPUT, "The cluster of --cluster cannot be reached",
         "Start a Dask scheduler and give its address, such as tcp://host:8786.",
@@ -131,11 +135,16 @@ def length_text(metres: float, digits: int = 2) -> str:
     return f"{Decimal(f'{metres:.{digits}g}'):f} m"
 
 
+def one_line(text: str) -> str:
+    """A `text` for one line of a terminal: control characters, which names of files may hold, are escaped."""
+    return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
+
+
 class BadInput(Exception):
     """Input that cannot be used (exit code 4). `reason` is one of the codes of `Reason`, `message` the cause."""
 
     def __init__(self, reason: str, message: str) -> None:
-        super().__init__(message)
+        super().__init__(one_line(message))
         self.reason = Reason(reason)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -151,7 +160,7 @@ class BadOutput(BadInput):
 
     def __init__(self, reason: str, message: str, command_message: str = "") -> None:
         super().__init__(reason, message)
-        self.command_message = command_message or message
+        self.command_message = one_line(command_message or message)
 
 
 class NoSolution(Exception):

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from startrack.core.errors import BadInput, BadOutput
+from startrack.core.errors import BadInput, BadOutput, Reason, one_line
 
 PACKAGE = Path(__file__).resolve().parents[1]
 MAX_TEXT_BYTES = 2**20  # camera and terrain files have a few kilobytes
@@ -155,16 +155,14 @@ def check_output(file: FilePath, *, overwrite: bool, reason: str = "bad_image") 
     except (OSError, ValueError) as cause:  # a name too long, or with a null character
         text = getattr(cause, "strerror", None) or cause
         raise BadOutput(reason, f"{printable(path)}: cannot be written ({text})") from cause
-    if os.path.lexists(path) and not os.path.isfile(path):  # a folder; a pipe or a device, which must not be replaced
-        raise BadOutput(reason, f"{printable(path)}: is no file, so that it cannot be replaced: choose another")
     check_free(path, overwrite=overwrite, reason=reason)
     make_folder(path.parent, reason)
     return path
 
 
 def printable(name: FilePath) -> str:
-    """A file's name as one line of text for messages: undecodable bytes are escaped, white space is one blank."""
-    return " ".join(os.fspath(name).encode("utf-8", "backslashreplace").decode().split())
+    """A file's name as one line of text for messages: undecodable bytes and control characters are escaped."""
+    return one_line(os.fspath(name).encode("utf-8", "backslashreplace").decode())
 
 
 def file_stem(name: str) -> str:
@@ -206,16 +204,34 @@ def write_atomically(path: FilePath, data: bytes, *, overwrite: bool, reason: st
 
 
 def _write_error(cause: Exception, reason: str, path: FilePath, text: str, advice: str = "") -> BadInput:
-    """BadInput of a full disk, else BadOutput: the path is at fault."""
-    kind = BadInput if isinstance(cause, OSError) and cause.errno in FULL_DISK else BadOutput
+    """BadInput (disk_full), or where the path is at fault BadOutput `reason`."""
+    is_full = isinstance(cause, OSError) and cause.errno in FULL_DISK
+    kind, reason = (BadInput, Reason.DISK_FULL) if is_full else (BadOutput, reason)
     return kind(reason, f"{printable(path)}: {text} ({getattr(cause, 'strerror', None) or cause}){advice}")
 
 
 def check_free(path: FilePath, *, overwrite: bool, reason: str = "bad_image") -> None:
-    """Raise BadOutput `reason` if the file exists and may not be replaced."""
+    """Raise BadOutput `reason` if the file exists and may not be replaced, as nothing but a regular file may."""
+    check_regular(path, reason)
     if not overwrite and os.path.lexists(path):
         text, ways = f"{printable(path)}: exists already: replace it with", ("overwrite=True", "-O")
         raise BadOutput(reason, *(f"{text} {way}, or write elsewhere" for way in ways))
+
+
+def check_regular(path: FilePath, reason: str = "bad_image") -> None:
+    """Raise BadOutput `reason` for a folder, a pipe, a device, a socket or a link to none of the user's files."""
+    if os.path.lexists(path) and not os.path.isfile(path):
+        cause = "cannot be replaced: it is no regular file; remove it, or write elsewhere"
+        raise BadOutput(reason, f"{printable(path)}: {cause}")
+
+
+def remove_file(path: FilePath, reason: str = "bad_image") -> None:
+    """Remove a former result, if there is one. Raises BadOutput `reason` if it is no regular file or has to stay."""
+    check_regular(path, reason)
+    try:
+        Path(path).unlink(missing_ok=True)
+    except OSError as cause:
+        raise _write_error(cause, reason, path, "cannot be written") from cause
 
 
 @contextmanager

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from math import erfc, sqrt
+from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import numpy as np
@@ -23,6 +27,9 @@ from numba.core.registry import CPUDispatcher  # noqa: E402
 from numba.core.runtime._nrt_python import c_helpers  # noqa: E402
 from numba.extending import overload  # noqa: E402, F401 - for kernels that choose code by types
 
+LOG = logging.getLogger(__name__)
+CUT_SHORT = EOFError, UnpicklingError, ValueError, LookupError, AttributeError  # of pickle, about a part of a file
+WARNED: set[str] = set()  # texts logged by this process
 REORDERED_SUMS = {"reassoc", "contract", "nsz"}  # as `fastmath`: lets the compiler sum several pixels at a time
 PYTHON_WRAPPER = "_ZN7cpython"  # begin of the name by which Python calls
 REACH, CDF_STEPS = 8.0, 4096  # of `normal_cdf`: standard deviations on either side, and steps of the table
@@ -81,14 +88,34 @@ def prepare_loading(codegen: Any) -> None:
         add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
 
 
+def warn_of_cache(text: str, folder: str) -> None:
+    """Log a `text` about the `folder` of compiled code, once a process."""
+    if text not in WARNED:
+        WARNED.add(text)
+        LOG.warning("%s (%s)", text, Path(folder).parent)
+
+
 class KernelCache(FunctionCache):  # type: ignore[misc]
     """numba's cache of a kernel, which loads it without all that compilation needs: that takes 0.2 s."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The compiled kernel for arguments of types `sig` in a `target_context`; None where there is none yet."""
         prepare_loading(target_context.codegen())
-        with self._guard_against_spurious_io_errors():
-            return self._load_overload(sig, target_context)
+        try:
+            with self._guard_against_spurious_io_errors():
+                return self._load_overload(sig, target_context)
+        except CUT_SHORT:
+            warn_of_cache("a file of compiled code was cut short: compiled anew", self.cache_path)
+            with suppress(OSError):
+                self.flush()
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep the compiled kernel `data` for arguments of types `sig`, where the disk takes it."""
+        try:
+            super().save_overload(sig, data)
+        except OSError as cause:
+            warn_of_cache(f"compiled code cannot be kept ({cause.strerror}): every command compiles", self.cache_path)
 
 
 class InnerKernel(CPUDispatcher):  # type: ignore[misc]

@@ -15,7 +15,7 @@ MAX_SPARE_BYTES = 2**26  # of a tile beyond the picture that it is cropped to
 def check_packed_strips(page: Any, file: Any) -> None:
     """Raise ValueError where strips or tiles would decode to more than the picture.
 
-    `page` is a tifffile.TiffPage of a compression among TIFF_COMPRESSIONS or any other, `file` (open, binary) holds its bytes.
+    `page` is a tifffile.TiffPage of any compression; `file` (open, binary) holds its bytes.
     """
     from isal import isal_zlib
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -56,8 +56,11 @@ def sidecars(image: Path) -> list[Path]:
 
 def sidecar_of(image: Path) -> Path | None:
     """The sidecar of the image if there is one. Cameras that write NAME.PNG write NAME.JSON."""
-    candidates = (candidate for path in sidecars(image) for candidate in (path, path.with_suffix(".JSON")))
-    return next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
+    return next((candidate for candidate in _candidates(image) if os.path.isfile(candidate)), None)
+
+
+def _candidates(image: Path) -> Iterator[Path]:
+    return (candidate for path in sidecars(image) for candidate in (path, path.with_suffix(".JSON")))
 
 
 def _stems(image: Path) -> list[str]:
@@ -81,6 +84,9 @@ class Sidecar:
     @classmethod
     def read(cls, image: Path) -> Sidecar:
         """The sidecar of an image; without one, one without keys. Raises BadInput bad_image."""
+        for candidate in _candidates(image):
+            if os.path.lexists(candidate) and not os.path.isfile(candidate):  # a pipe would block
+                raise cls(candidate)._fault("is no regular file")
         path = sidecar_of(image)
         if path is None:
             return cls(image)

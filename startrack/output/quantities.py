@@ -11,7 +11,7 @@ from startrack.chain import Detected, Identified, Inputs, Located, Measured, Ori
 from startrack.frames import format_utc
 from startrack.output.quantities_pose import ATTITUDE_QUANTITIES, POSITION_QUANTITIES
 from startrack.output.quantity import Column, Listed, Quantity, Show, list_schema, show_everywhere
-from startrack.output.values import blocked_deg, chance_text, predicted_visible, ranges_text
+from startrack.output.values import blocked_deg, chance_text, file_or_name, predicted_visible, ranges_text
 
 Q = Quantity
 LIGHT_QUANTITIES: tuple[Quantity, ...] = (
@@ -75,10 +75,10 @@ RUN_QUANTITIES: tuple[Quantity, ...] = (
     Q("provenance.version", "", Inputs, lambda v: __version__, "of startrack", "text"),
     Q("provenance.image_sha256", "", Inputs, lambda v: v.exposure.sha256,
       "of the file; of an array: of its type, shape and values", "text", form="%s"),
-    Q("provenance.camera", "", Inputs, lambda v: v.exposure.camera or (v.camera.name if v.camera is not None else None),
-      "camera file or name", "text", before=None, form="%s"),
+    Q("provenance.camera", "", Inputs, lambda v: file_or_name(v.exposure.camera, v.camera),
+      "camera file, as a path without links of folders, or name", "text", before=None, form="%s"),
     Q("provenance.terrain", "", Inputs,
-      lambda v: v.exposure.terrain or (v.terrain.name if v.terrain is not None else None), "terrain file or name",
+      lambda v: file_or_name(v.exposure.terrain, v.terrain), "terrain file, likewise, or name",
       "text", before=None, form="%s"),
     Q("provenance.catalog", "", Inputs, lambda v: v.catalog_name or None, "star catalogue", "text", before=None),
     Q("provenance.localizer", "", Inputs, lambda v: v.localizer_name or None,

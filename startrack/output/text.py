@@ -63,13 +63,13 @@ def summary_line(result: Outcome, seconds: float | None = None) -> str:
         return refusal_line(image_name(result.exposure), result.reason, result.message)
     took = f"{sum(result.timing_ms.values()) / 1e3:.1f} s" if seconds is None else f"{seconds:.1f} s with files"
     parts = [text for _, text in rows("summary", stage_values(result))]
-    return "  ".join([image_name(result.exposure), result.status, *parts, took])
+    return "  ".join([printable(image_name(result.exposure)), result.status, *parts, took])
 
 
 def refusal_line(image: str, reason: str, message: str) -> str:
     """One line about an `image` that was refused at whatever stage: `reason` and `message`, its own name left out."""
     cause = " ".join(message.split()).removeprefix(f"{printable(image)}: ")
-    return f"{Path(image).name}  refused  {reason}: {cause}"
+    return f"{printable(Path(image).name)}  refused  {reason}: {cause}"
 
 
 def lens_text(camera: Camera) -> str:

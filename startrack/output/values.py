@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from startrack.camera import Camera
 from startrack.chain import Located, Measured, Oriented
+from startrack.core.files import is_path
 from startrack.core.statistics import error_ellipse
 from startrack.core.types import Array, Fix
 from startrack.frames import R_from_rotvec, heading_pitch_roll_from_R_body_enu, latlon_from_enu
+from startrack.terrain import Terrain
 
 ARCSEC_PER_RAD = 648_000 / np.pi
 SMALLEST_CHANCE = 1e-100  # smaller probabilities are beyond the models that they come from
@@ -98,6 +102,14 @@ def predicted_visible(value: Located) -> int:
         horizon = value.terrain.horizon_rad(np.array([skyline_position_m(value)]), light.azimuth_rad)
         _predicted_visible[value] = int((light.usable & (light.elevation_rad > horizon)).sum())
     return _predicted_visible[value]
+
+
+def file_or_name(reference: str | None, used: Camera | Terrain | None) -> str | None:
+    """A camera's or terrain's `reference`, a file as an absolute path, or the name of the one that was `used`."""
+    if not reference:
+        return None if used is None else used.name
+    folder, name = os.path.split(reference)
+    return os.path.join(os.path.realpath(folder), name) if is_path(reference) else reference
 
 
 def chance_text(probability: float) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 
 from startrack.chain import Located, Measured, Oriented, Outcome, last_value
 from startrack.core.errors import BadInput
-from startrack.core.files import make_folder, write_atomically
+from startrack.core.files import check_regular, make_folder, printable, remove_file, write_atomically
 from startrack.core.types import MeasuredSkyline
 from startrack.output.geo import GEO_FORMATS, geo_text
 from startrack.output.picture.annotate import annotated_png
@@ -46,7 +46,7 @@ def companion(record: Path, suffix: str) -> Path:
 def remove_companions(record: Path) -> None:
     """Remove what an earlier run left beside a `record`: a refusal must not stand beside the picture of a success."""
     for suffix in KINDS[_stem_and_kind(record)[1]]:
-        companion(record, suffix).unlink(missing_ok=True)
+        remove_file(companion(record, suffix))
 
 
 def prepare_folder(path: Path, sha256: str, *, overwrite: bool, remedy: str) -> None:
@@ -56,21 +56,17 @@ def prepare_folder(path: Path, sha256: str, *, overwrite: bool, remedy: str) -> 
     Raises BadInput (bad_image, for lack of a better code) with the `remedy`, or where nothing can be written.
     """
     make_folder(path.parent)
+    check_regular(path)  # a pipe would block
     try:
-        if path.exists() and not path.is_file():  # a folder; a pipe, which would block
-            raise BadInput("bad_image", f"{path}: cannot be replaced: it is no file; {remedy}")
         before = json.loads(path.read_text(encoding="utf-8")) if path.exists() and not overwrite else None
     except OSError as cause:
-        raise BadInput("bad_image", f"{path}: cannot be read, nor replaced: {cause.strerror}") from cause
+        raise BadInput("bad_image", f"{printable(path)}: cannot be read, nor replaced: {cause.strerror}") from cause
     except (ValueError, RecursionError):  # no JSON: not ours
         before = {}
     provenance = before.get("provenance") if isinstance(before, dict) else None
     if before is not None and not (isinstance(provenance, dict) and provenance.get("image_sha256") == sha256):
-        raise BadInput("bad_image", f"{path} is not a result of this image: {remedy}")
-    try:
-        remove_companions(path)
-    except OSError as cause:
-        raise BadInput("bad_image", f"{cause.filename}: cannot be replaced: {cause.strerror}; {remedy}") from cause
+        raise BadInput("bad_image", f"{printable(path)} is not a result of this image: {remedy}")
+    remove_companions(path)
 
 
 def _stem_and_kind(record: Path) -> tuple[str, str]:
@@ -93,7 +89,7 @@ def write_results(
         if write_record:
             write_json(path, record)
     except BaseException:
-        with suppress(OSError):  # must not hide the cause
+        with suppress(BadInput):  # must not hide the cause
             remove_companions(path)
         raise
     return record
@@ -130,7 +126,7 @@ def write_geo(record: Path, outcome: Outcome, kinds: Sequence[str]) -> None:
         if kind in kinds and isinstance(outcome, Located):
             write_atomically(path, geo_text(outcome, kind).encode("utf-8"), overwrite=True)
         else:
-            path.unlink(missing_ok=True)
+            remove_file(path)
 
 
 def write_json(path: FilePath, record: dict[str, Any]) -> None:
@@ -161,7 +157,7 @@ def write_wcs(path: FilePath, corr_path: FilePath, value: Oriented) -> None:
     """
     header = wcs_bytes(value)
     if header is None:
-        Path(path).unlink(missing_ok=True)
+        remove_file(path)
     else:
         write_atomically(path, header, overwrite=True)
     write_atomically(corr_path, matches_bytes(value), overwrite=True)

@@ -72,10 +72,14 @@ def load_table(key: str, square: Square) -> HorizonTable | None:
     """The table of a `square` from memory or disk; None if there is none that can be read."""
     table = TABLES_IN_MEMORY.get(key)
     if table is None:
+        path = path_of_table(key)
+        if not path.is_file():
+            return None
         try:
-            with path_of_table(key).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
                 values, unknown = arrays["values"], arrays["unknown_rad"]
         except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+            LOG.warning("the table of horizons %s cannot be read (cut short?): made anew", path)
             return None
         if values.shape != (square.across**2, AZIMUTH_BINS, FIELDS) or unknown.shape != (AZIMUTH_BINS,):
             return None

@@ -14,8 +14,8 @@ from typing import Any
 
 from startrack import __version__, chain, output
 from startrack.chain import NearAttitude, Outcome, content_sha256
-from startrack.core.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput
-from startrack.core.files import FULL_DISK
+from startrack.core.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput, one_line
+from startrack.core.files import FULL_DISK, printable, remove_file
 from startrack.core.runner import Died, Runner, RunStopped
 from startrack.core.types import Exposure, PositionPrior
 from startrack.exposure import BagImage, read_bag_image, read_exposure
@@ -141,10 +141,10 @@ def _remove_former(result: Path) -> None:
     """Make the folder and remove the files of an earlier run. Raises BadInput if that is impossible."""
     try:
         result.parent.mkdir(parents=True, exist_ok=True)
-        result.unlink(missing_ok=True)
+        remove_file(result)
         output.remove_companions(result)
     except OSError as cause:
-        raise BadInput("bad_image", f"{result}: cannot be written ({cause.strerror})") from cause
+        raise BadInput("bad_image", f"{printable(result)}: cannot be written ({cause.strerror})") from cause
 
 
 def read_task(task: Task) -> Exposure:
@@ -222,8 +222,8 @@ def is_older_than(image: str | os.PathLike[str], result: str | os.PathLike[str])
 
 
 def text_of_name(name: str) -> str:
-    """A file's name as text: undecodable bytes become question marks."""
-    return name.encode("utf-8", "replace").decode("utf-8")
+    """A file's name as text of one line: undecodable bytes become question marks, control characters are escaped."""
+    return one_line(name.encode("utf-8", "replace").decode("utf-8"))
 
 
 def read_object(file: Path) -> dict[str, Any] | None:

@@ -26,6 +26,7 @@ TUM_COLUMNS = "time tx ty tz qx qy qz qw"
 LAST_TIME_S = datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC).timestamp()  # larger numbers are milliseconds or less
 QUATERNION_LENGTH_1 = 0.01  # error of a quaternion's length from rounding to two digits; more is another quantity
 SPAN_TOLERANCE_S = 1e-3  # some files round times to 0.1 ms; a rover moves less than 0.1 mm in that time
+LARGEST_COORDINATE_M = 1e8  # also of frames that count from the middle of a body
 MAX_ODOMETRY_BYTES = 2**28  # two million poses
 
 
@@ -219,10 +220,12 @@ def _first_fault(rows: Array) -> tuple[int, str] | None:
     time_s = rows[:, 0]
     with np.errstate(over="ignore", invalid="ignore"):
         length, step_s = np.linalg.norm(rows[:, 4:], axis=1), np.diff(time_s, prepend=-np.inf)
+        largest_m = np.abs(rows[:, 1:4]).max(axis=1)
         faults = {
             "a number is NaN or infinite": ~np.isfinite(rows).all(axis=1),
             "the time {now:.6g} is not in Unix seconds": ~((time_s >= 0) & (time_s <= LAST_TIME_S)),
             "the quaternion has the length {length:.3g}, not 1": ~(np.abs(length - 1) <= QUATERNION_LENGTH_1),
+            f"a coordinate is larger than {LARGEST_COORDINATE_M:.0e} m": ~(largest_m <= LARGEST_COORDINATE_M),
             "a second pose at the time {now:.6f}": step_s == 0,
             "times are not in order: {now:.6f} follows {before:.6f}": step_s < 0,
         }

@@ -124,7 +124,7 @@ def score_track(case: Case, rng: np.random.Generator, pixels: bool, number: int)
         found["smoothed"] = _score(position[-1:], covariance[-1:], course.position_m[:1])
     else:
         late = slice(SETTLED_FRAMES, None)
-        position, covariance = filter_positions(modes, steps, len(course.shared), sigma_m)
+        position, covariance, _, _ = filter_positions(modes, steps, len(course.shared), sigma_m)
         found["filtered"] = _score(position[late], covariance[late], course.position_m[late])
         robust = smooth_robustly(modes, steps, sigma_m).smoothed
         found["smoothed"] = _score(robust.position_m, robust.covariance_m2, course.position_m)

@@ -67,7 +67,7 @@ def compare(rng: np.random.Generator, python: str) -> dict[str, float]:
     start = time.process_time()
     ours = smooth(Observations.of(estimates, sigma_m), steps).position_m
     middle = time.process_time()
-    filtered, _ = filter_positions([(e,) for e in estimates], steps, len(course.shared), sigma_m)
+    filtered, _, _, _ = filter_positions([(e,) for e in estimates], steps, len(course.shared), sigma_m)
     end = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         given, answer = Path(folder, "in.npz"), Path(folder, "out.npz")

@@ -196,6 +196,7 @@ def test_the_library_gives_the_track_of_the_command(drive, tracked):
         (["--odometry", "none.tum"], 4, "none.tum"),
         (["-t", "shackleton-none"], 4, "bad_terrain"),
         (["--until-idle", "3"], 2, "is for --follow"),
+        (["--max-speed", "0"], 2, "is not above 0"),
     ],
 )
 def test_wrong_use_is_refused_in_a_line(drive, tmp_path, capsys, arguments, code, message):
@@ -207,6 +208,24 @@ def test_wrong_use_is_refused_in_a_line(drive, tmp_path, capsys, arguments, code
     assert found == code, text
     assert message in text
     assert "Traceback" not in text
+
+
+def test_wrong_odometry_is_left_out_or_refused(drive, tracked, tmp_path, capsys):
+    lines = [line for line in (drive / "frames" / "odometry.tum").read_text().splitlines() if line[0] != "#"]
+    poses = np.array([line.split() for line in lines], dtype=float)
+    poses[:, 1:3] *= -1.0
+    reversed_signs, out = tmp_path / "odometry.tum", tmp_path / "out"
+    np.savetxt(reversed_signs, poses, fmt="%.9f")
+    shutil.copytree(tracked, out)
+    assert run(drive / "frames", "--odometry", reversed_signs, "-D", out, "-q") == 3
+    assert "the odometry has the opposite sign" in capsys.readouterr().err
+    record = json.loads((out / "track.json").read_text())
+    Draft202012Validator(TRACK).validate(record)
+    assert record["odometry"]["fault"] == "the opposite sign"
+    for one, true in zip(record["frames"], truth_m(drive), strict=True):
+        assert np.hypot(one["east_m"] - true[0], one["north_m"] - true[1]) < 2.0 * one["radius999_m"]
+    assert run(drive / "frames", "--odometry", reversed_signs, "--max-speed", "0.04", "-D", out, "-q") == 4
+    assert "faster than 0.04 m/s" in capsys.readouterr().err
 
 
 def test_a_folder_without_images_is_refused(tmp_path, capsys):

@@ -52,7 +52,9 @@ def test_frames_of_another_depth_are_left_out(silent):
     other = 0.004 + noise
     other[[2, 5]] = -0.004
     assert left_out(other, silent) == [2, 5]
-    assert left_out([0.004, -0.004], silent) == [1]  # of two the later one
+    with pytest.raises(startrack.BadInput, match="neither is clearly right") as refusal:
+        left_out([0.004, -0.004], silent)
+    assert refusal.value.reason == "inconsistent_evidence"
 
 
 def test_the_library_refuses_what_the_command_refuses(tmp_path):

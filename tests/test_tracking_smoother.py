@@ -7,6 +7,7 @@ import pytest
 from tracking_helpers import HEIGHT_SIGMA_M, STEP_SIGMA_M, Drive, mean_nees, shifted, simulate_drive, with_slips
 
 from startrack.applications.tracking.contradictions import smooth_robustly
+from startrack.applications.tracking.explanations import Moves
 from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions
 from startrack.estimation import trajectory
 from startrack.estimation.observations import Observations, Steps
@@ -72,7 +73,7 @@ def test_the_filter_is_the_smoother_of_the_frames_so_far():
 def test_the_filter_forgets_posts_without_a_jump(monkeypatch):
     drive = simulate_drive(np.random.default_rng(12), 30)
     modes = [(e,) for e in drive.estimates]
-    whole, covariance = filter_positions(modes, drive.steps, 1, HEIGHT_SIGMA_M)
+    whole, covariance, _, _ = filter_positions(modes, drive.steps, 1, HEIGHT_SIGMA_M)
     monkeypatch.setattr(trajectory, "MOST_POSTS", 16)  # 12 are kept: a frame depends on 8, of which the next has 6
     state = TrackFilter(1, HEIGHT_SIGMA_M)
     for k, estimate in enumerate(drive.estimates):
@@ -146,7 +147,7 @@ def test_a_frame_that_contradicts_is_left_out_by_both_estimates():
     found = smooth_robustly(modes, drive.steps, HEIGHT_SIGMA_M)
     assert found.mode.tolist() == [0] * 8 + [-1] + [0] * 11
     assert not found.slipped.any()
-    online, _ = filter_positions(modes, drive.steps, 1, HEIGHT_SIGMA_M)
+    online, _, _, _ = filter_positions(modes, drive.steps, 1, HEIGHT_SIGMA_M)
     assert np.linalg.norm(online - drive.position_m, axis=1).max() < 15.0
 
 
@@ -154,7 +155,7 @@ def test_a_wrong_first_frame_does_not_hold_the_filter():
     drive = simulate_drive(np.random.default_rng(8), 12)
     modes = [(e,) for e in drive.estimates]
     modes[0] = (shifted(drive.estimates[0], np.array([300.0, 400.0])),)
-    online, _ = filter_positions(modes, drive.steps, 1, HEIGHT_SIGMA_M)
+    online, _, _, _ = filter_positions(modes, drive.steps, 1, HEIGHT_SIGMA_M)
     assert np.linalg.norm(online[4:] - drive.position_m[4:], axis=1).max() < 15.0
     assert smooth_robustly(modes, drive.steps, HEIGHT_SIGMA_M).mode[0] == -1
 
@@ -166,8 +167,8 @@ def test_three_refused_frames_are_bridged_with_growing_errors():
     assert found.mode.tolist() == [-1 if k in (5, 6, 7) else 0 for k in range(12)]
     online = OnlineTrack(1, HEIGHT_SIGMA_M)
     traces = []
-    for k, of in enumerate(modes):
-        online.add(of, drive.steps.move_m[k - 1] if k else np.zeros(2), STEP_SIGMA_M if k else 0.0)
+    for of in modes:
+        online.add(of, [Moves.of(drive.steps)])
         traces.append(np.trace(online.filter.covariance_m2))
     assert traces[4] < traces[5] < traces[6] < traces[7] > traces[8]
     smoothed = np.trace(found.smoothed.covariance_m2, axis1=1, axis2=2)

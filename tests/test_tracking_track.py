@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
-from tracking_helpers import HEIGHT_SIGMA_M, shifted, simulate_drive
+from tracking_helpers import HEIGHT_SIGMA_M, SHARED, attitudes, observed, odometry_of, shifted, simulate_drive
 
-from startrack.applications.tracking import ObservedFrame, Odometry, Track, TrackErrors, estimate_track
-from startrack.applications.tracking.odometry import odometry_steps
+from startrack.applications.tracking import ObservedFrame, Track, estimate_track
+from startrack.applications.tracking.odometry_moves import odometry_steps
 from startrack.core.errors import BadInput
 from startrack.estimation.observations import OdometryErrors
-from startrack.frames import R_body_enu_from_heading_pitch_roll, quat_xyzw_from_R
-from startrack.localization.shared_errors import SharedErrors
-from startrack.terrain import HeightMap, ShapeError, load_terrain
+from startrack.terrain import HeightMap, load_terrain
 
-START, EVERY_S = datetime(2030, 6, 1, tzinfo=UTC), 900.0
 FRAMES = 12
 
 
@@ -28,33 +24,6 @@ def ground() -> HeightMap:
     return replace(terrain, search_radius_m=3000.0, height_sigma_m=HEIGHT_SIGMA_M)
 
 
-SHARED = TrackErrors(SharedErrors((ShapeError(name="bias_rad", fact="horizon_sigma_deg", sigma=1e-3),)))
-
-
-def attitudes(rng) -> list[np.ndarray]:
-    """From enu to the body, turning as it drives."""
-    heading = np.cumsum(rng.normal(0.0, 0.2, FRAMES))
-    return [R_body_enu_from_heading_pitch_roll(a, *rng.normal(0.0, 0.03, 2)) for a in heading]
-
-
-def odometry_of(position_m: np.ndarray, R_body_enu: list[np.ndarray]) -> Odometry:
-    """Without errors, in a frame of its own."""
-    R_own_enu = R_body_enu_from_heading_pitch_roll(1.0, 0.0, 0.0)
-    return Odometry(
-        time_s=START.timestamp() + EVERY_S * np.arange(FRAMES),
-        position_m=np.column_stack([position_m, np.zeros(FRAMES)]) @ R_own_enu.T + [5.0, -7.0, 1.0],
-        quat_xyzw=np.array([quat_xyzw_from_R(R_own_enu @ R.T) for R in R_body_enu]),
-    )
-
-
-def observed(estimates, R_body_enu) -> list[ObservedFrame]:
-    """Frames with one mode each."""
-    return [
-        ObservedFrame(f"frame-{k}", START + timedelta(seconds=EVERY_S * k), R, (e,), None)
-        for k, (e, R) in enumerate(zip(estimates, R_body_enu, strict=True))
-    ]
-
-
 def refused(frame: ObservedFrame) -> ObservedFrame:
     """The frame without stars."""
     return replace(frame, modes=(), R_body_enu=None, reason="no_stars", message="no stars")
@@ -62,7 +31,7 @@ def refused(frame: ObservedFrame) -> ObservedFrame:
 
 def test_moves_are_turned_by_the_stars_attitude_also_over_refused_frames():
     rng = np.random.default_rng(1)
-    drive, R = simulate_drive(rng, FRAMES), attitudes(rng)
+    drive, R = simulate_drive(rng, FRAMES), attitudes(rng, FRAMES)
     frames = observed(drive.estimates, R)
     for k in (4, 5, 6):
         frames[k] = refused(frames[k])
@@ -74,7 +43,7 @@ def test_moves_are_turned_by_the_stars_attitude_also_over_refused_frames():
 
 def test_moves_before_the_first_attitude_are_not_known():
     rng = np.random.default_rng(2)
-    drive, R = simulate_drive(rng, FRAMES), attitudes(rng)
+    drive, R = simulate_drive(rng, FRAMES), attitudes(rng, FRAMES)
     frames = observed(drive.estimates, R)
     frames[0] = refused(frames[0])
     steps = odometry_steps(frames, odometry_of(drive.position_m, R), OdometryErrors(0.02, 0.05))
@@ -84,7 +53,7 @@ def test_moves_before_the_first_attitude_are_not_known():
 
 def test_a_track_names_what_it_used_and_bridges_the_rest(ground):
     rng = np.random.default_rng(3)
-    drive, R = simulate_drive(rng, FRAMES), attitudes(rng)
+    drive, R = simulate_drive(rng, FRAMES), attitudes(rng, FRAMES)
     frames = observed(drive.estimates, R)
     frames[5] = refused(frames[5])
     frames[8] = replace(frames[8], modes=(shifted(drive.estimates[8], np.array([150.0, 0.0])),))
@@ -111,7 +80,7 @@ def test_a_track_names_what_it_used_and_bridges_the_rest(ground):
 
 def test_without_odometry_a_refused_frame_has_no_position(ground):
     drive = simulate_drive(np.random.default_rng(4), FRAMES)
-    frames = observed(drive.estimates, attitudes(np.random.default_rng(4)))
+    frames = observed(drive.estimates, attitudes(np.random.default_rng(4), FRAMES))
     frames[3] = refused(frames[3])
     track = estimate_track(frames, ground, SHARED)
     for found in (track.smoothed, track.filtered):
@@ -122,6 +91,6 @@ def test_without_odometry_a_refused_frame_has_no_position(ground):
 
 def test_frames_out_of_order_are_refused(ground):
     drive = simulate_drive(np.random.default_rng(5), FRAMES)
-    frames = observed(drive.estimates, attitudes(np.random.default_rng(5)))
+    frames = observed(drive.estimates, attitudes(np.random.default_rng(5), FRAMES))
     with pytest.raises(BadInput, match="not in the order"):
         estimate_track(frames[::-1], ground, SHARED)

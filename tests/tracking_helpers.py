@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
+from startrack.applications.tracking import ObservedFrame, Odometry, TrackErrors
 from startrack.core.types import Array, Ints
 from startrack.estimation.observations import FrameEstimate, Steps
+from startrack.frames import R_body_enu_from_heading_pitch_roll, quat_xyzw_from_R
+from startrack.localization.shared_errors import SharedErrors
+from startrack.terrain import ShapeError
 
 HEIGHT_SIGMA_M = 5.0
 POSTS_IN_PLAY, POSTS_KEPT = 8, 6  # of a frame, and of the frame before
 STEP_M, STEP_SIGMA_M = 50.0, 1.0
+START, EVERY_S = datetime(2030, 6, 1, tzinfo=UTC), 900.0
+SHARED = TrackErrors(SharedErrors((ShapeError(name="bias_rad", fact="horizon_sigma_deg", sigma=1e-3),)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,3 +80,27 @@ def shifted(estimate: FrameEstimate, by_m: Array) -> FrameEstimate:
 def mean_nees(error_m: Array, covariance_m2: Array) -> float:
     """Mean normalised squared error of (n, 2) beside (n, 2, 2); 2 where both agree."""
     return float(np.einsum("ni,nij,nj->n", error_m, np.linalg.inv(covariance_m2), error_m).mean())
+
+
+def attitudes(rng: np.random.Generator, frames: int) -> list[Array]:
+    """From enu to the body, turning as it drives."""
+    heading = np.cumsum(rng.normal(0.0, 0.2, frames))
+    return [R_body_enu_from_heading_pitch_roll(a, *rng.normal(0.0, 0.03, 2)) for a in heading]
+
+
+def odometry_of(position_m: Array, R_body_enu: list[Array]) -> Odometry:
+    """Without errors, in a frame of its own."""
+    R_own_enu = R_body_enu_from_heading_pitch_roll(1.0, 0.0, 0.0)
+    return Odometry(
+        time_s=START.timestamp() + EVERY_S * np.arange(len(position_m)),
+        position_m=np.column_stack([position_m, np.zeros(len(position_m))]) @ R_own_enu.T + [5.0, -7.0, 1.0],
+        quat_xyzw=np.array([quat_xyzw_from_R(R_own_enu @ R.T) for R in R_body_enu]),
+    )
+
+
+def observed(estimates: Sequence[FrameEstimate], R_body_enu: Sequence[Array]) -> list[ObservedFrame]:
+    """Frames with one mode each."""
+    return [
+        ObservedFrame(f"frame-{k}", START + timedelta(seconds=EVERY_S * k), R, (e,), None)
+        for k, (e, R) in enumerate(zip(estimates, R_body_enu, strict=True))
+    ]

@@ -13,7 +13,7 @@ from startrack.applications.tracking import Odometry, Track
 from startrack.camera import Camera
 from startrack.catalog import apparent_stars, load_catalog
 from startrack.chain import Image, NearAttitude, Outcome, Refused, Settings, Time
-from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
+from startrack.core import MAX_SPEED_M_S, ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.errors import BAD_INPUT_REASONS, BadInput
 from startrack.core.types import Exposure
 from startrack.estimation.observations import OdometryErrors
@@ -69,6 +69,7 @@ def track(
     odometry: str | Odometry | None = None,
     odometry_sigma: float = ODOMETRY_SIGMA,
     odometry_floor_m: float = ODOMETRY_FLOOR_M,
+    max_speed_m_s: float = MAX_SPEED_M_S,
     at_rest: bool = False,
     settings: Settings | None = None,
 ) -> Track:
@@ -81,6 +82,7 @@ def track(
         odometry: a file (TUM text or a ROS bag), or the object. None: the moves between the images are not known.
         odometry_sigma: standard deviation of a move on each horizontal axis, relative to its length.
         odometry_floor_m: the same, beside that.
+        max_speed_m_s: of the rover; odometry with a faster move is refused.
         at_rest: the camera did not move.
         settings: stages to use instead of the usual ones.
 
@@ -88,14 +90,15 @@ def track(
         The track: `frames`, and the trajectories `smoothed` (by all images) and `filtered` (by those up to each).
 
     Raises:
-        BadInput: as `locate`; bad_odometry; bad_image without images and for one that is given twice; bad_calibration
+        BadInput: as `locate`; bad_odometry; inconsistent_evidence where two groups of images contradict each other, and
+            neither is clearly right; bad_image without images and for one that is given twice; bad_calibration
             for another camera and bad_terrain for another terrain than those of the first image; the reason of the
             first refused image where none has a single position.
     """
     settings = chain.settings_input(settings) or Settings()
     session = tracking.TrackSession(
         settings=settings, stated_camera=camera, stated_terrain=terrain,
-        odometry_errors=OdometryErrors(odometry_sigma, odometry_floor_m),
+        odometry_errors=OdometryErrors(odometry_sigma, odometry_floor_m, max_speed_m_s),
     )  # fmt: skip
     for image in images:
         session.add_exposure(chain.exposure_input(image, None))

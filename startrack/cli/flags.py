@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from startrack.cli.flag_types import amount, position_prior, positive_count, seconds, time_sigma_s
-from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
+from startrack.cli.flag_types import amount, position_prior, positive_count, positive_number, seconds, time_sigma_s
+from startrack.core import MAX_SPEED_M_S, ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 
 if TYPE_CHECKING:
     from startrack.core.declaration import Key
@@ -189,6 +189,12 @@ METHOD = (LOCALIZER, EVIDENCE, NEAR, NEAR_ATTITUDE)
 ODOMETRY = (
     flag("--odometry-sigma F", "error of a move on each horizontal axis, relative", amount, default=ODOMETRY_SIGMA),
     flag("--odometry-floor M", "the same, beside that in quadrature", amount, default=ODOMETRY_FLOOR_M),
+)
+MAX_SPEED = flag(
+    "--max-speed M_PER_S",
+    "of the rover: odometry with a faster move is refused",
+    positive_number,
+    default=MAX_SPEED_M_S,
 )
 
 DIR = flag("-D --dir OUT", "folder of the results", default="startrack-out")

@@ -58,6 +58,7 @@ def read(path: str, args: argparse.Namespace) -> Exposure:
 def odometry_errors(args: argparse.Namespace) -> OdometryErrors:
     """The errors of odometry that flags state, the usual ones where they do not."""
     flags = {"sigma_1": args.odometry_sigma, "floor_m": args.odometry_floor}
+    flags["max_speed_m_s"] = getattr(args, "max_speed", None)
     return OdometryErrors(**{name: value for name, value in flags.items() if value is not None})
 
 

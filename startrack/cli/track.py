@@ -143,7 +143,11 @@ class TrackRun:
             self.codes.add(exit_code_of(cause.reason))
             return
         self._write(track)
-        if any(frame.status != "used" for frame in track.frames):
+        if track.odometry_fault:
+            print(
+                f"the odometry has {track.odometry_fault}: it contradicts the images and is left out", file=sys.stderr
+            )
+        if track.odometry_fault or any(frame.status != "used" for frame in track.frames):
             self.codes.add(EXIT_REFUSED)
         if not growing:
             self._print(tracking.frame_records(track), "")
@@ -223,9 +227,10 @@ class TrackRun:
     def _write(self, track: Track, pictures: bool = True) -> None:
         args, odometry, made, moves_m = self.args, None, {}, None
         if args.odometry is not None:
-            odometry = {"file": Path(args.odometry).name, "sigma": args.odometry_sigma, "floor_m": args.odometry_floor}
+            odometry = {"file": Path(args.odometry).name, "sigma": args.odometry_sigma, "floor_m": args.odometry_floor,
+                        "fault": track.odometry_fault or None}  # fmt: skip
         if pictures and not args.no_plots:
-            if odometry is not None and not args.at_rest:
+            if odometry is not None and not track.odometry_fault:
                 moves_m = self.session.odometry_positions_m(track, self._odometry())
             picture = png_bytes(tracking.draw_track(track, moves_m))
             title = f"Track of {Path(args.frames[0]).resolve().name}"

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
+from startrack.core import MAX_SPEED_M_S, ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.types import Array, Ints
 
 if TYPE_CHECKING:
@@ -46,6 +46,7 @@ class OdometryErrors:
 
     sigma_1: float = ODOMETRY_SIGMA  # standard deviation, relative to the length of a move
     floor_m: float = ODOMETRY_FLOOR_M  # beside that, in quadrature
+    max_speed_m_s: float = MAX_SPEED_M_S  # faster moves are impossible
 
     def sigma_m(self, move_m: Array) -> Array:
         """Standard deviation (...) [m] of moves (..., 2), or (..., 3), on each axis."""

@@ -4,6 +4,7 @@ from typing import Any, Protocol
 
 from startrack.core.types import Evidence, Fix
 from startrack.localization.clock import clock_at, clock_matters, duration
+from startrack.localization.conclusion import AMBIGUOUS_MASS
 from startrack.localization.convex_hull import Hull, hull_position
 from startrack.localization.importance_sampling import Gaussian, WeightedPoints, moments, sample
 from startrack.localization.integrity import RISK, clear_logs
@@ -67,6 +68,7 @@ def require_localizer(given: Any) -> Localizer:
 
 
 __all__ = [
+    "AMBIGUOUS_MASS",
     "DEFAULT_LOCALIZER",
     "HIGH_RAD",
     "LOCALIZERS",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -15,12 +15,11 @@ import numpy as np
 from startrack.core.errors import BadInput
 from startrack.core.files import MAX_CAUSE_CHARS, FilePath, printable, read_text
 from startrack.core.types import Array, Value, array
-from startrack.estimation.observations import OdometryErrors, Steps
 from startrack.exposure import BAG_SUFFIXES, ODOMETRY_TYPES, is_bag, read_messages
 from startrack.frames import format_utc
 
 if TYPE_CHECKING:
-    from startrack.applications.tracking.observed_frame import ObservedFrame
+    from scipy.spatial.transform import Rotation
 
 TUM_COLUMNS = "time tx ty tz qx qy qz qw"
 LAST_TIME_S = datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC).timestamp()  # larger numbers are milliseconds or less
@@ -61,6 +60,16 @@ class Odometry(Value):
         Raises:
             BadInput: bad_odometry for times that are not finite, that decrease, or that the odometry does not cover.
         """
+        position_m, attitude = self.poses_at(time_s)
+        if len(position_m) < 2:
+            return np.zeros((0, 3))
+        return np.asarray(attitude[:-1].inv().apply(np.diff(position_m, axis=0)))
+
+    def poses_at(self, time_s: Array) -> tuple[Array, Rotation]:
+        """Positions (m, 3) [m] and attitudes (m), from body to the frame, at the times `time_s` (m,) [Unix s].
+
+        Interpolates and raises as `increments_body_m`.
+        """
         from scipy.spatial.transform import Rotation, Slerp
 
         at_s = np.asarray(time_s, dtype=np.float64)
@@ -77,35 +86,18 @@ class Odometry(Value):
             )
         at_s = np.clip(at_s, first, last)
         position_m = np.stack([np.interp(at_s, self.time_s, axis) for axis in self.position_m.T], axis=-1)
-        if len(at_s) < 2:
-            return np.zeros((0, 3))
-        attitude = Slerp(self.time_s, Rotation.from_quat(self.quat_xyzw))(at_s[:-1])
-        return np.asarray(attitude.inv().apply(np.diff(position_m, axis=0)))
+        return position_m, Slerp(self.time_s, Rotation.from_quat(self.quat_xyzw))(at_s)
 
-
-def odometry_steps(frames: Sequence[ObservedFrame], odometry: Odometry | None, errors: OdometryErrors) -> Steps:
-    """Moves between frames in enu, turned by the attitude that the stars show.
-
-    Frames without an attitude of their own take the last one before them, and the odometry's turns since. Moves before
-    the first attitude are not known.
-    """
-    steps = Steps.unknown(len(frames))
-    if odometry is None:
-        return steps
-    time_s = np.array([frame.time_utc.astimezone(UTC).timestamp() for frame in frames])
-    move, sigma, anchor, R = steps.move_m.copy(), steps.sigma_m.copy(), -1, None
-    for k in range(len(frames) - 1):
-        if frames[k].R_body_enu is not None:
-            anchor, R = k, frames[k].R_body_enu
-        if R is None:
-            continue
-        at = np.unique([anchor, k, k + 1])
-        # From the anchor to either frame, in the axes of the anchor's body.
-        ends = [odometry.increments_body_m(time_s[[anchor, end]])[0] for end in at[1:]]
-        move_body = ends[-1] - (ends[-2] if len(ends) > 1 else 0.0)
-        move[k] = (R.T @ move_body)[:2]
-        sigma[k] = errors.sigma_m(move_body)
-    return Steps(move, sigma)
+    def require_possible(self, max_speed_m_s: float) -> None:
+        """Raises BadInput (bad_odometry) for moves faster than `max_speed_m_s`."""
+        length_m, step_s = np.linalg.norm(np.diff(self.position_m, axis=0), axis=1), np.diff(self.time_s)
+        fast = length_m > max_speed_m_s * (step_s + SPAN_TOLERANCE_S)
+        if fast.any():
+            k = int(np.argmax(fast))
+            _refuse(
+                f"pose {k + 1}: {length_m[k]:.4g} m in {step_s[k]:.4g} s are faster than {max_speed_m_s:g} m/s, the "
+                "highest speed of the rover (--max-speed)"
+            )
 
 
 def read_odometry(path: FilePath, topic: str | None = None, *, growing: bool = False) -> Odometry:

@@ -116,7 +116,11 @@ TRACK = file_schema(
         "terrain": "text",
         "at_rest": "flag",
         "odometry": or_null(
-            object_schema({"file": "text", "sigma": "positive", "floor_m": "positive"}), "its file and stated errors"
+            object_schema({
+                "file": "text", "sigma": "positive", "floor_m": "positive",
+                "fault": or_null("text", "for which it is left out as a whole"),
+            }),
+            "its file and stated errors",
         ),
         "counts": object_schema(dict.fromkeys(("frames", *STATUSES, "slips"), "count")),
         "horizon": object_schema({"error_deg": "number", "sigma_deg": "positive"}, "true horizon less the map's"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from datetime import UTC
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from startrack.applications.tracking.filtered_positions import RECENT_FRAMES, OnlineTrack
+from startrack.applications.tracking.filtered_positions import OnlineTrack
 from startrack.applications.tracking.observed_frame import (
     FrameStore,
     ObservedFrame,
@@ -21,7 +21,8 @@ from startrack.applications.tracking.observed_frame import (
     observe_frame,
 )
 from startrack.applications.tracking.odometry import SPAN_TOLERANCE_S, Odometry
-from startrack.applications.tracking.track import Track, estimate_track, odometry_steps, track_of_newest
+from startrack.applications.tracking.odometry_moves import odometry_moves, odometry_steps
+from startrack.applications.tracking.track import Track, estimate_track, track_of_newest
 from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.catalog import load_catalog
 from startrack.chain import (
@@ -39,7 +40,6 @@ from startrack.exposure import NO_TIME
 if TYPE_CHECKING:
     from startrack.camera import Camera
     from startrack.core.types import Array, Exposure
-    from startrack.estimation.observations import Steps
     from startrack.terrain import Terrain
 
 STILL_S = 0.1  # since the last change of a file, after which it is complete
@@ -117,7 +117,7 @@ class TrackSession:
 
         Not a number where no move is known.
         """
-        steps = self._steps(self.frames[: len(track.frames)], odometry)
+        steps = odometry_steps(self.frames[: len(track.frames)], odometry, self.odometry_errors)
         move_m = np.where(np.isfinite(steps.sigma_m)[:, None], steps.move_m, np.nan)
         first_m = track.smoothed.position_enu_m[:1, :2]
         return np.concatenate([first_m, first_m + np.cumsum(move_m, axis=0)])
@@ -140,15 +140,10 @@ class TrackSession:
         for k in range(len(self._filtered), len(self.frames)):
             if not _is_reached(self.frames[k], odometry):
                 return
-            recent = self.frames[max(k - RECENT_FRAMES, 0) : k + 1]
-            steps = self._steps(recent, odometry)
-            move, sigma = (steps.move_m[-1], float(steps.sigma_m[-1])) if k else (np.zeros(2), 0.0)
-            self._online.add(self.frames[k].modes, move, sigma)
+            moves = odometry_moves(self.frames[: k + 1], odometry, self.odometry_errors)
+            self._online.add(self.frames[k].modes, moves)
             self._filtered.append(self.frames[k])
             yield track_of_newest(self.frames[k], self._online, self.terrain)
-
-    def _steps(self, frames: Sequence[ObservedFrame], odometry: Odometry | None) -> Steps:
-        return odometry_steps(frames, odometry, self.odometry_errors)
 
     def _load_references(self, exposure: Exposure) -> tuple[Camera, Terrain, TrackErrors]:
         """Camera, terrain and shared errors of the track: those of its first image. Raises BadInput for another's."""

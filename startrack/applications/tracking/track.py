@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import pairwise
@@ -12,7 +12,8 @@ import numpy as np
 from startrack.applications.tracking.contradictions import smooth_robustly
 from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions, positions_at_rest
 from startrack.applications.tracking.observed_frame import ImageFix, ObservedFrame
-from startrack.applications.tracking.odometry import Odometry, odometry_steps
+from startrack.applications.tracking.odometry import Odometry
+from startrack.applications.tracking.odometry_moves import odometry_moves
 from startrack.applications.tracking.track_errors import BIAS, CLOCK, DEPTH, TrackErrors
 from startrack.core.types import Array, BadInput, Bools, ClockError, Ints
 from startrack.estimation.observations import UNKNOWN_M, USUAL_ODOMETRY, OdometryErrors
@@ -49,7 +50,7 @@ class TrackFrame:
     status: str  # "used"; "left_out": contradicts the track, or ambiguous to the end; "refused"
     reason: str  # code; empty where used
     message: str
-    quat_xyzw_body_enu: Array | None  # (4,) None: no attitude
+    quat_xyzw_body_enu: Array | None  # (4,) None: no attitude, or one that contradicts the track
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +86,7 @@ class Track:
     slipped: Bools  # (n - 1,) odometry steps judged wheel slip
     at_rest: bool
     terrain: Terrain
+    odometry_fault: str = ""  # of the odometry as a whole, which is left out then
 
 
 def estimate_track(
@@ -107,7 +109,8 @@ def estimate_track(
         at_rest: the camera did not move: all exposures have one position.
 
     Raises BadInput: no_time for frames that are not in the order of time, bad_odometry for odometry that does not cover
-    them; ValueError where no frame has a single position.
+    them or is impossible, inconsistent_evidence where no group of frames is clearly right; ValueError where no frame
+    has a position.
     """
     times = [frame.time_utc for frame in frames]
     if any(a > b for a, b in pairwise(times)):
@@ -116,37 +119,44 @@ def estimate_track(
     if at_rest:
         robust, position_m, covariance_m2 = positions_at_rest(frames, terrain, shared)
         first, second = [*np.flatnonzero(robust.mode >= 0).tolist(), n][:2]
+        alone = dict.fromkeys(range(first, second), frames[first].fixes)
     else:
-        steps = odometry_steps(frames, odometry, odometry_errors)
-        robust = smooth_robustly(modes, steps, terrain.height_sigma_m)
-        position_m, covariance_m2 = filter_positions(modes, steps, len(shared), terrain.height_sigma_m)
-        first = next(k for k, of in enumerate(modes) if len(of) == 1)
-        second = first + 1
+        moves, names = odometry_moves(frames, odometry, odometry_errors), [frame.name for frame in frames]
+        robust = smooth_robustly(modes, moves, terrain.height_sigma_m, names=names)
+        filtered = filter_positions(modes, moves, len(shared), terrain.height_sigma_m)
+        position_m, covariance_m2, used_then, by_one = filtered
+        covariance_m2[(used_then >= 0) & (robust.mode < 0)] = UNKNOWN_M**2 * np.eye(2)  # taken back since
+        alone = {k: frames[k].fixes for k in by_one if robust.mode[k] >= 0}
     found, used = robust.smoothed, np.flatnonzero(robust.mode >= 0).tolist()
-    smoothed = np.broadcast_to(found.position_m, (n, 2)), np.broadcast_to(found.covariance_m2, (n, 2, 2))
-    by_one = [] if len(used) > 1 else range(n) if at_rest else used
+    known_m2 = np.where(robust.vouched[:, None, None], found.covariance_m2, UNKNOWN_M**2 * np.eye(2))
+    smoothed = np.broadcast_to(found.position_m, (n, 2)), np.broadcast_to(known_m2, (n, 2, 2))
+    by_one = [] if len(used) > 1 else list(range(n)) if at_rest else used
     bias, clock, depth = (_shared_error(found, shared, name) for name in (BIAS, CLOCK, DEPTH))
     crests = None
     if len(found.post):
         places_m = terrain.post_positions_m(found.post)
         crests = CrestHeights(found.post, places_m, found.post_error_m, found.post_sigma_m)
     return Track(
-        tuple(_track_frame(frame, mode) for frame, mode in zip(frames, robust.mode, strict=True)),
-        _trajectory(position_m, covariance_m2, terrain, frames[first].fixes, range(first, second)),
-        _trajectory(*smoothed, terrain, frames[used[0]].fixes, by_one), *(bias or (0.0, 0.0)),
+        tuple(_track_frame(*one) for one in zip(frames, robust.mode, robust.attitude_fits, strict=True)),
+        _trajectory(position_m, covariance_m2, terrain, alone),
+        _trajectory(*smoothed, terrain, dict.fromkeys(by_one, frames[used[0]].fixes)), *(bias or (0.0, 0.0)),
         clock and ClockError(*clock), depth and DepthError(*depth), crests, robust.slipped, at_rest, terrain,
+        robust.fault,
     )  # fmt: skip
 
 
 def track_of_newest(frame: ObservedFrame, online: OnlineTrack, terrain: Terrain) -> Track:
     """The last `frame` that `online` has, as a track of its own: by all frames up to it."""
-    known_by_one = [0] if online.is_first else []
-    here = online.filter.position_m[None], online.filter.covariance_m2[None]
-    found, none = _trajectory(*here, terrain, frame.fixes, known_by_one), np.zeros(0, dtype=bool)
-    return Track((_track_frame(frame, online.mode),), found, found, 0.0, 0.0, None, None, None, none, False, terrain)
+    alone = {0: frame.fixes} if online.is_first else {}
+    covariance_m2 = online.filter.covariance_m2 if online.is_vouched else UNKNOWN_M**2 * np.eye(2)
+    found = _trajectory(online.filter.position_m[None], covariance_m2[None], terrain, alone)
+    none = np.zeros(0, dtype=bool)
+    return Track(
+        (_track_frame(frame, online.mode, True),), found, found, 0.0, 0.0, None, None, None, none, False, terrain
+    )
 
 
-def _track_frame(frame: ObservedFrame, mode: int) -> TrackFrame:
+def _track_frame(frame: ObservedFrame, mode: int, attitude_fits: bool) -> TrackFrame:
     found, count = ("used", "", ""), len(frame.modes)
     if not frame.modes:
         found = "refused", frame.reason, frame.message
@@ -154,23 +164,24 @@ def _track_frame(frame: ObservedFrame, mode: int) -> TrackFrame:
         found = "left_out", "ambiguous", f"none of {count} positions agrees with the track"
     elif mode < 0:
         found = "left_out", "inconsistent_evidence", "its position contradicts the other frames"
-    quat = None if frame.R_body_enu is None else quat_xyzw_from_R(frame.R_body_enu)
+    R = frame.R_body_enu if attitude_fits and found[0] != "left_out" else None
+    quat = None if R is None else quat_xyzw_from_R(R)
     return TrackFrame(frame.name, frame.time_utc, *found, quat)
 
 
 def _trajectory(
-    position_m: Array, covariance_m2: Array, terrain: Terrain, fixes: Sequence[ImageFix], by_fix: Sequence[int]
+    position_m: Array, covariance_m2: Array, terrain: Terrain, alone: Mapping[int, Sequence[ImageFix]]
 ) -> Trajectory:
     """Positions (n, 2) and covariances (n, 2, 2) as a trajectory.
 
-    Those of the frames `by_fix` are by one image alone: the only one of its `fixes` is what is known of them.
+    Those of the frames in `alone` are by one image: the only one of its fixes is what is known of them.
     """
     known = np.sqrt(np.trace(covariance_m2, axis1=1, axis2=2)) < UNKNOWN_SIGMA_M
     position = np.full((len(position_m), 3), np.nan)
     for k in np.flatnonzero(known):
         position[k] = camera_at(position_m[k], terrain)
     found = Trajectory.of_normal(position, np.where(known[:, None, None], covariance_m2, np.inf))
-    for at in by_fix if len(fixes) == 1 else ():
+    for at, fixes in ((at, fixes) for at, fixes in alone.items() if len(fixes) == 1):
         found.position_enu_m[at], found.covariance_m2[at] = fixes[0].position_enu_m, fixes[0].covariance_m2
         found.radius95_m[at], found.radius999_m[at] = fixes[0].radius95_m, fixes[0].radius999_m
     return found

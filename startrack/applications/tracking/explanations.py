@@ -1,0 +1,287 @@
+"""Which images, moves and odometry of a track belong together: explanations, compared by their evidence.
+
+An explanation states of each image whether it is of this camera, and which of its positions is right; of each move,
+whether the wheels slipped; and of the odometry, whether it is as stated or wrong as a whole. Each has a prior (the
+constants below) and a likelihood: that of a Kalman filter without posts, whose errors count as the image's own. An
+image that is not of the track is anywhere, or near its place with a gross error. The moves are turned by the attitude
+of the last image that an explanation takes as right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+
+from startrack.core.types import Array, Bools, Ints
+from startrack.estimation.observations import FrameEstimate, Steps
+
+SLIP_PROBABILITY, SLIP_SIGMA_M = 0.05, 20.0  # of a move by wheel slip, and its size on each axis
+WRONG_PROBABILITY, WRONG_SIGMA_M = 1e-3, 200.0  # of a frame, and the error of its position on each axis
+FOREIGN_SIGMA_M = 5000.0  # of a position anywhere in a search area, about its middle
+MIXED_PROBABILITY, MIXED_PART = 1e-3, 0.1  # of a set with images from elsewhere, and how many of its images these are
+ODOMETRY_WRONG_PROBABILITY = 0.01  # as a whole
+KEPT_NATS, MOST_KEPT = 60.0, 60  # of explanations beside the best, and for each kind of odometry
+
+
+@dataclass(frozen=True, eq=False)
+class Moves:
+    """The moves between n frames, by odometry with one fault as a whole or none."""
+
+    fault: str  # empty: none
+    log_prior: float
+    delta_m: Array  # (n - 1, 3) in the odometry's frame
+    turn: Array  # (n + 1, 3, 3) from that frame to enu: before the first attitude, then by each frame's; nan: not known
+    sigma_m: Array  # (n - 1,) on each axis; infinite where the move is not known
+
+    @classmethod
+    def of(cls, steps: Steps) -> Moves:
+        """Those of `steps`, which need no attitude."""
+        n = len(steps.sigma_m) + 1
+        return cls("", 0.0, np.pad(steps.move_m, ((0, 0), (0, 1))), np.tile(np.eye(3), (n + 1, 1, 1)), steps.sigma_m)
+
+    def steps(self, anchor: Ints) -> Steps:
+        """The first moves in enu, turned as by the entries `anchor` (m,) of `turn`; none is known with a fault."""
+        delta, sigma = self.delta_m[: len(anchor)], self.sigma_m[: len(anchor)]
+        move = np.einsum("nij,nj->ni", self.turn[anchor], delta)[:, :2]
+        known = np.isfinite(move).all(axis=1) & np.isfinite(sigma) & (not self.fault)
+        return Steps(np.where(known[:, None], move, 0.0), np.where(known, sigma, np.inf))
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """One explanation of n frames, with the shares of all that differ in no frame and in no use of the odometry."""
+
+    share: float  # of the probability
+    moves: Moves
+    mode: Ints  # (n,) which mode of each frame is right; -1: none
+    slipped: Bools  # (n - 1,)
+    anchor: Ints  # (n - 1,) entry of `Moves.turn` for each move
+    position_m: Array  # (2,) of the last frame
+    covariance_m2: Array  # (2, 2)
+
+    @property
+    def steps(self) -> Steps:
+        """The moves with their errors, those that slipped with a larger one."""
+        steps = self.moves.steps(self.anchor)
+        return Steps(steps.move_m, np.where(self.slipped, np.hypot(steps.sigma_m, SLIP_SIGMA_M), steps.sigma_m))
+
+
+@dataclass(eq=False)
+class Branches:
+    """Explanations (b,) of the frames so far."""
+
+    log_likelihood: Array  # (b,) with all priors but that of wrong frames
+    log_wrong: Array  # (b,) the part of it by wrong frames
+    wrong: Ints  # (b,) number of wrong frames
+    mean: Array  # (b, 2 + k) of the position and the shared errors
+    covariance: Array  # (b, 2 + k, 2 + k)
+    odometry: Ints  # (b,) which moves
+    anchor: Ints  # (b,) entry of their turns
+    history: Ints  # (b, frames, 3) mode, slip before it, anchor of the move before it
+
+    def take(self, which: Ints | Bools) -> Branches:
+        """Those of an index."""
+        return Branches(*(getattr(self, f.name)[which] for f in fields(self)))
+
+    @staticmethod
+    def join(parts: Sequence[Branches]) -> Branches:
+        """All of several."""
+        return Branches(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Branches)))
+
+
+@dataclass(eq=False)
+class Explanations:
+    """The likeliest explanations of the frames so far; `add` in the order of time."""
+
+    shared_count: int
+    height_sigma_m: float
+    may_slip: bool = True
+    _frames: list[Sequence[FrameEstimate]] = field(default_factory=list)
+    _moves: Sequence[Moves] = ()
+    _found: Branches | None = None
+
+    def add(self, modes: Sequence[FrameEstimate], moves: Sequence[Moves]) -> None:
+        """One more frame, with one mode, several (ambiguous) or none (refused).
+
+        `moves` are those of each kind of odometry, of all frames so far at least; the first is as stated.
+        """
+        self._frames.append(modes)
+        self._moves, k = moves, len(self._frames) - 1
+        start = self._start() if self._found is None else self._moved(self._found, k - 1)
+        known = np.array([np.isfinite(m.turn[k + 1]).all() for m in moves])[start.odometry]
+        here = np.where(known, k + 1, start.anchor)
+        branches = [self._used(start, number, mode, here) for number, mode in enumerate(modes)]
+        if modes:
+            branches.append(self._wrong(start, modes))
+        else:  # refused; its attitude may be wrong
+            doubt = np.where(known, np.log(WRONG_PROBABILITY), -np.inf)
+            branches += [_decided(start, start.log_likelihood + np.log1p(-np.exp(doubt)), -1, here)]
+            branches += [_decided(start, start.log_likelihood + doubt, -1, start.anchor)] if known.any() else []
+        self._found = self._likeliest(Branches.join(branches))
+
+    def ranked(self) -> list[Explanation]:
+        """Explanations with their shares, the likeliest first.
+
+        Frames that the likeliest one takes as wrong may be those of the track, if they agree with each other as well.
+        """
+        found, n = self._branches, len(self._frames)
+        total = found.log_likelihood + self._wrong_prior(found.wrong)
+        groups: dict[tuple[object, ...], list[int]] = {}
+        for b in np.argsort(-total, kind="stable").tolist():
+            key = bool(self._moves[found.odometry[b]].fault), *found.history[b, :, 0].tolist()
+            groups.setdefault(key, []).append(b)
+        weights = [np.logaddexp.reduce(total[group]) for group in groups.values()]
+        best = [found.take(np.array(group[:1])) for group in groups.values()]
+        seen: set[object] = set()
+        for number, (is_faulty, *_) in enumerate(groups):  # the best with each use of the odometry
+            second = None if is_faulty in seen else self._second_group(best[number])
+            seen.add(is_faulty)
+            if second is not None:
+                agreeing, other = second
+                weights[number] = np.logaddexp(weights[number], agreeing + self._wrong_prior(best[number].wrong)[0])
+                weights.append(agreeing + self._wrong_prior(other.wrong)[0])
+                best.append(other)
+        share = np.exp(np.array(weights) - np.logaddexp.reduce(weights))
+        order = np.argsort(-share, kind="stable").tolist()
+        return [self._explanation(best[g], float(share[g]), n) for g in order]
+
+    @property
+    def _branches(self) -> Branches:
+        if self._found is None:
+            raise ValueError("no frame was added")
+        return self._found
+
+    def _explanation(self, one: Branches, share: float, n: int) -> Explanation:
+        mode, slipped, anchor = one.history[0].T
+        return Explanation(
+            share, self._moves[one.odometry[0]], mode, slipped[1:] > 0, anchor[1:n], one.mean[0, :2],
+            one.covariance[0, :2, :2],
+        )  # fmt: skip
+
+    def _start(self) -> Branches:
+        count, p = len(self._moves), 2 + self.shared_count
+        nothing, none = np.zeros(count), np.zeros(count, dtype=np.int64)
+        return Branches(
+            np.array([m.log_prior for m in self._moves]), nothing, none, np.zeros((count, p)),
+            np.tile(np.diag(np.square(self._free_sigma)), (count, 1, 1)), np.arange(count), none,
+            np.zeros((count, 1, 3), dtype=np.int64),
+        )  # fmt: skip
+
+    @property
+    def _free_sigma(self) -> Array:
+        return np.r_[FOREIGN_SIGMA_M, FOREIGN_SIGMA_M, np.ones(self.shared_count)]
+
+    def _moved(self, one: Branches, step: int) -> Branches:
+        """After a move, with the entry of the next frame in the history; a known move may be one that slipped."""
+        turn = np.array([m.turn for m in self._moves])[one.odometry, one.anchor]
+        delta = np.array([m.delta_m[step] for m in self._moves])[one.odometry]
+        sigma = np.array([m.sigma_m[step] for m in self._moves])[one.odometry]
+        move = np.einsum("bij,bj->bi", turn, delta)[:, :2]
+        lost = ~(np.isfinite(move).all(axis=1) & np.isfinite(sigma))
+        mean, covariance = one.mean.copy(), one.covariance.copy()
+        mean[:, :2] = np.where(lost[:, None], 0.0, mean[:, :2] + move)
+        covariance[lost, :2], covariance[lost, :, :2] = 0.0, 0.0
+        covariance[:, [0, 1], [0, 1]] += np.square(np.where(lost, FOREIGN_SIGMA_M, sigma))[:, None]
+        entry = np.stack([np.zeros_like(one.anchor), np.zeros_like(one.anchor), one.anchor], axis=-1)
+        history = np.concatenate([one.history, entry[:, None]], axis=1)
+        may = ~lost & self.may_slip
+        straight = Branches(
+            one.log_likelihood + np.where(may, np.log1p(-SLIP_PROBABILITY), 0.0), one.log_wrong, one.wrong, mean,
+            covariance, one.odometry, one.anchor, history,
+        )  # fmt: skip
+        slipped = straight.take(may)
+        slipped.log_likelihood += np.log(SLIP_PROBABILITY) - np.log1p(-SLIP_PROBABILITY)
+        slipped.covariance[:, [0, 1], [0, 1]] += SLIP_SIGMA_M**2
+        slipped.history[:, -1, 1] = 1
+        return Branches.join([straight, slipped])
+
+    def _used(self, one: Branches, number: int, mode: FrameEstimate, anchor: Ints) -> Branches:
+        residual, covariance, noise = self._innovation(one, mode)
+        cross = one.covariance @ mode.response.T
+        gain = np.linalg.solve(covariance, cross.swapaxes(1, 2)).swapaxes(1, 2)
+        found = _decided(
+            one, one.log_likelihood + np.log(mode.weight) + log_normal(residual, covariance), number, anchor
+        )
+        found.mean = one.mean + np.einsum("bij,bj->bi", gain, residual)
+        rest = np.eye(one.mean.shape[1]) - gain @ mode.response
+        found.covariance = rest @ one.covariance @ rest.swapaxes(1, 2) + gain @ noise @ gain.swapaxes(1, 2)
+        return found
+
+    def _wrong(self, one: Branches, modes: Sequence[FrameEstimate]) -> Branches:
+        """The frame is not of the track: anywhere, or near with a gross error; its shared errors are its own."""
+        near, free = np.r_[[WRONG_SIGMA_M**2] * 2, np.ones(self.shared_count)], np.square(self._free_sigma)
+        parts = []
+        for mode in modes:
+            residual, covariance, noise = self._innovation(one, mode)
+            gross = covariance + (mode.response * near) @ mode.response.T
+            anywhere = log_normal(mode.mean, (mode.response * free) @ mode.response.T + noise)
+            either = np.logaddexp(log_normal(residual, gross), anywhere) - np.log(2.0)
+            parts.append(np.log(mode.weight) + either)
+        likelihood = np.logaddexp.reduce(parts)
+        found = _decided(one, one.log_likelihood + likelihood, -1, one.anchor)
+        found.log_wrong, found.wrong = one.log_wrong + likelihood, one.wrong + 1
+        return found
+
+    def _innovation(self, one: Branches, mode: FrameEstimate) -> tuple[Array, Array, Array]:
+        """Observation less prediction (b, p), its covariance (b, p, p), and the part by the frame itself (p, p)."""
+        noise = mode.noise + self.height_sigma_m**2 * mode.by_post @ mode.by_post.T
+        covariance = mode.response @ one.covariance @ mode.response.T + noise
+        return mode.mean - one.mean @ mode.response.T, covariance, noise
+
+    def _wrong_prior(self, wrong: Ints) -> Array:
+        """Logarithm of the prior of so many wrong frames: single ones, or a set with images from elsewhere."""
+        right, parts = sum(bool(modes) for modes in self._frames) - wrong, []
+        for probability, part in ((1.0 - MIXED_PROBABILITY, WRONG_PROBABILITY), (MIXED_PROBABILITY, MIXED_PART)):
+            parts.append(np.log(probability) + wrong * np.log(part) + right * np.log1p(-part))
+        return np.asarray(np.logaddexp(*parts))
+
+    def _likeliest(self, found: Branches) -> Branches:
+        total = found.log_likelihood + self._wrong_prior(found.wrong)
+        order = np.argsort(-total, kind="stable")
+        order = order[total[order] > total.max() - KEPT_NATS]
+        kind = found.odometry[order]
+        place = np.cumsum(kind[:, None] == np.arange(len(self._moves)), axis=0)[np.arange(len(kind)), kind]
+        return found.take(order[place <= MOST_KEPT])
+
+    def _second_group(self, best: Branches) -> tuple[float, Branches] | None:
+        """Log-likelihood of `best` where its wrong frames are a track of their own, and the explanation by that one.
+
+        None where fewer than two are wrong, or they do not agree.
+        """
+        out = best.history[0, :, 0] < 0
+        if best.wrong[0] < 2:
+            return None
+        alone = Explanations(self.shared_count, self.height_sigma_m, self.may_slip)
+        moves = self._moves[best.odometry[0]]
+        turn = moves.turn.copy()
+        turn[1 : len(out) + 1][~out] = np.nan
+        start = Moves(moves.fault, 0.0, moves.delta_m, turn, moves.sigma_m)
+        for modes, is_out in zip(self._frames, out, strict=True):
+            alone.add(modes if is_out else (), [start])
+        other = alone._branches
+        other = other.take(other.wrong == 0)
+        if not len(other.wrong):
+            return None
+        other = other.take(np.argsort(-other.log_likelihood)[:1])
+        if other.log_likelihood[0] < best.log_wrong[0]:
+            return None
+        other.odometry, other.wrong = best.odometry, sum(bool(modes) for modes in self._frames) - best.wrong
+        return float(best.log_likelihood[0] - best.log_wrong[0] + other.log_likelihood[0]), other
+
+
+def _decided(one: Branches, log_likelihood: Array, mode: int, anchor: Ints) -> Branches:
+    """The same with a decision about the last frame."""
+    history = one.history.copy()
+    history[:, -1, 0] = mode
+    return Branches(
+        log_likelihood, one.log_wrong, one.wrong, one.mean, one.covariance, one.odometry, anchor, history
+    )  # fmt: skip
+
+
+def log_normal(residual: Array, covariance: Array) -> Array:
+    """Logarithm of normal densities at residuals (..., p) with covariances (..., p, p)."""
+    chi2 = np.einsum("...i,...ij,...j->...", residual, np.linalg.inv(covariance), residual)
+    size = residual.shape[-1] * np.log(2.0 * np.pi)
+    return np.asarray(-0.5 * (chi2 + size + np.linalg.slogdet(covariance)[1]))

@@ -1,0 +1,75 @@
+"""Moves between the frames of a track by odometry as it is stated, and with each fault that it may have as a whole."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC
+
+import numpy as np
+
+from startrack.applications.tracking.explanations import ODOMETRY_WRONG_PROBABILITY, Moves
+from startrack.applications.tracking.observed_frame import ObservedFrame
+from startrack.applications.tracking.odometry import Odometry
+from startrack.core.types import Array
+from startrack.estimation.observations import OdometryErrors, Steps
+
+UNITS = (1e-3, 1e3, 0.01, 0.3048)  # by which lengths in mm, km, cm or feet become metres
+SCALES = tuple(1.04**k for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6))  # in steps of twice the usual sigma
+APART_SIGMA_M = 300.0  # of one image from the one before on each axis, by nothing but that both are of one drive
+AXES = ((1, 0, 2), (2, 1, 0), (0, 2, 1), (1, 2, 0), (2, 0, 1))  # orders that are not x y z
+
+
+def odometry_moves(frames: Sequence[ObservedFrame], odometry: Odometry | None, errors: OdometryErrors) -> list[Moves]:
+    """Moves between frames by `odometry` as stated, and with each fault that it may have as a whole.
+
+    The attitude that the stars show turns them. Without odometry no move is known.
+
+    Raises:
+        BadInput: bad_odometry for odometry that does not cover the frames, or is impossible.
+    """
+    from scipy.spatial.transform import Rotation
+
+    unknown = Moves.of(Steps.unknown(len(frames)))
+    if odometry is None:
+        return [unknown]
+    odometry.require_possible(errors.max_speed_m_s)
+    position, attitude = odometry.poses_at(np.array([frame.time_utc.astimezone(UTC).timestamp() for frame in frames]))
+    Q = attitude.as_matrix()
+    back, first = Q.swapaxes(1, 2), Rotation.from_quat(np.roll(attitude.as_quat(), -1, axis=1)).as_matrix()
+    down = np.diag([1.0, -1.0, -1.0])
+    faults = {
+        "the opposite sign": (-position, Q),
+        **{f"lengths {1.0 / to:.4g} times the true ones": (to * position, Q) for to in (*UNITS, *SCALES)},
+        "quaternions with w first": (position, first),
+        "quaternions of the inverse rotations": (position, back),
+        "inverse poses": (-np.einsum("nij,nj->ni", back, position), back),
+        "z down and y to the right": (position @ down, down @ Q @ down),
+        "the opposite order in time": (position[::-1], Q[::-1]),
+        **{f"axes in the order {' '.join('xyz'[k] for k in order)}": (position[:, order], Q) for order in AXES},
+    }
+    apart = np.full(len(frames) - 1, APART_SIGMA_M)
+    R = np.array([np.full((3, 3), np.nan) if frame.R_body_enu is None else frame.R_body_enu for frame in frames])
+    none, log_prior = np.full((1, 3, 3), np.nan), np.log(0.5 * ODOMETRY_WRONG_PROBABILITY)
+
+    def moves(fault: str, log_prior: float, position_m: Array, to_odometry: Array) -> Moves:
+        """By poses in a frame of the odometry's own."""
+        turn = np.concatenate([none, R.swapaxes(1, 2) @ to_odometry.swapaxes(1, 2)])
+        delta = np.diff(position_m, axis=0)
+        return Moves(fault, log_prior, delta, turn, errors.sigma_m(delta))
+
+    return [
+        moves("", float(np.log1p(-ODOMETRY_WRONG_PROBABILITY)), position, Q),
+        *(moves(fault, float(log_prior - np.log(len(faults))), *poses) for fault, poses in faults.items()),
+        replace(unknown, fault="an unknown fault", log_prior=float(log_prior), sigma_m=apart),
+    ]
+
+
+def odometry_steps(frames: Sequence[ObservedFrame], odometry: Odometry | None, errors: OdometryErrors) -> Steps:
+    """Moves between frames in enu by `odometry` as stated, turned by the last attitude of the `frames` before each.
+
+    Moves before the first attitude are not known. Raises as `odometry_moves`.
+    """
+    has = np.array([frame.R_body_enu is not None for frame in frames[:-1]], dtype=bool)
+    anchor = np.maximum.accumulate(np.where(has, np.arange(1, len(has) + 1), 0)) if len(has) else np.zeros(0, int)
+    return odometry_moves(frames, odometry, errors)[0].steps(anchor)

@@ -74,9 +74,7 @@ def test_compiling_is_announced_once_and_loading_is_not(tmp_path):
     script.write_text(FIRST_USE)
     out, log = run_script(script, tmp_path / "cache")
     assert out == ""
-    assert log.splitlines() == [
-        "compiling what this command uses first: about 10 s, for height maps 20 s; kept on disk"
-    ]
+    assert log.splitlines() == ["compiling probe, once for this installation: for another kind of data"]
     assert run_script(script, tmp_path / "cache") == ("", "")
 
 
@@ -88,6 +86,19 @@ def test_a_kernel_gives_the_same_bytes_compiled_and_loaded(tmp_path):
     compiled, loaded = (run_script(script, tmp_path / "cache")[0] for _ in range(2))
     assert int(compiled.split()[0]) > 100
     assert compiled == loaded
+
+
+@pytest.mark.slow
+def test_the_line_about_compiling_counts_the_kernels_of_its_package(tmp_path):
+    script = tmp_path / "peaks.py"
+    script.write_text("from startrack.core.compilation import announce_compilation\nannounce_compilation()\n" + PEAKS)
+    out, log = run_script(script, tmp_path / "cache")
+    found = re.findall(r"compiling (\w+), once for this installation: (\d+) of (\d+) kernels are ready", log)
+    assert len(found) == len(log.splitlines()) == len({package for package, *_ in found})
+    ready, total = next((int(ready), int(total)) for package, ready, total in found if package == "detection")
+    sources = (compilation.PACKAGE / "detection").glob("*.py")
+    assert (ready, total) == (0, sum(source.read_text().count("@njit(cache=True") for source in sources))
+    assert run_script(script, tmp_path / "cache") == (out, "")
 
 
 @pytest.mark.slow
@@ -151,7 +162,7 @@ def test_two_processes_announce_once(tmp_path, capfd, monkeypatch, announced, le
     with Runner(compile_beside_another, jobs=2) as runner:
         processes = {process for _, process in runner.results([str(tmp_path)] * 4)}
     assert len(processes) == 2
-    assert capfd.readouterr().err.count("compiling what this command uses first") == lines
+    assert capfd.readouterr().err.count("compiling probe, once for this installation") == lines
 
 
 def test_a_localizer_called_without_the_pipeline_announces_too(monkeypatch):

@@ -41,6 +41,17 @@ def test_a_position_without_a_circle_is_called_approximate(located):
     assert re.search(r"±\S+ m \(95 %\)  approximate  heading", summary_line(own))
 
 
+def test_a_search_that_proved_nothing_is_visible(located):
+    """In the line and by a warning that says what it means; of a proven one neither."""
+    fix = replace(located.result.fix, search="beam", dropped_probability=None)
+    unproven = replace(located.result, fix=fix)
+    assert re.search(r"±\S+ m \(95 %\)  search: beam  heading", summary_line(unproven))
+    (warning,) = (text for text in unproven.warnings if "beam" in text)
+    assert "before the proof that no other position fits" in warning and "--near" in warning
+    proven = replace(located.result, fix=replace(fix, search="proven"))
+    assert "beam" not in summary_line(proven) + " ".join(proven.warnings)
+
+
 def test_without_a_time_of_its_own_the_stages_are_added_up(located):
     seconds = sum(located.result.timing_ms.values()) / 1e3
     assert summary_line(located.result).endswith(f"  {seconds:.1f} s")

@@ -11,8 +11,9 @@ import numpy as np
 from startrack.camera import REFRACTION_CONTAINED, Camera
 from startrack.catalog import StarCatalog, apparent_bodies, apparent_stars
 from startrack.chain.stages import Detected, Identified, Inputs, Oriented, Settings, extend
+from startrack.chain.sky_state import stating_sky
 from startrack.core.compilation import announce_compilation
-from startrack.core.types import Array, BadInput, Exposure, NotIdentified, TooFewStars
+from startrack.core.types import Array, BadInput, Exposure, NotIdentified, Stars, TooFewStars
 from startrack.detection import Detector
 from startrack.estimation.lens_correction import correct_lens
 from startrack.exposure import NO_TIME, are_fractions
@@ -94,13 +95,15 @@ def identify_stars(
     when, near = detected.exposure.time_utc, settings.near_attitude
     stars = apparent_stars(catalog, when, site)
     near_R_cam_icrs = None if near is None else near.R_cam_icrs_at(when, site)
+    with stating_sky(detected, camera, stars):
+        found = settings.identifier(detected.detections, camera, stars, near_R_cam_icrs)
     return extend(
         detected,
         Identified,
         camera=camera,
         stars=stars,
         bodies=apparent_bodies(site, when) if site is not None and when is not None else (),
-        identification=settings.identifier(detected.detections, camera, stars, near_R_cam_icrs),
+        identification=found,
     )
 
 
@@ -111,9 +114,14 @@ def identify_unknown_lens(detected: Detected, fovs_rad: Array, catalog: StarCata
     taken: an identification is accepted at any of them only where chance would not give it. Raises NotIdentified,
     TooFewStars.
     """
+    stars = apparent_stars(catalog, detected.exposure.time_utc, None)
+    with stating_sky(detected, None, stars):
+        return _identify_at_fovs(detected, fovs_rad, stars)
+
+
+def _identify_at_fovs(detected: Detected, fovs_rad: Array, stars: Stars) -> Identified:
     from startrack.identification import identify_unknown_lens as solve
 
-    stars = apparent_stars(catalog, detected.exposure.time_utc, None)
     sources, size_px = detected.detections, detected.exposure.size_px
     for fov_rad in fovs_rad:
         try:
@@ -125,10 +133,11 @@ def identify_unknown_lens(detected: Detected, fovs_rad: Array, catalog: StarCata
         return extend(
             detected, Identified, camera=found.camera, stars=stars, bodies=(), identification=found.identification
         )
-    low, high = np.degrees([fovs_rad[0], fovs_rad[-1]])
+    step = (fovs_rad[-1] / fovs_rad[0]) ** (1 / (len(fovs_rad) - 1))  # each is the middle of a part of the range
+    low, high = np.degrees([fovs_rad[0], fovs_rad[-1] * step]) * 2 / (1 + step)
     raise NotIdentified(
         f"no lens of {low:.3g} to {high:.3g} degrees explains the point sources ({len(fovs_rad)} tried): "
-        "is this the night sky, and in focus?"
+        "check the focus"
     )
 
 

@@ -6,8 +6,10 @@ import argparse
 import json
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 
 from startrack.core import errors
@@ -20,6 +22,7 @@ STEP_S = {  # of a step, by the first word of what is done: images of 4 Mpx, dra
     "calibrate": 0.25, "calibrate-board": 1.0, "horizon": 0.7, "horizons": 30.0, "locate": 0.6, "predict": 1.0,
     "render": 1.3, "track": 1.0,
 }  # fmt: skip
+LINE_S = 10.0
 ANNOUNCED_S = 5.0  # a longer wait is announced
 MOST_UNITS = 100  # of a duration, from which a larger unit is used
 UNITS = (1.0, "s"), (60.0, "minutes"), (3600.0, "hours")
@@ -77,31 +80,42 @@ def discard_stdout() -> None:
 
 
 class Progress:
-    """One row of a bar of rich; without a bar there is no output."""
+    """Steps done of all steps and the text of the current one; with a bar of rich its row shows them."""
 
-    def __init__(self, bar: RichProgress | None = None, row: Any = None) -> None:
+    def __init__(self, total: int | None = None, bar: RichProgress | None = None, row: Any = None) -> None:
+        self.completed, self.total, self.text = 0, total, ""
         self._bar, self._row = bar, row
 
     def advance(self, steps: int = 1, text: str | None = None) -> None:
         """Further steps are done; `text` names the current step."""
-        fields: dict[str, Any] = {} if text is None else {"text": text}
-        if self._bar is not None:
-            self._bar.update(self._row, advance=steps, **fields)
+        self.text = self.text if text is None else text
+        self.update(self.completed + steps, self.total)
 
-    def update(self, completed: int, total: int) -> None:
+    def update(self, completed: int, total: int | None) -> None:
         """Numbers of steps done and of all steps."""
+        self.completed, self.total = completed, total
         if self._bar is not None:
-            self._bar.update(self._row, completed=completed, total=total)
+            self._bar.update(self._row, completed=completed, total=total, text=self.text)
+
+    def line(self, seconds: float) -> str:
+        """What is done after so many seconds."""
+        count = f"{self.completed} of {self.total}" if self.total else ""
+        return ", ".join(part for part in (count, self.text, f"{seconds:.0f} s") if part)
 
 
 @contextmanager
 def progress(what: str, total: int | None = None, *, shown: bool = True, jobs: int = 1) -> Iterator[Progress]:
-    """A bar on stderr with the time left and a text, if `shown` and stderr is a terminal; it disappears at the end.
+    """A bar on stderr with the time left and a text, if `shown`; it disappears at the end.
 
     A line before it says what is done, by the first word of `what`, in `jobs` processes, and how long that may take.
+    Where stderr is no terminal, a line every LINE_S seconds shows that the work goes on.
     """
-    if not shown or total == 0 or not sys.stderr.isatty():
-        yield Progress()
+    if not shown or total == 0:
+        yield Progress(total)
+        return
+    if not sys.stderr.isatty():
+        with _lines_about(what, Progress(total)) as steps:
+            yield steps
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
@@ -111,7 +125,25 @@ def progress(what: str, total: int | None = None, *, shown: bool = True, jobs: i
         print(f"{what}: about {duration_text(wait_s)}", file=sys.stderr, flush=True)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with RichProgress(*columns, TextColumn("{task.fields[text]}"), console=Console(stderr=True), transient=True) as bar:
-        yield Progress(bar, bar.add_task(what, total=total, text=""))
+        yield Progress(total, bar, bar.add_task(what, total=total, text=""))
+
+
+@contextmanager
+def _lines_about(what: str, steps: Progress) -> Iterator[Progress]:
+    """In the block, print the state of the `steps` on stderr every LINE_S seconds."""
+    start, end = time.monotonic(), Event()
+
+    def print_lines() -> None:
+        while not end.wait(LINE_S):
+            print(f"{what}: {steps.line(time.monotonic() - start)}", file=sys.stderr, flush=True)
+
+    thread = Thread(target=print_lines, daemon=True)
+    thread.start()
+    try:
+        yield steps
+    finally:
+        end.set()
+        thread.join()
 
 
 @contextmanager

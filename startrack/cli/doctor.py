@@ -8,6 +8,8 @@ import platform
 import time
 from collections.abc import Callable
 from importlib import metadata
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from startrack import __version__
@@ -126,6 +128,8 @@ def _self_test() -> str:
     from startrack.camera import load_camera
     from startrack.catalog import load_catalog
     from startrack.chain import Refused, locate
+    from startrack.exposure import read_exposure, write_exposure
+    from startrack.output import write_results
     from startrack.rendering import Series, render
     from startrack.terrain import load_terrain
 
@@ -133,7 +137,10 @@ def _self_test() -> str:
     series = Series(camera=camera, terrain=terrain, catalog=catalog, seed=SELF_TEST_SEED)
     scene, rng = series.scene(0)
     exposure, truth = render(scene, rng=rng)
-    result = locate(exposure, camera, terrain, catalog)
+    with TemporaryDirectory() as folder:  # files too: their kernels are compiled then
+        picture = write_exposure(Path(folder, "self-test.png"), exposure)
+        result = locate(read_exposure(picture), camera, terrain, catalog)
+        write_results(result, Path(folder, "self-test.fix.json"))
     if isinstance(result, Refused):
         raise RuntimeError(f"the rendered exposure was refused: {result.reason}: {result.message}")
     error = float(np.linalg.norm((result.fix.position_enu_m - truth.position_enu_m)[:2]))

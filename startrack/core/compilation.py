@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 LOG = logging.getLogger(__name__)
 VARIABLE = "NUMBA_CACHE_DIR"
+CACHED = "@njit(cache=True"  # of a kernel that is kept on disk
 ABOVE_KERNELS = {"api", "applications", "chain", "cli", "output", "rendering"}  # no kernel uses them
 
 
@@ -51,18 +52,18 @@ def choose_cache_folder() -> None:
 
 
 class Turn:
-    """Whether this process may still announce a compilation, and of the processes that share a semaphore the first."""
+    """Whether this process announces compilations: of the processes that share a semaphore the first one does."""
 
     def __init__(self) -> None:
-        self.is_taken = False
+        self.is_taken = self.is_mine = False
         self.shared: Semaphore | None = None  # of a pool, in its processes
 
     def take(self) -> bool:
-        """True at the first call in all of the processes."""
-        if self.is_taken:
-            return False
-        self.is_taken = True
-        return self.shared is None or bool(self.shared.acquire(block=False))
+        """True in the process that was the first of all to call this."""
+        if not self.is_taken:
+            self.is_taken = True
+            self.is_mine = self.shared is None or bool(self.shared.acquire(block=False))
+        return self.is_mine
 
     def semaphore(self, context: BaseContext) -> Semaphore:
         """For `shared` of the processes that a multiprocessing `context` starts; none announces where this one has."""
@@ -74,16 +75,21 @@ ANNOUNCEMENT_TURN = Turn()
 
 @cache
 def announce_compilation() -> None:
-    """From now on, log one line when numba compiles the first kernel of startrack in this process.
+    """From now on, log one line when numba compiles the first kernel of a package of startrack in this process.
 
     Nothing is logged where all kernels come from the cache. Call this before the first use of a kernel.
     """
     from numba.core import event
 
+    announced: set[str] = set()
+
     class Announcement(event.Listener):  # type: ignore[misc]
         def on_start(self, event: Any) -> None:
-            if event.data["dispatcher"].py_func.__module__.startswith("startrack.") and ANNOUNCEMENT_TURN.take():
-                LOG.warning("compiling what this command uses first: about 10 s, for height maps 20 s; kept on disk")
+            root, _, module = event.data["dispatcher"].py_func.__module__.partition(".")
+            package = module.partition(".")[0]
+            if root == PACKAGE.name and package not in announced and ANNOUNCEMENT_TURN.take():
+                announced.add(package)
+                LOG.warning("compiling %s, once for this installation: %s", package, _compiled_text(package))
 
         def on_end(self, event: Any) -> None:
             """Nothing to do."""
@@ -121,6 +127,14 @@ def is_compiled() -> bool:
     For a decision that costs only time if it is wrong: kernels of changed sources count too.
     """
     return any(True for source in (PACKAGE / "localization").glob("*.py") for _ in _indices_of(source))
+
+
+def _compiled_text(package: str) -> str:
+    """How many of the kernels of a `package` of startrack are compiled."""
+    sources = [*(PACKAGE / package).rglob("*.py")]
+    total = sum(source.read_text(encoding="utf-8").count(CACHED) for source in sources)
+    ready = sum(1 for source in sources for _ in _indices_of(source))
+    return f"{ready} of {total} kernels are ready" if ready < total else "for another kind of data"
 
 
 def _indices_of(source: Path) -> Iterator[Path]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 # mypy: disable-error-code="no-untyped-def"
 import numpy as np
 
-from startrack.core.kernels import REORDERED_SUMS, njit, rows_beside
+from startrack.core.kernels import REORDERED_SUMS, njit, read_only, rows_beside
 from startrack.core.smooth_image import Image, SmoothImage
 from startrack.core.types import Ints
 
@@ -91,5 +91,5 @@ def cut_light(
     The stamps around the pixels `centres` (n, 2), x and y, must lie in the image.
     """
     light, variance = np.empty((2, len(centres), 2 * radius + 1, 2 * radius + 1), dtype=np.float32)
-    _fill_stamps(image, background.rows, noise.rows, background.side, centres, light, variance)
+    _fill_stamps(read_only(image), background.rows, noise.rows, background.side, centres, light, variance)
     return light, variance

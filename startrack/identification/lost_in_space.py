@@ -96,7 +96,7 @@ class Identifier:
             )
         raise NotIdentified(
             f"no attitude explains the {len(inside)} point sources better than chance ({search.tried} tried; "
-            f"{refusal}): is the camera file right, and is this the night sky?",
+            f"{refusal}): check that the camera file is that of this lens",
             detected=len(inside),
             tried=search.tried,
         )

@@ -56,7 +56,7 @@ CIRCLE_EDGE = 1.01  # of the disc's radius: detections beyond it are no stars
 FIELD_STEPS_PER_E = 4.0  # indexes are made for fields a fourth part of a factor e apart
 SAME_LENS_RAD = 0.05  # between attitudes
 JOINT_FIT = Scheme(loss=HUBER_WITH_CUT, steps=12, settled_px=3e-4, estimates_extra=True)
-ADVICE = "is the field of view right, is this the night sky, and in focus? With a camera file fewer stars suffice"
+ADVICE = "check the field of view and the focus; with a camera file fewer stars suffice"
 
 
 @dataclass(frozen=True)

@@ -137,7 +137,8 @@ POSITION_QUANTITIES: tuple[Quantity, ...] = (
              Show("text", "places", modes_text))),
     Q("search.outcome", "", Located, lambda v: v.fix.search, "as `position.search`; also where several positions fit: "
       "`proven` is then the proof that no further position fits", SEARCHES,
-      shown=(Show("text", "places", "; search {}", unless="position.search"),
+      shown=(Show("summary", "search", lambda search: "search: beam" if search == "beam" else ""),
+             Show("text", "places", "; search {}", unless="position.search"),
              Show("page", "Search", "{}", unless="position.search"))),
     Q("search.dropped_probability", "", Located, lambda v: v.fix.dropped_probability,
       "as `position.dropped_probability`", "chance", nullable=True),

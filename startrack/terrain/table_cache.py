@@ -114,7 +114,7 @@ def load_or_build_table(ground: TracedMap, progress: Progress | None = None) -> 
     with _single_builder(path_of_table(key).with_suffix(".lock"), ground.name):
         table = load_table(key, ground.square)
         if table is None:
-            LOG.info("horizons of %s: computed now, once; this takes up to a minute", ground.name)
+            LOG.info("horizons of %s: computed now, once; this may take minutes", ground.name)
             start = clock.perf_counter()
             table = build_table(ground, progress)
             is_kept, path = keep_table(key, table), path_of_table(key)

@@ -1,0 +1,116 @@
+"""Signs of life of long work, and what a picture that is not identified says of its sky."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import sys
+import time
+from contextlib import contextmanager
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from render_helpers import FISHEYE
+from scipy.spatial.transform import Rotation
+
+from startrack.camera import camera_text
+from startrack.catalog import apparent_stars, load_catalog
+from startrack.chain import detect
+from startrack.chain.sky_state import VISIBLE_SNR, count_expected_stars
+from startrack.cli import console
+from startrack.cli.main import main
+from startrack.exposure import exposure_of
+
+
+def test_long_work_without_a_terminal_prints_lines(monkeypatch):
+    """While a step lasts too; none before the first interval is over, and none after the end."""
+    monkeypatch.setattr(console, "LINE_S", 0.05)
+    monkeypatch.setattr("sys.stderr", io.StringIO())
+    with console.progress("horizon of 3 pictures", 3) as steps:
+        steps.advance(text="measured the skyline of a.png")
+        while sys.stderr.getvalue().count("\n") < 2:
+            time.sleep(0.01)
+        steps.advance(text="b.png")
+    lines = sys.stderr.getvalue().splitlines()
+    assert re.fullmatch(r"horizon of 3 pictures: 1 of 3, measured the skyline of a\.png, \d+ s", lines[0])
+    time.sleep(0.2)
+    assert sys.stderr.getvalue().splitlines() == lines
+    with console.progress("table", 3, shown=False):
+        time.sleep(0.2)
+    assert sys.stderr.getvalue().splitlines() == lines
+
+
+@pytest.mark.parametrize(
+    "command", ["calibrate {image} --fov 160 -o {out}", "horizon {image} --fov 160 --site=34,-111 -o {out}",
+                "track {image} -t shackleton-thesis -D {out}", "render --count 3 -c {camera} -D {out}"],
+)  # fmt: skip
+def test_commands_that_last_count_their_steps(tmp_path, monkeypatch, command):
+    counted = []
+
+    @contextmanager
+    def record(what, steps):
+        try:
+            yield steps
+        finally:
+            counted.append((what.split()[0], steps.completed))
+
+    monkeypatch.setattr(console, "_lines_about", record)
+    picture(tmp_path, 100.0, 0)
+    files = {"image": tmp_path / "a.png", "camera": tmp_path / "camera.toml", "out": tmp_path / "out.csv"}
+    main(command.format(**files).split())
+    assert [what for what, _ in counted] == [command.split()[0]]
+    assert counted[0][1] > 0 or command.startswith("horizon")  # whose only picture is refused first
+
+
+def test_expected_stars_are_those_in_the_frame_of_a_clear_sky():
+    """Against the stars of the catalogue that a camera in 100 random attitudes has in view above the noise."""
+    stars = apparent_stars(load_catalog(), None, None)
+    noise = np.random.default_rng(1).normal(1000.0, 6.0, (512, 512))
+    y, x = np.mgrid[:512, :512]
+    noise += 500 * np.exp(-0.5 * ((x - 250) ** 2 + (y - 250) ** 2))  # a source: an image without any is refused
+    detected = detect(exposure_of(noise.round().astype(np.uint16)), FISHEYE)
+    detected = replace(detected, exposure=replace(detected.exposure, exposure_s=0.5))
+    found = detected.detections
+    sensor, counts = FISHEYE.sensor, []
+    limit_e = VISIBLE_SNR * np.median(found.noise_e) * np.sqrt(4 * np.pi) * sensor.psf_sigma_px
+    bright = stars.v_mag < -2.5 * np.log10(limit_e / (0.5 * sensor.zero_point_e_per_s))
+    for R in Rotation.random(100, rng=np.random.default_rng(2)).as_matrix():
+        xy_px, inside = FISHEYE.project(stars.rays_icrs[bright] @ R.T)
+        counts.append(np.count_nonzero(inside & (np.abs(xy_px - 255.5) < 256).all(axis=1)))
+    assert min(counts) > 100
+    expected = count_expected_stars(detected, FISHEYE, stars)
+    assert expected == pytest.approx(np.mean(counts), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [["-c", "{camera}"], *(pytest.param(["--fov", fov], marks=pytest.mark.slow) for fov in ("160", "120..170"))],
+)
+@pytest.mark.parametrize(("level", "text"), [(100.0, "background from 1"), (40_000.0, "(90 % of the range)")])
+def test_a_picture_that_is_not_identified_states_its_sky(tmp_path, capsys, flags, level, text):
+    """Sources, background, and with a camera's zero point the stars of a clear sky; clouds come before the files."""
+    picture(tmp_path, level, 60)
+    words = [word.format(camera=tmp_path / "camera.toml") for word in flags]
+    assert main(["identify", str(tmp_path / "a.png"), "-D", str(tmp_path), "--no-plots", *words]) == 3
+    (line,) = capsys.readouterr().out.splitlines()
+    assert re.search(r"Measured: \d+ point sources", line) and text in line
+    assert line.endswith("clouds, moonlight or twilight?")
+    assert ("where a clear sky would show about" in line) == (flags[0] == "-c")
+    if ".." in flags[-1]:
+        assert "no lens of 120 to 170 degrees" in line
+
+
+def picture(folder, level, sources):
+    """A picture of some dots that are no stars, above an uneven background."""
+    rng = np.random.default_rng(5)
+    y, x = np.mgrid[:512, :512]
+    pixels = rng.normal(level * (1 + x / 1000), 5.0)
+    for place in rng.uniform(20, 490, (sources, 2)):
+        pixels += 500 * np.exp(-0.5 * ((x - place[0]) ** 2 + (y - place[1]) ** 2))
+    (folder / "a.png").write_bytes(cv2.imencode(".png", pixels.round().astype(np.uint16))[1])
+    (folder / "camera.toml").write_text(camera_text(FISHEYE))
+    facts = {"time_utc": "2030-01-01T00:00:00Z", "exposure_s": 0.5, "camera": "camera.toml"}
+    (folder / "a.json").write_text(json.dumps(facts))

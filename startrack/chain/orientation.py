@@ -10,8 +10,8 @@ import numpy as np
 
 from startrack.camera import REFRACTION_CONTAINED, Camera
 from startrack.catalog import StarCatalog, apparent_bodies, apparent_stars
-from startrack.chain.stages import Detected, Identified, Inputs, Oriented, Settings, extend
 from startrack.chain.sky_state import stating_sky
+from startrack.chain.stages import Detected, Identified, Inputs, Oriented, Settings, extend
 from startrack.core.compilation import announce_compilation
 from startrack.core.types import Array, BadInput, Exposure, NotIdentified, Stars, TooFewStars
 from startrack.detection import Detector

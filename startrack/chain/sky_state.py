@@ -1,4 +1,4 @@
-"""What an image that is not identified shows of its sky: sources, background, and the stars that a clear sky would show."""
+"""What an image that is not identified shows of its sky: sources, background, and the stars of a clear sky."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def sky_text(detected: Detected, camera: Camera | None, stars: Stars) -> str:
     of_range = f" ({100 * high / exposure.saturation_adu:.0f} % of the range)" if exposure.saturation_adu else ""
     expected = None if camera is None else count_expected_stars(detected, camera, stars)
     clear = "" if expected is None else f" where a clear sky would show about {float(f'{expected:.2g}'):.0f}"
-    on_moon = detected.terrain is not None and detected.terrain.site.body == "moon"
+    on_moon = detected.terrain is not None and detected.terrain.air is None
     text = f"Measured: {len(found)} point sources{clear}, background from {low:.0f} to {high:.0f} ADU{of_range}"
     return text if on_moon else f"{text}: {CAUSES}"
 

@@ -46,10 +46,6 @@ EVIDENCE_SOURCES = ("both", "stars", "sky")  # of a position; "sky" begins with 
 UNKNOWN_TIME_SIGMA_RAD = np.radians(60 / 3600)  # aberration and proper motion left out
 SHOWN_CHANGE_PX = 0.1  # of the lens, from which a warning states it
 STAGES = ("read", "detect", "identify", "attitude", "evidence", "locate")  # keys of `timing_ms`
-UNPROVEN = (
-    "search: beam: the search ended before the proof that no other position fits; the stated one is the best that was "
-    "found. --near EAST,NORTH,SIGMA narrows the search"
-)
 T = TypeVar("T")
 
 
@@ -242,7 +238,7 @@ class Located(StarFix, Measured):
         """Those of `Measured`, what blocks the view, and errors beyond the defaults of facts that no file states."""
         blocked = [f"blocked and left out: {self.fix.blocked.text}"] if self.fix.blocked else []
         shown = [f"the image shows {one.text}, which no file states: it is estimated" for one in self.fix.shown]
-        return [*super().warnings, *blocked, *shown, *([UNPROVEN] if self.fix.search == "beam" else [])]
+        return [*super().warnings, *blocked, *shown, *self.fix.cautions]
 
     @property
     def evidence_source(self) -> str:

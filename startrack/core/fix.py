@@ -161,6 +161,12 @@ class Integrity:
         return [int(group) for group in order[:count] if self.part[group] > 0.0]
 
 
+UNPROVEN = (
+    "search: beam: the search ended before the proof that no other position fits; the stated one is the best that was "
+    "found. --near EAST,NORTH,SIGMA narrows the search"
+)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Fix(Value):
     """Posterior of the camera's position."""
@@ -187,3 +193,8 @@ class Fix(Value):
         super().__post_init__()
         if self.at_time_m is None:
             object.__setattr__(self, "at_time_m", self.position_enu_m[:2])
+
+    @property
+    def cautions(self) -> list[str]:
+        """What a search that proved nothing means; empty after any other."""
+        return [UNPROVEN] if self.search == "beam" else []

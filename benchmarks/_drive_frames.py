@@ -57,15 +57,16 @@ def frames_by_evidence(course: Course, rng: np.random.Generator) -> Iterator[Obs
 
 
 def simulate_evidence(
-    course: Course, position: Array, when: datetime, error_mag: Array, rng: np.random.Generator
-) -> Evidence:
-    """The stars near the skyline of one exposure."""
+    course: Course, position: Array, when: datetime, error_mag: Array, rng: np.random.Generator,
+    near_rad: float = NEAR_RAD,
+) -> Evidence:  # fmt: skip
+    """The stars up to `near_rad` from the skyline of one exposure."""
     site, ground = course.stated.site, course.ground
     assert site is not None
     stars = apparent_stars(load_catalog(), when, site)
     azimuth, elevation = azel_from_rays(stars.rays_icrs @ R_enu_icrs(site, when).T)
     about = np.interp(azimuth, AROUND_RAD, ground.horizon_rad(position[None], AROUND_RAD)) + course.raised_rad
-    use = np.flatnonzero((stars.v_mag < FAINTEST_MAG) & (np.abs(elevation - about) < NEAR_RAD))
+    use = np.flatnonzero((stars.v_mag < FAINTEST_MAG) & (np.abs(elevation - about) < near_rad))
     visible = elevation[use] > ground.horizon_rad(position[None], azimuth[use]) + course.raised_rad
     snr = 5.0 * 10 ** (-0.4 * (stars.v_mag[use] - SNR_5_MAG))
     light = visible * snr * 10 ** (-0.4 * error_mag[use]) + rng.normal(size=len(use))

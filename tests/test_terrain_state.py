@@ -110,7 +110,7 @@ def test_a_terminal_is_asked(pit, capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("flags", "code", "named"),
     [
-        (["--depth-sigma", "900"], 4, "depth_sigma_m must be below 320 m"),
+        (["--depth-sigma", "900"], 4, "depth_sigma_m must be below 800 m"),
         (["--exact", "--depth-sigma", "3"], 4, "exact is true, but depth_sigma_m is not 0"),
         (["--ellipse-sigma", "7"], 4, "ellipse_sigma_1 must be"), (["--stretch-sigma", "0.1"], 2, "another kind"),
         (["--depth-sigma", "-1"], 2, "negative"), (["--depth-sigma", "deep"], 2, "--depth-sigma"),

@@ -35,7 +35,14 @@ from startrack.evidence import (
     with_noise_of_blocks,
 )  # fmt: skip
 from startrack.frames import LOWEST_PREDICTED_RAD, R_enu_icrs, Site
-from startrack.localization import DEFAULT_LOCALIZER, Localizer, clock_at, clock_matters, require_localizer
+from startrack.localization import (
+    DEFAULT_LOCALIZER,
+    Localizer,
+    clock_at,
+    clock_matters,
+    require_localizer,
+    settle_steepness,
+)
 from startrack.terrain import Terrain
 
 LOW_IN_AIR = "low in the air"
@@ -206,7 +213,9 @@ def fix_position(rays: StarRays, to: type[F], localizer: Localizer, evidence: Ev
 
     `evidence` None: that of the stars.
     """
-    fix = localizer(rays.evidence() if evidence is None else evidence, rays.terrain)
+    rows = rays.evidence() if evidence is None else evidence
+    rays = replace(rays, terrain=settle_steepness(rows, rays.terrain))
+    fix = localizer(rows, rays.terrain)
     if fix.clock is not None and not rays.terrain.axisymmetric and clock_matters(rays.clock, rays.terrain):
         later_s = fix.clock.offset_s - rays.clock.offset_s
         rays = rays.later(later_s, SURE_SIGMAS * fix.clock.sigma_s) if later_s else rays

@@ -7,7 +7,7 @@ the observations' noise correlated, with the covariance G S G^T.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 UNKNOWN_M = 1e6  # standard deviation of a position about which nothing is known
+UNSEEN_NOISE = 1e-6  # of means that do not respond to anything: any will do, and about that of others leaves all digits
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +39,18 @@ class FrameEstimate:
     def parameters(self) -> int:
         """2 + k."""
         return len(self.mean)
+
+    def transform(self, to: Array, moved: Array | float = 0.0, unseen: Array | float = 0.0) -> FrameEstimate:
+        """Of parameters after the linear map `to` (p, p), and `moved` (p,) besides.
+
+        What `moved` holds are positions, to which the mean responds wholly. Of what `unseen` (p, p) projects on, the
+        prior is all that is known.
+        """
+        response = to @ self.response @ np.linalg.pinv(to, rcond=1e-12)
+        return replace(
+            self, mean=to @ self.mean + moved, covariance=to @ self.covariance @ to.T + unseen, response=response,
+            noise=to @ self.noise @ to.T + UNSEEN_NOISE * unseen, by_post=to @ self.by_post,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

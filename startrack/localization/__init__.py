@@ -6,7 +6,7 @@ from startrack.core.types import Evidence, Fix
 from startrack.localization.clock import clock_at, clock_matters, duration
 from startrack.localization.conclusion import AMBIGUOUS_MASS
 from startrack.localization.convex_hull import Hull, hull_position
-from startrack.localization.importance_sampling import Gaussian, WeightedPoints, moments, sample
+from startrack.localization.importance_sampling import ENOUGH, Gaussian, WeightedPoints, moments, sample
 from startrack.localization.integrity import RISK, clear_logs
 from startrack.localization.posterior import MIN_ROW_NATS, ExactPosterior
 from startrack.localization.pseudo_gradient import PseudoGradient, descend
@@ -15,6 +15,7 @@ from startrack.localization.sector_moments import solve_linear
 from startrack.localization.shared_errors import ErrorBasis, SharedErrors
 from startrack.localization.skyline_model import SkylineModel
 from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD
+from startrack.localization.steepness import settle_steepness
 from startrack.localization.summary import camera_at
 from startrack.terrain import Terrain
 
@@ -70,6 +71,7 @@ def require_localizer(given: Any) -> Localizer:
 __all__ = [
     "AMBIGUOUS_MASS",
     "DEFAULT_LOCALIZER",
+    "ENOUGH",
     "HIGH_RAD",
     "LOCALIZERS",
     "LOW_RAD",
@@ -97,5 +99,6 @@ __all__ = [
     "moments",
     "require_localizer",
     "sample",
+    "settle_steepness",
     "solve_linear",
 ]

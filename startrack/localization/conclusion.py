@@ -16,7 +16,7 @@ from startrack.localization.integrity import assess_integrity
 from startrack.localization.search import Explored
 from startrack.localization.summary import camera_at, link_points, require_inside
 from startrack.localization.wrong_files import require_files, require_map_in_view
-from startrack.terrain import Terrain
+from startrack.terrain import DIAMETER, Terrain
 
 AMBIGUOUS_MASS = 0.01
 NEGLIGIBLE_MODE = 2e-3  # of the probability: points apart that hold less belong to the nearest mode
@@ -36,6 +36,12 @@ class Posterior:
     def positions_m(self) -> Array:
         """(n, 2)."""
         return np.concatenate([one.positions_m for one in self.hypotheses])
+
+    @property
+    def unscaled_radius95_m(self) -> float:
+        """Of the circle that holds 95 % in a crater of the stated width: rays do not show how wide it is."""
+        positions = np.concatenate([_positions_without_fact(one, DIAMETER.key) for one in self.hypotheses])
+        return self.radii(positions, self.share, self.share @ positions)[0]
 
     @cached_property
     def share(self) -> Array:
@@ -109,7 +115,8 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
     best, own = whole.best, _own_main(whole)
     parameters, near = moments(best.found.points[own], best.found.share[own])
     clear = best.model.states(parameters)[:, 0]
-    if not ambiguous and radius95 > USELESS_FRACTION * terrain.search_radius_m:
+    widest_m = USELESS_FRACTION * terrain.search_radius_m
+    if not ambiguous and radius95 > widest_m and whole.unscaled_radius95_m > widest_m:
         raise NotLocated(_useless_text(whole))
     require_map_in_view(best.model, clear)
     integrity = None

@@ -65,22 +65,32 @@ class Neighbourhood:
     def map_sigma_rad(self) -> Array:
         """(SECTORS,) error of the map's skyline, as if independent between the sectors.
 
-        Ground of which facts are not stated is rough by ROUGH_RAD besides. Posts that make the skyline at several
-        azimuths err there together: each azimuth is given the variance that the sum over its neighbours has, which is
-        right for errors that go far around the compass, as of a position.
+        Ground of which facts are not stated is rough by ROUGH_RAD besides.
+        """
+        rough = 0.0 if all(one.is_stated for one in self.terrain.shape_errors) else ROUGH_RAD
+        by_posts = self.post_sigma_rad
+        if by_posts is None:
+            by_posts = np.asarray(self.terrain.horizon_sigma_rad(self.reference_m[None], MIDDLES_RAD)).ravel()
+        return np.hypot(by_posts, rough)
+
+    @cached_property
+    def post_sigma_rad(self) -> Array | None:
+        """(SECTORS,) the part of `map_sigma_rad` that is from errors of the posts; None of a ground without them.
+
+        Posts that make the skyline at several azimuths err there together: each azimuth is given the variance that the
+        sum over its neighbours has, which is right for errors that go far around the compass, as of a position.
         """
         terrain = self.terrain
-        rough = 0.0 if all(one.is_stated for one in terrain.shape_errors) else ROUGH_RAD
         posts = terrain.horizon_posts(self.reference_m, MIDDLES_RAD)
         if not terrain.height_sigma_m or not np.isfinite(posts.horizon_rad).any():
-            return np.hypot(np.asarray(terrain.horizon_sigma_rad(self.reference_m[None], MIDDLES_RAD)).ravel(), rough)
+            return None
         used = posts.post >= 0
         numbers, of = np.unique(posts.post[used], return_inverse=True)
         sector = np.broadcast_to(np.arange(SECTORS)[:, None], posts.post.shape)[used]
         by_post = posts.rad_per_m[used]
         total = np.bincount(of, weights=by_post, minlength=len(numbers))
         variance = np.bincount(sector, weights=by_post * total[of], minlength=SECTORS)
-        return np.hypot(terrain.height_sigma_m * np.sqrt(variance), rough)
+        return np.asarray(terrain.height_sigma_m * np.sqrt(variance))
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from startrack.localization.joint_posterior import sample_posterior
 from startrack.localization.likelihood import SECTOR_RAD, PositionLikelihood
 from startrack.localization.position_prior import SearchedNear, name_prior, weigh_by_prior
 from startrack.localization.search import NATS, Explored, Search, log_sum
+from startrack.localization.steepness import settle_steepness
 from startrack.terrain import Terrain, require_terrain
 
 MIN_ROWS = 8
@@ -45,8 +46,8 @@ class ExactPosterior:
 
         Raises NotLocated: insufficient_geometry, outside_search_area, inconsistent_evidence.
         """
-        terrain = require_terrain(terrain)
         announce_compilation()
+        terrain = settle_steepness(evidence, require_terrain(terrain))
         informative = (np.abs(evidence.llr) > MIN_ROW_NATS) | (evidence.extended_nats > MIN_ROW_NATS)
         informative &= terrain.is_informative(evidence.azimuth_rad, evidence.elevation_rad)
         count = int(np.count_nonzero(informative))

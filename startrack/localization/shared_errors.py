@@ -17,6 +17,7 @@ from startrack.frames import R_from_rotvec, turn_sky
 from startrack.localization.sector_moments import SectorMoments
 from startrack.terrain import ShapeError, Terrain
 
+LEAST_SIZE = 0.05  # of a crater, in the stated one
 SCALE_STEP = 1e-3  # of a crater's size, at which the skyline's change with it is taken
 TURN_STEP_RAD = 2e-3  # of the sky, at which the skyline's change with the time is taken: its crests are no narrower
 CLOCK_FACT = "time_sigma_s"
@@ -45,7 +46,7 @@ class SharedErrors:
         """
         known = _known_errors(terrain, clock)
         known = [replace(one, gross_probability=1.0) if one.fact == doubted else one for one in known]
-        listed = tuple(one for one in known if one.sigma > 0.0 or one.gross_probability > 0.0)
+        listed = tuple(one for one in known if one.sigma > 0.0 or one.gross_probability > 0.0 or one.mean != 0.0)
         has_clock = any(one.fact == CLOCK_FACT for one in listed)
         return cls(listed, clock if has_clock else None, terrain.axisymmetric)
 
@@ -80,9 +81,9 @@ class SharedErrors:
 
     @cached_property
     def mean(self) -> Array:
-        """(k,) expected values: zero, but for rows that are turned to another time than the stated one."""
-        found = np.zeros(len(self.listed))
-        found[-1:] = -self.later_s
+        """(k,) expected values: not zero for rows turned to another time, or a ground of another shape, than stated."""
+        found = np.array([one.mean for one in self.listed])
+        found[-1:] -= self.later_s
         return found
 
     def log_probability(self, gross: str = "") -> float:
@@ -123,7 +124,7 @@ class SharedErrors:
 
     def true_positions(self, points: Array, values: Array) -> Array:
         """The positions `points` (n, 2) turned and scaled by the `values` (n, k) of the errors, in a round crater."""
-        points = points * (1.0 + values[:, self._scales].sum(axis=1, keepdims=True))
+        points = points * np.maximum(1.0 + values[:, self._scales].sum(axis=1, keepdims=True), LEAST_SIZE)
         if self.clock is None or not self.axisymmetric:
             return points
         angle = self.clock.turn_rad_s[2] * values[:, -1]

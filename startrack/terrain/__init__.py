@@ -11,7 +11,7 @@ from startrack.terrain.io import KEYS as TERRAIN_KEYS
 from startrack.terrain.io import MAKERS, files_of_terrain, load_terrain, site_of_terrain, terrain_from_dict
 from startrack.terrain.protocol import NO_POST, ForwardingTerrain, Terrain
 from startrack.terrain.raster import EQUIRECTANGULAR, STEREOGRAPHIC, Projection, Raster
-from startrack.terrain.shape import ShapeError
+from startrack.terrain.shape import DIAMETER, ShapeError
 
 if TYPE_CHECKING:
     from startrack.terrain.height_map import HeightMap
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from startrack.terrain.state_file import StateableError, state_errors, stateable_errors
 
 __all__ = [
+    "DIAMETER",
     "EQUIRECTANGULAR",
     "MAKERS",
     "NO_POST",

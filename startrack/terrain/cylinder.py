@@ -29,7 +29,8 @@ from startrack.terrain.shape import (
     select_slopes,
 )
 
-MAX_SHAPE_SIGMA = 0.2  # of depth and diameter; the posterior of the shape is expanded about the stated one
+MAX_SHAPE_SIGMA = 0.5  # of depth and diameter; beyond, a normal distribution holds sizes below 0
+LINEAR_SHAPE_1 = 0.05  # of depth over diameter: beyond, the shape that the rows show is searched, as it is not linear
 _SIZES = {"diameter_m": replace(LENGTH, required=True), "depth_m": replace(LENGTH, required=True)}
 CYLINDER_KEYS = {  # of [cylinder] in a terrain file
     **_SIZES,
@@ -48,7 +49,7 @@ class Cylinder(Crater):
 
     Source: Kua 2008, section 3.1 (eq. 3.1 seen from the camera's height instead of the floor). Raises BadInput
     bad_terrain for lengths that are no numbers, not positive or above 10,000 km, for a camera that is not below the
-    rim, and for a `depth_sigma_m` or `diameter_sigma_m` of a fifth or more. `search_radius_m` may be infinite.
+    rim, and for a `depth_sigma_m` or `diameter_sigma_m` of half or more. `search_radius_m` may be infinite.
     """
 
     name: str = "cylinder"
@@ -57,6 +58,7 @@ class Cylinder(Crater):
     ellipse_sigma_1: float | None = EXACT  # relative to the radius, of each of two terms
     rim_tilt_sigma_rad: float | None = EXACT  # of each of two axes
     camera_height_sigma_m: float = EXACT
+    stated_depth_m: float | None = None  # of the file, which the errors are about; None: `depth_m`
     axisymmetric = True
     horizon_cost = 0.02
 
@@ -74,9 +76,9 @@ class Cylinder(Crater):
             raise BadInput(
                 "bad_terrain", f"camera_height_m is {self.camera_height_m:g}: the camera must be below the rim"
             )
-        for key, size in (("depth_sigma_m", self.depth_m), ("diameter_sigma_m", self.diameter_m)):
+        for key, size in (("depth_sigma_m", self._stated_m), ("diameter_sigma_m", self.diameter_m)):
             if (getattr(self, key) or 0.0) >= MAX_SHAPE_SIGMA * size:
-                raise BadInput("bad_terrain", f"{key} must be below {MAX_SHAPE_SIGMA * size:g} m, a fifth of it")
+                raise BadInput("bad_terrain", f"{key} must be below {MAX_SHAPE_SIGMA * size:g} m, half of it")
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation [rad]; pi/2 from inside the wall. See `Terrain`."""
@@ -99,8 +101,10 @@ class Cylinder(Crater):
         """Errors of depth and width (relative), ellipse, tilt of the rim, height of the camera, and refraction."""
         depth = None if self.depth_sigma_m is None else self.depth_sigma_m / self.depth_m
         diameter = None if self.diameter_sigma_m is None else self.diameter_sigma_m / self.diameter_m
+        deeper = self._stated_m / self.depth_m - 1.0
         return (
-            *DEPTH.shape_errors(depth), *DIAMETER.shape_errors(diameter), *ELLIPSE.shape_errors(self.ellipse_sigma_1),
+            *(replace(one, mean=deeper) for one in DEPTH.shape_errors(depth)),
+            *DIAMETER.shape_errors(diameter), *ELLIPSE.shape_errors(self.ellipse_sigma_1),
             *RIM_TILT.shape_errors(self.rim_tilt_sigma_rad), *CAMERA_ERROR.shape_errors(self.camera_height_sigma_m),
             *refraction_errors(self.air),
         )  # fmt: skip
@@ -125,6 +129,29 @@ class Cylinder(Crater):
             camera_height_m=self.camera_height_m + errors.pop("camera_height_m", 0.0), **errors,
         )  # fmt: skip
         return with_refraction_error(crater, refraction_1)
+
+    @property
+    def unknown_steepness_1(self) -> float:  # type: ignore[override]
+        """See `Terrain`: of depth over diameter."""
+        sigma = {one.name: one.sigma for one in self.shape_errors}
+        found = float(np.hypot(sigma.get("depth_1", 0.0), sigma.get("diameter_1", 0.0)))
+        return found if found > LINEAR_SHAPE_1 and self.stated_depth_m is None else 0.0
+
+    @property
+    def steepness_1(self) -> float:  # type: ignore[override]
+        """See `Terrain`."""
+        return self.wall_m / (self._stated_m - self.camera_height_m)
+
+    def with_steepness(self, steepness_1: float) -> Cylinder:
+        """See `Terrain`: of another depth."""
+        if steepness_1 == self.steepness_1:
+            return self
+        depth_m = self.camera_height_m + steepness_1 * (self._stated_m - self.camera_height_m)
+        return replace(self, depth_m=depth_m, stated_depth_m=self._stated_m)
+
+    @property
+    def _stated_m(self) -> float:
+        return self.depth_m if self.stated_depth_m is None else self.stated_depth_m
 
     def facts(self) -> dict[str, Any]:
         """Diameter and depth, as JSON values."""

@@ -60,6 +60,8 @@ class Terrain(ABC):
     axisymmetric: bool = False  # whether a turn of the sky about the vertical only turns the position
     horizon_cost: float = 1.0  # of one horizon, beside one traced on a height map: the search has a budget of these
     shape_errors: tuple[ShapeError, ...] = ()  # errors that all azimuths share, those that are stated as zero too
+    unknown_steepness_1: float = 0.0  # relative sigma of the horizon's tangent, where a search must find it; 0: known
+    steepness_1: float = 1.0  # the horizon's tangent that errors are counted from, over that of the stated shape
     rim_radius_m: float | None = None  # of a circular rim about the origin, drawn on maps instead of the relief
     table_path: Path | None = None  # file of the table that `prepare` computes; None where it computes none
     unstated_errors: tuple[str, ...] = ()  # keys of errors that the terrain file leaves out: they count as zero
@@ -176,6 +178,13 @@ class Terrain(ABC):
         """
         return np.zeros((0, *np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))))
 
+    def with_steepness(self, steepness_1: float) -> Terrain:
+        """The same knowledge of a ground, its errors counted from one of this `steepness_1`.
+
+        For grounds whose `unknown_steepness_1` may differ from 0.
+        """
+        return self
+
     def with_shape(self, values: Array) -> Terrain:
         """The ground that has the errors `values` (k,), in the units of the k `shape_errors`, exactly.
 
@@ -243,6 +252,10 @@ class ForwardingTerrain(Terrain):
     def with_air(self, stated: Mapping[str, Any] | None) -> Self:
         """A copy of this one, about `whole` under the air that is `stated`."""
         return self._about(self.whole.with_air(stated))
+
+    def with_steepness(self, steepness_1: float) -> Terrain:
+        """A copy of this one, about `whole` of this `steepness_1`."""
+        return self._about(self.whole.with_steepness(steepness_1))
 
     def _about(self, whole: Terrain) -> Self:
         other = copy(self)

@@ -37,6 +37,7 @@ class ShapeError(Prior):
 
     name: str  # such as "depth_1" (relative), "bias_rad", "camera_height_m"
     fact: str  # the key of the terrain file that states it, such as "depth_sigma_m"
+    mean: float = 0.0  # before: not 0 of a ground whose errors are counted from another one than the stated
 
     @property
     def is_stated(self) -> bool:

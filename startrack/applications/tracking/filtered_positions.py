@@ -107,10 +107,10 @@ def positions_at_rest(
     """
     n = len(frames)
     still = Steps(np.zeros((n - 1, 2)), np.full(n - 1, STILL_M))
-    agreeing = smooth_robustly(
-        [frame.modes for frame in frames], still, terrain.height_sigma_m, may_slip=False,
-        names=[frame.name for frame in frames],
-    )  # fmt: skip
+    terrain = terrain.with_steepness(next((frame.steepness_1 for frame in frames if frame.modes), 1.0))
+    errors, modes = errors.on(terrain), [[errors.place(one) for one in frame.modes] for frame in frames]
+    names = [frame.name for frame in frames]
+    agreeing = smooth_robustly(modes, still, terrain.height_sigma_m, may_slip=False, names=names)
     single = np.array([len(frame.modes) == 1 for frame in frames])
     agree, count = np.count_nonzero(single & (agreeing.mode >= 0)), np.count_nonzero(single)
     if count > 1 and 2 * agree <= count:
@@ -126,7 +126,7 @@ def positions_at_rest(
         return found
 
     first, *later = np.flatnonzero(agreeing.mode >= 0).tolist()
-    found, reference = take(first, frames[first].modes[agreeing.mode[first]]), agreeing.smoothed.position_m[0]
+    found, reference = take(first, modes[first][agreeing.mode[first]]), agreeing.smoothed.position_m[0]
     half = max(FRAME_REACH_SIGMAS * largest_sigma(found.covariance_m2[0]), LEAST_FRAME_HALF_M)
     models: list[FrameModel] = []
     for k in (first, *later):
@@ -135,5 +135,5 @@ def positions_at_rest(
             models.append(FrameModel.of_evidence(evidence, terrain, errors, reference, half))
         if k != first:
             points = sample_together(models, reference, agreeing.smoothed.covariance_m2[0])
-            found = take(k, observe_together(models, points))
+            found = take(k, errors.place(observe_together(models, points)))
     return replace(agreeing, smoothed=found), position, covariance

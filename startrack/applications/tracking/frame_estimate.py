@@ -17,8 +17,9 @@ import numpy as np
 
 from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, Ints
-from startrack.estimation.observations import UNKNOWN_M, FrameEstimate
+from startrack.estimation.observations import UNKNOWN_M, UNSEEN_NOISE, FrameEstimate
 from startrack.localization import (
+    ENOUGH,
     ErrorBasis,
     Gaussian,
     SkylineModel,
@@ -37,6 +38,8 @@ MIN_NOISE_SHARE = 0.3  # of the evidence's covariance: the least noise that a fr
 NEGLIGIBLE_POST = 1e-4  # part of the variance of a position, by all posts that are left out together
 ROUNDING = 1e-9  # of the covariance, added to the noise so that it can be inverted
 STEP_SIGMAS, LEAST_STEP_RAD = 0.5, 1e-7  # of the skyline's spread, to each side: where the change with it is taken
+LEAST_SHARE = float(np.sqrt(2.0 / ENOUGH))  # of the information along a parameter: a variance by points errs by that
+UNSEEN_RAD = 1e-7  # mean square of the skyline's rise by shared errors of one standard deviation, that no image shows
 LEAST_CORRECTED = 0.1  # of a variance: the correction of moments makes it no smaller
 
 
@@ -77,10 +80,8 @@ class FrameModel:
 
     def is_allowed(self, parameters: Array) -> Array:
         """(n,) whether a camera can stand there, in the neighbourhood."""
-        in_units = self.errors.to_model(parameters, self.model.seen.rows)
-        positions = self.model.errors.true_positions(in_units[:, :2], in_units[:, 2:])
         near = np.abs(parameters[:, :2] - self.model.around.reference_m).max(axis=1) < self.model.around.half_m
-        return near & np.asarray(self.model.terrain.allowed(positions))
+        return near & np.asarray(self.model.terrain.allowed(parameters[:, :2]))
 
     def settle(self, parameters: Array) -> None:
         """Take the states of the chain, which decide where the circle is cut, at parameters (2 + k,)."""
@@ -192,39 +193,46 @@ def observe_together(models: Sequence[FrameModel], found: WeightedPoints) -> Fra
     used = np.isfinite(found.log_weight)
     mean, covariance = balanced_moments(found)
     points, share = found.points[used], found.share[used]
-    prior = np.diag(np.concatenate([np.zeros(2), np.ones(len(mean) - 2)]))
-    by_evidence = covariance - covariance @ prior @ covariance  # of the mean at given true parameters
+    shown, response = shown_part(covariance)
+    by_evidence = response @ covariance  # of the mean at given true parameters
     plain, spread = moments(points, share)
     by_horizon, counted = np.zeros((len(mean), len(MIDDLES_RAD))), np.zeros_like(covariance)
     for model in models:
         model.settle(mean)
         slopes = model.slopes(points, share)
         common = ((points - plain) * share[:, None]).T @ (slopes - share @ slopes)
-        own = covariance @ np.linalg.solve(spread, common)
-        counted += (own * np.square(model.model.around.map_sigma_rad)) @ own.T
+        own = shown @ covariance @ np.linalg.solve(spread, common)
+        by_posts = model.model.around.post_sigma_rad  # other errors of the ground are this frame's own noise
+        counted += 0.0 if by_posts is None else (own * np.square(by_posts)) @ own.T
         by_horizon += own
     noise = clipped_noise(by_evidence - counted, by_evidence) + ROUNDING * covariance
+    noise += UNSEEN_NOISE * (covariance - shown @ covariance @ shown.T)
     post, by_post = _posts(models[0], by_horizon, covariance)
     shared_by_posts = models[0].model.terrain.height_sigma_m ** 2 * by_post @ by_post.T
     estimate = FrameEstimate(
-        mean, covariance - by_evidence + noise + shared_by_posts, np.eye(len(mean)) - covariance @ prior, noise, post,
-        by_post,
+        shown @ mean, covariance - by_evidence + noise + shared_by_posts, response, noise, post, by_post,
     )  # fmt: skip
-    # Without sampling noise in the parameters that the evidence does not depend on.
-    seen = np.append([True, True], np.any([model.rise_rad.any(axis=0) for model in models], axis=0))
-    estimate = _transform(estimate, np.diag(seen * 1.0), np.diag(seen * 1.0), np.diag(~seen * 1.0))
-    # With the position after the turn of the clock's error.
-    to = np.eye(len(mean))
-    to[:2, 2:] = models[0].errors.turn_m(estimate.mean[:2])
-    return _transform(estimate, to, np.asarray(np.linalg.inv(to)), np.zeros_like(to)) if to[:2, 2:].any() else estimate
+    # Without sampling noise along shared errors that the evidence does not depend on.
+    square_rad2, axes = np.linalg.eigh(
+        np.sum([model.rise_rad.T @ model.rise_rad for model in models], axis=0) / SECTORS
+    )
+    unseen = np.zeros_like(covariance)
+    unseen[2:, 2:] = axes @ np.diag(square_rad2 < UNSEEN_RAD**2) @ axes.T
+    return estimate.transform(np.eye(len(mean)) - unseen, unseen=unseen)
 
 
-def _transform(estimate: FrameEstimate, to: Array, back: Array, own: Array) -> FrameEstimate:
-    """The estimate of the parameters after the linear map `to` with the inverse `back`, with `own` noise (p, p)."""
-    return replace(
-        estimate, mean=to @ estimate.mean, covariance=to @ estimate.covariance @ to.T + own,
-        response=to @ estimate.response @ back, noise=to @ estimate.noise @ to.T + own, by_post=to @ estimate.by_post,
-    )  # fmt: skip
+def shown_part(covariance: Array) -> tuple[Array, Array]:
+    """Projection (d, d) on what the evidence shows, and response (d, d) of the mean to the true parameters.
+
+    They are those of a posterior with this `covariance` (d, d). Directions in which it differs from the prior by no
+    more than sampled points err are not shown: the evidence would seem to be certain there.
+    """
+    root = np.linalg.cholesky(covariance)
+    share, axes = np.linalg.eigh(
+        np.eye(len(root)) - root[2:].T @ root[2:]
+    )  # of the information that is not the prior's
+    share, back = np.where(share > LEAST_SHARE, share, 0.0), axes.T @ np.linalg.inv(root)
+    return root @ (axes * (share > 0.0)) @ back, root @ (axes * share) @ back
 
 
 def clipped_noise(noise: Array, whole: Array) -> Array:

@@ -25,7 +25,7 @@ from startrack.estimation.trajectory import SIGMAS_95
 from startrack.localization import HIGH_RAD, LOW_RAD, MIN_ROW_NATS, camera_at
 from startrack.terrain import Terrain
 
-FRAME_FORMAT = "startrack.observed-frame/3"
+FRAME_FORMAT = "startrack.observed-frame/4"
 ROWS = ("azimuth_rad", "elevation_rad", "llr", "edge_sigma_rad", "extended_nats")
 MODE_SIGMA_M = 10.0  # of a mode whose circle is not known
 T = TypeVar("T")
@@ -56,6 +56,7 @@ class ObservedFrame:
     shown: tuple[ShownError, ...] = ()  # errors beyond the defaults of facts that no file states
     reason: str = ""  # of a refusal
     message: str = ""
+    steepness_1: float = 1.0  # of the terrain, as the image shows it where it is not known
 
     @property
     def facts(self) -> frozenset[str]:
@@ -66,9 +67,9 @@ class ObservedFrame:
 def observe_frame(outcome: Outcome, errors: TrackErrors | None = None, terrain: Terrain | None = None) -> ObservedFrame:
     """The `outcome` of one image as an observation of its position and of the shared `errors`.
 
-    `errors` and `terrain` are those of the track; None: those of the image. Raises ValueError for an image without a
-    time, for a fix that states no error (another localizer), and for one that shows a gross error of a fact that is not
-    among those of `errors` (see `TrackErrors.with_gross`).
+    `errors` and `terrain` are those of the track; None: those of the image. Errors are counted from the steepness of
+    the `terrain`. Raises ValueError for an image without a time, for a fix that states no error (another localizer),
+    and for one that shows a gross error of a fact that is not among those of `errors` (see `TrackErrors.with_gross`).
     """
     value, name, when = last_value(outcome), outcome.exposure.name, outcome.exposure.time_utc
     if when is None:
@@ -89,7 +90,8 @@ def observe_frame(outcome: Outcome, errors: TrackErrors | None = None, terrain: 
         raise ValueError(f"{name}: it shows a gross error of {', '.join(missing)}: it must be shared")
     fixes = _image_fixes(value.fix, terrain)
     rows = _informative_rows(value, terrain, fixes[0].at_time_m)
-    return observe_again(ObservedFrame(name, when, R, (), rows, fixes, value.fix.shown), errors, terrain)
+    frame = ObservedFrame(name, when, R, (), rows, fixes, value.fix.shown, steepness_1=value.terrain.steepness_1)
+    return observe_again(frame, errors, terrain)
 
 
 def facts_of(outcome: Outcome, errors: TrackErrors) -> frozenset[str]:
@@ -102,6 +104,7 @@ def observe_again(frame: ObservedFrame, errors: TrackErrors, terrain: Terrain) -
     """The `frame` by its evidence, with these shared `errors`."""
     if frame.evidence is None:
         return frame
+    errors = errors.on(terrain)
     modes = [
         replace(estimate_frame(frame.evidence, terrain, errors, fix.at_time_m, fix.covariance_m2), weight=fix.weight)
         for fix in frame.fixes
@@ -175,7 +178,7 @@ def encode_frame(frame: ObservedFrame) -> bytes:
     head = {
         "format": FRAME_FORMAT, "name": frame.name, "time_utc": frame.time_utc.isoformat(), "modes": len(frame.modes),
         "fixes": len(frame.fixes), "shown": [asdict(one) for one in frame.shown], "reason": frame.reason,
-        "message": frame.message,
+        "message": frame.message, "steepness_1": frame.steepness_1,
     }  # fmt: skip
     file = io.BytesIO()
     np.savez(file, head=np.array(json.dumps(head)), **arrays)  # type: ignore[arg-type]
@@ -199,6 +202,7 @@ def decode_frame(data: bytes) -> ObservedFrame:
         tuple(_value(FrameEstimate, f"mode{number}", arrays) for number in range(head["modes"])), rows,
         tuple(_value(ImageFix, f"fix{number}", arrays) for number in range(head["fixes"])),
         tuple(ShownError(**one) for one in head["shown"]), head["reason"], head["message"],
+        head["steepness_1"],
     )  # fmt: skip
 
 

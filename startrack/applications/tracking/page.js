@@ -222,7 +222,7 @@ function table() {
 function leadText() {
   const of = (status) => frames.status.filter((one) => one === status).length;
   const parts = Object.entries(FRAME_WORDS).map(([status, words]) => [of(status), words]).filter(([n]) => n).map(([n, words]) => `${say(n, 0)} ${words}`);
-  return `${say(count, 0)} ${count === 1 ? "frame" : "frames"} on ${page.terrain}: ${parts.join(", ")}.`;
+  return `${say(count, 0)} ${count === 1 ? "frame" : "frames"} on ${page.terrain}: ${[parts.join(", "), ...page.crater].join("; ")}.`;
 }
 
 map.node.append(layers());

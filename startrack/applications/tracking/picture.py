@@ -84,6 +84,7 @@ def _facts(track: Track) -> list[str]:
         ]
     if len(known) > 1 and not track.at_rest:
         lines.append(f"95 % radius of all, smoothed: median {length_text(float(np.median(radius_m[known])))}")
+    lines += track.crater_texts
     if track.slipped.any():
         lines.append(f"slips of the odometry: {np.count_nonzero(track.slipped)}")
     return lines

@@ -109,6 +109,16 @@ FRAME_QUANTITIES = (
         for k, axis in enumerate("xyzw")
     ),
 )  # fmt: skip
+STATED_SIZE = "and how much larger than its file states; null where that is taken as exact"
+
+
+def size_schema(key: str) -> dict[str, Any]:
+    """Schema of the depth or the width of a crater, whose value is under `key`."""
+    return object_schema({
+        key: "positive", "sigma_m": "positive", "error_percent": "number", "sigma_percent": "positive"
+    })  # fmt: skip
+
+
 TRACK = file_schema(
     "Trajectory of a camera",
     object_schema({
@@ -125,10 +135,8 @@ TRACK = file_schema(
         "counts": object_schema(dict.fromkeys(("frames", *STATUSES, "slips"), "count")),
         "horizon": object_schema({"error_deg": "number", "sigma_deg": "positive"}, "true horizon less the map's"),
         "clock": or_null(object_schema({"offset_s": "number", "sigma_s": "positive"}), "true time less the stated one"),
-        "depth": or_null(
-            object_schema({"error_percent": "number", "sigma_percent": "positive"}),
-            "true depth of a crater less that of its file; null where that is taken as exact",
-        ),
+        "depth": or_null(size_schema("depth_m"), f"of a crater, {STATED_SIZE}"),
+        "width": or_null(size_schema("diameter_m"), f"of a crater, {STATED_SIZE}"),
         "frames": list_schema(schema_of(FRAME_QUANTITIES, units=True)),
         "provenance": object_schema({"version": "text"}),
     }),

@@ -22,10 +22,11 @@ from startrack.applications.tracking.observed_frame import (
 )
 from startrack.applications.tracking.odometry import SPAN_TOLERANCE_S, Odometry
 from startrack.applications.tracking.odometry_moves import odometry_moves, odometry_steps
-from startrack.applications.tracking.track import Track, estimate_track, track_of_newest
+from startrack.applications.tracking.track import Track, estimate_track, smooth_placed, track_of_newest
 from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.catalog import load_catalog
 from startrack.chain import (
+    Located,
     Settings,
     input_hashes,
     job_sha256,
@@ -65,6 +66,7 @@ class TrackSession:
     camera: Camera | None = None
     shared: TrackErrors | None = None
     _references: tuple[Any, Any] | None = None  # camera and terrain as the first image has them
+    _steepness_1: float | None = None  # of the terrain, from which the errors of all images are counted
     _filtered: list[ObservedFrame] = field(default_factory=list)  # that the filter has
     _online: OnlineTrack | None = None
 
@@ -83,17 +85,24 @@ class TrackSession:
         frame = self.store.read(key) if self.store and key else None
         if frame is None:
             outcome = locate(exposure, camera, terrain, load_catalog(), self.settings)
-            frame = observe_frame(outcome, replace(shared, gross=facts_of(outcome, shared)), terrain)
+            ground = self._count_from(terrain, outcome.terrain.steepness_1) if isinstance(outcome, Located) else terrain
+            frame = observe_frame(outcome, replace(shared, gross=facts_of(outcome, shared)), ground)
             if self.store and key:
                 self.store.write(key, frame)
+        ground = self._count_from(terrain, frame.steepness_1) if frame.modes else terrain
         together = shared.with_gross(frame.facts)
         if together.gross != shared.gross:
-            self.frames = [observe_again(one, together, terrain) for one in self.frames]
+            self.frames = [observe_again(one, together, ground) for one in self.frames]
             self.shared = together
-        frame = frame if frame.facts == together.gross else observe_again(frame, together, terrain)
+        frame = frame if frame.facts == together.gross else observe_again(frame, together, ground)
         self.frames.append(frame)
         self.frames.sort(key=lambda one: (one.time_utc, one.name))
         return frame
+
+    def _count_from(self, terrain: Terrain, steepness_1: float) -> Terrain:
+        """The terrain with its errors counted from the steepness of the first image with a position, if not known."""
+        self._steepness_1 = self._steepness_1 or steepness_1
+        return terrain.with_steepness(self._steepness_1)
 
     def estimate(self, odometry: Odometry | None = None, *, at_rest: bool = False, covered_only: bool = False) -> Track:
         """The track of the frames so far; `odometry` and `at_rest` are those of `estimate_track`.
@@ -132,18 +141,31 @@ class TrackSession:
 
         If a frame comes late, all frames after it are filtered anew. Raises as `estimate`.
         """
-        if self.terrain is None or self.shared is None:
+        terrain, shared = self.terrain, self.shared
+        if terrain is None or shared is None:
             return
         if self._filtered != self.frames[: len(self._filtered)]:
             self._filtered, self._online = [], None
-        self._online = self._online or OnlineTrack(len(self.shared), self.terrain.height_sigma_m)
         for k in range(len(self._filtered), len(self.frames)):
             if not _is_reached(self.frames[k], odometry):
                 return
-            moves = odometry_moves(self.frames[: k + 1], odometry, self.odometry_errors)
-            self._online.add(self.frames[k].modes, moves)
+            online = self._online = self._filter_to(k, odometry, shared, terrain.height_sigma_m)
             self._filtered.append(self.frames[k])
-            yield track_of_newest(self.frames[k], self._online, self.terrain)
+            yield track_of_newest(self.frames[k], online, terrain)
+
+    def _filter_to(self, k: int, odometry: Odometry | None, shared: TrackErrors, height_sigma_m: float) -> OnlineTrack:
+        """The filter with frame k; where positions are not linear in `shared`, of all frames about what they show."""
+        online, anew = self._online, shared.bends
+        frames = self.frames[: k + 1]
+        moves, modes = odometry_moves(frames, odometry, self.odometry_errors), [frame.modes for frame in frames]
+        placed = [[shared.place(one) for one in of] for of in modes]
+        if anew and any(modes):
+            placed, _ = smooth_placed(modes, moves, shared, height_sigma_m)
+        if online is None or anew:
+            online = OnlineTrack(len(shared), height_sigma_m)
+        for of in placed[0 if anew else k :]:
+            online.add(of, moves)
+        return online
 
     def _load_references(self, exposure: Exposure) -> tuple[Camera, Terrain, TrackErrors]:
         """Camera, terrain and shared errors of the track: those of its first image. Raises BadInput for another's."""

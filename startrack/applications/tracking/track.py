@@ -9,19 +9,25 @@ from itertools import pairwise
 
 import numpy as np
 
-from startrack.applications.tracking.contradictions import smooth_robustly
+from startrack.applications.tracking.contradictions import RobustTrack, smooth_robustly
+from startrack.applications.tracking.explanations import Moves
 from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions, positions_at_rest
 from startrack.applications.tracking.observed_frame import ImageFix, ObservedFrame
 from startrack.applications.tracking.odometry import Odometry
 from startrack.applications.tracking.odometry_moves import odometry_moves
-from startrack.applications.tracking.track_errors import BIAS, CLOCK, DEPTH, TrackErrors
+from startrack.applications.tracking.track_errors import BIAS, CLOCK, DEPTH, WIDTH, TrackErrors
 from startrack.core.types import Array, BadInput, Bools, ClockError, Ints
-from startrack.estimation.observations import UNKNOWN_M, USUAL_ODOMETRY, OdometryErrors
+from startrack.estimation.observations import UNKNOWN_M, USUAL_ODOMETRY, FrameEstimate, OdometryErrors
 from startrack.estimation.trajectory import Smoothed, radius_holding
 from startrack.frames import quat_xyzw_from_R
 from startrack.localization import camera_at
 from startrack.terrain import Terrain
 
+SIZES = {DEPTH: "depth_m", WIDTH: "diameter_m"}  # errors of a crater, and the fact of each
+SIZE_ROUNDS, STILL_MOVES_M = (
+    10,
+    0.01,
+)  # of the expansion about the size that a track shows, until no position moves by more
 UNKNOWN_SIGMA_M = 1e-3 * UNKNOWN_M  # a position with a larger error is not known
 
 
@@ -64,11 +70,20 @@ class CrestHeights:
 
 
 @dataclass(frozen=True, eq=False)
-class DepthError:
-    """By which a crater is deeper than its file states, relative."""
+class SizeError:
+    """The depth or the width of a crater, and by how much it is larger than its file states."""
 
-    error_1: float
+    size_m: float
+    error_1: float  # relative to the stated one
     sigma_1: float
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the size."""
+        return self.size_m * self.sigma_1 / (1.0 + self.error_1)
+
+    def __str__(self) -> str:
+        return f"{self.size_m:.1f} ± {self.sigma_m:.1f} m"
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,12 +96,19 @@ class Track:
     bias_rad: float  # by which the true horizon is higher than the map's, all around
     bias_sigma_rad: float
     clock: ClockError | None
-    depth: DepthError | None  # None: the file's depth is taken as exact
+    depth: SizeError | None  # None: the file's depth is taken as exact
+    width: SizeError | None  # None: the file's diameter is taken as exact
     crests: CrestHeights | None  # None: a terrain without posts, or without errors of their heights
     slipped: Bools  # (n - 1,) odometry steps judged wheel slip
     at_rest: bool
-    terrain: Terrain
+    terrain: Terrain  # where its size is not known, the crater as estimated
     odometry_fault: str = ""  # of the odometry as a whole, which is left out then
+
+    @property
+    def crater_texts(self) -> list[str]:
+        """Depth and width of a crater in words; empty where they are taken as exact."""
+        sizes = {"depth": self.depth, "width": self.width}
+        return [f"{word} of the crater: {size}" for word, size in sizes.items() if size is not None]
 
 
 def estimate_track(
@@ -122,8 +144,8 @@ def estimate_track(
         alone = dict.fromkeys(range(first, second), frames[first].fixes)
     else:
         moves, names = odometry_moves(frames, odometry, odometry_errors), [frame.name for frame in frames]
-        robust = smooth_robustly(modes, moves, terrain.height_sigma_m, names=names)
-        filtered = filter_positions(modes, moves, len(shared), terrain.height_sigma_m)
+        placed, robust = smooth_placed(modes, moves, shared, terrain.height_sigma_m, names)
+        filtered = filter_positions(placed, moves, len(shared), terrain.height_sigma_m)
         position_m, covariance_m2, used_then, by_one = filtered
         covariance_m2[(used_then >= 0) & (robust.mode < 0)] = UNKNOWN_M**2 * np.eye(2)  # taken back since
         alone = {k: frames[k].fixes for k in by_one if robust.mode[k] >= 0}
@@ -131,7 +153,9 @@ def estimate_track(
     known_m2 = np.where(robust.vouched[:, None, None], found.covariance_m2, UNKNOWN_M**2 * np.eye(2))
     smoothed = np.broadcast_to(found.position_m, (n, 2)), np.broadcast_to(known_m2, (n, 2, 2))
     by_one = [] if len(used) > 1 else list(range(n)) if at_rest else used
-    bias, clock, depth = (_shared_error(found, shared, name) for name in (BIAS, CLOCK, DEPTH))
+    bias, clock = (_shared_error(found, shared, name) for name in (BIAS, CLOCK))
+    crater = terrain.with_shape(_shape_values(found, shared, terrain)) if shared.size_sigma_1 else terrain
+    depth, width = (_size_error(found, shared, name, crater.facts().get(key, np.nan)) for name, key in SIZES.items())
     crests = None
     if len(found.post):
         places_m = terrain.post_positions_m(found.post)
@@ -140,9 +164,35 @@ def estimate_track(
         tuple(_track_frame(*one) for one in zip(frames, robust.mode, robust.attitude_fits, strict=True)),
         _trajectory(position_m, covariance_m2, terrain, alone),
         _trajectory(*smoothed, terrain, dict.fromkeys(by_one, frames[used[0]].fixes)), *(bias or (0.0, 0.0)),
-        clock and ClockError(*clock), depth and DepthError(*depth), crests, robust.slipped, at_rest, terrain,
-        robust.fault,
+        clock and ClockError(*clock), depth, width, crests, robust.slipped, at_rest,
+        crater if shared.bends else terrain, robust.fault,
     )  # fmt: skip
+
+
+def smooth_placed(
+    modes: Sequence[Sequence[FrameEstimate]],
+    moves: Sequence[Moves],
+    shared: TrackErrors,
+    height_sigma_m: float,
+    names: Sequence[str] = (),
+) -> tuple[list[list[FrameEstimate]], RobustTrack]:
+    """The modes with their positions in the crater of the errors `shared` that all show, and the track by them.
+
+    Where the size of a crater is not known, positions are products of it: they are expanded about the estimate anew.
+    `moves` and `names` are those of `smooth_robustly`, which says what this raises.
+    """
+    placed = [[shared.place(one) for one in of] for of in modes]
+    robust = smooth_robustly(placed, moves, height_sigma_m, names=names)
+    for _ in range(SIZE_ROUNDS if shared.bends else 0):
+        before = robust.smoothed
+        placed = [
+            [shared.place(one, position_m, before.shared) for one in of]
+            for of, position_m in zip(modes, before.position_m, strict=True)
+        ]
+        robust = smooth_robustly(placed, moves, height_sigma_m, names=names)
+        if np.abs(robust.smoothed.position_m - before.position_m).max() < STILL_MOVES_M:
+            break
+    return placed, robust
 
 
 def track_of_newest(frame: ObservedFrame, online: OnlineTrack, terrain: Terrain) -> Track:
@@ -152,7 +202,7 @@ def track_of_newest(frame: ObservedFrame, online: OnlineTrack, terrain: Terrain)
     found = _trajectory(online.filter.position_m[None], covariance_m2[None], terrain, alone)
     none = np.zeros(0, dtype=bool)
     return Track(
-        (_track_frame(frame, online.mode, True),), found, found, 0.0, 0.0, None, None, None, none, False, terrain
+        (_track_frame(frame, online.mode, True),), found, found, 0.0, 0.0, None, None, None, None, none, False, terrain
     )
 
 
@@ -185,6 +235,21 @@ def _trajectory(
         found.position_enu_m[at], found.covariance_m2[at] = fixes[0].position_enu_m, fixes[0].covariance_m2
         found.radius95_m[at], found.radius999_m[at] = fixes[0].radius95_m, fixes[0].radius999_m
     return found
+
+
+def _shape_values(found: Smoothed, shared: TrackErrors, terrain: Terrain) -> Array:
+    """(n,) of all errors of the terrain's shape, as estimated."""
+    known = dict(zip(shared.names, (shared.mean + shared.sigma * found.shared).tolist(), strict=True))
+    return np.array([known.get(one.name, one.mean) for one in terrain.shape_errors])
+
+
+def _size_error(found: Smoothed, shared: TrackErrors, name: str, size_m: float) -> SizeError | None:
+    """Of the shared error of this name, in a crater of that size; None where it is not shared."""
+    error = _shared_error(found, shared, name)
+    if error is None:
+        return None
+    stated = 1.0 + float(shared.mean[shared.names.index(name)])  # relative to the size that errors are counted from
+    return SizeError(size_m, error[0] / stated, error[1] / stated)
 
 
 def _shared_error(found: Smoothed, shared: TrackErrors, name: str) -> tuple[float, float] | None:

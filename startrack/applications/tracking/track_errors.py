@@ -11,11 +11,13 @@ import numpy as np
 
 from startrack.chain import EDGE_SIGMA_PX
 from startrack.core.types import Array, BadInput, Clock, Evidence, Exposure, ImageErrors
+from startrack.estimation.observations import FrameEstimate
 from startrack.exposure import NO_TIME
 from startrack.localization import SharedErrors, clock_at
 from startrack.terrain import Terrain
 
-BIAS, CLOCK, DEPTH, EDGE = "bias_rad", "clock_s", "depth_1", "edge_px"
+LINEAR_SIZE_1 = 0.005  # sigma of a crater's size: of positions 15 m off it leaves 0.1 m
+BIAS, CLOCK, DEPTH, WIDTH, EDGE = "bias_rad", "clock_s", "depth_1", "diameter_1", "edge_px"
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +50,10 @@ class TrackErrors:
         stated = exposure.time_sigma_s, exposure.time_sigma_is_stated
         return cls.of(terrain, clock_at(terrain.site, exposure.time_utc, *stated), uses_sky)
 
+    def on(self, terrain: Terrain) -> Self:
+        """The same on a `terrain` of another steepness, which its errors are counted from."""
+        return replace(self, listed=SharedErrors.of(terrain, self.listed.clock))
+
     def with_gross(self, facts: Iterable[str]) -> Self:
         """The same with gross errors of more `facts`; those that the terrain states are left out."""
         return replace(self, gross=self.gross | (frozenset(facts) & frozenset(self.listed.facts)))
@@ -65,13 +71,18 @@ class TrackErrors:
             found = np.where([one.fact == fact for one in self.listed.listed], self.listed.sigma(fact), found)
         return np.append(found, [EDGE_SIGMA_PX] if self.uses_sky else [])
 
+    @property
+    def mean(self) -> Array:
+        """(k,) before, in the units of the names: what is stated, from what the errors are counted from."""
+        return np.append(self.listed.mean, [0.0] if self.uses_sky else [])
+
     def __len__(self) -> int:
         return len(self.names)
 
     def to_model(self, parameters: Array, evidence: Evidence) -> Array:
         """Parameters (n, 2 + m) of a `SkylineModel` of `evidence`, from `parameters` (n, 2 + k) of the track."""
         m = len(self.listed)
-        found = parameters[:, : 2 + m] * np.r_[1.0, 1.0, self.sigma[:m]]
+        found = parameters[:, : 2 + m] * np.r_[1.0, 1.0, self.sigma[:m]] + np.r_[0.0, 0.0, self.listed.mean]
         if self.listed.clock is not None and evidence.clock is not None:
             found[:, -1] -= evidence.clock.offset_s  # the directions include it
         return found
@@ -92,13 +103,34 @@ class TrackErrors:
         own[0, 0] -= EDGE_SIGMA_PX**2
         return replace(errors, covariance=own)
 
-    def turn_m(self, position_m: Array) -> Array:
-        """(2, k) by which the positions of parameters are turned and scaled with the errors, at `position_m` (2,).
+    @property
+    def bends(self) -> bool:
+        """Whether positions are not linear in the size of a round crater, as little as it is known."""
+        return self.size_sigma_1 > LINEAR_SIZE_1
 
-        See `SharedErrors`: in a round crater the parameters hold the position before its turn and its scaling.
+    @cached_property
+    def size_sigma_1(self) -> float:
+        """The larger one of depth and width of a round crater, relative; 0 where they are known."""
+        return max(
+            (s for s, name in zip(self.sigma.tolist(), self.names, strict=True) if name in (DEPTH, WIDTH)), default=0.0
+        )
+
+    def place(
+        self, estimate: FrameEstimate, position_m: Array | None = None, shared: Array | None = None
+    ) -> FrameEstimate:
+        """The `estimate` of a frame with its position after the turn and the scaling of a round crater.
+
+        See `SharedErrors`: the `estimate` holds the position before. The change with the errors is taken at the
+        true `position_m` (2,), None: that of the estimate, and at errors `shared` (k,), None: as stated.
         """
         m, small = len(self.listed), 1e-3
-        points, one = np.tile(position_m, (m, 1)), small * np.diag(self.sigma[:m])
-        to = self.listed.true_positions
-        found = (to(points, one) - to(points, -one)).T / (2 * small)
-        return np.pad(found, ((0, 0), (0, len(self) - m)))
+        if not (m and self.listed.axisymmetric):
+            return estimate
+        at = np.zeros(len(self)) if shared is None else shared
+        values, one = at[:m] * self.sigma[:m], small * np.diag(self.sigma[:m])
+        by_position = self.listed.true_positions(np.eye(2), np.tile(values, (2, 1))).T
+        before = estimate.mean[:2] if position_m is None else np.linalg.solve(by_position, position_m)
+        moved = [self.listed.true_positions(np.tile(before, (m, 1)), values + sign * one) for sign in (1.0, -1.0)]
+        to = np.eye(len(estimate.mean))
+        to[:2, :2], to[:2, 2 : 2 + m] = by_position, (moved[0] - moved[1]).T / (2 * small)
+        return estimate.transform(to, np.r_[-to[:2, 2:] @ at, np.zeros(len(at))])

@@ -12,7 +12,7 @@ import numpy as np
 
 from startrack import __version__
 from startrack.applications.tracking.quantities import FORMAT, FRAME_QUANTITIES, STATUSES, frame_records
-from startrack.applications.tracking.track import CrestHeights, Track, Trajectory
+from startrack.applications.tracking.track import CrestHeights, SizeError, Track, Trajectory
 from startrack.applications.tracking.track_map import known_points, track_extent
 from startrack.core.files import write_atomically
 from startrack.core.types import Array
@@ -41,9 +41,6 @@ def track_record(track: Track, odometry: dict[str, Any] | None = None) -> dict[s
     """The object in track.json; `odometry` has the settings of the odometry (None: there is none)."""
     statuses = [frame.status for frame in track.frames]
     clock = None if track.clock is None else {"offset_s": track.clock.offset_s, "sigma_s": track.clock.sigma_s}
-    depth = track.depth and {
-        "error_percent": 100.0 * track.depth.error_1, "sigma_percent": 100.0 * track.depth.sigma_1
-    }  # fmt: skip
     error_deg, sigma_deg = np.degrees([track.bias_rad, track.bias_sigma_rad]).tolist()
     return {
         "format": FORMAT,
@@ -56,9 +53,18 @@ def track_record(track: Track, odometry: dict[str, Any] | None = None) -> dict[s
         },
         "horizon": {"error_deg": error_deg, "sigma_deg": sigma_deg},
         "clock": clock,
-        "depth": depth,
+        "depth": size_record(track.depth, "depth_m"),
+        "width": size_record(track.width, "diameter_m"),
         "frames": frame_records(track),
         "provenance": {"version": __version__},
+    }  # fmt: skip
+
+
+def size_record(size: SizeError | None, key: str) -> dict[str, float] | None:
+    """The object of the depth or the width of a crater, whose value is under `key`; None of one that is exact."""
+    return None if size is None else {
+        key: size.size_m, "sigma_m": size.sigma_m, "error_percent": 100.0 * size.error_1,
+        "sigma_percent": 100.0 * size.sigma_1,
     }  # fmt: skip
 
 
@@ -147,6 +153,7 @@ def track_page(track: Track, picture_png: bytes, *, title: str, odometry_m: Arra
             if not q.key.endswith(OFF_PAGE)
         },
         "odometry": None if odometry_m is None else np.round(known_points(odometry_m), 3).tolist(),
+        "crater": track.crater_texts,
         "terrain": track.terrain.name,
         "terrains": {track.terrain.name: ground_map(track.terrain, (east_m, north_m), RELIEF_MARGIN * half_m)},
         "world": [east_m - half_m, north_m - half_m, east_m + half_m, north_m + half_m],

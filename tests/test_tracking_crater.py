@@ -247,3 +247,16 @@ def test_what_a_posterior_does_not_show_makes_no_observation():
 def test_frames_keep_the_steepness_that_they_show():
     frame = replace(drive(3, stated(), frames=2)[0][0], steepness_1=1.234)
     assert decode_frame(encode_frame(frame)).steepness_1 == 1.234
+
+
+@pytest.mark.parametrize("factor", [100.0, 3.28, 0.01, 0.001])
+def test_odometry_in_other_units_makes_no_other_crater(factor):
+    frames, odometry, _ = drive(4, stated(), frames=5)
+    wrong = replace(odometry, position_m=factor * odometry.position_m)
+    try:
+        track = estimate_track(frames, stated(), TrackErrors.of(stated(), None), odometry=wrong)
+    except BadInput as refusal:
+        assert refusal.reason == "inconsistent_evidence"
+    else:  # the odometry is left out
+        assert track.odometry_fault
+        assert track.width.sigma_1 > 0.15

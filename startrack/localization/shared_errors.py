@@ -17,7 +17,7 @@ from startrack.frames import R_from_rotvec, turn_sky
 from startrack.localization.sector_moments import SectorMoments
 from startrack.terrain import ShapeError, Terrain
 
-LEAST_SIZE = 0.05  # of a crater, in the stated one
+LEAST_SIZE = 1e-3  # of a crater, in the stated one: a normal error reaches beyond
 SCALE_STEP = 1e-3  # of a crater's size, at which the skyline's change with it is taken
 TURN_STEP_RAD = 2e-3  # of the sky, at which the skyline's change with the time is taken: its crests are no narrower
 CLOCK_FACT = "time_sigma_s"

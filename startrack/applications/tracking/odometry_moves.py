@@ -20,10 +20,13 @@ APART_SIGMA_M = 300.0  # of one image from the one before on each axis, by nothi
 AXES = ((1, 0, 2), (2, 1, 0), (0, 2, 1), (1, 2, 0), (2, 0, 1))  # orders that are not x y z
 
 
-def odometry_moves(frames: Sequence[ObservedFrame], odometry: Odometry | None, errors: OdometryErrors) -> list[Moves]:
+def odometry_moves(
+    frames: Sequence[ObservedFrame], odometry: Odometry | None, errors: OdometryErrors, *, shows_scale: bool = True
+) -> list[Moves]:
     """Moves between frames by `odometry` as stated, and with each fault that it may have as a whole.
 
-    The attitude that the stars show turns them. Without odometry no move is known.
+    The attitude that the stars show turns them. Without odometry no move is known. `shows_scale`: whether images show a
+    wrong scale; they do not in a crater of unknown size.
 
     Raises:
         BadInput: bad_odometry for odometry that does not cover the frames, or is impossible.
@@ -40,7 +43,10 @@ def odometry_moves(frames: Sequence[ObservedFrame], odometry: Odometry | None, e
     down = np.diag([1.0, -1.0, -1.0])
     faults = {
         "the opposite sign": (-position, Q),
-        **{f"lengths {1.0 / to:.4g} times the true ones": (to * position, Q) for to in (*UNITS, *SCALES)},
+        **{
+            f"lengths {1.0 / to:.4g} times the true ones": (to * position, Q)
+            for to in ((*UNITS, *SCALES) if shows_scale else ())
+        },
         "quaternions with w first": (position, first),
         "quaternions of the inverse rotations": (position, back),
         "inverse poses": (-np.einsum("nij,nj->ni", back, position), back),

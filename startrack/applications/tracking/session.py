@@ -157,7 +157,8 @@ class TrackSession:
         """The filter with frame k; where positions are not linear in `shared`, of all frames about what they show."""
         online, anew = self._online, shared.bends
         frames = self.frames[: k + 1]
-        moves, modes = odometry_moves(frames, odometry, self.odometry_errors), [frame.modes for frame in frames]
+        moves = odometry_moves(frames, odometry, self.odometry_errors, shows_scale=not anew)
+        modes = [frame.modes for frame in frames]
         placed = [[shared.place(one) for one in of] for of in modes]
         if anew and any(modes):
             placed, _ = smooth_placed(modes, moves, shared, height_sigma_m)

@@ -24,6 +24,7 @@ from startrack.localization import camera_at
 from startrack.terrain import Terrain
 
 SIZES = {DEPTH: "depth_m", WIDTH: "diameter_m"}  # errors of a crater, and the fact of each
+MOST_SIZE_SIGMAS, LEAST_SIZE_1 = 4.0, 0.1  # of a crater's depth or width: what its file states is wrong beyond
 SIZE_ROUNDS, STILL_MOVES_M = (
     10,
     0.01,
@@ -143,7 +144,8 @@ def estimate_track(
         first, second = [*np.flatnonzero(robust.mode >= 0).tolist(), n][:2]
         alone = dict.fromkeys(range(first, second), frames[first].fixes)
     else:
-        moves, names = odometry_moves(frames, odometry, odometry_errors), [frame.name for frame in frames]
+        moves = odometry_moves(frames, odometry, odometry_errors, shows_scale=not shared.bends)
+        names = [frame.name for frame in frames]
         placed, robust = smooth_placed(modes, moves, shared, terrain.height_sigma_m, names)
         filtered = filter_positions(placed, moves, len(shared), terrain.height_sigma_m)
         position_m, covariance_m2, used_then, by_one = filtered
@@ -183,16 +185,28 @@ def smooth_placed(
     """
     placed = [[shared.place(one) for one in of] for of in modes]
     robust = smooth_robustly(placed, moves, height_sigma_m, names=names)
-    for _ in range(SIZE_ROUNDS if shared.bends else 0):
+    rounds, moved_m = 0, np.inf
+    while shared.bends and moved_m > STILL_MOVES_M and rounds < SIZE_ROUNDS:
         before = robust.smoothed
         placed = [
             [shared.place(one, position_m, before.shared) for one in of]
             for of, position_m in zip(modes, before.position_m, strict=True)
         ]
         robust = smooth_robustly(placed, moves, height_sigma_m, names=names)
-        if np.abs(robust.smoothed.position_m - before.position_m).max() < STILL_MOVES_M:
-            break
+        rounds, moved_m = rounds + 1, float(np.abs(robust.smoothed.position_m - before.position_m).max())
+    if shared.bends and (moved_m > STILL_MOVES_M or not _is_possible(robust.smoothed, shared)):
+        raise BadInput(
+            "inconsistent_evidence",
+            "the odometry contradicts what the terrain file states of the crater's size: are its lengths in metres?",
+        )
     return placed, robust
+
+
+def _is_possible(found: Smoothed, shared: TrackErrors) -> bool:
+    """Whether the crater's size is one that its file may mean."""
+    is_size = np.array([name in SIZES for name in shared.names])
+    sizes = (1.0 + shared.mean + shared.sigma * found.shared)[is_size] / (1.0 + shared.mean)[is_size]
+    return bool(np.abs(found.shared[is_size]).max() < MOST_SIZE_SIGMAS and sizes.min() > LEAST_SIZE_1)
 
 
 def track_of_newest(frame: ObservedFrame, online: OnlineTrack, terrain: Terrain) -> Track:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from scipy.spatial import cKDTree
 
 from startrack.applications.calibration import calibrate
@@ -279,19 +280,46 @@ def test_a_refused_file_is_asked_for_the_site_that_it_was_made_with(cold_calibra
         largest_px=2.0, has_site=site is not None, file_has_site=file_has_site,
     )  # fmt: skip
     assert verify_dict(found)["message"].endswith(advice) and advice in verify_line(found)
-    assert replace(found, change_px=0.1).message == ""
+    small = replace(found, change_px=0.1)
+    assert small.message == ""
+    open_question = advice != "the lens has changed: calibrate again"
+    assert ("--site" in verify_line(small)) == open_question == bool(verify_dict(small)["warnings"])
+
+
+@pytest.mark.parametrize(
+    ("header", "flag", "warns"),
+    [({"OBSLAT": 34.4773, "OBSLONG": -111.4332}, "34.7443,-111.4223", True),
+     ({"OBSLAT": 34.74, "OBSLONG": -111.42}, "34.7443,-111.4223", False),
+     ({"SITELAT": "34 44 39.5", "SITELONG": "111:25:20"}, "34.7443,-111.4223", False),  # to the west
+     ({"SITELAT": "-34 44 39.5", "SITELONG": "111:25:20"}, "34.7443,-111.4223", True),
+     ({"LAT-OBS": "somewhere", "LONG-OBS": 3}, "34.7443,-111.4223", False), ({}, "34.7443,-111.4223", False)],
+)  # fmt: skip
+def test_a_site_of_the_header_that_differs_from_the_flag_is_named(tmp_path, capsys, header, flag, warns):
+    unit = fits.PrimaryHDU(np.random.default_rng(1).integers(90, 110, (200, 200)).astype(np.int16))
+    unit.header.update({"DATE-AVG": "2018-08-06T05:17:34", **header})
+    unit.writeto(tmp_path / "a.fits")
+    main(["calibrate", str(tmp_path / "a.fits"), "--fov", "180", f"--site={flag}", "-o", str(tmp_path / "a.toml")])
+    err = capsys.readouterr().err
+    assert ("degrees from --site" in err) == warns, err
+    if warns:
+        assert "is used" in err and "a: the header's site" in err
 
 
 @pytest.mark.slow
 def test_verify_finds_what_the_record_states(written_files, exposure, tmp_path, capsys):
     """The lens of the photograph is scaled so that it must be refused; the site in the record decides on the advice."""
     camera = load_camera(written_files / "new.toml")
-    save_camera(replace(camera, focal_px=(camera.focal_px[0] * 1.004, camera.focal_px[1] * 1.004)), tmp_path / "a.toml")
+    moved = replace(camera, focal_px=(camera.focal_px[0] * 1.004, camera.focal_px[1] * 1.004), refraction="")
+    save_camera(moved, tmp_path / "a.toml")
     words = ["calibrate", "verify", str(PHOTO), "-c", str(tmp_path / "a.toml")]
     assert main(words) == 3
     assert "if the file was made with --site" in capsys.readouterr().out
     record = (written_files / "new.calibration.json").read_text()
     (tmp_path / "a.calibration.json").write_text(record)
+    assert main(words) == 3
+    assert "was made with a site" in capsys.readouterr().out
+    (tmp_path / "a.calibration.json").unlink()
+    save_camera(replace(moved, refraction=camera.refraction), tmp_path / "a.toml")  # the file itself states it
     assert main(words) == 3
     assert "was made with a site" in capsys.readouterr().out
     assert main([*words, "--site=34.7443,111.4223,2361"]) == 3

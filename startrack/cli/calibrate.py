@@ -108,8 +108,8 @@ def verify(args: argparse.Namespace) -> int:
                 show_step(f"verifying with {exposure.name}")
                 camera, site = load_camera(named), site_of(args, [exposure])
                 file = resolve_named(named, "calib", "no_calibration")
-                refraction = value_in_record(file, "lens", "refraction")  # None: not known whether with a site
-                known = None if refraction is None else bool(refraction == REFRACTION_REMOVED)
+                refraction = camera.refraction or value_in_record(file, "lens", "refraction")
+                known = None if not refraction else bool(refraction == REFRACTION_REMOVED)
                 found = calibration.verify(exposure, camera, load_catalog(), site, file_has_site=known)
                 outcome = calibration.verify_dict(found), calibration.verify_line(found)
             except NoSolution as cause:

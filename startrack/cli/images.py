@@ -27,9 +27,10 @@ from startrack.core.runner import count_cores
 from startrack.core.table_text import column_lines, join_columns
 from startrack.core.types import Evidence, Exposure, NotLocated
 from startrack.estimation.observations import OdometryErrors
-from startrack.frames import Site, parse_utc
+from startrack.frames import Site, parse_utc, rays_from_azel
 from startrack.terrain import TERRAIN_KEYS, Terrain, load_terrain
 
+SITE_TOLERANCE_DEG = 0.1  # as far as an azimuth of a skyline may be wrong
 FACT_FLAGS = {  # keyword of `read_exposure`: argument of the command
     "time_utc": "time", "time_sigma_s": "time_sigma", "exposure_s": "exposure", "camera": "camera",
     "terrain": "terrain", "mask": "mask", "dark": "dark", "flat": "flat",
@@ -123,8 +124,26 @@ def flag_site(args: argparse.Namespace) -> Site | None:
 def site_of(args: argparse.Namespace, exposures: list[Exposure]) -> Site | None:
     """The site of --site, else of the terrain that a flag or the images name; None if there is none."""
     given = flag_site(args)
+    if given is not None and not args.quiet:
+        _compare_site(args.site, given, exposures)
     named = next((e.terrain for e in exposures if e.terrain), None)
     return given if given is not None or named is None else load_terrain(named).site
+
+
+def _compare_site(flag: str, site: Site, exposures: list[Exposure]) -> None:
+    """Print a line on stderr where a header states another place than --site."""
+    stated = next((e for e in exposures if e.header_site_deg is not None), None)
+    if stated is None or stated.header_site_deg is None:
+        return
+    latitude, longitude = np.radians(stated.header_site_deg)
+    here = rays_from_azel(site.longitude_rad, site.latitude_rad)
+    # Programs count longitudes to the east or to the west.
+    there = rays_from_azel(np.array([longitude, -longitude]), np.array([latitude, latitude]))
+    apart_rad = float(np.min(2 * np.arcsin(np.linalg.norm(there - here, axis=-1) / 2)))
+    if apart_rad > math.radians(SITE_TOLERANCE_DEG):
+        place = "{:.4f}, {:.4f}".format(*stated.header_site_deg)
+        text = f"the header's site {place} is {math.degrees(apart_rad):.1f} degrees from --site {flag}, which is used"
+        print(f"{stated.name}: {text}", file=sys.stderr, flush=True)
 
 
 def prepare_reference(reference: str | None, args: argparse.Namespace) -> Terrain | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -29,7 +30,9 @@ HEADER_OF = {  # the sidecar's key of a fact and its name in a header: FITS keyw
 }  # fmt: skip
 # The names of the sidecar's keys are valid in a header too, except in FITS, where a card called CAMERA is common and
 # names the hardware.
-HEADER_KEYS = {name: name for name in ("DATE-OBS", "TIMESYS", *HEADER_OF.values())} | HEADER_OF
+SITE_NAMES = (("OBSLAT", "OBSLONG"), ("SITELAT", "SITELONG"), ("LAT-OBS", "LONG-OBS"), ("OBSGEO-B", "OBSGEO-L"))
+_NAMES = ("DATE-OBS", "TIMESYS", *HEADER_OF.values(), *(name for pair in SITE_NAMES for name in pair))
+HEADER_KEYS = {name: name for name in _NAMES} | HEADER_OF
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +51,7 @@ class Facts:
     mask: str | None = None  # path
     dark: str | None = None  # path of the dark frame
     flat: str | None = None  # path of the flat field
+    site_deg: tuple[float, float] | None = None  # latitude and longitude in the header
     bayer_pattern: str | None = None  # RGGB and the like: the pixels are a mosaic of colours
     warnings: tuple[str, ...] = ()  # values that were ignored, and why
 
@@ -108,7 +112,7 @@ def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts
             if value is not None and key in NAMED_FILES:
                 value = resolve_path(image, value)
         found[key] = as_utc(value) if key == "time_utc" and value is not None else value
-    return Facts(**found, warnings=tuple(notes))
+    return Facts(**found, site_deg=_header_site_deg(header), warnings=tuple(notes))
 
 
 def facts_in_text(text: str) -> dict[str, Any]:
@@ -121,6 +125,26 @@ def facts_in_text(text: str) -> dict[str, Any]:
     if not isinstance(entries, dict):
         return {}
     return {HEADER_KEYS[key]: value for key, value in reversed(entries.items()) if key in HEADER_KEYS}
+
+
+def _header_site_deg(header: Mapping[str, Any]) -> tuple[float, float] | None:
+    """The first pair of latitude and longitude [degrees] in a header, of numbers or texts such as 34 28 38.3."""
+    for names in SITE_NAMES:
+        with suppress(KeyError, ValueError):
+            latitude, longitude = (_degrees_of(header[name]) for name in names)
+            if abs(latitude) <= 90 and abs(longitude) <= 360:  # False for NaN too
+                return latitude, longitude
+    return None
+
+
+def _degrees_of(value: Any) -> float:
+    """Degrees of a number, or of degrees, minutes and seconds with blanks or colons. Raises ValueError."""
+    text = str(value).strip()
+    parts = [abs(float(part)) for part in text.replace(":", " ").split()]
+    if not 1 <= len(parts) <= 3:
+        raise ValueError(text)
+    size = sum(part / 60.0**power for power, part in enumerate(parts))
+    return -size if text.startswith("-") else size
 
 
 def header_number(header: Mapping[str, Any], key: str, notes: list[str]) -> float | None:

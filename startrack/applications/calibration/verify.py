@@ -53,6 +53,14 @@ class Verification:
             return "the lens has changed: calibrate again; or, if the file was made with --site, give --site here too"
         return "the lens has changed: calibrate again"
 
+    @property
+    def warnings(self) -> list[str]:
+        """What an accepted comparison leaves open: whether both lenses are with the refraction of the air."""
+        if not self.is_valid or self.file_has_site == self.has_site or (self.has_site and self.file_has_site is None):
+            return []
+        made = {True: "with", False: "without", None: "perhaps with"}[self.file_has_site]
+        return [f"the camera file was made {made} a site, this comparison {'with' if self.has_site else 'without'} one"]
+
 
 def verify(
     exposure: Exposure, camera: Camera, catalog: StarCatalog, site: Site | None = None,
@@ -110,6 +118,7 @@ def verify_dict(found: Verification) -> dict[str, Any]:
         "status": "ok" if found.is_valid else "refused",
         "reason": None if found.is_valid else "inconsistent_evidence",
         "message": found.message,
+        "warnings": found.warnings,
         "camera": old.name,
         "stars": found.stars,
         "rms_px": found.rms_px,
@@ -127,4 +136,5 @@ def verify_line(found: Verification) -> str:
     return (
         f"{found.image}  {verdict}  {found.stars} stars  map changed by {found.change_px:.2f} px RMS "
         f"(± {found.change_sigma_px:.2f}), {found.largest_px:.2f} px at most"
+        + "".join(f"; {text} (--site)" for text in found.warnings)
     )

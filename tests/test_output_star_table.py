@@ -79,12 +79,17 @@ def replace_row(light, llr, cause):
 
 def test_without_a_terrain_there_are_matches_and_predictions(located, tmp_path):
     result = extend(located.result, Oriented, terrain=None)
-    write_star_table(tmp_path / "t.ecsv", result)
+    write_star_table(tmp_path / "t.ecsv", result, catalog=True)
     table = Table.read(tmp_path / "t.ecsv", format="ascii.ecsv")
-    assert table.colnames == COLUMNS.split()[:4] + COLUMNS.split()[6:10]
+    assert table.colnames == [*COLUMNS.split()[:4], *COLUMNS.split()[6:10], "status"]
     matched = ~np.ma.getmaskarray(table["x_measured_px"])
     assert matched.sum() == len(result.identification)
     assert (~matched).sum() > 100
+    assert set(table["status"][matched]) == {"identified"} and set(table["status"][~matched]) == {"predicted"}
+    write_star_table(tmp_path / "named.ecsv", result)
+    named = Table.read(tmp_path / "named.ecsv", format="ascii.ecsv")
+    assert named.colnames == table.colnames
+    assert [tuple(row) for row in named] == [tuple(row) for row in table[matched]]
     with pytest.raises(ValueError, match="identified"):
         star_table_text(extend(result, Identified))
 

@@ -177,7 +177,7 @@ class Solution:
             return None
         from astropy.table import QTable
 
-        return QTable.read(output.star_table_text(value), format="ascii.ecsv")
+        return QTable.read(output.star_table_text(value, catalog=True), format="ascii.ecsv")
 
     @cached_property
     def skyline(self) -> QTable | None:

@@ -56,7 +56,11 @@ COMMANDS = (
                 ),
             ),
             "method": (flags.NEAR_ATTITUDE,),
-            **SHARED,
+            "output": (
+                *flags.OUTPUT,
+                flag("--catalog-table", "list in NAME.stars.ecsv the stars in the frame that were not identified too"),
+            ),
+            "more": SHARED["more"],
         },
         example="startrack identify sky.png --fov 60",
     ),

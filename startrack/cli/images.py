@@ -132,16 +132,16 @@ def site_of(args: argparse.Namespace, exposures: list[Exposure]) -> Site | None:
 
 def _compare_site(flag: str, site: Site, exposures: list[Exposure]) -> None:
     """Print a line on stderr where a header states another place than --site."""
-    stated = next((e for e in exposures if e.header_site_deg is not None), None)
-    if stated is None or stated.header_site_deg is None:
+    stated = next((e for e in exposures if e.header_site_rad is not None), None)
+    if stated is None or stated.header_site_rad is None:
         return
-    latitude, longitude = np.radians(stated.header_site_deg)
+    latitude, longitude = stated.header_site_rad
     here = rays_from_azel(site.longitude_rad, site.latitude_rad)
     # Programs count longitudes to the east or to the west.
     there = rays_from_azel(np.array([longitude, -longitude]), np.array([latitude, latitude]))
     apart_rad = float(np.min(2 * np.arcsin(np.linalg.norm(there - here, axis=-1) / 2)))
     if apart_rad > math.radians(SITE_TOLERANCE_DEG):
-        place = "{:.4f}, {:.4f}".format(*stated.header_site_deg)
+        place = "{:.4f}, {:.4f}".format(*np.degrees(stated.header_site_rad))
         text = f"the header's site {place} is {math.degrees(apart_rad):.1f} degrees from --site {flag}, which is used"
         print(f"{stated.name}: {text}", file=sys.stderr, flush=True)
 

@@ -120,7 +120,9 @@ def _solve_image(args: argparse.Namespace, path: str, out: Path, solve: Solve) -
     start = time.perf_counter()
     result = chain.add_timing(solve(exposure, camera), read=1e3 * read_s)
     more = {"explain": output.explain(result)} if is_located and args.explain else {}
-    record = output.write_results(result, out, plots=not args.no_plots, more=more)
+    record = output.write_results(
+        result, out, plots=not args.no_plots, catalog_table=getattr(args, "catalog_table", False), more=more
+    )
     if is_located:
         output.write_geo(out, result, args.format)
     line = output.summary_line(result, seconds=read_s + time.perf_counter() - start)

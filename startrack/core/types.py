@@ -88,7 +88,7 @@ class Exposure(Value):
     saturation_adu: float | None = None  # largest value the file's type can hold, None for float images
     sha256: str = ""
     warnings: tuple[str, ...] = ()
-    header_site_deg: tuple[float, float] | None = None  # latitude and longitude that the header states; only compared
+    header_site_rad: tuple[float, float] | None = None  # latitude and longitude that the header states; only compared
     correction: Correction | None = None  # by dark frame and flat field; None: `pixels_adu` are the recorded counts
 
     def __post_init__(self) -> None:

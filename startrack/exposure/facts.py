@@ -51,7 +51,7 @@ class Facts:
     mask: str | None = None  # path
     dark: str | None = None  # path of the dark frame
     flat: str | None = None  # path of the flat field
-    site_deg: tuple[float, float] | None = None  # latitude and longitude in the header
+    site_rad: tuple[float, float] | None = None  # latitude and longitude in the header
     bayer_pattern: str | None = None  # RGGB and the like: the pixels are a mosaic of colours
     warnings: tuple[str, ...] = ()  # values that were ignored, and why
 
@@ -112,7 +112,7 @@ def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts
             if value is not None and key in NAMED_FILES:
                 value = resolve_path(image, value)
         found[key] = as_utc(value) if key == "time_utc" and value is not None else value
-    return Facts(**found, site_deg=_header_site_deg(header), warnings=tuple(notes))
+    return Facts(**found, site_rad=_header_site_rad(header), warnings=tuple(notes))
 
 
 def facts_in_text(text: str) -> dict[str, Any]:
@@ -127,12 +127,12 @@ def facts_in_text(text: str) -> dict[str, Any]:
     return {HEADER_KEYS[key]: value for key, value in reversed(entries.items()) if key in HEADER_KEYS}
 
 
-def _header_site_deg(header: Mapping[str, Any]) -> tuple[float, float] | None:
-    """The first pair of latitude and longitude [degrees] in a header, of numbers or texts such as 34 28 38.3."""
+def _header_site_rad(header: Mapping[str, Any]) -> tuple[float, float] | None:
+    """The first pair of latitude and longitude [rad] in a header, of numbers or texts such as 34 28 38.3."""
     for names in SITE_NAMES:
         with suppress(KeyError, ValueError):
-            latitude, longitude = (_degrees_of(header[name]) for name in names)
-            if abs(latitude) <= 90 and abs(longitude) <= 360:  # False for NaN too
+            latitude, longitude = (math.radians(_degrees_of(header[name])) for name in names)
+            if abs(latitude) <= math.pi / 2 and abs(longitude) <= 2 * math.pi:  # False for NaN too
                 return latitude, longitude
     return None
 

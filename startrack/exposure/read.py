@@ -91,7 +91,7 @@ def exposure_of_decoded(decoded: Decoded, facts: Facts, *, raw: bytes, name: str
         mask=facts.mask,
         saturation_adu=decoded.saturation_adu,
         sha256=hashlib.sha256(raw).hexdigest(),
-        header_site_deg=facts.site_deg,
+        header_site_rad=facts.site_rad,
         warnings=notes + facts.warnings,
         correction=correction,
     )

@@ -23,6 +23,7 @@ from startrack.output.quantity import Column, Quantity
 if TYPE_CHECKING:
     from startrack.evidence import StarPhotometry
 
+IDENTIFIED = "identified", "predicted"  # without a terrain
 STAR_STATUSES = ("seen", "hidden", "uncertain", "unusable")
 FAINTER_THAN_FAINTEST_MATCH_MAG = 0.5
 LEAST_HALF_RAD, MOST_HALF_RAD = np.radians(0.02), np.radians(5.0)
@@ -60,16 +61,19 @@ def quantity_columns(quantities: Iterable[Quantity], values: Mapping[str, Iterab
     ]
 
 
-def star_table_text(value: Inputs) -> str:
+def star_table_text(value: Inputs, *, catalog: bool = False) -> str:
     """The star table of `value`, the last of a result, as ECSV, brightest star first; stars must have been identified.
 
-    After `locate`: every star whose light was measured. Without a terrain: the matched stars and all others in the
-    frame down to half a magnitude below the faintest of them, without azimuth, elevation and evidence.
+    After `locate`: every star whose light was measured. Without a terrain: the identified stars, and with `catalog` all
+    others in the frame down to half a magnitude below the faintest of them, without azimuth, elevation and evidence.
     """
     if not isinstance(value, Oriented):
         raise ValueError("no star table without identified stars")
     light = value.light if isinstance(value, Measured) else None
-    if light is None:  # stars in the frame down to the depth of the matches
+    if light is None and not catalog:
+        star = np.sort(value.identification.star)
+        xy_px, _ = value.camera.project(value.stars.rays_icrs[star] @ value.attitude.R_cam_icrs.T)
+    elif light is None:  # stars in the frame down to the depth of the matches
         faintest = float(value.stars.v_mag[value.identification.star].max(initial=-np.inf))
         star = np.flatnonzero(value.stars.v_mag <= faintest + FAINTER_THAN_FAINTEST_MATCH_MAG)
         xy_px, inside = value.camera.project(value.stars.rays_icrs[star] @ value.attitude.R_cam_icrs.T)
@@ -111,6 +115,9 @@ def star_table_text(value: Inputs) -> str:
             Column("status", status_of(light), "string", description="seen, hidden, uncertain or unusable"),
             Column("cause", light.cause, "string", description="why it is unusable"),
         ]
+    else:
+        status = np.where(np.isfinite(measured_px[:, 0]), *IDENTIFIED)
+        columns.append(Column("status", status, "string", description=" or ".join(IDENTIFIED)))
     return ecsv_text(columns)
 
 

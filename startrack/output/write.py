@@ -76,16 +76,23 @@ def _stem_and_kind(record: Path) -> tuple[str, str]:
 
 
 def write_results(
-    outcome: Outcome, path: Path, *, plots: bool = True, write_record: bool = True, more: dict[str, Any] | None = None
+    outcome: Outcome,
+    path: Path,
+    *,
+    plots: bool = True,
+    write_record: bool = True,
+    catalog_table: bool = False,
+    more: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The record of an `outcome`, written to `path` (such as NAME.fix.json) after tables, WCS and pictures.
 
-    `plots` and `write_record`: whether the pictures and the record are written; `more`: keys that are added to the
-    record. Raises BadInput where a file cannot be written; none of them is then left.
+    `plots` and `write_record`: whether the pictures and the record are written; `catalog_table`: whether the star table
+    without a terrain holds the stars that were not identified too; `more`: keys that are added to the record. Raises
+    BadInput where a file cannot be written; none of them is then left.
     """
     record = record_of(outcome, _stem_and_kind(path)[1]) | (more or {})
     try:
-        _write_companions(outcome, path, plots=plots)
+        _write_companions(outcome, path, plots=plots, catalog_table=catalog_table)
         if write_record:
             write_json(path, record)
     except BaseException:
@@ -95,7 +102,7 @@ def write_results(
     return record
 
 
-def _write_companions(outcome: Outcome, path: Path, *, plots: bool) -> None:
+def _write_companions(outcome: Outcome, path: Path, *, plots: bool, catalog_table: bool) -> None:
     """Write tables, WCS and pictures beside each other: pictures are drawn and packed while tables are written."""
     value = last_value(outcome)
     with ThreadPoolExecutor() as pool:
@@ -106,7 +113,7 @@ def _write_companions(outcome: Outcome, path: Path, *, plots: bool) -> None:
             if plots:
                 files.append(pool.submit(_write_panorama, companion(path, SKYLINE_PICTURE), value, value.skyline))
         if isinstance(value, Measured) or (isinstance(value, Oriented) and value.terrain is None):
-            write_star_table(companion(path, ".stars.ecsv"), value)
+            write_star_table(companion(path, ".stars.ecsv"), value, catalog=catalog_table)
             write_wcs(companion(path, ".wcs"), companion(path, ".corr"), value)
     for file in files:
         file.result()
@@ -145,9 +152,9 @@ def json_text(record: dict[str, Any]) -> str:
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
-def write_star_table(path: FilePath, value: Oriented) -> None:
-    """Write the star table of an identified `value` to `path`. Raises BadInput where it cannot be written."""
-    write_atomically(path, star_table_text(value).encode("utf-8"), overwrite=True)
+def write_star_table(path: FilePath, value: Oriented, *, catalog: bool = False) -> None:
+    """Write `star_table_text` of a `value` and `catalog` to `path`. Raises BadInput where it cannot be written."""
+    write_atomically(path, star_table_text(value, catalog=catalog).encode("utf-8"), overwrite=True)
 
 
 def write_wcs(path: FilePath, corr_path: FilePath, value: Oriented) -> None:

@@ -10,7 +10,7 @@ of the last image that an explanation takes as right.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -22,6 +22,7 @@ WRONG_PROBABILITY, WRONG_SIGMA_M = 1e-3, 200.0  # of a frame, and the error of i
 FOREIGN_SIGMA_M = 5000.0  # of a position anywhere in a search area, about its middle
 MIXED_PROBABILITY, MIXED_PART = 1e-3, 0.1  # of a set with images from elsewhere, and how many of its images these are
 ODOMETRY_WRONG_PROBABILITY = 0.01  # as a whole
+FREEDOMS = 6  # of odometry as a whole: a linear map from three axes to two
 KEPT_NATS, MOST_KEPT = 60.0, 60  # of explanations beside the best, and for each kind of odometry
 
 
@@ -34,12 +35,14 @@ class Moves:
     delta_m: Array  # (n - 1, 3) in the odometry's frame
     turn: Array  # (n + 1, 3, 3) from that frame to enu: before the first attitude, then by each frame's; nan: not known
     sigma_m: Array  # (n - 1,) on each axis; infinite where the move is not known
+    freedom_m: Array  # (n - 1, 3, FREEDOMS) of `delta_m`, by errors of a standard normal prior that all moves share
 
     @classmethod
     def of(cls, steps: Steps) -> Moves:
         """Those of `steps`, which need no attitude."""
         n = len(steps.sigma_m) + 1
-        return cls("", 0.0, np.pad(steps.move_m, ((0, 0), (0, 1))), np.tile(np.eye(3), (n + 1, 1, 1)), steps.sigma_m)
+        turn, none = np.tile(np.eye(3), (n + 1, 1, 1)), np.zeros((n - 1, 3, FREEDOMS))
+        return cls("", 0.0, np.pad(steps.move_m, ((0, 0), (0, 1))), turn, steps.sigma_m, none)
 
     def steps(self, anchor: Ints) -> Steps:
         """The first moves in enu, turned as by the entries `anchor` (m,) of `turn`; none is known with a fault."""
@@ -75,8 +78,8 @@ class Branches:
     log_likelihood: Array  # (b,) with all priors but that of wrong frames
     log_wrong: Array  # (b,) the part of it by wrong frames
     wrong: Ints  # (b,) number of wrong frames
-    mean: Array  # (b, 2 + k) of the position and the shared errors
-    covariance: Array  # (b, 2 + k, 2 + k)
+    mean: Array  # (b, 2 + k + FREEDOMS) of the position, the shared errors and those of the odometry as a whole
+    covariance: Array  # (b, 2 + k + FREEDOMS, 2 + k + FREEDOMS)
     odometry: Ints  # (b,) which moves
     anchor: Ints  # (b,) entry of their turns
     history: Ints  # (b, frames, 3) mode, slip before it, anchor of the move before it
@@ -161,11 +164,12 @@ class Explanations:
         )  # fmt: skip
 
     def _start(self) -> Branches:
-        count, p = len(self._moves), 2 + self.shared_count
+        count, p = len(self._moves), 2 + self.shared_count + FREEDOMS
+        prior = np.diag(np.square(np.append(self._free_sigma, np.ones(FREEDOMS))))
         nothing, none = np.zeros(count), np.zeros(count, dtype=np.int64)
         return Branches(
             np.array([m.log_prior for m in self._moves]), nothing, none, np.zeros((count, p)),
-            np.tile(np.diag(np.square(self._free_sigma)), (count, 1, 1)), np.arange(count), none,
+            np.tile(prior, (count, 1, 1)), np.arange(count), none,
             np.zeros((count, 1, 3), dtype=np.int64),
         )  # fmt: skip
 
@@ -178,9 +182,13 @@ class Explanations:
         turn = np.array([m.turn for m in self._moves])[one.odometry, one.anchor]
         delta = np.array([m.delta_m[step] for m in self._moves])[one.odometry]
         sigma = np.array([m.sigma_m[step] for m in self._moves])[one.odometry]
+        freedom = np.array([m.freedom_m[step] for m in self._moves])[one.odometry]
         move = np.einsum("bij,bj->bi", turn, delta)[:, :2]
         lost = ~(np.isfinite(move).all(axis=1) & np.isfinite(sigma))
-        mean, covariance = one.mean.copy(), one.covariance.copy()
+        shift = np.tile(np.eye(one.mean.shape[1]), (len(lost), 1, 1))
+        shift[:, :2, -FREEDOMS:] = np.where(lost[:, None, None], 0.0, (turn @ freedom)[:, :2])
+        mean = np.einsum("bij,bj->bi", shift, one.mean)
+        covariance = shift @ one.covariance @ shift.swapaxes(1, 2)
         mean[:, :2] = np.where(lost[:, None], 0.0, mean[:, :2] + move)
         covariance[lost, :2], covariance[lost, :, :2] = 0.0, 0.0
         covariance[:, [0, 1], [0, 1]] += np.square(np.where(lost, FOREIGN_SIGMA_M, sigma))[:, None]
@@ -199,13 +207,14 @@ class Explanations:
 
     def _used(self, one: Branches, number: int, mode: FrameEstimate, anchor: Ints) -> Branches:
         residual, covariance, noise = self._innovation(one, mode)
-        cross = one.covariance @ mode.response.T
+        seen = np.pad(mode.response, ((0, 0), (0, FREEDOMS)))
+        cross = one.covariance @ seen.T
         gain = np.linalg.solve(covariance, cross.swapaxes(1, 2)).swapaxes(1, 2)
         found = _decided(
             one, one.log_likelihood + np.log(mode.weight) + log_normal(residual, covariance), number, anchor
         )
         found.mean = one.mean + np.einsum("bij,bj->bi", gain, residual)
-        rest = np.eye(one.mean.shape[1]) - gain @ mode.response
+        rest = np.eye(one.mean.shape[1]) - gain @ seen
         found.covariance = rest @ one.covariance @ rest.swapaxes(1, 2) + gain @ noise @ gain.swapaxes(1, 2)
         return found
 
@@ -227,8 +236,9 @@ class Explanations:
     def _innovation(self, one: Branches, mode: FrameEstimate) -> tuple[Array, Array, Array]:
         """Observation less prediction (b, p), its covariance (b, p, p), and the part by the frame itself (p, p)."""
         noise = mode.noise + self.height_sigma_m**2 * mode.by_post @ mode.by_post.T
-        covariance = mode.response @ one.covariance @ mode.response.T + noise
-        return mode.mean - one.mean @ mode.response.T, covariance, noise
+        p = mode.parameters
+        covariance = mode.response @ one.covariance[:, :p, :p] @ mode.response.T + noise
+        return mode.mean - one.mean[:, :p] @ mode.response.T, covariance, noise
 
     def _wrong_prior(self, wrong: Ints) -> Array:
         """Logarithm of the prior of so many wrong frames: single ones, or a set with images from elsewhere."""
@@ -257,7 +267,7 @@ class Explanations:
         moves = self._moves[best.odometry[0]]
         turn = moves.turn.copy()
         turn[1 : len(out) + 1][~out] = np.nan
-        start = Moves(moves.fault, 0.0, moves.delta_m, turn, moves.sigma_m)
+        start = replace(moves, log_prior=0.0, turn=turn)
         for modes, is_out in zip(self._frames, out, strict=True):
             alone.add(modes if is_out else (), [start])
         other = alone._branches

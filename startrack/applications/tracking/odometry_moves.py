@@ -8,14 +8,14 @@ from datetime import UTC
 
 import numpy as np
 
-from startrack.applications.tracking.explanations import ODOMETRY_WRONG_PROBABILITY, Moves
+from startrack.applications.tracking.explanations import FREEDOMS, ODOMETRY_WRONG_PROBABILITY, Moves
 from startrack.applications.tracking.observed_frame import ObservedFrame
 from startrack.applications.tracking.odometry import Odometry
 from startrack.core.types import Array
 from startrack.estimation.observations import OdometryErrors, Steps
 
 UNITS = (1e-3, 1e3, 0.01, 0.3048)  # by which lengths in mm, km, cm or feet become metres
-SCALES = tuple(1.04**k for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6))  # in steps of twice the usual sigma
+SIMILAR_SIGMA_1 = 0.1  # of the scale, and of a turn about the vertical [rad], of odometry that is nearly right
 APART_SIGMA_M = 300.0  # of one image from the one before on each axis, by nothing but that both are of one drive
 AXES = ((1, 0, 2), (2, 1, 0), (0, 2, 1), (1, 2, 0), (2, 0, 1))  # orders that are not x y z
 
@@ -44,8 +44,7 @@ def odometry_moves(
     faults = {
         "the opposite sign": (-position, Q),
         **{
-            f"lengths {1.0 / to:.4g} times the true ones": (to * position, Q)
-            for to in ((*UNITS, *SCALES) if shows_scale else ())
+            f"lengths {1.0 / to:.4g} times the true ones": (to * position, Q) for to in (UNITS if shows_scale else ())
         },
         "quaternions with w first": (position, first),
         "quaternions of the inverse rotations": (position, back),
@@ -56,18 +55,31 @@ def odometry_moves(
     }
     apart = np.full(len(frames) - 1, APART_SIGMA_M)
     R = np.array([np.full((3, 3), np.nan) if frame.R_body_enu is None else frame.R_body_enu for frame in frames])
-    none, log_prior = np.full((1, 3, 3), np.nan), np.log(0.5 * ODOMETRY_WRONG_PROBABILITY)
+    none = np.full((1, 3, 3), np.nan)
 
-    def moves(fault: str, log_prior: float, position_m: Array, to_odometry: Array) -> Moves:
+    def moves(fault: str, position_m: Array, to_odometry: Array) -> Moves:
         """By poses in a frame of the odometry's own."""
         turn = np.concatenate([none, R.swapaxes(1, 2) @ to_odometry.swapaxes(1, 2)])
         delta = np.diff(position_m, axis=0)
-        return Moves(fault, log_prior, delta, turn, errors.sigma_m(delta))
+        return Moves(fault, 0.0, delta, turn, errors.sigma_m(delta), unknown.freedom_m)
 
+    right = moves("", position, Q)
+    east, north = np.eye(FREEDOMS).reshape(2, 3, FREEDOMS)
+    similar, linear = np.zeros_like(unknown.freedom_m), np.zeros_like(unknown.freedom_m)
+    similar[..., 0] = SIMILAR_SIGMA_1 * shows_scale * right.delta_m
+    similar[:, :2, 1] = SIMILAR_SIGMA_1 * right.delta_m[:, :2] @ [[0.0, 1.0], [-1.0, 0.0]]
+    linear[:, 0], linear[:, 1] = right.delta_m @ east, right.delta_m @ north
+    named = [moves(fault, *poses) for fault, poses in faults.items()]
+    wrong = [
+        replace(right, fault="a wrong scale or heading", freedom_m=similar),
+        replace(unknown, fault="other axes, quaternions or lengths", freedom_m=linear, sigma_m=right.sigma_m),
+        replace(unknown, fault="an unknown fault", sigma_m=apart),
+    ]
+    prior = np.log(ODOMETRY_WRONG_PROBABILITY / (len(wrong) + 1))
     return [
-        moves("", float(np.log1p(-ODOMETRY_WRONG_PROBABILITY)), position, Q),
-        *(moves(fault, float(log_prior - np.log(len(faults))), *poses) for fault, poses in faults.items()),
-        replace(unknown, fault="an unknown fault", log_prior=float(log_prior), sigma_m=apart),
+        replace(right, log_prior=float(np.log1p(-ODOMETRY_WRONG_PROBABILITY))),
+        *(replace(one, log_prior=float(prior - np.log(len(named)))) for one in named),
+        *(replace(one, log_prior=float(prior)) for one in wrong),
     ]
 
 

@@ -156,6 +156,9 @@ CLASSES: dict[str, Change] = {
     "odometry: in km": with_odometry(lambda p, t, q: (1e-3 * p, t, q)),
     "odometry: in feet": with_odometry(lambda p, t, q: (p / 0.3048, t, q)),
     "odometry: 10 % too long": with_odometry(lambda p, t, q: (1.1 * p, t, q)),
+    "odometry: half as long": with_odometry(lambda p, t, q: (0.5 * p, t, q)),
+    "odometry: 5 degrees turned": with_odometry(lambda p, t, q: (p, t, q * Rotation.from_rotvec([0.0, 0.0, 0.087]))),
+    "odometry: 20 degrees turned": with_odometry(lambda p, t, q: (p, t, q * Rotation.from_rotvec([0.0, 0.0, 0.35]))),
     "odometry: zero": with_odometry(lambda p, t, q: (0.0 * p, t, q)),
     **{
         f"odometry: stamps {part:+g} of an interval": with_odometry(lambda p, t, q, s=part * EVERY_S: (p, t + s, q))

@@ -116,6 +116,9 @@ FAULTS = {
     "inverse": (inverse_poses, "inverse poses"),
     "km": (lambda one: changed(one, 1e-3 * one.position_m), "lengths 0.001 times the true ones"),
     "feet": (lambda one: changed(one, one.position_m / 0.3048), "lengths 3.281 times the true ones"),
+    "x to -y, y to -x": (
+        lambda one: changed(one, -one.position_m[:, [1, 0, 2]]), "other axes, quaternions or lengths",
+    ),
     "zero": (lambda one: changed(one, 0.0 * one.position_m), "an unknown fault"),
 }  # fmt: skip
 

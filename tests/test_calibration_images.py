@@ -250,7 +250,7 @@ def test_verify_and_show(written_files, capsys):
     photo, site = str(PHOTO), "--site=34.7443,-111.4223,2361"
     assert main(["calibrate", "verify", photo, "-c", str(written_files / "new.toml"), site, "--json"]) == 0
     record = json.loads(capsys.readouterr().out)
-    assert record["status"] == "ok"
+    assert (record["status"], record["image"]) == ("ok", PHOTO.name)
     assert record["map_change_px"] < 0.05
     assert main(["calibrate", "show", str(written_files / "new.toml")]) == 0
     assert "decentring" in capsys.readouterr().out

@@ -103,7 +103,7 @@ REFUSED = [
     ({"search": {"radius_m": 5000.0}}, "cover"), ({"search": {"max_slope_deg": 0.0}}, "max_slope_deg"),
     ({"search": {"glare_deg": [10.0]}}, "glare_deg"), ({"body": "earth"}, "a map of the Moon"),
     ({"cylinder": {"diameter_m": 100.0, "depth_m": 10.0}}, "two grounds"),
-    ({"origin": {"latitude_deg": 0.0}}, "not near the origin"),
+    ({"origin": {"latitude_deg": 0.0}}, "origin: its middle is at latitude -90.00, longitude"),
 ]  # fmt: skip
 
 

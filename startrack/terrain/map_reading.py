@@ -49,8 +49,12 @@ def read_map(
     raster = _heights_of(stored, path, scale, offset_m)
     cut = raster if near is None else raster.crop_around(*near, WINDOW_HALF_M[found])
     if min(cut.heights_m.shape) < 2:
+        x_m, y_m = raster.xy(0.5 * np.array(raster.heights_m.shape))
+        latitude, longitude = np.degrees(raster.projection.latlon_from_xy(x_m, y_m))
         raise BadInput(
-            "bad_terrain", f"{path}: it is not near the origin: give the latitude and longitude of a place on this map"
+            "bad_terrain",
+            f"{path}: it is not near the origin: its middle is at latitude {latitude:.2f}, longitude {longitude:.2f}; "
+            "give the latitude and longitude of a place on this map",
         )
     return cut
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from startrack.applications.calibration.run import identify_with_camera, load_fr
 from startrack.applications.calibration.shared_errors import widen_covariance
 from startrack.camera import Camera, cap_grid, projection_covariance_px2
 from startrack.catalog import StarCatalog
+from startrack.core.files import printable
 from startrack.core.types import Array, Exposure, NotIdentified
 from startrack.estimation.joint_fit import fit_frames, grow_from_matches
 from startrack.frames import Site
@@ -88,7 +90,7 @@ def verify(
     change = difference_px(camera, fit.camera, grid)
     variance = projection_covariance_px2(fit.camera, grid) + projection_covariance_px2(camera, grid)
     return Verification(
-        image=exposure.name,
+        image=printable(Path(exposure.path).name) or exposure.name,
         camera=camera,
         fresh=fit.camera,
         stars=int(fit.used.sum()),

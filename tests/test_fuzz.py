@@ -100,6 +100,7 @@ def test_each_kind_of_failure_is_counted():
     assert (outcome.answers, outcome.refusals) == (2, 1)
     assert [crash["index"] for crash in outcome.crashes] == [2, 3]
     assert (outcome.hangs, outcome.above_cap) == ([4], [5])
+    assert [found["index"] for found in outcome.above_bounds] == [6]
 
 
 def test_access_outside_the_folder_is_seen(tmp_path):

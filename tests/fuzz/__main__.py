@@ -41,16 +41,17 @@ def main() -> int:
 def table(outcomes: list[Outcome]) -> str:
     """The outcomes as a Markdown table."""
     lines = [f"| input | tried | answers | refusals | crashes | hangs (over {HANG_S:.0f} s) "
-             f"| above {MEMORY_BYTES / 2**30:.0f} GiB | slowest s |", "| --- " * 8 + "|"]  # fmt: skip
+             f"| above {MEMORY_BYTES / 2**30:.0f} GiB | above the bounds | slowest s |", "| --- " * 9 + "|"]  # fmt: skip
     for one in outcomes:
         lines.append(
             f"| {one.kind} | {one.tried} | {one.answers} | {one.refusals} | {len(one.crashes)} | {len(one.hangs)} "
-            f"| {len(one.above_cap)} | {one.slowest_s:.1f} |"
+            f"| {len(one.above_cap)} | {len(one.above_bounds)} | {one.slowest_s:.1f} |"
         )
     for one in outcomes:
         lines += [f"{one.kind} {crash['index']}: {crash['cause']}" for crash in one.crashes[:20]]
         lines += [f"{one.kind} {index}: no end within the limit" for index in one.hangs]
         lines += [f"{one.kind} {index}: above the cap of memory" for index in one.above_cap]
+        lines += [f"{one.kind} {found['index']}: {found['bound']}" for found in one.above_bounds]
     return "\n".join(lines)
 
 

@@ -22,7 +22,8 @@ from . import targets
 
 HANG_S = 10.0  # one file through a reader
 COMMAND_HANG_S = 60.0  # one file through a whole command
-MEMORY_BYTES = 2**31  # address space of one file beyond what the process has after its start
+MEMORY_BYTES = 2**31  # address space of one file beyond what the process has after its start: the end of it
+BOUND_CPU_S, BOUND_BYTES = 2.0, 500e6  # of one file, beyond what a sound one takes
 POLL_S = 0.05
 COMMAND, SELF_TEST = "command", "self-test"  # the latter: files that fail in every way, to test the counting
 KINDS = (*targets.READERS, COMMAND)
@@ -41,11 +42,12 @@ class Outcome:
     crashes: list[dict[str, object]] = field(default_factory=list)
     hangs: list[int] = field(default_factory=list)
     above_cap: list[int] = field(default_factory=list)
+    above_bounds: list[dict[str, object]] = field(default_factory=list)  # of processor time or memory
 
     @property
     def failures(self) -> int:
-        """Crashes, hangs and files above the cap."""
-        return len(self.crashes) + len(self.hangs) + len(self.above_cap)
+        """Crashes, hangs, and files above the cap or the bounds."""
+        return len(self.crashes) + len(self.hangs) + len(self.above_cap) + len(self.above_bounds)
 
 
 def run_campaign(kind: str, runs: int, seed: int, hang_s: float | None = None) -> Outcome:
@@ -85,6 +87,8 @@ def _run_process(kind: str, first: int, runs: int, seed: int, folder: Path, hang
         failure = json.loads(line)
         if "slowest_s" in failure:
             outcome.slowest_s = max(outcome.slowest_s, failure["slowest_s"])
+        elif "bound" in failure:
+            outcome.above_bounds.append(failure)
         elif failure.pop("memory"):
             outcome.above_cap.append(failure["index"])
         else:
@@ -105,7 +109,9 @@ def work(kind: str, first: int, runs: int, seed: int, folder: Path) -> None:
     if kind != SELF_TEST:
         targets.prepare(folder)
     if kind == COMMAND:
-        targets.run_sound_commands(folder)
+        targets.run_sound_commands(folder)  # compiles
+    sound_s = _sound_cpu_s(folder) if kind == COMMAND else 0.0
+    peak = _peak_bytes()
     status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
     cap = int(status["VmSize"].split()[0]) * 1024 + MEMORY_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (cap, cap))
@@ -114,7 +120,7 @@ def work(kind: str, first: int, runs: int, seed: int, folder: Path) -> None:
     with (folder / "state").open("r+b") as file, mmap.mmap(file.fileno(), STATE.size) as state, \
             (folder / "failures.jsonl").open("a") as lines:  # fmt: skip
         for index in range(first, runs):
-            began = time.monotonic()
+            began, cpu_s = time.monotonic(), time.process_time()
             state[:] = STATE.pack(index, answers, refusals, began)
             try:
                 reason = _one(kind, seed, index, folder)
@@ -123,8 +129,27 @@ def work(kind: str, first: int, runs: int, seed: int, folder: Path) -> None:
                 record = {"index": index, "memory": isinstance(cause, MemoryError), "cause": _cause_text(cause)}
                 print(json.dumps(record), file=lines, flush=True)
             slowest_s = max(slowest_s, time.monotonic() - began)
+            used_s, grown = time.process_time() - cpu_s - sound_s, _peak_bytes() - peak
+            if used_s > BOUND_CPU_S or grown > BOUND_BYTES:
+                bound = f"{used_s:.1f} s of CPU and {grown / 1e6:.0f} MB beyond a sound file"
+                print(json.dumps({"index": index, "bound": bound}), file=lines, flush=True)
+            peak = max(peak, _peak_bytes() - BOUND_BYTES / 2)  # later files of the process have half of the bound
         state[:] = STATE.pack(runs, answers, refusals, time.monotonic())
         print(json.dumps({"slowest_s": slowest_s}), file=lines, flush=True)
+
+
+def _sound_cpu_s(folder: Path) -> float:
+    """Processor time of the slowest command on sound files."""
+    times = []
+    for words in targets.COMMANDS:
+        began = time.process_time()
+        targets.run_sound(words, folder, small=False)
+        times.append(time.process_time() - began)
+    return max(times)
+
+
+def _peak_bytes() -> float:
+    return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def _one(kind: str, seed: int, index: int, folder: Path) -> str | None:
@@ -137,16 +162,18 @@ def _one(kind: str, seed: int, index: int, folder: Path) -> str | None:
 
 
 def _fail(index: int) -> str | None:
-    """An answer, a refusal, an exception, an end of the process, a hang and too much memory, by the number."""
-    match index % 6:
+    """An answer, a refusal, an exception, an end of the process, a hang, no memory, and too much, by the number."""
+    match index % 7:
         case 0 | 1:
-            return None if index % 6 == 0 else "refused"
+            return None if index % 7 == 0 else "refused"
         case 2:
             raise ValueError("self-test")
         case 3:
             os._exit(9)
         case 4:
             time.sleep(3600)
+        case 6:
+            return None if b"x" * int(1.2 * BOUND_BYTES) else "refused"
     return str(len(bytearray(2 * MEMORY_BYTES)))
 
 

@@ -114,9 +114,9 @@ def test_access_outside_the_folder_is_seen(tmp_path):
         outside.read_text()
 
 
-def test_a_message_of_several_lines_is_a_finding(folder, monkeypatch):
+def test_a_message_of_many_words_is_a_finding(folder, monkeypatch):
     def refuse(data, number, folder):
-        raise BadInput("bad_image", "two\nlines")
+        raise BadInput("bad_image", 1000 * "word ")
 
     monkeypatch.setitem(targets.READERS, "png", refuse)
     with pytest.raises(targets.Broken, match="message"):

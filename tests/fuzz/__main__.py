@@ -40,8 +40,8 @@ def main() -> int:
 
 def table(outcomes: list[Outcome]) -> str:
     """The outcomes as a Markdown table."""
-    lines = [f"| input | tried | answers | refusals | crashes | hangs (over {HANG_S:.0f} s) "
-             f"| above {MEMORY_BYTES / 2**30:.0f} GiB | above the bounds | slowest s |", "| --- " * 9 + "|"]  # fmt: skip
+    lines = [f"| input | tried | answers | refusals | crashes | hangs (over {HANG_S:.0f} s) | above "
+             f"{MEMORY_BYTES / 2**30:.0f} GiB | above the bounds | slowest s |", "| --- " * 9 + "|"]  # fmt: skip
     for one in outcomes:
         lines.append(
             f"| {one.kind} | {one.tried} | {one.answers} | {one.refusals} | {len(one.crashes)} | {len(one.hangs)} "

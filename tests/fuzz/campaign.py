@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 import traceback
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -111,16 +112,14 @@ def work(kind: str, first: int, runs: int, seed: int, folder: Path) -> None:
     if kind == COMMAND:
         targets.run_sound_commands(folder)  # compiles
     sound_s = _sound_cpu_s(folder) if kind == COMMAND else 0.0
-    peak = _peak_bytes()
-    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-    cap = int(status["VmSize"].split()[0]) * 1024 + MEMORY_BYTES
+    cap = _bytes_of("VmSize") + MEMORY_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (cap, cap))
     answers = refusals = 0
     slowest_s = 0.0
     with (folder / "state").open("r+b") as file, mmap.mmap(file.fileno(), STATE.size) as state, \
             (folder / "failures.jsonl").open("a") as lines:  # fmt: skip
         for index in range(first, runs):
-            began, cpu_s = time.monotonic(), time.process_time()
+            began, cpu_s, before = time.monotonic(), time.process_time(), _reset_peak_bytes()
             state[:] = STATE.pack(index, answers, refusals, began)
             try:
                 reason = _one(kind, seed, index, folder)
@@ -129,11 +128,10 @@ def work(kind: str, first: int, runs: int, seed: int, folder: Path) -> None:
                 record = {"index": index, "memory": isinstance(cause, MemoryError), "cause": _cause_text(cause)}
                 print(json.dumps(record), file=lines, flush=True)
             slowest_s = max(slowest_s, time.monotonic() - began)
-            used_s, grown = time.process_time() - cpu_s - sound_s, _peak_bytes() - peak
+            used_s, grown = time.process_time() - cpu_s - sound_s, _bytes_of("VmHWM") - before
             if used_s > BOUND_CPU_S or grown > BOUND_BYTES:
                 bound = f"{used_s:.1f} s of CPU and {grown / 1e6:.0f} MB beyond a sound file"
                 print(json.dumps({"index": index, "bound": bound}), file=lines, flush=True)
-            peak = max(peak, _peak_bytes() - BOUND_BYTES / 2)  # later files of the process have half of the bound
         state[:] = STATE.pack(runs, answers, refusals, time.monotonic())
         print(json.dumps({"slowest_s": slowest_s}), file=lines, flush=True)
 
@@ -148,8 +146,17 @@ def _sound_cpu_s(folder: Path) -> float:
     return max(times)
 
 
-def _peak_bytes() -> float:
-    return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+def _reset_peak_bytes() -> int:
+    """Make the present memory the largest one so far (VmHWM), where the system lets a process do so."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+    return _bytes_of("VmHWM")
+
+
+def _bytes_of(key: str) -> int:
+    """A size of memory in this process's status."""
+    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return int(status[key].split()[0]) * 1024
 
 
 def _one(kind: str, seed: int, index: int, folder: Path) -> str | None:

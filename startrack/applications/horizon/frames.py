@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from startrack.applications.horizon.agreement import LeftOut, split_fixed
 from startrack.camera import Camera
 from startrack.catalog import (
     LOWEST_STAR_RAD,
@@ -51,15 +52,6 @@ class SkyFrame:
         return np.asarray(self.R_cam_icrs @ self.R_enu_icrs.T)
 
 
-@dataclass(frozen=True, kw_only=True)
-class LeftOut:
-    """A photograph without identified stars, and why."""
-
-    name: str
-    reason: Reason
-    message: str
-
-
 def orient_frames(
     exposures: Sequence[Exposure],
     catalog: StarCatalog,
@@ -69,11 +61,12 @@ def orient_frames(
     fov_rad: float | None,
     progress: Progress = lambda text: None,
 ) -> tuple[tuple[SkyFrame, ...], tuple[LeftOut, ...]]:
-    """The `exposures` at the `site` with identified stars of the `catalog`, and those without.
+    """The `exposures` at the `site` with identified stars of the `catalog`, and those without, or of another attitude.
 
     The lens is that of `camera`, or found from `fov_rad`, and then fitted to the stars of all frames in their apparent
     directions. `progress` is called with a text at each step. Raises BadInput (no_time, no_calibration, size_mismatch,
-    bad_terrain of another body, inconsistent_evidence where stars below the horizon are seen).
+    bad_terrain of another body, inconsistent_evidence where stars below the horizon are seen, or where no majority of
+    the exposures shows one attitude).
     """
     if camera is None and fov_rad is None:
         raise BadInput("no_calibration", "no camera is known: give a camera file (-c) or the field of view (--fov)")
@@ -109,6 +102,8 @@ def orient_frames(
         take(exposure, outcome)
     if not identified:
         return (), tuple(left_out)
+    identified, contradicting = split_fixed(identified, site)
+    left_out += contradicting
     frames = tuple(frame_of(one.exposure, one.detections, catalog, site) for one in identified)
     progress("fitting the lens")
     lead = max(identified, key=lambda one: len(one.identification))

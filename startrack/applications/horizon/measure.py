@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from startrack.applications.horizon.agreement import LeftOut
 from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, COLUMNS_PER_AZIMUTH, SKYLINE_AZIMUTHS, WIDTHS
-from startrack.applications.horizon.frames import LeftOut, Progress, SkyFrame, orient_frames
+from startrack.applications.horizon.frames import Progress, SkyFrame, orient_frames
 from startrack.applications.horizon.posterior import (
     WEAKEST_CONTRAST,
     add_step_log_likelihood,

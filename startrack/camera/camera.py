@@ -10,6 +10,7 @@ import numpy as np
 from startrack.camera.lens import Lens
 from startrack.camera.lenses import KannalaBrandt
 from startrack.camera.optics import Decentring, Sensor
+from startrack.core.obstacles import Obstacles
 from startrack.core.types import Array, Bools, Mask
 from startrack.frames import length_xy
 
@@ -46,6 +47,7 @@ class Camera:
     covariance: Array | None = None
     refraction: str = ""  # of the Earth's air: "contained" in the lens, or "taken out"; empty: not known
     mask: str | Mask | None = None  # path of the file, or the mask, of pixels that never show the sky
+    obstacles: str | Obstacles | None = None  # path of the file, or themselves, about the body: what hides the sky
 
     @property
     def handed_focal_px(self) -> tuple[float, float]:

@@ -14,6 +14,7 @@ from startrack.camera.lenses import default_lens, lens_kinds
 from startrack.camera.optics import MIN_THROUGHPUT_1, Decentring, Sensor
 from startrack.core.declaration import Choice, Flag, List, Number, Table, Text
 from startrack.core.files import relative_path, write_atomically
+from startrack.core.obstacles import Obstacles
 from startrack.core.types import MAX_PIXELS, Array, BadInput, Mask
 from startrack.frames import R_from_quat_xyzw, quat_xyzw_from_R
 
@@ -73,6 +74,8 @@ def camera_keys(lens: type[Lens] | None = None) -> Table:
                                            description="beyond this the lens is not known; default: max_angle_deg"),
             "mirrored": Flag(default=False),
             "mask": Text(description="8-bit image of this size, relative to this file: pixels below 128 do not count"),
+            "obstacles": Text(description="CSV file, relative to this one: azimuth_deg from body x to the right, and "
+                                           "elevation_deg above the body's x y plane, below which the view is hidden"),
             "refraction": Choice(values=(REFRACTION_REMOVED, REFRACTION_CONTAINED),
                                  description="of the Earth's air: contained in a lens calibrated without a site"),
             "decentring": List(each=Number(low=-1, high=1), count=2, description="p1, p2 of a decentred lens"),
@@ -90,6 +93,8 @@ def save_camera(camera: Camera, path: str | Path) -> None:
     """
     if isinstance(camera.mask, Mask):
         raise ValueError("the camera's mask is an array: write it as an image, and give its path")
+    if isinstance(camera.obstacles, Obstacles):
+        raise ValueError("the camera's obstacles are no file: write them as one, and give its path")
     write_atomically(path, camera_text(camera, Path(path).parent).encode("utf-8"), overwrite=True)
 
 
@@ -98,8 +103,9 @@ def camera_text(camera: Camera, folder: Path | None = None) -> str:
     import tomli_w
 
     values = camera_to_dict(camera)
-    if "mask" in values and folder is not None:
-        values["mask"] = relative_path(values["mask"], folder)
+    for key in ("mask", "obstacles"):
+        if key in values and folder is not None:
+            values[key] = relative_path(values[key], folder)
     return tomli_w.dumps(values)
 
 
@@ -133,8 +139,9 @@ def camera_to_dict(camera: Camera) -> dict[str, Any]:
     }
     if camera.refraction:
         d["refraction"] = camera.refraction
-    if isinstance(camera.mask, str):
-        d["mask"] = camera.mask
+    for key, value in (("mask", camera.mask), ("obstacles", camera.obstacles)):
+        if isinstance(value, str):
+            d[key] = value
     if camera.decentring:
         d["decentring"] = [float(camera.decentring.p1), float(camera.decentring.p2)]
     if not np.array_equal(camera.R_body_cam, ZENITH_MOUNT_R_BODY_CAM):
@@ -183,6 +190,7 @@ def _camera(values: dict[str, Any], default_name: str, folder: Path) -> Camera:
         covariance_order=order,
         covariance=covariance,
         mask=str(folder / values["mask"]) if "mask" in values else None,
+        obstacles=str(folder / values["obstacles"]) if "obstacles" in values else None,
     )
 
 

@@ -65,17 +65,17 @@ def _correction_hashes(image: Path, facts: dict[str, Any]) -> list[str]:
     return [f"{key} {_cached_sha256(Path(file))}" for key, file in files.items() if file]
 
 
-def input_hashes(
-    image: str, cameras: Iterable[str | None], terrain: str | None, mask: str | None = None
-) -> dict[str, str]:
-    """Path to SHA-256 of the files of `cameras`, a `terrain` and a `mask`, and of those that they are read from.
+def input_hashes(image: str, cameras: Iterable[str | None], terrain: str | None, *others: object) -> dict[str, str]:
+    """Path to SHA-256 of the files of `cameras`, a `terrain` and `others`, and of those that they are read from.
 
     Shipped files do not count: they belong to the version. Paths are relative to the folder of the `image`, so that a
     tree may move.
     """
     named = [reference for reference in cameras if reference and is_path(reference)]
-    files = [Path(reference) for reference in (*named, terrain, mask) if reference and is_path(reference)]
-    files += [one for camera in named for one in _mask_of(Path(camera))]
+    files = [
+        Path(reference) for reference in (*named, terrain, *others) if isinstance(reference, str) and is_path(reference)
+    ]
+    files += [one for camera in named for one in _files_of_camera(Path(camera))]
     files += files_of_terrain(terrain) if terrain and is_path(terrain) else ()
     return {relative_path(file, Path(image).parent): _cached_sha256(file) for file in files}
 
@@ -86,13 +86,13 @@ def are_unchanged(image: str, hashes: dict[str, str]) -> bool:
     return all(_cached_sha256(Path(folder, path)) == sha256 for path, sha256 in hashes.items())
 
 
-def _mask_of(camera: Path) -> list[Path]:
-    """The mask that a camera file names, if any."""
+def _files_of_camera(camera: Path) -> list[Path]:
+    """The mask and the obstacles that a camera file names, if any."""
     try:
         values = parse_toml(read_text(camera, "bad_calibration"), "bad_calibration") if camera.suffix == ".toml" else {}
     except BadInput:  # refused when it is loaded
         return []
-    return [camera.parent / str(values["mask"])] if "mask" in values else []
+    return [camera.parent / str(values[key]) for key in ("mask", "obstacles") if key in values]
 
 
 def _cached_sha256(path: Path) -> str:

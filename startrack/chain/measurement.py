@@ -25,9 +25,11 @@ from startrack.evidence import (
     SkyStep,
     StarEvidence,
     StarPhotometry,
+    add_obstacles,
     filtered_noise_e,
     flux_scale,
     height_above_px,
+    leave_out_obstacles,
     measure_response,
     measure_sky_step,
     reliable_azimuths,
@@ -63,6 +65,9 @@ def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -
     Gaia's stars are used. Raises BadInput (bad_terrain, no_time) where the frame `enu` cannot be related to the stars.
     """
     when, site = require_time_and_site(oriented.exposure, terrain)
+    R_enu_cam = R_enu_icrs(site, when) @ oriented.attitude_fit.attitude.R_cam_icrs.T
+    mask = add_obstacles(oriented.detections.mask, oriented.camera, R_enu_cam, terrain, oriented.exposure.obstacles)
+    oriented = replace(oriented, detections=leave_out_obstacles(oriented.detections, mask))
     shown = oriented
     if settings.deep_stars:
         oriented = add_gaia_stars(oriented, site)

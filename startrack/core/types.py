@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from startrack.core.errors import BadInput, NoSolution, NotIdentified, NotLocated, TooFewStars
 from startrack.core.fix import Blocked, Clock, ClockError, Fix, Integrity, Mode, PositionPrior, ShownError, UnstatedFact
+from startrack.core.obstacles import Obstacles
 from startrack.core.smooth_image import Image, SmoothImage
 from startrack.core.values import Array, Bools, Ints, Rows, Value, array, rotation, vector
 
@@ -85,6 +86,7 @@ class Exposure(Value):
     terrain: str | None = None  # resolved path or shipped name of the terrain file
     air: Mapping[str, Any] | None = None  # what is stated of the air over the site, by key of `frames.AIR_KEYS`
     mask: str | Mask | None = None  # resolved path of the mask's file, or the mask; None: every pixel counts
+    obstacles: str | Obstacles | None = None  # resolved path of their file, or themselves: what hides the ground
     saturation_adu: float | None = None  # largest value the file's type can hold, None for float images
     sha256: str = ""
     warnings: tuple[str, ...] = ()

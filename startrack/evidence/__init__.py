@@ -10,6 +10,7 @@ from startrack.evidence.flux_scale import (
     fit_flux_scale,
     flux_scale,
 )
+from startrack.evidence.obstacles import add_obstacles, leave_out_obstacles
 from startrack.evidence.photometry import (
     SURE_SIGMAS,
     Photometry,
@@ -72,6 +73,7 @@ __all__ = [
     "Sources",
     "StarEvidence",
     "StarPhotometry",
+    "add_obstacles",
     "average_shifts",
     "check_single_skyline",
     "expect_stars",
@@ -81,6 +83,7 @@ __all__ = [
     "flux_scale",
     "half_width",
     "height_above_px",
+    "leave_out_obstacles",
     "measure",
     "measure_response",
     "measure_sky_light",

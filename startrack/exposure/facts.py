@@ -49,6 +49,7 @@ class Facts:
     terrain: str | None = None  # path, or name of a shipped file
     air: Mapping[str, Any] | None = None  # by key of `frames.AIR_KEYS`
     mask: str | None = None  # path
+    obstacles: str | None = None  # path
     dark: str | None = None  # path of the dark frame
     flat: str | None = None  # path of the flat field
     site_rad: tuple[float, float] | None = None  # latitude and longitude in the header

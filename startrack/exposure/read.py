@@ -89,6 +89,7 @@ def exposure_of_decoded(decoded: Decoded, facts: Facts, *, raw: bytes, name: str
         terrain=facts.terrain,
         air=facts.air,
         mask=facts.mask,
+        obstacles=facts.obstacles,
         saturation_adu=decoded.saturation_adu,
         sha256=hashlib.sha256(raw).hexdigest(),
         header_site_rad=facts.site_rad,

@@ -31,13 +31,16 @@ SIDECAR = Table(
         "terrain": Text(description="a terrain file, or the name of a shipped one"),
         "air": AIR_TABLE,
         "mask": Text(description="8-bit image of the frame's size: pixels below 128 do not count"),
+        "obstacles": Text(
+            description="CSV file of azimuth_deg and elevation_deg, below which something hides the ground's skyline"
+        ),
         "dark": Text(description="dark frame of the frame's size, subtracted"),
         "flat": Text(description="flat field of the frame's size, divided by"),
         "bayer_pattern": Choice(values=BAYER_PATTERNS, description="colours of the first 2 x 2 pixels of a mosaic"),
     },
 )
 NAMED_FILES = ("camera", "terrain")  # paths, or names of shipped files
-IMAGE_KEYS = ("mask", "dark", "flat")  # always paths: no such image is shipped, and no header names one
+IMAGE_KEYS = ("mask", "obstacles", "dark", "flat")  # always paths: none is shipped, and no header names one
 RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".crw", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"}
 PICTURE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".fits", ".fit", ".fts"} | RAW_SUFFIXES
 PACKING_SUFFIXES = {".gz", ".bz2", ".fz"}

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.files import check_free, is_path, printable, relative_path, write_atomically
-from startrack.core.types import BadInput, Exposure, Mask
+from startrack.core.types import BadInput, Exposure
 from startrack.exposure.facts import HEADER_OF, Facts
 from startrack.exposure.sidecar import IMAGE_KEYS, NAMED_FILES, SIDECAR, sidecars
 from startrack.frames import format_utc
@@ -88,7 +88,7 @@ def _stated_facts(facts: Facts | Exposure, folder: Path) -> dict[str, Any]:
         elif key in NAMED_FILES:
             value = _relative_path(value, folder)
         elif key in IMAGE_KEYS:
-            value = None if value is None or isinstance(value, Mask) else relative_path(value, folder)
+            value = None if value is None or not isinstance(value, str) else relative_path(value, folder)
         if value is not None:
             stated[key] = value
     return stated

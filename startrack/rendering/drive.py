@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from startrack.core import MAX_COUNT
-from startrack.core.files import FilePath, printable, read_text
+from startrack.core.files import FilePath, printable
+from startrack.core.obstacles import read_columns
 from startrack.core.types import Array, BadInput, Value, array
 from startrack.estimation.observations import OdometryErrors
 
@@ -78,22 +78,10 @@ def read_drive(path: FilePath, speed_m_s: float) -> Drive:
 
     `path` is the file's. Raises BadInput (bad_odometry) with the file and the cause.
     """
-    lines = csv.reader(read_text(path, "bad_odometry").removeprefix("\ufeff").splitlines())
-    rows = [(lines.line_num, [word.strip() for word in row]) for row in lines if any(word.strip() for word in row)]
+    waypoints_m = read_columns(path, PATH_COLUMNS, "bad_odometry")
     try:
-        if not rows or any(rows[0][1].count(name) != 1 for name in PATH_COLUMNS):
-            raise ValueError(f"its first line does not name the columns {' and '.join(PATH_COLUMNS)}")
-        columns = [rows[0][1].index(name) for name in PATH_COLUMNS]
-        waypoints_m: list[list[float]] = []
-        for number, row in rows[1:]:
-            try:
-                waypoints_m.append([float(row[column]) for column in columns])
-            except (ValueError, IndexError):
-                waypoints_m.append([np.nan])
-            if not np.isfinite(waypoints_m[-1]).all():
-                raise ValueError(f"line {number}: two finite numbers are expected for {' and '.join(PATH_COLUMNS)}")
-        return Drive(waypoints_m=np.reshape(waypoints_m, (-1, 2)), speed_m_s=speed_m_s)
-    except (ValueError, csv.Error) as cause:
+        return Drive(waypoints_m=waypoints_m, speed_m_s=speed_m_s)
+    except ValueError as cause:
         raise BadInput("bad_odometry", f"{printable(path)}: {cause}") from cause
 
 

@@ -19,6 +19,7 @@ from startrack.evidence import (
     SKYLINE_POINTS,
     Skyline,
     StarEvidence,
+    add_obstacles,
     expect_stars,
     expected_flux_scale,
     fit_flux_scale,
@@ -91,9 +92,10 @@ def simulate_rays(
             airmass_at(rays_enu, site),
         )  # fmt: skip
     stars, R_enu = apparent_stars(catalog, when, site), R_enu_icrs(site, when)
+    mask = add_obstacles(combine_masks(None, camera.mask, camera.size_px), camera, scene.R_cam_enu.T, terrain)
     found = expect_stars(
         camera, stars, list(scene.bodies), scene.R_cam_icrs, R_enu, scale, psf_sigma_px=sensor.psf_sigma_px,
-        noise_e=typical_e, mask=combine_masks(None, camera.mask, camera.size_px),
+        noise_e=typical_e, mask=mask,
         air=airmass_at(stars.rays_icrs @ R_enu.T, site),
     )  # fmt: skip
     true = np.asarray(stars.rays_icrs[found.star] @ scene.R_enu_icrs.T)  # directions at the true time

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import atan2, sqrt
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from startrack.core.declaration import Flag
 from startrack.core.kernels import njit
+from startrack.core.obstacles import Obstacles
 from startrack.core.types import Array, BadInput
 from startrack.terrain.crater import Crater, DeformedCrater, distance_bounds, distance_to_circle, slopes_of_round_crater
 from startrack.terrain.protocol import Terrain
@@ -59,6 +61,8 @@ class Cylinder(Crater):
     rim_tilt_sigma_rad: float | None = EXACT  # of each of two axes
     camera_height_sigma_m: float = EXACT
     stated_depth_m: float | None = None  # of the file, which the errors are about; None: `depth_m`
+    obstacles: Obstacles | None = None
+    files: tuple[Path, ...] = ()
     axisymmetric = True
     horizon_cost = 0.02
 

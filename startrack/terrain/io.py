@@ -13,6 +13,7 @@ import numpy as np
 
 from startrack.core.declaration import Choice, Either, List, Number, Table, Text
 from startrack.core.files import parse_toml, printable, read_text, resolve_named
+from startrack.core.obstacles import Obstacles, read_obstacles
 from startrack.core.types import BadInput
 from startrack.frames import AIR_TABLE, Site
 from startrack.terrain.cylinder import CYLINDER_KEYS, Cylinder
@@ -80,6 +81,8 @@ KEYS = Table(
                 REFRACTION.key: REFRACTION.limits,
             },
         ),
+        "obstacles": replace(FILE, description="CSV file, relative to this one: azimuth_deg from north through east, "
+                             "elevation_deg below which something that is on no map hides the skyline"),
         "rover": Table(
             default={},
             keys={
@@ -187,7 +190,15 @@ def terrain_from_dict(values: dict[str, Any], default_name: str = "terrain", fol
     return makers[0](keys, keys.get("name", default_name), site, folder or Path())
 
 
-def _make_cylinder(keys: dict[str, Any], name: str, site: Site, _: Path) -> Cylinder:
+def _obstacles(keys: dict[str, Any], folder: Path) -> tuple[Obstacles | None, tuple[Path, ...]]:
+    """The obstacles that a terrain file names, and their file."""
+    if "obstacles" not in keys:
+        return None, ()
+    return read_obstacles(folder / keys["obstacles"], "bad_terrain"), (folder / keys["obstacles"],)
+
+
+def _make_cylinder(keys: dict[str, Any], name: str, site: Site, folder: Path) -> Cylinder:
+    obstacles, files = _obstacles(keys, folder)
     cylinder, rover = keys["cylinder"], keys["rover"]
     sigmas: dict[str, Any] = {fact.key: cylinder.get(fact.key) for fact in CYLINDER_FACTS}
     if cylinder.get("exact", False):
@@ -204,6 +215,8 @@ def _make_cylinder(keys: dict[str, Any], name: str, site: Site, _: Path) -> Cyli
         search_radius_m=keys["search"].get("radius_m", cylinder["diameter_m"] / 2),
         camera_height_sigma_m=rover.get("camera_height_sigma_m", 0.0),
         rim_tilt_sigma_rad=_radians(sigmas.pop("rim_tilt_sigma_deg")),
+        obstacles=obstacles,
+        files=files,
         **sigmas,
     )
 
@@ -218,6 +231,7 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
 
     dem, rover, search = keys["dem"], keys["rover"], keys["search"]
     near, files = (site.latitude_rad, site.longitude_rad), _map_files(keys, folder)
+    obstacles, more_files = _obstacles(keys, folder)
     scaling = {key: dem[key] for key in ("scale", "offset_m") if key in dem}
     maps = tuple(read_map(file, near=near, body=site.body, **scaling) for file in files)
     on_earth = {}
@@ -237,7 +251,8 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
         site=site,
         camera_height_m=rover["camera_height_m"],
         maps=maps,
-        files=tuple(files),
+        files=(*files, *more_files),
+        obstacles=obstacles,
         search_radius_m=search.get("radius_m", Terrain.search_radius_m),
         height_sigma_m=dem.get("height_sigma_m", 0.0),
         unstated_errors=() if "height_sigma_m" in dem else ("height_sigma_m",),

@@ -12,6 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.obstacles import Obstacles
 from startrack.core.types import Array, Bools, Ints
 from startrack.frames import Air, Site
 from startrack.terrain.earth_projection import EarthProjection
@@ -65,6 +66,7 @@ class Terrain(ABC):
     rim_radius_m: float | None = None  # of a circular rim about the origin, drawn on maps instead of the relief
     table_path: Path | None = None  # file of the table that `prepare` computes; None where it computes none
     unstated_errors: tuple[str, ...] = ()  # keys of errors that the terrain file leaves out: they count as zero
+    obstacles: Obstacles | None = None  # that hide its skyline, scanned from about where the camera stands
     files: tuple[Path, ...] = ()  # that it was read from, beside the terrain file: what is made with it depends on them
 
     @property

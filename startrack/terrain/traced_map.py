@@ -10,6 +10,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from startrack.core.obstacles import Obstacles
 from startrack.core.types import SECTORS, Array, BadInput, Bools
 from startrack.frames import Site
 from startrack.terrain.earth_projection import EarthProjection
@@ -52,7 +53,8 @@ class TracedMap(Terrain):
     name: str = "height map"
     site: Site
     maps: tuple[Raster, ...]  # finest first
-    files: tuple[Path, ...] = ()  # of them
+    files: tuple[Path, ...] = ()  # of them, and of obstacles
+    obstacles: Obstacles | None = None
     camera_height_m: float = 1.5
     search_radius_m: float = Terrain.search_radius_m
     terrestrial_refraction_1: float = 0.0  # curvature of a level sight line in air, relative to the body's

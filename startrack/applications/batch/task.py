@@ -161,8 +161,7 @@ def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str
     except BadInput as cause:
         return _unread_record(task, cause.reason, str(cause), sha256), {}
     # Before the files are read, so that a change in between is noticed.
-    mask = exposure.mask if isinstance(exposure.mask, str) else None
-    inputs = chain.input_hashes(task.path, [exposure.camera], exposure.terrain, mask)
+    inputs = chain.input_hashes(task.path, [exposure.camera], exposure.terrain, exposure.mask, exposure.obstacles)
     try:
         near = None if task.near is None else PositionPrior(*task.near)
         localizer = require_localizer(task.localizer)

@@ -189,8 +189,7 @@ class TrackSession:
 
     def _key(self, exposure: Exposure, path: str, shared: TrackErrors) -> str:
         """Hash of all that decides a frame."""
-        mask = exposure.mask if isinstance(exposure.mask, str) else None
-        files = input_hashes(path, [exposure.camera], exposure.terrain, mask)
+        files = input_hashes(path, [exposure.camera], exposure.terrain, exposure.mask, exposure.obstacles)
         alone = replace(shared, gross=frozenset())  # with the facts that the image itself shows
         clock = None if shared.listed.clock is None else shared.listed.clock.turn_rad_s.tolist()
         errors = [repr(shared.listed.listed), alone.names, alone.sigma.tolist(), clock]

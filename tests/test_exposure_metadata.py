@@ -169,7 +169,7 @@ def test_unknown_keys_of_a_sidecar_pass_with_a_warning(image, sidecar):
     sidecar({"exposure": 5, "Camera": "a.toml", "terrain": "b"})
     exposure = read_exposure(image)
     assert (exposure.exposure_s, exposure.terrain) == (20.0, "b")
-    known = "time_utc, time_sigma_s, exposure_s, camera, terrain, air, mask, dark, flat, bayer_pattern"
+    known = "time_utc, time_sigma_s, exposure_s, camera, terrain, air, mask, obstacles, dark, flat, bayer_pattern"
     assert exposure.warnings == tuple(
         f"sidecar frame.json: key {key!r} is none of {known}; not used" for key in ("exposure", "Camera")
     )

@@ -116,7 +116,14 @@ MAKERS: dict[str, Callable[[], Any]] = {
 }
 every_terrain = pytest.mark.parametrize("name", MAKERS)
 MEMBERS = [name for name in dir(Terrain) if not name.startswith("_")]
-WITHOUT_DEFAULT = ("site", "air", "projection", "rim_radius_m", "table_path")  # None of a terrain that has none
+WITHOUT_DEFAULT = (
+    "site",
+    "air",
+    "projection",
+    "rim_radius_m",
+    "table_path",
+    "obstacles",
+)  # None of a terrain that has none
 
 
 def tolerance_rad(name: str) -> float:

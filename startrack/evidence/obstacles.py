@@ -14,7 +14,7 @@ from startrack.frames import azel_from_rays
 from startrack.terrain import Terrain
 
 R_COMPASS_BODY = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # right, forward, up
-BLOCK_PX = 4  # a square that one direction stands for; so many pixels about obstacles are hidden too
+HIDDEN_BLOCK_PX = 4  # a square that one direction stands for; so many pixels about obstacles are hidden too
 
 
 def add_obstacles(
@@ -22,9 +22,9 @@ def add_obstacles(
 ) -> Mask | None:
     """The `mask` with the pixels that the obstacles of `camera`, `terrain` and image hide; None: nothing is hidden.
 
-    Azimuths of a camera's obstacles count from the rover's nose to its right, the others from north through east; its
-    elevations are above the plane of the body's x and y. Raises BadInput: bad_calibration and bad_image for files that
-    cannot be used.
+    `of_image` are those of the sidecar. Azimuths of a camera's obstacles count from the rover's nose to its right, and
+    its elevations are above the plane of the body's x and y; the others are in enu, `R_enu_cam` (3, 3) from the camera.
+    Raises BadInput: bad_calibration and bad_image for files that cannot be used.
     """
     stated = (
         (camera.obstacles, R_COMPASS_BODY @ camera.R_body_cam, "bad_calibration"),
@@ -48,14 +48,16 @@ def leave_out_obstacles(detections: Detections, mask: Mask | None) -> Detections
 
 
 def _hidden_pixels(obstacles: Obstacles, camera: Camera, R_frame_cam: Array) -> Bools:
-    """(H, W) of the pixels whose directions obstacles hide, and of those up to BLOCK_PX beside them."""
+    """(H, W) of the pixels whose directions obstacles hide, and of those up to HIDDEN_BLOCK_PX beside them."""
     import cv2
 
     width, height = camera.size_px
-    columns, rows = (np.arange(0, n, BLOCK_PX) + 0.5 * (BLOCK_PX - 1) for n in (width, height))
+    columns, rows = (np.arange(0, n, HIDDEN_BLOCK_PX) + 0.5 * (HIDDEN_BLOCK_PX - 1) for n in (width, height))
     px = np.stack(np.meshgrid(columns, rows), axis=-1)
     azimuth, elevation = azel_from_rays(camera.unproject(px.reshape(-1, 2)) @ R_frame_cam.T)
     blocks = obstacles.hides(azimuth, elevation).reshape(len(rows), len(columns))
-    whole = np.repeat(np.repeat(blocks, BLOCK_PX, axis=0), BLOCK_PX, axis=1)[:height, :width].astype(np.uint8)
-    side = 2 * BLOCK_PX + 1
+    whole = np.repeat(np.repeat(blocks, HIDDEN_BLOCK_PX, axis=0), HIDDEN_BLOCK_PX, axis=1)[:height, :width].astype(
+        np.uint8
+    )
+    side = 2 * HIDDEN_BLOCK_PX + 1
     return np.asarray(cv2.dilate(whole, np.ones((side, side), np.uint8)) > 0)

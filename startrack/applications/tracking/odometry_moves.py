@@ -43,9 +43,7 @@ def odometry_moves(
     down = np.diag([1.0, -1.0, -1.0])
     faults = {
         "the opposite sign": (-position, Q),
-        **{
-            f"lengths {1.0 / to:.4g} times the true ones": (to * position, Q) for to in (UNITS if shows_scale else ())
-        },
+        **{f"lengths {1.0 / to:.4g} times the true ones": (to * position, Q) for to in (UNITS if shows_scale else ())},
         "quaternions with w first": (position, first),
         "quaternions of the inverse rotations": (position, back),
         "inverse poses": (-np.einsum("nij,nj->ni", back, position), back),

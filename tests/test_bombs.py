@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import tifffile
 from astropy.io import fits
+from fuzz.seeds import HEIGHT_MAP, hill_map
 from PIL import Image
 
 from startrack.camera import load_camera
@@ -40,16 +41,21 @@ HEAD = "SIMPLE  =                    T", "BITPIX  =                   16"
 EMPTY = cards("XTENSION= 'IMAGE   '", "BITPIX  =                   16", "NAXIS   =                    0")
 
 
-def packed_tiff(strip, **tags):
-    """A deflated TIFF whose only strip is replaced by `strip`."""
+def deflated_tiff():
     file = io.BytesIO()
     tifffile.imwrite(file, FRAME, compression="zlib", rowsperstrip=40, metadata=None)
-    raw = file.getvalue()
+    return file.getvalue()
+
+
+def with_strip(raw, strip):
+    """The deflated TIFF `raw` with `strip` in place of its first strip or tile."""
     with tifffile.TiffFile(io.BytesIO(raw)) as tiff:
-        starts, counts = tiff.pages[0].tags[273], tiff.pages[0].tags[279]
+        tags = tiff.pages[0].tags
+        starts, counts = (tags[273], tags[279]) if 273 in tags else (tags[324], tags[325])
+        assert tiff.pages[0].compression in (8, 32946)
     raw = bytearray(raw)
-    raw[starts.valueoffset : starts.valueoffset + 4] = struct.pack("<I", len(raw))
-    raw[counts.valueoffset : counts.valueoffset + 4] = struct.pack("<I", len(strip))
+    for tag, value in ((starts, len(raw)), (counts, len(strip))):
+        struct.pack_into({3: "<H", 4: "<I", 16: "<Q"}[tag.dtype], raw, tag.valueoffset, value)
     return bytes(raw) + strip
 
 
@@ -93,7 +99,7 @@ BOMBS = {
     "tiles.fits.fz": (bombed_tiles, "inflates to more than its pixels"),
     "small-tiles.fits.fz": (lambda: fits_bytes(fits.CompImageHDU(np.zeros((400, 100), np.int16), tile_shape=(1, 1))),
                             "40000 tiles of 1 pixels"),
-    "deflate.tif": (lambda: packed_tiff(zlib.compress(ZEROS)), "inflates to more than its part"),
+    "deflate.tif": (lambda: with_strip(deflated_tiff(), zlib.compress(ZEROS)), "inflates to more than its part"),
     "pages.tif": (lambda: many_pages(5000), "more than 1000 pictures"),
     "interlaced.png": (lambda: png(zlib.compress(ZEROS), interlaced=1), "cannot be decoded"),
     "chunks.png": (lambda: png(b"", 250_000 * chunk(b"tEXt", b"a\0b")), "more than 200000 chunks"),
@@ -139,6 +145,13 @@ def test_a_key_of_many_parts_is_refused(tmp_path, key, read):
     path.write_text(key if key.startswith("[") else f"{key} = 1")
     with pytest.raises(BadInput, match="more than 16 parts"):
         read(path)
+
+
+def test_a_height_map_whose_strip_inflates_to_much_more_is_refused(tmp_path):
+    (tmp_path / "hill.tif").write_bytes(with_strip(hill_map(), zlib.compress(ZEROS)))
+    (tmp_path / "hill.toml").write_text(HEIGHT_MAP)
+    with pytest.raises(BadInput, match="inflates to more than its part"):
+        load_terrain(tmp_path / "hill.toml")
 
 
 def test_aliases_of_yaml_are_refused(tmp_path):

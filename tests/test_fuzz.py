@@ -121,3 +121,9 @@ def test_a_message_of_many_words_is_a_finding(folder, monkeypatch):
     monkeypatch.setitem(targets.READERS, "png", refuse)
     with pytest.raises(targets.Broken, match="message"):
         targets.read("png", b"", 0, folder)
+
+
+@pytest.mark.parametrize(("kind", "index"), [("tiff", 1356), ("elevation", 723), ("elevation", 1903)])
+def test_mutated_files_that_once_failed_are_refused_or_read(folder, kind, index):
+    """A compression of many numbers, posts 1e-304 m apart, and a map of 519 million posts in one piece."""
+    assert targets.read(kind, *targets.mutated(kind, SEED, index), folder) in (None, "bad_image", "bad_terrain")

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.declaration import value_text
 from startrack.core.tiff_strips import TIFF_COMPRESSIONS, check_packed_strips
 from startrack.exposure.decoding import (
     Decoded,
@@ -128,7 +129,7 @@ def _pixels(page: Any, raw: bytes) -> NDArray[Any]:
         with _silence_opencv(cv2):
             decoded = cv2.imdecode(np.frombuffer(raw, np.uint8), cv2.IMREAD_UNCHANGED)
         if decoded is None:
-            cause = f"TIFF is damaged or its compression ({page.compression!r}) is unknown here"
+            cause = f"TIFF is damaged or its compression ({value_text(page.compression)}) is unknown here"
             raise bad_image(f"{cause}; save it uncompressed")
         stored = np.asarray(decoded)
     want = (page.imagelength, page.imagewidth, 3)[: 3 if page.samplesperpixel == 3 else 2]

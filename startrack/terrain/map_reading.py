@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -23,6 +24,7 @@ from startrack.terrain.shape import MAX_LENGTH_M
 # the Earth the highest stand 2.8 degrees high at most farther away, where the air leaves few stars.
 WINDOW_HALF_M = {"moon": 300_000.0, "earth": 150_000.0}
 LOWEST_M, HIGHEST_ABOVE_SEA_M = -11_050.0, 9_000.0  # of the Earth: the deepest sea and the highest mountain, and 100 m
+MAX_BLOCK_POSTS = 50_000_000  # 200 MB of floating point, for any window
 HEIGHT_NAMES = "altitude", "dem", "elevation", "height", "topo", "z"  # of the grid of heights among others of a file
 
 
@@ -171,6 +173,8 @@ def _content_of(file: Any, path: Path, near: tuple[float, float] | None, hint: s
     shape = rows.stop - rows.start, columns.stop - columns.start
     if shape[0] * shape[1] > MAX_PIXELS:
         raise BadInput("bad_terrain", f"{path}: too large; cut it to the area (startrack terrain import --half)")
+    if math.prod(file.block_shapes[0]) > MAX_BLOCK_POSTS:  # of which a window is a part
+        raise BadInput("bad_terrain", f"{path}: stored in one piece; write it in tiles (gdal_translate -co TILED=YES)")
     values = file.read(1, window=Window(columns.start, rows.start, shape[1], shape[0]))
     scale, offset = file.scales[0], file.offsets[0]
     unit = UNITS_M.get(str(file.units[0]).lower())

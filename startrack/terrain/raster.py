@@ -188,7 +188,8 @@ class Raster:
     def row_column(self, latitude_rad: Array, longitude_rad: Array) -> Array:
         """Fractional rows and columns (..., 2) of places at `latitude_rad`, `longitude_rad` (...)."""
         x, y = self.projection.xy_from_latlon(latitude_rad, longitude_rad)
-        return np.stack([(y - self.y0_m) / self.dy_m, (x - self.x0_m) / self.dx_m], axis=-1)
+        with np.errstate(over="ignore"):  # of a damaged file whose posts are 1e-300 m apart
+            return np.stack([(y - self.y0_m) / self.dy_m, (x - self.x0_m) / self.dx_m], axis=-1)
 
     def sample(self, row_column: Array) -> Array:
         """Heights (...) [m] at fractional `row_column` (..., 2), bilinear; NaN beyond the outer posts."""

@@ -12,19 +12,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.applications.reproduction.published.vertical import RADIANS_OF_ARCSEC, draw_tilt_rad, vertical_at
+from startrack.applications.reproduction.published.vertical import draw_tilt_rad, vertical_at
 from startrack.core.types import Array
 from startrack.frames import Site, sphere_radius_m
+from startrack.output import ARCSEC_PER_RAD
 
 REST_TILT_ARCSEC = 47.0  # mean tilt that the bias amounts to: 400 m on the Moon
 LUNAR_GRAVITY_M_S2 = 1.625  # at the surface, GM / r^2 of the 1737.4 km sphere
 REST_EPOCHS = 300  # measurements at rest: five minutes
 EPOCH_S = 1.0  # between two of them
-STAR_FIX_RAD = 2.0 * RADIANS_OF_ARCSEC  # sigma of the platform's tilt by one picture of stars
-FORCE_SIGMA_M_S2 = 20.0 * RADIANS_OF_ARCSEC * LUNAR_GRAVITY_M_S2  # of one reading: 1" after averaging
+STAR_FIX_RAD = 2.0 / ARCSEC_PER_RAD  # sigma of the platform's tilt by one picture of stars
+FORCE_SIGMA_M_S2 = 20.0 / ARCSEC_PER_RAD * LUNAR_GRAVITY_M_S2  # of one reading: 1" after averaging
 REST_SIGMA_M_S = 1e-3  # of the statement that the rover does not move
-START_SIGMAS = (1e6, 0.1, 0.02, 47.0 * RADIANS_OF_ARCSEC * LUNAR_GRAVITY_M_S2)  # m, m/s, rad, m/s^2: nothing known
-WALK_SIGMAS = (0.0, 1e-5, 1e-3 * RADIANS_OF_ARCSEC, 0.0)  # of one epoch: the gyroscopes' drift between two star fixes
+START_SIGMAS = (1e6, 0.1, 0.02, 47.0 / ARCSEC_PER_RAD * LUNAR_GRAVITY_M_S2)  # m, m/s, rad, m/s^2: nothing known
+WALK_SIGMAS = (0.0, 1e-5, 1e-3 / ARCSEC_PER_RAD, 0.0)  # of one epoch: the gyroscopes' drift between two star fixes
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ import numpy as np
 
 from startrack.core.types import Array
 from startrack.frames import R_enu_fixed, R_from_rotvec, Site, enu_from_latlon, sphere_radius_m
+from startrack.output import ARCSEC_PER_RAD
 
-RADIANS_OF_ARCSEC = float(np.pi / 648_000.0)
 AXIS_BY_MEAN = float(np.sqrt(2.0 / np.pi))  # standard deviation of an axis over the mean length of two (Rayleigh)
 
 
@@ -37,4 +37,4 @@ def tilt_vertical(vertical: Array, tilt_rad: Array) -> Array:
 
 def draw_tilt_rad(mean_arcsec: float, *, rng: np.random.Generator) -> Array:
     """A tilt (2,) [rad] about east and north with normal components; its length is `mean_arcsec` in the mean."""
-    return rng.standard_normal(2) * (mean_arcsec * AXIS_BY_MEAN * RADIANS_OF_ARCSEC)
+    return rng.standard_normal(2) * (mean_arcsec * AXIS_BY_MEAN / ARCSEC_PER_RAD)

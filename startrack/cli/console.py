@@ -31,7 +31,9 @@ Outcome = tuple[dict[str, Any], str]  # of an image: the JSON object, and the li
 
 def refusal(cause: BadInput | NoSolution, name: str, **first: Any) -> Outcome:
     """The outcome of an image or file `name` that was refused; `first` stands at the beginning of the JSON object."""
-    return refusal_record(cause.reason, str(cause), **first), f"{name}  refused {cause.reason}: {cause}"
+    return refusal_record(
+        cause.reason, str(cause), **first
+    ), f"{errors.one_line(name)}  refused {cause.reason}: {cause}"
 
 
 def refusal_record(reason: str, message: str, **first: Any) -> dict[str, Any]:
@@ -64,7 +66,7 @@ def print_advice(reason: str | None, message: str, args: argparse.Namespace) -> 
 def print_left_out(images: Any) -> None:
     """A line on stderr for each of the `images` refused, which have a name, a reason and a message."""
     for one in images:
-        print(f"{one.name}: left out, {one.reason}: {one.message}", file=sys.stderr, flush=True)
+        print(f"{errors.one_line(one.name)}: left out, {one.reason}: {one.message}", file=sys.stderr, flush=True)
 
 
 def worst_code(codes: set[int]) -> int:
@@ -100,7 +102,7 @@ class Progress:
     def line(self, seconds: float) -> str:
         """What is done after so many seconds."""
         count = f"{self.completed} of {self.total}" if self.total else ""
-        return ", ".join(part for part in (count, self.text, f"{seconds:.0f} s") if part)
+        return errors.one_line(", ".join(part for part in (count, self.text, f"{seconds:.0f} s") if part))
 
 
 @contextmanager

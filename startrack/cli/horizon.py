@@ -13,7 +13,7 @@ from startrack.applications import horizon
 from startrack.catalog import load_catalog
 from startrack.cli.console import Outcome, named_steps, print_left_out, print_outcome, refusal
 from startrack.cli.images import approximate_camera, check_fov, check_one_time, read, site_of
-from startrack.core.errors import BadInput, BadOutput, NoSolution
+from startrack.core.errors import BadInput, BadOutput, NoSolution, one_line
 
 FORMAT = "startrack.horizon/1"
 
@@ -57,7 +57,7 @@ def _measure(args: argparse.Namespace) -> Outcome:
     words.append(f"{len(found.frames)} image{'s' if len(found.frames) > 1 else ''}")
     line = "  ".join([Path(args.output).name, "ok", *words, *([note] if note else [])])
     if args.verbose:
-        line += "".join(f"\n  {one.name}: {len(one.matched_star)} stars fit the lens" for one in found.frames)
+        line += "".join(f"\n  {one_line(one.name)}: {len(one.matched_star)} stars fit the lens" for one in found.frames)
     return record, line
 
 

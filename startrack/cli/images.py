@@ -21,7 +21,7 @@ from startrack.chain import NearAttitude, read_near_attitude
 from startrack.cli.console import progress
 from startrack.cli.flags import checked_flag
 from startrack.core.compilation import announce_compilation, is_compiled
-from startrack.core.errors import BadInput
+from startrack.core.errors import BadInput, one_line
 from startrack.core.files import is_path
 from startrack.core.runner import count_cores
 from startrack.core.table_text import column_lines, join_columns
@@ -143,7 +143,7 @@ def _compare_site(flag: str, site: Site, exposures: list[Exposure]) -> None:
     if apart_rad > math.radians(SITE_TOLERANCE_DEG):
         place = "{:.4f}, {:.4f}".format(*np.degrees(stated.header_site_rad))
         text = f"the header's site {place} is {math.degrees(apart_rad):.1f} degrees from --site {flag}, which is used"
-        print(f"{stated.name}: {text}", file=sys.stderr, flush=True)
+        print(f"{one_line(stated.name)}: {text}", file=sys.stderr, flush=True)
 
 
 def prepare_reference(reference: str | None, args: argparse.Namespace) -> Terrain | None:

@@ -138,7 +138,11 @@ class TrackRun:
                 raise
             for frame in self.session.frames:
                 if frame.reason:
-                    print(f"{frame.name}  refused  {frame.reason}: {frame.message}", file=sys.stderr, flush=True)
+                    print(
+                        f"{printable(frame.name)}  refused  {frame.reason}: {frame.message}",
+                        file=sys.stderr,
+                        flush=True,
+                    )
             print(f"startrack: {cause.reason}: {cause}", file=sys.stderr, flush=True)
             self.codes.add(exit_code_of(cause.reason))
             return
@@ -196,7 +200,7 @@ class TrackRun:
             place = f"E {east_m:.1f} m  N {north_m:.1f} m  ±{radius_m:.1f} m (95 %)" if is_known else "no position"
             why = f"  {record['reason']}: {record['message']}" if record["reason"] else ""
             slip = "  after a slip" if record["slipped"] else ""
-            print(f"{record['image']}  {record['status'].replace('_', ' ')}  {place}{slip}{why}", flush=True)
+            print(f"{printable(record['image'])}  {record['status'].replace('_', ' ')}  {place}{slip}{why}", flush=True)
 
     def _add(self, path: str) -> None:
         self._add_exposure(read_exposure(path, **self.session.facts), path)
@@ -210,7 +214,7 @@ class TrackRun:
             if one.fact not in self._shown:
                 self._shown.add(one.fact)
                 what = f"the image shows {one.text}, which no file states: the track estimates it"
-                print(f"{frame.name}  {what}", file=sys.stderr, flush=True)
+                print(f"{printable(frame.name)}  {what}", file=sys.stderr, flush=True)
         if not frame.modes:
             self.codes.add(EXIT_REFUSED)
 

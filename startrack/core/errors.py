@@ -169,7 +169,7 @@ class NoSolution(Exception):
     reason: Reason = Reason.INCONSISTENT_EVIDENCE
 
     def __init__(self, message: str, reason: str | None = None, **evidence: Any) -> None:
-        super().__init__(message)
+        super().__init__(one_line(message))
         if reason is not None:
             self.reason = Reason(reason)
         self.evidence = evidence

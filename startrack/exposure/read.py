@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.files import printable
 from startrack.core.types import TIME_SIGMA_S, Bools, Exposure
 from startrack.exposure.correction import correct_counts, correction_warnings, mask_of
 from startrack.exposure.decoding import (
@@ -59,7 +58,7 @@ def read_exposure(
         dark=dark, flat=flat,
     )  # fmt: skip
     facts = resolve_facts(Path(path), decoded.header, given)
-    return exposure_of_decoded(decoded, facts, raw=raw, name=printable(stem(Path(path))), path=os.fspath(path))
+    return exposure_of_decoded(decoded, facts, raw=raw, name=stem(Path(path)), path=os.fspath(path))
 
 
 def exposure_of_decoded(decoded: Decoded, facts: Facts, *, raw: bytes, name: str, path: str) -> Exposure:

@@ -150,7 +150,8 @@ def _geoid_values(grid: str, values: dict[str, Any]) -> dict[str, Any]:
     if values["body"] != "earth":
         raise BadInput("bad_terrain", "heights above a geoid are those of maps of the Earth")
     at = values["origin"]
-    geoid = geoid_at(grid, Site("earth", *np.radians([at["latitude_deg"], at["longitude_deg"]]), at["height_m"]))
+    latitude, longitude = (float(np.radians(at[name])) for name in ("latitude_deg", "longitude_deg"))
+    geoid = geoid_at(grid, Site("earth", latitude, longitude, at["height_m"]))
     return {
         "geoid_m": round(geoid.height_m, 3), "geoid_slope_arcsec": [round(slope, 3) for slope in geoid.slope_arcsec],
     }  # fmt: skip

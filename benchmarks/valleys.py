@@ -2,6 +2,8 @@
 
     python benchmarks/valleys.py [--frames 40] [--skies 10] [--rests 20] [--case NAME ...]
 
+A run of one case has a section of its own in RESULTS.md.
+
 The ground is that near Jacksboro, Tennessee, at 3 arcsec (SRTM), as it comes with matplotlib; places are valley floors
 whose mean horizon is 9 to 26 degrees. 2048 px, a star of V 6 on the axis at 5 sigma, a sky of 21.5 mag/arcsec2, stars
 refracted and dimmed by the standard atmosphere. "5 m per post": the ground differs from the map by 5 m of white noise
@@ -248,7 +250,8 @@ def main() -> None:
             if not args.print_only:
                 command = f"python benchmarks/valleys.py --frames {args.frames} --skies {args.skies}"
                 command += f" --rests {args.rests} --case " + shlex.join(args.case[: len(rows)])
-                write_section("Valleys of the Earth", command, ("numpy", "astropy", "matplotlib"), table(HEAD, rows))
+                section = "Valleys of the Earth" + (f": {args.case[0]}" if len(args.case) == 1 else "")
+                write_section(section, command, ("numpy", "astropy", "matplotlib"), table(HEAD, rows))
     print(table(HEAD, rows))
 
 

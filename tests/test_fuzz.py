@@ -96,7 +96,7 @@ def test_any_value_of_a_sidecar_is_used_or_refused(folder, key, value):
 
 def test_each_kind_of_failure_is_counted():
     """Exceptions, ended processes, hangs and too much memory; the files after them are still tried."""
-    outcome = campaign.run_campaign(campaign.SELF_TEST, 7, SEED, hang_s=1.0)
+    outcome = campaign.run_campaign(campaign.SELF_TEST, 7, SEED, hang_s=5.0)
     assert (outcome.answers, outcome.refusals) == (2, 1)
     assert [crash["index"] for crash in outcome.crashes] == [2, 3]
     assert (outcome.hangs, outcome.above_cap) == ([4], [5])

@@ -117,12 +117,12 @@ def test_pixels_give_the_rays_back(lens: Lens, mirrored: bool) -> None:
     assert np.abs(camera.unproject(camera.project(rays)[0]) - rays).max() < 1e-9
 
 
-@pytest.mark.parametrize("lens", SHAPES, ids=repr)
+@pytest.mark.parametrize("lens", [one for one in SHAPES if wcs_cards(camera_of(one), np.eye(3))], ids=repr)
 def test_world_coordinates_are_those_of_the_lens(lens: Lens) -> None:
+    """Of lenses that a FITS projection describes."""
     camera, R = camera_of(lens), Rotation.random(rng=np.random.default_rng(3)).as_matrix()
     cards = wcs_cards(camera, R)
-    if cards is None:
-        pytest.skip("no FITS projection describes this lens")
+    assert cards is not None
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="The WCS transformation has more axes")
         wcs = WCS(fits.Header.fromstring(header_block(cards).decode("ascii")))

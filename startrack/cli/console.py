@@ -31,9 +31,8 @@ Outcome = tuple[dict[str, Any], str]  # of an image: the JSON object, and the li
 
 def refusal(cause: BadInput | NoSolution, name: str, **first: Any) -> Outcome:
     """The outcome of an image or file `name` that was refused; `first` stands at the beginning of the JSON object."""
-    return refusal_record(
-        cause.reason, str(cause), **first
-    ), f"{errors.one_line(name)}  refused {cause.reason}: {cause}"
+    line = f"{errors.one_line(name)}  refused {cause.reason}: {cause}"
+    return refusal_record(cause.reason, str(cause), **first), line
 
 
 def refusal_record(reason: str, message: str, **first: Any) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from startrack.core.runner import count_cores
 from startrack.core.table_text import column_lines, join_columns
 from startrack.core.types import Evidence, Exposure, NotLocated
 from startrack.estimation.observations import OdometryErrors
-from startrack.frames import Site, parse_utc, rays_from_azel
+from startrack.frames import Site, angle_between_rad, parse_utc, rays_from_azel
 from startrack.terrain import TERRAIN_KEYS, Terrain, load_terrain
 
 SITE_TOLERANCE_DEG = 0.1  # as far as an azimuth of a skyline may be wrong
@@ -132,18 +132,18 @@ def site_of(args: argparse.Namespace, exposures: list[Exposure]) -> Site | None:
 
 def _compare_site(flag: str, site: Site, exposures: list[Exposure]) -> None:
     """Print a line on stderr where a header states another place than --site."""
-    stated = next((e for e in exposures if e.header_site_rad is not None), None)
-    if stated is None or stated.header_site_rad is None:
+    stated = [(e.name, e.header_site_rad) for e in exposures if e.header_site_rad is not None]
+    if not stated:
         return
-    latitude, longitude = stated.header_site_rad
+    name, (latitude, longitude) = stated[0]
     here = rays_from_azel(site.longitude_rad, site.latitude_rad)
     # Programs count longitudes to the east or to the west.
     there = rays_from_azel(np.array([longitude, -longitude]), np.array([latitude, latitude]))
-    apart_rad = float(np.min(2 * np.arcsin(np.linalg.norm(there - here, axis=-1) / 2)))
+    apart_rad = float(np.min(angle_between_rad(here, there)))
     if apart_rad > math.radians(SITE_TOLERANCE_DEG):
-        place = "{:.4f}, {:.4f}".format(*np.degrees(stated.header_site_rad))
+        place = "{:.4f}, {:.4f}".format(*np.degrees([latitude, longitude]))
         text = f"the header's site {place} is {math.degrees(apart_rad):.1f} degrees from --site {flag}, which is used"
-        print(f"{one_line(stated.name)}: {text}", file=sys.stderr, flush=True)
+        print(f"{one_line(name)}: {text}", file=sys.stderr, flush=True)
 
 
 def prepare_reference(reference: str | None, args: argparse.Namespace) -> Terrain | None:

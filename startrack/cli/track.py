@@ -138,19 +138,15 @@ class TrackRun:
                 raise
             for frame in self.session.frames:
                 if frame.reason:
-                    print(
-                        f"{printable(frame.name)}  refused  {frame.reason}: {frame.message}",
-                        file=sys.stderr,
-                        flush=True,
-                    )
+                    line = f"{printable(frame.name)}  refused  {frame.reason}: {frame.message}"
+                    print(line, file=sys.stderr, flush=True)
             print(f"startrack: {cause.reason}: {cause}", file=sys.stderr, flush=True)
             self.codes.add(exit_code_of(cause.reason))
             return
         self._write(track)
         if track.odometry_fault:
-            print(
-                f"the odometry has {track.odometry_fault}: it contradicts the images and is left out", file=sys.stderr
-            )
+            why = "it contradicts the images and is left out"
+            print(f"the odometry has {track.odometry_fault}: {why}", file=sys.stderr)
         if track.odometry_fault or any(frame.status != "used" for frame in track.frames):
             self.codes.add(EXIT_REFUSED)
         if not growing:

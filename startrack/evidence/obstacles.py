@@ -55,9 +55,7 @@ def _hidden_pixels(obstacles: Obstacles, camera: Camera, R_frame_cam: Array) -> 
     columns, rows = (np.arange(0, n, HIDDEN_BLOCK_PX) + 0.5 * (HIDDEN_BLOCK_PX - 1) for n in (width, height))
     px = np.stack(np.meshgrid(columns, rows), axis=-1)
     azimuth, elevation = azel_from_rays(camera.unproject(px.reshape(-1, 2)) @ R_frame_cam.T)
-    blocks = obstacles.hides(azimuth, elevation).reshape(len(rows), len(columns))
-    whole = np.repeat(np.repeat(blocks, HIDDEN_BLOCK_PX, axis=0), HIDDEN_BLOCK_PX, axis=1)[:height, :width].astype(
-        np.uint8
-    )
+    blocks = obstacles.hides(azimuth, elevation).reshape(len(rows), len(columns)).astype(np.uint8)
+    whole = np.repeat(np.repeat(blocks, HIDDEN_BLOCK_PX, axis=0), HIDDEN_BLOCK_PX, axis=1)[:height, :width]
     side = 2 * HIDDEN_BLOCK_PX + 1
     return np.asarray(cv2.dilate(whole, np.ones((side, side), np.uint8)) > 0)

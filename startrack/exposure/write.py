@@ -88,7 +88,7 @@ def _stated_facts(facts: Facts | Exposure, folder: Path) -> dict[str, Any]:
         elif key in NAMED_FILES:
             value = _relative_path(value, folder)
         elif key in IMAGE_KEYS:
-            value = None if value is None or not isinstance(value, str) else relative_path(value, folder)
+            value = relative_path(value, folder) if isinstance(value, str) else None
         if value is not None:
             stated[key] = value
     return stated

@@ -13,9 +13,8 @@ from startrack.core.types import Array
 from startrack.estimation.frame_matching import require_time
 from startrack.frames import R_enu_icrs, Site
 
-MOVED_SIGMA_RAD = np.radians(
-    0.05
-)  # of a fixed camera between pictures, on each axis; a real one: 0.02 degrees in five weeks
+# Of a fixed camera between pictures, on each axis; a real one moved by 0.02 degrees in five weeks.
+MOVED_SIGMA_RAD = np.radians(0.05)
 WRONG_PICTURE_PROBABILITY = 1e-3  # of a wrong time or place; any attitude is then as probable
 ALL_ROTATIONS_RAD3 = 8.0 * np.pi**2  # volume of the rotations
 

@@ -213,9 +213,8 @@ def observe_together(models: Sequence[FrameModel], found: WeightedPoints) -> Fra
         shown @ mean, covariance - by_evidence + noise + shared_by_posts, response, noise, post, by_post,
     )  # fmt: skip
     # Without sampling noise along shared errors that the evidence does not depend on.
-    square_rad2, axes = np.linalg.eigh(
-        np.sum([model.rise_rad.T @ model.rise_rad for model in models], axis=0) / SECTORS
-    )
+    rises = np.vstack([model.rise_rad for model in models])
+    square_rad2, axes = np.linalg.eigh(rises.T @ rises / SECTORS)
     unseen = np.zeros_like(covariance)
     unseen[2:, 2:] = axes @ np.diag(square_rad2 < UNSEEN_RAD**2) @ axes.T
     return estimate.transform(np.eye(len(mean)) - unseen, unseen=unseen)
@@ -228,9 +227,8 @@ def shown_part(covariance: Array) -> tuple[Array, Array]:
     more than sampled points err are not shown: the evidence would seem to be certain there.
     """
     root = np.linalg.cholesky(covariance)
-    share, axes = np.linalg.eigh(
-        np.eye(len(root)) - root[2:].T @ root[2:]
-    )  # of the information that is not the prior's
+    not_prior = np.eye(len(root)) - root[2:].T @ root[2:]
+    share, axes = np.linalg.eigh(not_prior)  # of the information
     share, back = np.where(share > LEAST_SHARE, share, 0.0), axes.T @ np.linalg.inv(root)
     return root @ (axes * (share > 0.0)) @ back, root @ (axes * share) @ back
 

@@ -155,16 +155,15 @@ class TrackSession:
 
     def _filter_to(self, k: int, odometry: Odometry | None, shared: TrackErrors, height_sigma_m: float) -> OnlineTrack:
         """The filter with frame k; where positions are not linear in `shared`, of all frames about what they show."""
-        online, anew = self._online, shared.bends
         frames = self.frames[: k + 1]
-        moves = odometry_moves(frames, odometry, self.odometry_errors, shows_scale=not anew)
+        moves = odometry_moves(frames, odometry, self.odometry_errors, shows_scale=not shared.bends)
         modes = [frame.modes for frame in frames]
-        placed = [[shared.place(one) for one in of] for of in modes]
-        if anew and any(modes):
-            placed, _ = smooth_placed(modes, moves, shared, height_sigma_m)
-        if online is None or anew:
-            online = OnlineTrack(len(shared), height_sigma_m)
-        for of in placed[0 if anew else k :]:
+        if shared.bends:
+            online, placed = None, smooth_placed(modes, moves, shared, height_sigma_m)[0] if any(modes) else modes
+        else:
+            online, placed = self._online, [[shared.place(one) for one in modes[k]]]
+        online = online or OnlineTrack(len(shared), height_sigma_m)
+        for of in placed:
             online.add(of, moves)
         return online
 

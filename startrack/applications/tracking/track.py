@@ -25,10 +25,7 @@ from startrack.terrain import Terrain
 
 SIZES = {DEPTH: "depth_m", WIDTH: "diameter_m"}  # errors of a crater, and the fact of each
 MOST_SIZE_SIGMAS, LEAST_SIZE_1 = 4.0, 0.1  # of a crater's depth or width: what its file states is wrong beyond
-SIZE_ROUNDS, STILL_MOVES_M = (
-    10,
-    0.01,
-)  # of the expansion about the size that a track shows, until no position moves by more
+SIZE_ROUNDS, STILL_MOVES_M = 10, 0.01  # of the expansion about a crater's size, until no position moves by more
 UNKNOWN_SIGMA_M = 1e-3 * UNKNOWN_M  # a position with a larger error is not known
 
 

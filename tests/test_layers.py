@@ -29,7 +29,7 @@ LAYERS = (  # lowest first; a package imports from lower layers only
 )
 ALLOWED: set[tuple[str, str]] = set()  # exceptions: (package, package of the same or a higher layer)
 HEAVY = (
-    "astropy", "cv2", "lunarsky", "matplotlib", "PIL", "rich", "rosbags", "scipy", "skimage", "skyfield", "spiceypy",
+    "astropy", "cv2", "lunarsky", "matplotlib", "PIL", "rich", "rosbags", "scipy", "skyfield", "spiceypy",
     "tifffile",
 )  # fmt: skip
 CV2_ROOMS = {"applications", "detection", "evidence", "exposure", "output"}  # image processing at the top

@@ -18,7 +18,7 @@ from jsonschema import Draft202012Validator
 import startrack
 from startrack.applications.horizon import measure_skyline, predicted_visible
 from startrack.applications.horizon.frames import orient_frames
-from startrack.applications.horizon.measure import measure_frames
+from startrack.applications.horizon.measure import join_skylines, measure_frames
 from startrack.applications.horizon.posterior import limit_llr
 from startrack.applications.horizon.write import (
     check_output,
@@ -187,12 +187,12 @@ def test_the_brightest_star_counts_as_much_as_a_bright_one():
 def test_the_csv_has_a_row_a_degree(tmp_path):
     write_skyline(str(tmp_path / "a.csv"), small_skyline(), LOWELL, overwrite=False)
     lines = (tmp_path / "a.csv").read_text().splitlines()
-    assert lines[0] == "azimuth_deg,elevation_deg,sigma_deg"
+    assert lines[0] == "azimuth_deg,elevation_deg,sigma_deg,is_measured,source"
     assert len(lines) == 361
-    assert lines[1] == "0,,"
+    assert lines[1] == "0,,,0,"
     assert lines[3].split(",")[0] == "2"
     assert float(lines[3].split(",")[1]) == pytest.approx(1.0 + 2 * 9 / 359, abs=1e-4)
-    assert csv_text(small_skyline()).endswith("359,10.0000,0.1000\n")
+    assert csv_text(small_skyline()).endswith("359,10.0000,0.1000,1,both\n")
 
 
 def test_the_ecsv_is_read_by_astropy():
@@ -212,6 +212,42 @@ def test_the_nina_file_is_complete():
     assert altitude[5] == pytest.approx(1.0 + 5 * 9 / 359, abs=1e-3)
 
 
+def test_azimuths_that_are_interpolated_or_differ_are_marked():
+    number = np.arange(360)
+    skyline = replace(small_skyline(), source=np.where((number > 39) & (number < 43), "varies", "both"))
+    comments = [line for line in nina_text(skyline).splitlines() if line.startswith("#")]
+    assert comments[1:3] == ["# 0 to 0: not measured", "# 5 to 6: not measured"]
+    assert comments[3] == "# 40 to 42: differs between pictures: the highest edge"
+    assert "40,2.0028,0.1000,1,varies" in csv_text(skyline).splitlines()
+
+
+def altered(raised_deg: float, azimuths: slice, known: bool = True) -> MeasuredSkyline:
+    """The small skyline, raised at some azimuths or unknown there."""
+    skyline, elevation = small_skyline(), np.array(small_skyline().elevation_rad)
+    elevation[azimuths] = elevation[azimuths] + np.radians(raised_deg) if known else np.nan
+    sigma = np.where(np.isnan(elevation), np.inf, np.radians(0.1))
+    return replace(skyline, elevation_rad=elevation, sigma_rad=sigma)
+
+
+def test_what_moves_between_pictures_is_reported_with_the_higher_edge():
+    low, high = small_skyline(), altered(5.0, slice(100, 107))
+    for pictures in ([low, high, low], [high, low, low]):
+        found = join_skylines(low, pictures)
+        assert np.flatnonzero(found.source == "varies").tolist() == list(range(100, 107))
+        np.testing.assert_array_equal(found.elevation_rad, high.elevation_rad)
+    rng = np.random.default_rng(3)
+    noisy = [replace(low, elevation_rad=low.elevation_rad + rng.normal(0, low.sigma_rad.min(), 360)) for _ in range(4)]
+    assert np.count_nonzero(join_skylines(low, noisy).source == "varies") <= 2
+
+
+def test_more_pictures_never_know_fewer_azimuths():
+    none, some = altered(0.0, slice(None), known=False), altered(0.0, slice(50, 200), known=False)
+    for together in (none, some):
+        found = join_skylines(together, [some, none])
+        assert np.all(found.known >= some.known)
+        np.testing.assert_array_equal(found.elevation_rad, some.elevation_rad)
+
+
 def test_the_stellarium_landscape_is_polygonal(tmp_path):
     write_skyline(f"{tmp_path}/garden/", small_skyline(), LOWELL, overwrite=False)
     settings = configparser.ConfigParser()
@@ -221,6 +257,7 @@ def test_the_stellarium_landscape_is_polygonal(tmp_path):
     assert float(settings["location"]["latitude"]) == pytest.approx(34.7443)
     points = np.loadtxt(tmp_path / "garden" / settings["landscape"]["polygonal_horizon_list"])
     assert points.shape == (360, 2)
+    assert np.flatnonzero(points[:, 1] < -5.0).tolist() == [0, 5, 6]  # the gaps
 
 
 def test_the_panorama_is_a_picture(tmp_path):

@@ -49,7 +49,10 @@ def _measure(args: argparse.Namespace) -> Outcome:
         found = horizon.measure_frames(frames, left_out, site, show_step)
     horizon.write_skyline(args.output, found.skyline, site, overwrite=args.overwrite)
     unknown = int((~found.skyline.known).sum())
-    note = f"{unknown} of them interpolated" if horizon.needs_all_azimuths(args.output) and unknown else ""
+    varying = int((found.skyline.source == "varies").sum())
+    notes = [f"{unknown} of them interpolated"] if horizon.needs_all_azimuths(args.output) and unknown else []
+    notes += [f"{varying} differ between the images: the highest edge is taken"] if varying else []
+    note = "; ".join(notes)
     record, skyline = _record(args, found, note), found.skyline
     words = [f"{record['azimuths']['known']} of {len(skyline)} azimuths"]
     if record["median_sigma_deg"] is not None:
@@ -73,7 +76,8 @@ def _record(args: argparse.Namespace, found: horizon.SkylineResult, note: str) -
         "left_out": [{"image": one.name, "reason": one.reason, "message": one.message} for one in found.left_out],
         "azimuths": {
             "known": int(known.sum()),
-            **{name.replace(" ", "_"): int((skyline.source == name).sum()) for name in ("stars", "sky light", "both")},
+            **{name.replace(" ", "_"): int((skyline.source == name).sum())
+               for name in ("stars", "sky light", "both", "varies")},  # fmt: skip
         },
         "median_sigma_deg": float(np.degrees(np.median(skyline.sigma_rad[known]))) if known.any() else None,
         "lowest_deg": math.degrees(skyline.elevation_rad[known].min()) if known.any() else None,

@@ -253,12 +253,15 @@ class Evidence(Rows):
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredSkyline(Rows):
-    """A skyline measured in photographs: apparent elevations, refraction included, at azimuths in enu."""
+    """A skyline measured in photographs: apparent elevations, refraction included, at azimuths in enu.
+
+    Where its source is "varies" it differs between the photographs (a dome, a branch), and the highest edge is there.
+    """
 
     azimuth_rad: Array = array("n")
     elevation_rad: Array = array("n", may_be_nan=True)  # nan where unknown
     sigma_rad: Array = array("n")  # infinite where unknown
-    source: NDArray[np.str_] = array("n", dtype=np.str_)  # "stars", "sky light", "both"; "" where unknown
+    source: NDArray[np.str_] = array("n", dtype=np.str_)  # "stars", "sky light", "both"; "varies"; "" where unknown
 
     @property
     def known(self) -> Bools:

@@ -83,7 +83,7 @@ HORIZON = object_schema(
         "output": "text",
         "images": list_schema("text"),
         "left_out": list_schema(object_schema({"image": "text", "reason": {"enum": REFUSALS}, "message": "text"})),
-        "azimuths": object_schema(dict.fromkeys(("known", "stars", "sky_light", "both"), "count")),
+        "azimuths": object_schema(dict.fromkeys(("known", "stars", "sky_light", "both", "varies"), "count")),
         "median_sigma_deg": or_null("positive", "of the known azimuths"),
         "lowest_deg": or_null("number", "apparent elevation"),
         "highest_deg": or_null("number", "apparent elevation"),

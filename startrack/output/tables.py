@@ -140,7 +140,7 @@ def skyline_table_text(skyline: MeasuredSkyline) -> str:
         Column("azimuth_deg", azimuth, unit="deg", description="from north through east"),
         Column("elevation_deg", elevation, unit="deg", description="of the skyline in the image"),
         Column("sigma_deg", sigma, unit="deg", description="standard deviation of the elevation"),
-        Column("source", skyline.source, "string", description="stars, sky light, both"),
+        Column("source", skyline.source, "string", description="stars, sky light, both, varies"),
     ])  # fmt: skip
 
 

@@ -34,6 +34,7 @@ NEAR_LIGHT_RAD = np.radians(0.3)  # a step this near to the skyline is evidence 
 GAP_SIGNIFICANCE = 5.0  # of light below the skyline that is brighter than usual ground
 DEEPEST_GAP_RAD = np.radians(15.0)
 DECISIVE_LLR = 2.0
+VARIES_SIGMAS = 5.0  # of two pictures' skylines: what differs by more moves (a dome, a crane, a branch)
 
 
 @dataclass(frozen=True)
@@ -76,12 +77,47 @@ def measure_frames(
     if not frames:
         first = left_out[0]
         raise NoSolution(f"{first.name}: {first.message}", reason=first.reason)
-    total, stars, steps = column_log_prior(), [], []
-    for frame, (light, by_width, log_likelihood) in zip(frames, map_in_threads(_measure_frame, frames), strict=True):
+    measured = []
+    for frame, one in zip(frames, map_in_threads(_measure_frame, frames), strict=True):
         progress(f"measured the skyline of {frame.name}")
-        stars.append(light)
-        steps.append(by_width)
-        total += log_likelihood
+        measured.append(one)
+    skyline = _skyline_of(frames, measured, site)
+    if len(frames) > 1:
+        alone = [_skyline_of((frame,), [one], site) for frame, one in zip(frames, measured, strict=True)]
+        skyline = join_skylines(skyline, alone)
+    return SkylineResult(skyline, frames, left_out)
+
+
+def join_skylines(together: MeasuredSkyline, alone: Sequence[MeasuredSkyline]) -> MeasuredSkyline:
+    """The skyline of all pictures `together`, with what each picture `alone` shows and they do not show alike.
+
+    An azimuth where two pictures differ by more than VARIES_SIGMAS has the highest edge, its sigma, and the source
+    "varies". One that only some pictures know has the value of the most accurate of them.
+    """
+    elevation = np.stack([one.elevation_rad for one in alone])
+    sigma = np.stack([one.sigma_rad for one in alone])
+    bins = np.arange(len(together))
+    high, low = (np.argmax(np.where(np.isfinite(elevation), way * elevation, -np.inf), axis=0) for way in (1.0, -1.0))
+    with np.errstate(invalid="ignore"):
+        apart = elevation[high, bins] - elevation[low, bins]
+        varies = apart > VARIES_SIGMAS * np.hypot(sigma[high, bins], sigma[low, bins])
+    chosen = np.where(varies, high, np.argmin(sigma, axis=0))
+    one = np.isfinite(elevation).any(axis=0) & (varies | ~together.known)
+    source = np.stack([one.source for one in alone])[chosen, bins]
+    return MeasuredSkyline(
+        azimuth_rad=together.azimuth_rad,
+        elevation_rad=np.where(one, elevation[chosen, bins], together.elevation_rad),
+        sigma_rad=np.where(one, sigma[chosen, bins], together.sigma_rad),
+        source=np.select([varies, one], ["varies", source], together.source),
+    )
+
+
+def _skyline_of(
+    frames: Sequence[SkyFrame], measured: Sequence[tuple[StarLight, list[Steps], Array]], site: Site
+) -> MeasuredSkyline:
+    """The skyline that `frames`, each `measured`, show together."""
+    stars, steps = [one[0] for one in measured], [one[1] for one in measured]
+    total = column_log_prior() + sum(one[2] for one in measured)
     # The columns' posterior as bins of one degree; the errors that the frames share are added once.
     mean, sigma = combine_columns(total)
     azimuth = np.radians(np.arange(SKYLINE_AZIMUTHS, dtype=np.float64) * (360.0 / SKYLINE_AZIMUTHS))
@@ -96,13 +132,12 @@ def measure_frames(
     known &= np.roll(known, 1) & np.roll(known, -1)
     variance = scatter / COLUMNS_PER_AZIMUTH + np.square(variation) / (variation + WALL_RAD**2) + shared
     source = np.select([by_stars & by_light, by_light, by_stars], ["both", "sky light", "stars"], "")
-    skyline = MeasuredSkyline(
+    return MeasuredSkyline(
         azimuth_rad=azimuth,
         elevation_rad=np.where(known, elevation, np.nan),
         sigma_rad=np.where(known, np.sqrt(variance), np.inf),
         source=np.where(known, source, ""),
     )
-    return SkylineResult(skyline, frames, left_out)
 
 
 def _measure_frame(frame: SkyFrame) -> tuple[StarLight, list[Steps], Array]:

@@ -15,6 +15,7 @@ from startrack.output import png_bytes, skyline_picture, skyline_table_text, sky
 
 SKYLINE_SUFFIXES = (".csv", ".ecsv", ".hrz", ".png")  # and none: the folder of a Stellarium landscape
 LANDSCAPE, HORIZON_LIST = "landscape.ini", "horizon.txt"
+GAP_DEG = -10.0  # altitude of a Stellarium landscape where the skyline is unknown: the gap is seen
 TINY_DEG = 1e-5  # Stellarium draws a polygon with a corner at exactly 0 or 180 degrees badly
 
 
@@ -41,7 +42,7 @@ def check_output(output: str, *, overwrite: bool) -> None:
 
 def needs_all_azimuths(output: str) -> bool:
     """Whether the format of the file `output` cannot leave azimuths empty."""
-    return kind_of(output) in (".hrz", "")
+    return kind_of(output) == ".hrz"
 
 
 def write_skyline(output: str, skyline: MeasuredSkyline, site: Site, *, overwrite: bool) -> tuple[Path, ...]:
@@ -63,22 +64,35 @@ def write_skyline(output: str, skyline: MeasuredSkyline, site: Site, *, overwrit
 
 
 def csv_text(skyline: MeasuredSkyline) -> str:
-    """One row a degree; elevation and sigma are empty where the skyline is unknown."""
-    rows = ["azimuth_deg,elevation_deg,sigma_deg"]
-    rows += map(",".join, zip(*skyline_texts_deg(skyline), strict=True))
+    """One row a degree; elevation and sigma are empty where the skyline is unknown, and `is_measured` is 0."""
+    columns = *skyline_texts_deg(skyline), [str(int(known)) for known in skyline.known], skyline.source.tolist()
+    rows = ["azimuth_deg,elevation_deg,sigma_deg,is_measured,source", *map(",".join, zip(*columns, strict=True))]
     return "\n".join(rows) + "\n"
 
 
 def nina_text(skyline: MeasuredSkyline) -> str:
     """Lines "azimuth altitude" in degrees from 0 to 360, as N.I.N.A. reads them (# begins a comment)."""
-    first = horizon_list_text(skyline, "{:g} {:.3f}\n")
-    return first + f"{360.0:g} {np.degrees(interpolate_unknown(skyline)[0]):.3f}\n"
+    rows = _rows(skyline, interpolate_unknown(skyline), "{:g} {:.3f}")
+    return "\n".join([*rows, f"360 {rows[-len(skyline)].split()[1]}"]) + "\n"
 
 
-def horizon_list_text(skyline: MeasuredSkyline, form: str = "{:.1f} {:.3f}\n") -> str:
-    """The list of azimuth and altitude of a polygonal landscape, each in the format `form`."""
-    places_deg = np.degrees([skyline.azimuth_rad, interpolate_unknown(skyline)])
-    return "# azimuth altitude\n" + "".join(form.format(*place) for place in places_deg.T)
+def horizon_list_text(skyline: MeasuredSkyline) -> str:
+    """The list of azimuth and altitude of a polygonal landscape, with gaps where the skyline is unknown."""
+    elevation_rad = np.where(skyline.known, skyline.elevation_rad, np.radians(GAP_DEG))
+    return "\n".join(_rows(skyline, elevation_rad, "{:.1f} {:.3f}")) + "\n"
+
+
+def _rows(skyline: MeasuredSkyline, elevation_rad: Array, form: str) -> list[str]:
+    """Comments with the azimuths that are not measured or differ, then azimuths and elevations (n,) in a `form`."""
+    azimuth_deg = np.round(np.degrees(skyline.azimuth_rad), 6)
+    kinds = (~skyline.known, "not measured"), (skyline.source == "varies", "differs between pictures: the highest edge")
+    comments = []
+    for kind, words in kinds:
+        at = np.flatnonzero(kind)
+        runs = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1) if len(at) else []
+        comments += [f"# {azimuth_deg[run[0]]:g} to {azimuth_deg[run[-1]]:g}: {words}" for run in runs]
+    rows = [form.format(*place) for place in zip(azimuth_deg, np.degrees(elevation_rad), strict=True)]
+    return ["# azimuth altitude", *comments, *rows]
 
 
 def landscape_text(name: str, site: Site) -> str:

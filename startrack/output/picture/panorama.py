@@ -29,6 +29,7 @@ LEGEND: dict[str, tuple[str, str, float, Colour]] = {  # words, mark, half its s
     "sky light": ("skyline by the light of the sky", "disc", 1.5, Ink.MEASURED),
     "stars": ("by stars seen and missing", "diamond", 4.0, Ink.MEASURED),
     "both": ("by both", "square", 4.0, Ink.MEASURED),
+    "varies": ("differs between the pictures", "cross", 2.5, Ink.HIDDEN),
 }
 BANDS = {"sky light": Ink.MEASURED, "stars": Ink.IDENTIFIED, "both": Ink.SKYLINE}
 
@@ -83,11 +84,14 @@ def skyline_picture(skyline: MeasuredSkyline) -> NDArray[np.uint8]:
     azimuth_rad = np.append(skyline.azimuth_rad, 2 * np.pi)
     elevation_rad, sigma_rad = (np.append(a, a[0]) for a in (skyline.elevation_rad, skyline.sigma_rad))
     canvas = Canvas(WIDTH_PX, HEIGHT_PX)
-    plot = _draw_horizon(canvas, "measured skyline", azimuth_rad, elevation_rad)
+    varies = np.where(skyline.source == "varies", "varies", "")
+    title = f"measured skyline{'; crossed: it ' + LEGEND['varies'][0] if (varies != '').any() else ''}"
+    plot = _draw_horizon(canvas, title, azimuth_rad, elevation_rad)
     for run in known_runs(np.isfinite(elevation_rad)):
         for shift in (-sigma_rad[run], sigma_rad[run]):
             plot.window.line(plot.canvas_px(azimuth_rad[run], elevation_rad[run] + shift), Ink.FAINT)
     plot.draw_curve(azimuth_rad, elevation_rad, Ink.SKYLINE)
+    plot.draw_marks(skyline.azimuth_rad, skyline.elevation_rad, varies)
     return canvas.rendered_pixels()
 
 

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from startrack.applications.calibration import calibrate
 from startrack.applications.calibration.acceptance import joint_log_p_value
 from startrack.applications.calibration.report import write_report
+from startrack.applications.calibration.static_parts import find_obstructions
 from startrack.applications.calibration.verify import Verification, verify, verify_dict, verify_line
 from startrack.camera import load_camera, save_camera
 from startrack.catalog import load_catalog
@@ -167,7 +168,7 @@ def test_the_record_of_a_refused_calibration_is_replaced(tmp_path):
 
 def test_mask_and_hot_pixels_of_the_former_calibration_are_removed(cold_calibration, tmp_path):
     """Except a mask that the new calibration used."""
-    found = replace(cold_calibration, obstructed=None)
+    found = replace(cold_calibration, obstructed=None, no_mask_because="")
     mask, hot = tmp_path / "new.mask.png", tmp_path / "new.hot-pixels.csv"
     for used_masks, is_kept in (([str(mask)], True), ([None], False)):
         mask.write_text("former")
@@ -393,3 +394,16 @@ def test_impossible_boards_are_wrong_usage(words, tmp_path, capsys):
         main(["calibrate", "board", str(tmp_path / "none.png"), *flags])
     assert stopped.value.code == 2
     assert "--pattern" in capsys.readouterr().err
+
+
+def test_why_no_mask_is_proposed_is_said(cold_calibration, tmp_path):
+    """Of a picture without a known level, or of clouds: half of its bright stars are missing."""
+    joint = cold_calibration.joint
+    found, why = find_obstructions(joint, joint.frames, None)
+    assert found is None and "--bias" in why
+    frame = joint.frames[0]
+    thinned = replace(frame, sources=frame.sources.take(np.arange(len(frame.sources)) % 2 == 0))
+    found, why = find_obstructions(joint, [thinned], 2000.0)
+    assert found is None and "a clear, dark night is needed" in why
+    silent = replace(cold_calibration, obstructed=None, no_mask_because=why)
+    assert write_camera(tmp_path / "new.toml", silent, []) == f"no mask is proposed: {why}"

@@ -237,14 +237,14 @@ def predicted_stars(rng: np.random.Generator, hidden: Bools, rate: float, count:
 def test_open_sky_is_hardly_ever_proposed_for_the_mask():
     rng, size = np.random.default_rng(8), (1024, 1024)
     nothing = np.zeros(size, dtype=bool)
-    wrong = [obstructed_cells(predicted_stars(rng, nothing, 0.8), size).any() for _ in range(60)]
+    wrong = [obstructed_cells(predicted_stars(rng, nothing, 0.8), ~nothing).any() for _ in range(60)]
     assert sum(wrong) <= 3  # 0.6 expected at most; more than 3 in 0.3 % of such tests
 
 
 def test_what_never_shows_a_star_is_proposed_for_the_mask():
     size = (1024, 1024)
     hidden = mast(size, 100)
-    found = obstructed_cells(predicted_stars(np.random.default_rng(9), hidden, 0.9), size)
+    found = obstructed_cells(predicted_stars(np.random.default_rng(9), hidden, 0.9), np.ones(size, dtype=bool))
     assert np.mean(found[hidden]) > 0.8
     assert np.count_nonzero(found & ~hidden) < 0.2 * np.count_nonzero(hidden)
 
@@ -252,4 +252,14 @@ def test_what_never_shows_a_star_is_proposed_for_the_mask():
 def test_one_star_missed_in_every_frame_is_no_obstruction():
     many = 500
     same = PredictedStars(np.zeros(many, int), np.full((many, 2), 300.0), np.zeros(many, bool), np.full(many, 0.9))
-    assert not obstructed_cells(same, (512, 512)).any()
+    assert not obstructed_cells(same, np.ones((512, 512), dtype=bool)).any()
+
+
+def test_what_is_as_bright_as_the_sky_is_not_proposed_and_a_dark_outline_is_followed():
+    size = (1024, 1024)
+    hidden = mast(size, 100)
+    stars = predicted_stars(np.random.default_rng(9), hidden, 0.9)
+    assert not obstructed_cells(stars, np.zeros(size, dtype=bool)).any()
+    found = obstructed_cells(stars, hidden)
+    assert np.mean(found[hidden]) > 0.8
+    assert not np.any(found & ~hidden)

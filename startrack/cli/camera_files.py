@@ -126,13 +126,13 @@ def write_camera(camera_file: Path, found: Calibration, used_masks: Iterable[str
         lines = ["x_px,y_px", *(f"{x:.0f},{y:.0f}" for x, y in hot_px)]
         write_atomically(camera_file.with_suffix(HOT_PIXELS), ("\n".join(lines) + "\n").encode(), overwrite=True)
     if found.obstructed is None:
-        return ""
+        return f"no mask is proposed: {found.no_mask_because}" if found.no_mask_because else ""
     path = camera_file.with_suffix(MASK)
     pixels = np.where(found.obstructed, 0.0, 255.0).astype(np.float32)
     write_exposure(path, Exposure(pixels_adu=pixels, saturation_adu=255.0), overwrite=True)
     return (
-        f"{path.name}: {100 * found.obstructed.mean():.1f} % of the pixels are in places that never show a star; it is "
-        f'not used unless {camera_file.name} has the line mask = "{path.name}" above its first [table]'
+        f"{path.name}: {100 * found.obstructed.mean():.1f} % of the pixels are dark in places that never show a star; "
+        f'it is not used unless {camera_file.name} has the line mask = "{path.name}" above its first [table]'
     )
 
 

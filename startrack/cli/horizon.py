@@ -76,8 +76,10 @@ def _record(args: argparse.Namespace, found: horizon.SkylineResult, note: str) -
         "left_out": [{"image": one.name, "reason": one.reason, "message": one.message} for one in found.left_out],
         "azimuths": {
             "known": int(known.sum()),
-            **{name.replace(" ", "_"): int((skyline.source == name).sum())
-               for name in ("stars", "sky light", "both", "varies")},  # fmt: skip
+            **{
+                name.replace(" ", "_"): int((skyline.source == name).sum())
+                for name in ("stars", "sky light", "both", "varies")
+            },
         },
         "median_sigma_deg": float(np.degrees(np.median(skyline.sigma_rad[known]))) if known.any() else None,
         "lowest_deg": math.degrees(skyline.elevation_rad[known].min()) if known.any() else None,

@@ -71,11 +71,12 @@ def require_body(exposure: Exposure, site: Site | None) -> None:
 
 @dataclass(frozen=True)
 class BrightStars:
-    """Stars (n,) bright enough to be detected where the sky is open, wherever they are predicted."""
+    """Unblended stars (n,) bright enough to be detected where the sky is open, wherever they are predicted."""
 
     star: Ints  # indices into the frame's sky
     xy_px: Array  # (n, 2)
     found: Bools  # whether there is a source of equal brightness
+    rate: float  # of those found where the sky is open
 
 
 @dataclass(frozen=True)
@@ -120,10 +121,16 @@ def match_frame(frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: flo
         tree, px, seen, gate_px, star_mag=star_mag, star_sigma_mag=stars.v_sigma_mag[:count],
         detection_mag=source_mag, saturated=found.saturated, limit_mag=limit, tolerance_mag=TOLERANCE_MAG,
     )  # fmt: skip
-    alone = is_isolated(px[star], star, px, seen, stars.v_mag, BLENDED_SIGMAS * found.psf_sigma_px, BLENDED_MAG)
+
+    def are_alone(some: Ints) -> Bools:
+        return is_isolated(px[some], some, px, seen, stars.v_mag, BLENDED_SIGMAS * found.psf_sigma_px, BLENDED_MAG)
+
+    alone = are_alone(star)
     faintest = float(np.quantile(source_mag[detection], LIMIT_QUANTILE)) if len(detection) else -np.inf
     bright = seen[star_mag[seen] < faintest - DEPTH_BELOW_THRESHOLD_MAG]
-    expected = bright[_is_open_sky(px[bright], found.xy_px[detection], frame.exposure.size_px)]
+    is_open = _is_open_sky(px[bright], found.xy_px[detection], frame.exposure.size_px)
+    expected, single = bright[is_open], are_alone(bright)
+    rate = np.isin(bright[single & is_open], star)
     significant = (camera.angle_rad(found.xy_px) < within_rad) & (source_mag < faintest - DEPTH_BELOW_THRESHOLD_MAG)
     return FrameMatches(
         detection=detection[alone],
@@ -132,7 +139,9 @@ def match_frame(frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: flo
         expected_found=int(np.isin(expected, star).sum()),
         significant=int(significant.sum()),
         significant_matched=int(np.count_nonzero(significant[detection])),
-        bright=BrightStars(bright, px[bright], np.isin(bright, star)),
+        bright=BrightStars(
+            bright[single], px[bright[single]], np.isin(bright[single], star), float(rate.sum() / max(len(rate), 1))
+        ),
     )
 
 

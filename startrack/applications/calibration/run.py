@@ -42,7 +42,8 @@ class Calibration(CheckedCamera):
     site: Site | None
     false_alarm_probability: float  # the largest of the images' identifications
     photometry: Photometry
-    obstructed: Bools | None  # (H, W) pixels proposed for the mask: no star is ever seen there; None: no such pixels
+    obstructed: Bools | None  # (H, W) dark pixels proposed for the mask: no star is ever seen there; None: none
+    no_mask_because: str  # why the pictures cannot show such pixels
 
     @property
     def is_free_of_refraction(self) -> bool:
@@ -120,6 +121,10 @@ def calibrate(
     progress("measuring throughput and sensor")
     photometry = measure_photometry(joint, known_sensor or KnownSensor())
     mask = None if camera is None else camera.mask
+    level_adu = photometry.properties.bias_adu
+    if known_sensor is not None and known_sensor.bias_adu is not None:
+        level_adu = known_sensor.bias_adu
+    obstructed, no_mask_because = find_obstructions(joint, same, level_adu) if mask is None else (None, "")
     return Calibration(
         camera=replace(fitted, sensor=photometry.sensor, mask=mask),
         joint=joint,
@@ -128,7 +133,8 @@ def calibrate(
         site=site,
         false_alarm_probability=max(one.found.false_alarm_probability for one in run.identified),
         photometry=photometry,
-        obstructed=find_obstructions(joint, same) if mask is None else None,
+        obstructed=obstructed,
+        no_mask_because=no_mask_because,
     )
 
 

@@ -8,6 +8,7 @@ from functools import partial, reduce
 
 import numpy as np
 
+from startrack.camera import Camera
 from startrack.core.runner import map_in_threads
 from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Bools, Ints
@@ -23,7 +24,11 @@ STAR_RADIUS_PX = 3
 BESIDE = np.array([[0, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0]])  # twice the mean of the four
 CELLS_PX = (128, 64, 32, 16)  # sides; the smallest that have enough stars trace the outline
 MAX_RATE_1 = 0.95  # of bright stars that are detected where the sky is open: variable stars, and errors of catalogues
-MIN_RATE_1 = 0.5  # of a frame that is used; below it clouds hide most stars
+MIN_RATE_1 = 0.8  # of a frame that is used: on clear dark nights 0.88 to 0.93, under clouds 0.58 to 0.73
+SKY_RING_1 = 0.03  # width of the rings about the axis, in focal lengths
+DARKER_1 = 0.7  # part of the sky's light at the same angle: trees 0 to 0.65, clouds from 0.93
+LEAST_DARK_1 = 0.25  # part of a cell that is as dark
+LIGHT_SMOOTH_PX = 5  # odd, 5 at most: of the light
 FALSE_ALARM = 0.01  # expected cells of open sky without a star, all tests of a calibration together
 
 
@@ -95,46 +100,65 @@ class PredictedStars:
     rate: Array  # of such stars detected under the open sky of the frame
 
 
-def find_obstructions(joint: JointFit, frames: Sequence[Frame]) -> Bools | None:
-    """Pixels (H, W) in cells that never show a star; None where there are none.
+def find_obstructions(joint: JointFit, frames: Sequence[Frame], level_adu: float | None) -> tuple[Bools | None, str]:
+    """Dark pixels (H, W) in cells that never show a star, None where there are none; and why nothing can be said.
 
-    `frames` are those of the `joint` fit with all their sources. Bright stars count, those in masked pixels do not, and
-    frames under clouds are left out.
+    `frames` are those of the `joint` fit with all their sources, `level_adu` that without light. Bright stars count,
+    those in masked pixels do not, and frames under clouds are left out.
     """
-    camera = joint.fit.camera
+    camera, dark = joint.fit.camera, []
+    if level_adu is None:
+        return None, "the level without light is not known: give --bias"
     parts = [(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0))]
     matches = match_frames(frames, camera, joint.fit.R_cam_icrs, camera.calibrated_angle_rad, joint.gate_px)
     for frame, matched in zip(frames, matches, strict=True):
-        rate = matched.expected_found / max(matched.expected, 1)
-        if rate < MIN_RATE_1:
+        bright = matched.bright
+        if bright.rate < MIN_RATE_1:
             continue
         mask = combine_masks(frame.exposure.mask, None, camera.size_px, frame.exposure.correction)
-        bright = matched.bright
         column, row = np.rint(bright.xy_px).astype(np.int64).T
         counts = np.ones(len(row), dtype=bool) if mask is None else ~mask.masked[row, column]
         hip = frame.sky.stars.hip[bright.star[counts]]
-        parts.append((hip, bright.xy_px[counts], bright.found[counts], np.full(len(hip), min(rate, MAX_RATE_1))))
+        parts.append((hip, bright.xy_px[counts], bright.found[counts], np.full(len(hip), min(bright.rate, MAX_RATE_1))))
+        dark.append(_light_part(frame, camera, level_adu) < DARKER_1)
+    if not dark:
+        return None, f"no picture shows {100 * MIN_RATE_1:.0f} % of its bright stars: a clear, dark night is needed"
     predicted = PredictedStars(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    obstructed = obstructed_cells(predicted, camera.size_px)
-    return obstructed if obstructed.any() else None
+    obstructed = obstructed_cells(predicted, np.asarray(np.mean(dark, axis=0) > 0.5))
+    return obstructed if obstructed.any() else None, ""
 
 
-def obstructed_cells(predicted: PredictedStars, size_px: tuple[int, int]) -> Bools:
-    """Pixels (H, W) of an image of `size_px` (W, H) in cells where the `predicted` stars are missing.
+def _light_part(frame: Frame, camera: Camera, level_adu: float) -> Array:
+    """The light (H, W) of a frame above `level_adu`, smoothed, over its median in rings about the axis."""
+    import cv2
+    from scipy.ndimage import median
+
+    light = cv2.medianBlur(np.asarray(frame.exposure.pixels_adu, dtype=np.float32), LIGHT_SMOOTH_PX) - level_adu
+    height, width = light.shape
+    x, y = ((np.arange(n) - c) / f for n, c, f in zip((width, height), camera.centre_px, camera.focal_px, strict=True))
+    ring = (np.hypot(x, y[:, None]) / SKY_RING_1).astype(np.int64)
+    sky = np.asarray(median(light, ring, np.arange(ring.max() + 1)))[ring]
+    return np.asarray(np.divide(light, sky, out=np.ones_like(sky), where=sky > 0))
+
+
+def obstructed_cells(predicted: PredictedStars, dark: Bools) -> Bools:
+    """The `dark` pixels of an image (H, W) in cells where the `predicted` stars are missing.
 
     In a cell of open sky each bright star i, counted once however many frames show it there, is missed with probability
     1 - p_i, where p_i is the rate of detected bright stars in the frame's open sky. The probability that all are missed
-    is the product P. The cell is obstructed where no star is found and P times the number of cells tested is below
-    FALSE_ALARM. Squares of several sides are tested, each at four offsets, and the obstructed ones joined.
+    is the product P. The cell is obstructed where no star is found, P times the number of cells tested is below
+    FALSE_ALARM, and LEAST_DARK_1 of it is dark. Squares of several sides are tested, each at four offsets, and the dark
+    pixels of the obstructed ones joined.
     """
-    width, height = size_px
-    obstructed = np.zeros((height, width), dtype=bool)
+    obstructed = np.zeros_like(dark)
     grids = [(side, dx, dy) for side in CELLS_PX for dx in (0, side // 2) for dy in (0, side // 2)]
-    tests = [_test_cells(predicted, *grid, width) for grid in grids]
+    tests = [_test_cells(predicted, *grid, dark.shape[1]) for grid in grids]
     limit = np.log(FALSE_ALARM / max(sum(len(log_p) for _, log_p in tests), 1))
     for (side, dx, dy), (corners, log_p) in zip(grids, tests, strict=True):
         for x, y in corners[log_p < limit].tolist():
-            obstructed[max(y - dy, 0) : y - dy + side, max(x - dx, 0) : x - dx + side] = True
+            cell = np.s_[max(y - dy, 0) : y - dy + side, max(x - dx, 0) : x - dx + side]
+            if dark[cell].mean() >= LEAST_DARK_1:
+                obstructed[cell] |= dark[cell]
     return obstructed
 
 

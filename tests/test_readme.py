@@ -168,3 +168,11 @@ def test_tables_of_the_format_page_are_made_from_the_code():
     for page in make_tables.PAGES:
         text = page.read_text(encoding="utf-8")
         assert make_tables.page_with_tables(text) == text
+
+
+def test_links_between_pages_show_titles_and_no_file_names():
+    texts = [
+        text for page in PAGES for text in re.findall(r"\[([^\]\n]+)\]\([^)\n]+\)", page.read_text(encoding="utf-8"))
+    ]
+    assert len(texts) > 100
+    assert [text for text in texts if text.endswith(".md")] == []

@@ -17,7 +17,6 @@ import shlex
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
 from functools import cache
 
 import numpy as np
@@ -25,29 +24,30 @@ from _hazard_grounds import Risen
 from _map_draws import draw_ground
 from _results import table, write_section
 from _sky_view import Hazard, Rng, View, expose, smooth_noise, turn
-from matplotlib import cbook
 
+from startrack.applications.reproduction.valley import (
+    BELOW_RAD,
+    DARK_RAD,
+    NIGHT_RAD,
+    draw_floor,
+    draw_time,
+    jacksboro,
+)
 from startrack.applications.tracking import TrackErrors, observe_frame
 from startrack.applications.tracking.filtered_positions import positions_at_rest
 from startrack.camera import Camera, load_camera
-from startrack.catalog import apparent_bodies, load_catalog
+from startrack.catalog import load_catalog
 from startrack.chain import Located, locate
 from startrack.core.runner import count_cores
 from startrack.core.types import Array
-from startrack.frames import R_enu_icrs, Site, azel_from_rays, rays_from_azel
+from startrack.frames import azel_from_rays, rays_from_azel
 from startrack.rendering import Series
-from startrack.terrain import HeightMap, Raster, Terrain
-from startrack.terrain.earth_projection import EarthProjection
-from startrack.terrain.ellipsoid_fit import above_ellipsoid
+from startrack.terrain import HeightMap, Terrain
 
-LATITUDE_DEG, LONGITUDE_DEG = 36.59, -84.246
-RADIUS_M, HIGHEST_BEYOND_M = 9000.0, 1300.0
-HORIZON_DEG, STEEPEST_RAD = (9.0, 26.0), np.radians(15.0)
 POST_SIGMA_M = 5.0
 SKY_MAG = 21.5
-YEAR, DAYS = datetime(2026, 1, 1, tzinfo=UTC), 365
-NIGHT_RAD, TWILIGHT_RAD = np.radians(-18.0), np.radians([-14.0, -11.0])  # elevations of the Sun
-MOON_RAD, DARK_RAD = np.radians([15.0, 60.0]), np.radians(-5.0)  # elevations of the Moon, up and down
+TWILIGHT_RAD = np.radians([-14.0, -11.0])  # elevations of the Sun
+MOON_RAD = np.radians([15.0, 60.0])  # elevations of the Moon when it is up
 REST_EVERY_S = 327.0  # twelve exposures an hour
 RADIUS999_SIGMAS = 3.717  # of a circle in two dimensions
 SEED = 29
@@ -55,48 +55,6 @@ HEAD = [
     "frames", "answered", "mean error, m", "median", "largest", "NEES", "beyond the 99.9 % circle", "beyond twice",
     "wanted mean",
 ]  # fmt: skip
-
-
-def jacksboro(height_sigma_m: float = 0.0) -> HeightMap:
-    """The valleys as a terrain whose map has this error."""
-    data = cbook.get_sample_data("jacksboro_fault_dem.npz")
-    step = float(data["dx"])
-    raster = Raster(
-        heights_m=data["elevation"].astype(np.float32), source="jacksboro", dx_m=step, dy_m=-step,
-        projection=EarthProjection(middle_x=float(data["xmin"]) + 200 * step),
-        x0_m=float(data["xmin"]) + step / 2, y0_m=float(data["ymin"]) - step / 2,
-    )  # fmt: skip
-    site = Site("earth", float(np.radians(LATITUDE_DEG)), float(np.radians(LONGITUDE_DEG)), 300.0)
-    return HeightMap(
-        name="jacksboro", site=site, maps=(above_ellipsoid(raster, site, 0.0, None),), search_radius_m=RADIUS_M,
-        height_sigma_m=height_sigma_m, highest_beyond_m=HIGHEST_BEYOND_M, terrestrial_refraction_1=0.13,
-        terrestrial_refraction_sigma_1=None, horizon_sigma_common_rad=None if height_sigma_m else 0.0,
-    )  # fmt: skip
-
-
-def draw_floor(terrain: HeightMap, rng: Rng) -> Array:
-    """A place (2,) on a valley floor."""
-    around = np.linspace(0, 2 * np.pi, 72, endpoint=False)
-    while True:
-        at = rng.uniform(-RADIUS_M, RADIUS_M, 2)
-        if np.hypot(*at) < 0.95 * RADIUS_M and terrain.slope_rad(at) < STEEPEST_RAD:
-            mean = np.degrees(terrain.horizon_rad(at[None], around).mean())
-            if HORIZON_DEG[0] <= mean <= HORIZON_DEG[1]:
-                return at
-
-
-def draw_time(site: Site, rng: Rng, *, sun_rad: tuple[float, float], moon_rad: tuple[float, float]) -> datetime:
-    """A time with Sun and Moon at elevations in these ranges."""
-    while True:
-        when = YEAR + timedelta(days=float(rng.uniform(0, DAYS)))
-        at = {one.name: float(azel_of(one.ray_icrs, site, when)[1]) for one in apparent_bodies(site, when)}
-        if sun_rad[0] <= at["Sun"] <= sun_rad[1] and moon_rad[0] <= at["Moon"] <= moon_rad[1]:
-            return when
-
-
-def azel_of(ray_icrs: Array, site: Site, when: datetime) -> tuple[Array, Array]:
-    """Azimuth and elevation [rad] of a direction."""
-    return azel_from_rays(R_enu_icrs(site, when) @ ray_icrs)
 
 
 def moonlight(view: View, rng: Rng) -> Array:
@@ -156,8 +114,8 @@ class Case:
     post_m: float = 0.0
     has_trees: bool = False
     light: Callable[[View, Rng], Array] = lambda view, rng: view.light_e
-    sun_rad: tuple[float, float] = (-np.pi / 2, float(NIGHT_RAD))
-    moon_rad: tuple[float, float] = (-np.pi / 2, float(DARK_RAD))
+    sun_rad: tuple[float, float] = (BELOW_RAD, NIGHT_RAD)
+    moon_rad: tuple[float, float] = (BELOW_RAD, DARK_RAD)
     is_sky: bool = False
     exposures: int = 1  # at rest, in one posterior
 
@@ -192,8 +150,8 @@ def locate_frame(job: tuple[str, int]) -> tuple[str, float, float, float]:
     case, rng = CASES[name], np.random.default_rng([SEED, number])
     stated = _terrain(case.post_m)
     assert stated.site is not None
-    place_m = draw_floor(_terrain(0.0), rng)
-    when = draw_time(stated.site, rng, sun_rad=case.sun_rad, moon_rad=case.moon_rad)
+    place_m = draw_floor(_terrain(0.0), rng=rng)
+    when = draw_time(stated.site, sun_rad=case.sun_rad, moon_rad=case.moon_rad, rng=rng)
     ground: Terrain = draw_ground(_terrain(0.0), case.post_m, rng) if case.post_m else _terrain(0.0)
     ground = trees(ground, place_m, rng) if case.has_trees else ground
     series = Series(

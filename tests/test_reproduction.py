@@ -51,6 +51,7 @@ from startrack.localization import ExactPosterior, Hull, PseudoGradient
 SMALL = Size(
     "small", skies=10, per_sky=300, ours_per_sky=5, bound_per_sky=5, deep_per_sky=2, one_sky=500, ours_one_sky=120,
     sweep_skies=1, sweep_per_sky=2, traverses=10, compared_per_sky=1, compared_on_map=1,
+    compared_in_valley=1, compared_series=1,
 )  # fmt: skip
 TINY = replace(SMALL, skies=3, per_sky=8, ours_per_sky=2, bound_per_sky=2, deep_per_sky=1, one_sky=8, ours_one_sky=4)
 
@@ -215,9 +216,8 @@ def test_distances_between_changes_are_the_thesis_s():
 def test_each_table_and_figure_is_written(small_run, name):
     artefact, files = small_run[name]
     pictures = [path for path in files if path.suffix == ".png"]
-    assert len(pictures) == {"table3.1": 0, "methods": 2, "methods.shackleton": 2, "figB": 10, "fig3.10": 2}.get(
-        name, 1
-    )
+    compared = {"methods": 2, "methods.shackleton": 2, "methods.valley": 2, "proposals": 0}
+    assert len(pictures) == ({"table3.1": 0, "figB": 10, "fig3.10": 2} | compared).get(name, 1)
     for path in pictures:
         with Image.open(path) as picture:
             picture.load()

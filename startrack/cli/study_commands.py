@@ -10,7 +10,7 @@ from startrack.core import SKY_V_MAG_ARCSEC2
 # The keys of startrack.applications.reproduction.ARTEFACTS, whose import would load numpy.
 ARTEFACT_NAMES = (
     "table3.1", "fig3.3", "fig3.4", "fig3.5", "fig3.6", "fig3.7", "fig3.8", "fig3.9", "fig3.10", "figA.1", "figA.2",
-    "figB", "magnitude", "aspect", "methods", "methods.shackleton",
+    "figB", "magnitude", "aspect", "methods", "methods.shackleton", "methods.valley", "proposals",
 )  # fmt: skip
 DRIVE_FLAGS = (
     flag("--every SECONDS", "time between the exposures", types.seconds),

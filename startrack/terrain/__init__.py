@@ -14,6 +14,7 @@ from startrack.terrain.raster import EQUIRECTANGULAR, STEREOGRAPHIC, Projection,
 from startrack.terrain.shape import DIAMETER, ShapeError
 
 if TYPE_CHECKING:
+    from startrack.terrain.earth_projection import EarthProjection
     from startrack.terrain.height_map import HeightMap
     from startrack.terrain.import_map import import_maps
     from startrack.terrain.map_reading import read_map
@@ -28,6 +29,7 @@ __all__ = [
     "STEREOGRAPHIC",
     "TERRAIN_KEYS",
     "Cylinder",
+    "EarthProjection",
     "ForwardingTerrain",
     "HeightMap",
     "Projection",
@@ -50,7 +52,8 @@ __all__ = [
     "write_map",
 ]  # fmt: skip
 _LAZY_MODULES = {  # of names that few programs use: imported at the first use
-    "HeightMap": "height_map", "StateableError": "state_file", "import_maps": "import_map", "read_map": "map_reading",
+    "EarthProjection": "earth_projection", "HeightMap": "height_map", "StateableError": "state_file",
+    "import_maps": "import_map", "read_map": "map_reading",
     "state_errors": "state_file", "stateable_errors": "state_file", "write_bands": "map_writing",
     "write_map": "map_writing",
 }  # fmt: skip

@@ -50,7 +50,7 @@ class EarthProjection:
         return reference_system(self.wkt)
 
     def units_per_m(self, latitude_rad: float) -> tuple[float, float]:
-        """Map units of a metre on the ground along x and y at a latitude; of projected maps near their middle."""
+        """Map units of a metre on the ground along x and y at `latitude_rad`; of projected maps near their middle."""
         lat, lon = (latitude_rad, 0.0) if self.middle_x is not None else self.near
         step = SCALE_STEP_M / EARTH_MEAN_RADIUS_M
         x, y = self.xy_from_latlon(
@@ -61,7 +61,7 @@ class EarthProjection:
         )
 
     def xy_from_latlon(self, latitude_rad: ArrayLike, longitude_rad: ArrayLike) -> tuple[Array, Array]:
-        """Map coordinates x, y (...) of places (...); not finite where the projection does not reach."""
+        """Map coordinates x, y (...) of places at `latitude_rad` and `longitude_rad` (...); not finite out of reach."""
         lon, lat = np.broadcast_arrays(np.degrees(longitude_rad), np.degrees(latitude_rad))
         x, y = self._transformation[0].transform(lon, lat) if self.wkt else (lon, lat)
         x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)

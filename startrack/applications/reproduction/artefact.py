@@ -47,6 +47,8 @@ class Size:
     traverses: int
     compared_per_sky: int  # by every method that the thesis names
     compared_on_map: int  # places of the map of Shackleton, each under its own sky
+    compared_in_valley: int  # the same on the Earth
+    compared_series: int  # places of a ground with many exposures
 
     def limit_our_positions(self, most: int) -> Size:
         """This size with our method on at most `most` positions per starfield, ten times as many in figure 3.10."""
@@ -54,8 +56,8 @@ class Size:
         return replace(self, **per_sky, ours_one_sky=min(self.ours_one_sky, 10 * most))
 
 
-QUICK = Size("quick", 10, 500, 60, 60, 10, 5_000, 500, 5, 12, 10, 2, 2)
-FULL = Size("full", 10, 10_000, 10_000, 1_000, 500, 100_000, 100_000, 10, 100, 100, 20, 100)
+QUICK = Size("quick", 10, 500, 60, 60, 10, 5_000, 500, 5, 12, 10, 4, 12, 5, 8)
+FULL = Size("full", 10, 10_000, 10_000, 1_000, 500, 100_000, 100_000, 10, 100, 100, 20, 40, 20, 20)
 
 
 @dataclass(frozen=True)

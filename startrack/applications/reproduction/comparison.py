@@ -10,22 +10,24 @@ from typing import Any
 
 import numpy as np
 
-from startrack.applications.reproduction.published.cozman_krotkov import locate_by_posterior
-from startrack.applications.reproduction.published.kua_drive import draw_drive, locate_by_drive, outermost_stars
+from startrack.applications.reproduction.published.kua_drive import locate_by_drive, outermost_stars
 from startrack.applications.reproduction.published.malay import draw_readings, locate_at_rest
+from startrack.applications.reproduction.published.naval import locate_by_features
 from startrack.applications.reproduction.published.sigel_wettergreen import locate_by_inclinometer
 from startrack.applications.reproduction.published.stein_medioni import locate_by_segments
 from startrack.applications.reproduction.published.talluri_aggarwal import locate_by_four_bearings
-from startrack.applications.reproduction.scene import THESIS_GROUND, Scene
+from startrack.applications.reproduction.scene import THESIS_GROUND, Scene, terrain_of
+from startrack.applications.reproduction.series import locate_by_rest, locate_by_stops
 from startrack.applications.reproduction.simulator import SHACKLETON, Stream, visible_stars
+from startrack.chain import Settings
 from startrack.core.chunk_store import Chunk
-from startrack.core.types import Array, NotLocated
+from startrack.core.types import Array, Bools, NoSolution
 from startrack.localization import PseudoGradient, descend, hull_position
 
 
 @dataclass(frozen=True)
 class ComparedMethod:
-    """A method, what it is given, its published figure, and its function of a scene, which may raise NotLocated."""
+    """A method, what it is given, its published figure, and its function of a scene, which may raise NoSolution."""
 
     name: str
     sees: str
@@ -36,23 +38,37 @@ class ComparedMethod:
     published: str
     locate: Callable[[Scene], Array]  # position (2,) [m]
     needs_crater: bool = False  # the thesis's: it knows no other ground
+    needs_moon: bool = False  # its error is that of a vertical on the Moon
+    is_series: bool = False  # of many exposures: at a part of the places only
 
 
+BOUNDED = ("bounded_lit", "bounded_dark")  # of a scene: Cozman's answers
 LIT = ("lit skyline", "given", "no", "given", "the map")
-DARK = ("skyline by stars", "stars", "yes", "stars", "the map")
+DARK = ("dark skyline", "stars", "yes", "stars", "the map")
 STARS = ("stars", "stars", "yes", "stars", "the map")
 TILTED = ("stars", "stars", "yes", "measured", "none")
-COMPARED = {  # startrack first: the skyline by stars stands on its fix, whose time is its own
-    "startrack": ComparedMethod("startrack", *STARS, "", lambda scene: scene.fix_m),
+COMPARED = {
+    "startrack-list": ComparedMethod("startrack, list of stars", *STARS, "", lambda scene: scene.listed_m),
+    "startrack-stars": ComparedMethod(
+        "startrack, picture", *STARS, "",
+        lambda scene: scene.locate_picture(Settings(evidence_sources="stars")).fix.position_enu_m[:2],
+    ),
+    "startrack": ComparedMethod(  # the dark skyline is measured with it: its time is its own
+        "startrack, picture", "stars and sky", *STARS[1:], "", lambda scene: scene.located.fix.position_enu_m[:2]
+    ),
+    "startrack-rest": ComparedMethod("startrack, at rest", *STARS, "", locate_by_rest, is_series=True),
+    "startrack-drive": ComparedMethod("startrack, drive", *STARS, "", locate_by_stops, is_series=True),
     "sigel-wettergreen": ComparedMethod(
         "Sigel and Wettergreen", *TILTED, "1.2 km",
         lambda scene: locate_by_inclinometer(scene.truth_m, SHACKLETON, rng=scene.draws(Stream.TILT))[0],
+        needs_moon=True,
     ),
     "malay": ComparedMethod(
         "Malay et al.", *TILTED, "400 m",
         lambda scene: locate_at_rest(
             draw_readings(scene.truth_m, SHACKLETON, rng=scene.draws(Stream.REST)), SHACKLETON
         ),
+        needs_moon=True,
     ),
     "talluri-aggarwal-lit": ComparedMethod(
         "Talluri and Aggarwal", *LIT, "26 m, with noise 55 m",
@@ -70,10 +86,17 @@ COMPARED = {  # startrack first: the skyline by stars stands on its fix, whose t
         "Stein and Medioni", *DARK, "", lambda scene: locate_by_segments(scene.dark, scene.grid, scene.table, 0.0)
     ),
     "cozman-krotkov-lit": ComparedMethod(
-        "Cozman and Krotkov", *LIT, "hundreds of m", lambda scene: locate_by_posterior(scene.lit, scene.grid).mean_m
+        "Cozman and Krotkov", *LIT, "hundreds of m", lambda scene: scene.bounded_lit.mean_m
     ),
     "cozman-krotkov-dark": ComparedMethod(
-        "Cozman and Krotkov", *DARK, "", lambda scene: locate_by_posterior(scene.dark, scene.grid).mean_m
+        "Cozman and Krotkov", *DARK, "", lambda scene: scene.bounded_dark.mean_m
+    ),
+    "naval-lit": ComparedMethod(
+        "Naval et al.", "lit skyline", "no", "no", "given", "the map", "373 m",
+        lambda scene: locate_by_features(scene.turned, scene.terrain, scene.features),
+    ),
+    "naval-dark": ComparedMethod(
+        "Naval et al.", *DARK, "", lambda scene: locate_by_features(scene.dark, scene.terrain, scene.features)
     ),
     "kua-drive": ComparedMethod(
         "Kua's earlier work", "stars of a drive", "stars", "yes", "stars", "diameter", "800 m",
@@ -92,10 +115,9 @@ COMPARED = {  # startrack first: the skyline by stars stands on its fix, whose t
 
 def estimate_drive(scene: Scene) -> tuple[Array, float]:
     """Position (2,) [m] at the end of a drive to the place of a `scene`, and depth of the crater [m], both by it."""
-    drive = draw_drive(scene.truth_m, scene.crater.radius_m, rng=scene.draws(Stream.DRIVE))
-    seen = [visible_stars(scene.points_m, stop, scene.crater.radius_m) for stop in drive.positions_m]
+    seen = [visible_stars(scene.points_m, stop, scene.crater.radius_m) for stop in scene.drive.positions_m]
     vectors = [outermost_stars(scene.points_m[one], scene.crater.wall_m) for one in seen]
-    positions, depth_m = locate_by_drive(vectors, drive.legs_m, scene.crater.radius_m)
+    positions, depth_m = locate_by_drive(vectors, scene.drive.legs_m, scene.crater.radius_m)
     return positions[-1], depth_m
 
 
@@ -109,45 +131,72 @@ def _descend_from_hull(scene: Scene) -> Array:
 
 def methods_on(ground: str) -> dict[str, ComparedMethod]:
     """The methods of COMPARED that can be used on a `ground`."""
-    return {name: one for name, one in COMPARED.items() if ground == THESIS_GROUND or not one.needs_crater}
+    site = terrain_of(ground).site
+    is_crater, is_moon = ground == THESIS_GROUND, site is not None and site.body == "moon"
+    return {
+        name: one
+        for name, one in COMPARED.items()
+        if (is_crater or not one.needs_crater) and (is_moon or not one.needs_moon)
+    }
 
 
-def compare_places(seed: int, sky: int, start: int, stop: int, ground: str = THESIS_GROUND) -> Chunk:
+def compare_places(
+    seed: int, sky: int, start: int, stop: int, ground: str = THESIS_GROUND, series_every: int = 1
+) -> Chunk:
     """Answers at places number `start` to `stop` - 1 of a `sky` on a `ground`, in the order of `methods_on` it.
 
-    `truth_m` (n, 2), `position_m` (n, methods, 2), NaN where a method refuses, and `seconds` (1, methods) of processor
-    time for the methods: without the skylines, which they are given, and without the grid and its polygons, which are
-    made once a process.
+    `truth_m` (n, 2), `position_m` (n, methods, 2), NaN where a method refuses, `is_tried` (n, methods): methods of many
+    exposures are at one place in `series_every`, by the sum of the numbers of sky and place. `bounds_m` (n, 2, 2, 2):
+    of Cozman's lit and dark answer the least and greatest mean. `seconds` (n, methods) of processor time for the
+    methods: without the skylines, which they are given, and without the grid and its polygons, which are made once a
+    process.
     """
     scenes = [Scene(seed, sky, number, ground) for number in range(start, stop)]
     methods = methods_on(ground)
-    positions, seconds = np.full((len(scenes), len(methods), 2), np.nan), np.zeros((1, len(methods)))
+    positions, seconds = np.full((len(scenes), len(methods), 2), np.nan), np.zeros((len(scenes), len(methods)))
+    tried = np.array([
+        [not one.is_series or (sky + number) % series_every == 0 for one in methods.values()]
+        for number in range(start, stop)
+    ])  # fmt: skip
     _warm_up(ground)
     for k, scene in enumerate(scenes):
-        _ = scene.table, scene.seen, scene.evidence, scene.lit, scene.rough
+        _ = scene.table, scene.features, scene.seen, scene.evidence, scene.lit, scene.rough, scene.turned, scene.picture
         for j, method in enumerate(methods.values()):
-            began = time.process_time()
-            positions[k, j] = _answer(method, scene)
-            seconds[0, j] += time.process_time() - began
-            if np.isfinite(positions[k, 0, 0]):
-                _ = scene.dark
-    return {"truth_m": np.stack([scene.truth_m for scene in scenes]), "position_m": positions, "seconds": seconds}
+            if tried[k, j]:
+                began = time.process_time()
+                positions[k, j] = _answer(method, scene)
+                seconds[k, j] = time.process_time() - began
+    return {
+        "truth_m": np.stack([scene.truth_m for scene in scenes]), "position_m": positions, "is_tried": tried,
+        "bounds_m": np.stack([[_bounds(scene, name) for name in BOUNDED] for scene in scenes]), "seconds": seconds,
+    }  # fmt: skip
 
 
 @lru_cache(maxsize=2)
 def _warm_up(ground: str) -> None:
     """Compile and load what the methods need on a `ground`, once a process, before the clock starts."""
+    terrain_of(ground).prepare()
     scene = Scene(0, 0, 0, ground)
     for method in methods_on(ground).values():
-        _answer(method, scene)
+        if not method.is_series:
+            _answer(method, scene)
 
 
 def _answer(method: ComparedMethod, scene: Scene) -> Array:
     """The position (2,) [m] by a `method`; NaN where it refuses."""
     try:
         return method.locate(scene)
-    except NotLocated:
+    except NoSolution:
         return np.full(2, np.nan)
+
+
+def _bounds(scene: Scene, name: str) -> Array:
+    """Least and greatest mean (2, 2) [m] of an answer with bounds; NaN where it refuses."""
+    try:
+        bounded = getattr(scene, name)
+    except NoSolution:
+        return np.full((2, 2), np.nan)
+    return np.stack([bounded.low_m, bounded.high_m])
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +206,18 @@ class ComparedErrors:
     names: tuple[str, ...]  # keys of COMPARED
     truth_m: Array  # (n, 2)
     position_m: Array  # (n, methods, 2); NaN where a method refuses
-    ms_per_fix: Array  # (methods,) of processor time
+    is_tried: Bools  # (n, methods)
+    bounds_m: Array  # (n, 2, 2, 2) of Cozman's lit and dark answer: least and greatest mean
+    seconds: Array  # (n, methods) of processor time
+
+    @property
+    def ms_per_fix(self) -> Array:
+        """Processor time (methods,) [ms] of an answer in the mean."""
+        return np.asarray(1e3 * self.seconds.sum(axis=0) / np.maximum(self.is_tried.sum(axis=0), 1))
+
+    def tried(self, name: str) -> int:
+        """Number of places at which the method `name` is used."""
+        return int(self.is_tried[:, self.names.index(name)].sum())
 
     def errors_m(self, name: str) -> Array:
         """Errors (m,) [m] of the method `name` where it has an answer."""
@@ -178,5 +238,17 @@ class ComparedErrors:
             "p95_m": float(np.quantile(errors, 0.95)) if known else None,
             "max_m": float(errors.max()) if known else None,
             "count": count,
-            "refused": len(self.truth_m) - count,
+            "refused": self.tried(name) - count,
         }
+
+    def bound_statistics(self, skyline: int) -> tuple[float, float] | None:
+        """Mean half width [m] of Cozman's bounds on an axis, and the share of axes whose truth they contain.
+
+        `skyline` 0: the lit one, 1: the dark one. None without an answer.
+        """
+        low, high = np.moveaxis(self.bounds_m[:, skyline], 1, 0)
+        known = np.isfinite(low[:, 0])
+        if not known.any():
+            return None
+        inside = (low <= self.truth_m) & (self.truth_m <= high)
+        return float(0.5 * np.mean((high - low)[known])), float(np.mean(inside[known]))

@@ -13,7 +13,7 @@ from startrack.applications.reproduction.simulator import DIAMETER_M
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ERROR_RANGE_M = (1.0, 10_000.0)  # of the axis: from a tenth of the best mean to the crater's radius
+ERROR_RANGE_M = (0.1, 10_000.0)  # of the axis: from a tenth of the best mean to the crater's radius
 PICTURED_PLACE = 0
 INSET_M = 300.0  # half side of the enlarged part
 
@@ -25,15 +25,15 @@ def cumulative_picture(found: ComparedErrors) -> Picture:
         axes = figure.subplots()
         for name in found.names:
             errors = np.sort(found.errors_m(name))
-            share = np.arange(1, len(errors) + 1) / len(found.truth_m)
+            share = np.arange(1, len(errors) + 1) / found.tried(name)
             axes.step(errors, share, where="post", label=label_of(name), **_style(name))
         axes.set(xscale="log", xlim=ERROR_RANGE_M, ylim=(0, 1), xlabel="position error (m)", ylabel="share of places")
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
 
     caption = (
-        f"Share of {len(found.truth_m)} places at which the error is at most that of the axis; a method that refuses "
-        "places ends below 1. Dashed: the skyline by stars."
+        f"Share of {len(found.truth_m)} places (series: fewer) at which the error is at most that of the axis; a "
+        "method that refuses places ends below 1. Dashed: the dark skyline; dotted: with the light of the sky."
     )
     return Picture((9.0, 5.2), draw, caption)
 
@@ -60,20 +60,23 @@ def answers_picture(found: ComparedErrors, edge: str) -> Picture:
             set_limits(middle - INSET_M / 1e3, middle + INSET_M / 1e3)
         near.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
 
-    caption = f"The answers of all methods at one place; squares: from the skyline by stars. Green: {edge}."
+    caption = f"The answers of all methods at one place; squares: from the dark skyline. Green: {edge}."
     return Picture((12.0, 4.8), draw, caption)
 
 
 def label_of(name: str) -> str:
     """The name of a method with the skyline that it is given."""
     method = COMPARED[name]
-    return f"{method.name}, {method.sees}" if "skyline" in method.sees else method.name
+    names = [one.name for one in COMPARED.values()]
+    return method.name if names.count(method.name) == 1 else f"{method.name}, {method.sees}"
 
 
 def _style(name: str) -> dict[str, Any]:
-    """Colour and line of a method: both runs of one have the same colour."""
+    """Colour and line of a method: all runs of one have the same colour."""
+    from matplotlib import colormaps
+
     method, names = COMPARED[name], list(dict.fromkeys(method.name for method in COMPARED.values()))
     return {
-        "color": f"C{names.index(method.name)}",
-        "linestyle": "--" if method.sees == "skyline by stars" else "-",
+        "color": colormaps["tab20"](names.index(method.name)),
+        "linestyle": {"dark skyline": "--", "stars and sky": ":"}.get(method.sees, "-"),
     }

@@ -8,8 +8,9 @@ import numpy as np
 
 from startrack.applications.reproduction.artefact import Artefact, Context, markdown_table
 from startrack.applications.reproduction.comparison import COMPARED, ComparedErrors, ComparedMethod, methods_on
-from startrack.applications.reproduction.method_figures import answers_picture, cumulative_picture
+from startrack.applications.reproduction.method_figures import answers_picture, cumulative_picture, label_of
 from startrack.applications.reproduction.methods import ALL_METHODS, Task, tasks_of
+from startrack.applications.reproduction.scene import VALLEY_GROUND
 from startrack.output import Column
 
 MAP_GROUND = "shackleton-rendered"  # the map itself is the ground: its errors are those of rounding
@@ -20,8 +21,11 @@ HEAD = ("method", "sees", "heading", "clock", "vertical", "prior", "mean (m)", "
 def method_table(context: Context) -> Artefact:
     """The errors of every method that the thesis names, with what each is given and its published figure."""
     size = context.size
+    every = _series_every(context, size.skies * size.compared_per_sky)
     tasks = [
-        task for sky in range(size.skies) for task in tasks_of(ALL_METHODS, context.seed, sky, size.compared_per_sky)
+        task
+        for sky in range(size.skies)
+        for task in tasks_of(ALL_METHODS, context.seed, sky, size.compared_per_sky, series_every=every)
     ]
     title, places = "Every method that the thesis names, at the same places", "places of the thesis's crater"
     return _compare(context, "methods", tasks, title, places, "the crater's edge")
@@ -29,13 +33,27 @@ def method_table(context: Context) -> Artefact:
 
 def map_table(context: Context) -> Artefact:
     """The same on the map of Shackleton, by the methods that do not need a round crater."""
-    tasks = [
-        task
-        for sky in range(context.size.compared_on_map)
-        for task in tasks_of(ALL_METHODS, context.seed, sky, 1, ground=MAP_GROUND)
-    ]
     title, places = "Methods that the thesis names on the map of Shackleton", "places of the map of Shackleton"
+    tasks = _tasks_on(context, MAP_GROUND, context.size.compared_on_map)
     return _compare(context, "methods.shackleton", tasks, title, places, "the circle in which the places lie")
+
+
+def valley_table(context: Context) -> Artefact:
+    """The same in valleys of the Earth, by the methods that need neither a round crater nor the Moon."""
+    title, places = "Methods that the thesis names in valleys of the Earth", "places in valleys near Jacksboro"
+    tasks = _tasks_on(context, VALLEY_GROUND, context.size.compared_in_valley)
+    return _compare(context, "methods.valley", tasks, title, places, "a circle of the size of Shackleton")
+
+
+def _tasks_on(context: Context, ground: str, places: int) -> list[Task]:
+    """One place of a `ground` under each of so many skies."""
+    more = {"ground": ground, "series_every": _series_every(context, places)}
+    return [task for sky in range(places) for task in tasks_of(ALL_METHODS, context.seed, sky, 1, **more)]
+
+
+def _series_every(context: Context, places: int) -> int:
+    """One place in so many has series of exposures."""
+    return -(-places // context.size.compared_series)
 
 
 def _compare(context: Context, name: str, tasks: list[Task], title: str, places: str, edge: str) -> Artefact:
@@ -43,24 +61,28 @@ def _compare(context: Context, name: str, tasks: list[Task], title: str, places:
     found = _collect(context, name, tasks)
     statistics = {one: found.statistics(one) for one in found.names}
     skies = len({task.sky for task in tasks})
-    rows = [_cells(COMPARED[one], of_method) for one, of_method in statistics.items()]
+    rows = [_cells(COMPARED[one], of_method, found.tried(one)) for one, of_method in statistics.items()]
     text = f"""Position error in metres at {len(found.truth_m)} {places}, under {skies} starfields, with the standard \
 error of the mean; thesis: chapter 2 for the published figures. Seed {context.seed}. The table of numbers has the \
 processor time of no method, since a file must not depend on the machine: `--json` prints it.
 
-{markdown_table(HEAD, rows)}"""
+{markdown_table(HEAD, rows)}
+
+{_order_text(statistics)}
+
+{_bounds_text(found)}"""
     best = min((one["mean_m"], key) for key, one in statistics.items() if one["mean_m"] is not None)
     return Artefact(
         name=name,
         title=title,
-        line=f"startrack {_number(statistics['startrack']['mean_m'])} m, best {COMPARED[best[1]].name} {best[0]:.1f} m",
+        line=f"startrack {_number(statistics['startrack']['mean_m'])} m, best {label_of(best[1])} {best[0]:.2f} m",
         text=text,
         columns=_columns(statistics),
         pictures={name: cumulative_picture(found), f"{name}.map": answers_picture(found, edge)},
         values={
             "thesis": {one: COMPARED[one].published for one in found.names},
-            "reproduced": {key: one for key, one in statistics.items() if key != "startrack"},
-            "ours": statistics["startrack"],
+            "reproduced": {key: one for key, one in statistics.items() if not key.startswith("startrack")},
+            "ours": {key: one for key, one in statistics.items() if key.startswith("startrack")},
         },
         timing_ms={one: float(ms) for one, ms in zip(found.names, found.ms_per_fix, strict=True)},
     )
@@ -69,22 +91,45 @@ processor time of no method, since a file must not depend on the machine: `--jso
 def _collect(context: Context, what: str, tasks: list[Task]) -> ComparedErrors:
     """The errors of every method at the places of `tasks`, which have the same ground."""
     chunks = list(context.store.chunks(what, tasks))
-    keys = ("truth_m", "position_m", "seconds")
-    truth, position, seconds = (np.concatenate([one[key] for one in chunks]) for key in keys)
-    names = tuple(methods_on(tasks[0].ground))
-    return ComparedErrors(names, truth, position, 1e3 * seconds.sum(axis=0) / len(truth))
+    keys = ("truth_m", "position_m", "is_tried", "bounds_m", "seconds")
+    return ComparedErrors(
+        tuple(methods_on(tasks[0].ground)), *(np.concatenate([one[key] for one in chunks]) for key in keys)
+    )
 
 
-def _cells(method: ComparedMethod, one: dict[str, Any]) -> list[str]:
+def _order_text(statistics: dict[str, dict[str, Any]]) -> str:
+    """The methods in the order of their mean errors, with standard errors."""
+    known = [(one["mean_m"], name, one) for name, one in statistics.items() if one["mean_m"] is not None]
+    ranked = [f"{label_of(name)} {_mean(one)}" for _, name, one in sorted(known, key=lambda row: row[:2])]
+    return f"By the mean error, in metres: {'; '.join(ranked)}."
+
+
+def _bounds_text(found: ComparedErrors) -> str:
+    """Cozman's bounds under contaminated priors."""
+    texts = []
+    for number, name in enumerate(("lit", "dark")):
+        if (bounds := found.bound_statistics(number)) is not None:
+            half_m, share = bounds
+            texts.append(
+                f"{name} {_number(half_m)} m to either side, the truth inside on {100 * share:.0f} % of the axes"
+            )
+    return f"Cozman's bounds of the mean, under priors of which a tenth is anything: {'; '.join(texts)}."
+
+
+def _cells(method: ComparedMethod, one: dict[str, Any], tried: int) -> list[str]:
     given = [method.name, method.sees, method.heading, method.clock, method.vertical, method.prior]
-    mean = f"{_number(one['mean_m'])} ± {_number(one['mean_sigma_m'])}"
-    errors = [mean, *(_number(one[key]) for key in ("median_m", "p95_m", "max_m"))]
-    return [*given, *errors, str(one["refused"]), method.published or "-"]
+    errors = [_mean(one), *(_number(one[key]) for key in ("median_m", "p95_m", "max_m"))]
+    return [*given, *errors, f"{one['refused']} of {tried}", method.published or "-"]
+
+
+def _mean(one: dict[str, Any]) -> str:
+    """A mean with its standard error; a dash without an answer."""
+    return "-" if not one["count"] else f"{_number(one['mean_m'])} ± {_number(one['mean_sigma_m'])}"
 
 
 def _number(value: float | None) -> str:
     """Three digits; a dash for what is not known."""
-    return "-" if value is None else f"{value:.1f}" if value < 100 else f"{value:.0f}"
+    return "-" if value is None else f"{value:.{0 if value >= 100 else 1 if value >= 10 else 2}f}"
 
 
 def _columns(statistics: dict[str, dict[str, Any]]) -> tuple[Column, ...]:

@@ -38,7 +38,9 @@ FIX_SOURCES = (  # their content is part of a chunk's key
 )  # fmt: skip
 COMPARED_SOURCES = (  # of the chunks of all methods too
     "applications/reproduction/comparison.py", "applications/reproduction/scene.py",
-    "applications/reproduction/published/*.py", "evidence/sky_step.py", "terrain/*.py",
+    "applications/reproduction/published/*.py", "applications/reproduction/series.py",
+    "applications/reproduction/valley.py", "applications/tracking/*.py", "chain/*.py", "detection/*.py",
+    "estimation/*.py", "evidence/*.py", "identification/*.py", "rendering/*.py", "simulation/*.py", "terrain/*.py",
 )  # fmt: skip
 KUA, OURS, BOUND = "kua", "ours", "bound"  # the thesis's two steps; ours; the limit for a perfect list
 ALL_METHODS = "all"  # that the thesis names, with `compare_places`
@@ -60,6 +62,7 @@ class Task:
     aspect_ratio: float = ASPECT_RATIO
     mistakes: Mistakes = PERFECT
     ground: str = THESIS_GROUND  # of all methods
+    series_every: int = 1  # see `compare_places`
 
     def __len__(self) -> int:
         return self.stop - self.start
@@ -95,7 +98,7 @@ def compute_chunk(task: Task) -> Chunk:
     bound: `centroid_m` (n, 2). all: see `compare_places`.
     """
     if task.method == ALL_METHODS:
-        return compare_places(task.seed, task.sky, task.start, task.stop, task.ground)
+        return compare_places(task.seed, task.sky, task.start, task.stop, task.ground, task.series_every)
     sky, cylinder = Sky.draw(task.seed, task.sky, task.magnitude), crater(task.aspect_ratio)
     points, radius_m = sky.project_to_rim_plane(cylinder), cylinder.radius_m
     truth = draw_positions(task.seed, task.sky, task.start, task.stop)

@@ -1,4 +1,4 @@
-"""One place in the thesis's crater or on a map, and what can be measured there: stars, skylines, random errors."""
+"""One place in a crater, on a map or in a valley, and what can be measured there: stars, skylines, a picture."""
 
 from __future__ import annotations
 
@@ -7,18 +7,29 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from startrack.applications.reproduction.published.skylines import MapGrid, dark_skyline, lit_skyline, traced_grid
+from startrack.applications.reproduction.published.cozman_krotkov import BoundedPosition, locate_by_posterior
+from startrack.applications.reproduction.published.kua_drive import Drive, draw_drive
+from startrack.applications.reproduction.published.naval import MapFeatures, map_features
+from startrack.applications.reproduction.published.skylines import MapGrid, lit_skyline, traced_grid
 from startrack.applications.reproduction.published.stein_medioni import (
     ROUGH_HEADING_RAD,
     PolygonTable,
     polygon_table,
 )
 from startrack.applications.reproduction.simulator import PERFECT, Sky, Stream, crater, draw_positions, visible_stars
-from startrack.core.types import Array, Bools, Evidence, MeasuredSkyline
+from startrack.applications.reproduction.valley import draw_floor, draw_time, jacksboro
+from startrack.camera import Camera, load_camera
+from startrack.catalog import load_catalog
+from startrack.chain import Located, Settings, locate
+from startrack.core.types import Array, BadInput, Bools, Evidence, Exposure, MeasuredSkyline, NotLocated
+from startrack.frames import Site
 from startrack.localization import ExactPosterior
+from startrack.rendering import Series, render
 from startrack.terrain import Cylinder, Terrain, load_terrain
 
-THESIS_GROUND = ""  # the thesis's crater
+THESIS_GROUND, VALLEY_GROUND = "", "jacksboro"  # the thesis's crater; valleys of the Earth
+PICTURE_CAMERA = "fisheye-2048"
+PICTURE_V_MAG = 9.0  # of the faintest stars rendered: three magnitudes below those of 5 sigma, as in predictions
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +45,13 @@ class Scene:
     def terrain(self) -> Terrain:
         return terrain_of(self.ground)
 
+    @property
+    def site(self) -> Site:
+        """Raises BadInput (bad_terrain) where the terrain has none."""
+        if self.terrain.site is None:
+            raise BadInput("bad_terrain", f"terrain {self.terrain.name} has no site: its sky is not known")
+        return self.terrain.site
+
     @cached_property
     def crater(self) -> Cylinder:
         """The thesis's crater, for methods that know no other ground."""
@@ -46,6 +64,8 @@ class Scene:
     @cached_property
     def truth_m(self) -> Array:
         """The place (2,) [m]."""
+        if self.ground == VALLEY_GROUND:
+            return draw_floor(valleys(), rng=self.draws(Stream.POSITIONS))
         return draw_positions(self.seed, self.sky_number, self.number, self.number + 1)[0]
 
     @cached_property
@@ -63,6 +83,7 @@ class Scene:
 
     @cached_property
     def evidence(self) -> Evidence:
+        """Of the list of stars."""
         return PERFECT.evidence(self.sky, self.seen)
 
     @cached_property
@@ -74,8 +95,12 @@ class Scene:
         return polygon_table(self.grid)
 
     @cached_property
-    def fix_m(self) -> Array:
-        """Position (2,) [m] by startrack. Raises NotLocated."""
+    def features(self) -> MapFeatures:
+        return map_features(self.terrain)
+
+    @cached_property
+    def listed_m(self) -> Array:
+        """Position (2,) [m] by startrack from the list of stars. Raises NotLocated."""
         return ExactPosterior()(self.evidence, self.terrain).position_enu_m[:2]
 
     @cached_property
@@ -89,9 +114,57 @@ class Scene:
         return lit_skyline(self.truth_m, self.terrain, ROUGH_HEADING_RAD * draws.standard_normal(), rng=draws)
 
     @cached_property
+    def turned(self) -> MeasuredSkyline:
+        """The skyline in sunlight with any heading."""
+        draws = self.draws(Stream.ANY_HEADING)
+        return lit_skyline(self.truth_m, self.terrain, draws.uniform(0.0, 2 * np.pi), rng=draws)
+
+    @cached_property
     def dark(self) -> MeasuredSkyline:
-        """Raises NotLocated where startrack has no position: then it measures no skyline either."""
-        return dark_skyline(self.evidence, self.fix_m, self.terrain)
+        """The skyline that startrack measures in the picture. Raises NotLocated where it measures none."""
+        if self.located.skyline is None:
+            raise NotLocated("the picture shows no skyline")
+        return self.located.skyline
+
+    @cached_property
+    def bounded_lit(self) -> BoundedPosition:
+        return locate_by_posterior(self.lit, self.grid)
+
+    @cached_property
+    def bounded_dark(self) -> BoundedPosition:
+        return locate_by_posterior(self.dark, self.grid)
+
+    @cached_property
+    def drive(self) -> Drive:
+        """A drive that ends here."""
+        return draw_drive(self.truth_m, self.terrain.search_radius_m, rng=self.draws(Stream.DRIVE))
+
+    @cached_property
+    def pictures(self) -> Series:
+        """Pictures from here, in a night without Moon on the Earth, at any time on the Moon."""
+        draws, (east, north) = self.draws(Stream.PICTURE), self.truth_m.tolist()
+        when = draw_time(self.site, rng=draws) if self.site.body == "earth" else None
+        return Series(
+            camera=picture_camera(), terrain=self.terrain, catalog=load_catalog().brighter_than(PICTURE_V_MAG),
+            seed=int(draws.integers(1 << 30)), time_utc=when, east_m=east, north_m=north, faint_v_mag=PICTURE_V_MAG,
+        )  # fmt: skip
+
+    @cached_property
+    def picture(self) -> Exposure:
+        scene, rng = self.pictures.scene(0)
+        return render(scene, rng=rng)[0]
+
+    @cached_property
+    def located(self) -> Located:
+        """The picture, located by stars and the light of the sky. Raises NotLocated."""
+        return self.locate_picture(Settings())
+
+    def locate_picture(self, settings: Settings) -> Located:
+        """The picture located with `settings`. Raises NotLocated where it is refused or several positions fit."""
+        outcome = locate(self.picture, picture_camera(), self.terrain, load_catalog(), settings)
+        if not isinstance(outcome, Located) or outcome.fix.ambiguous:
+            raise NotLocated(outcome.message)
+        return outcome
 
     def draws(self, stream: Stream) -> np.random.Generator:
         """Random numbers of a `stream` for this place."""
@@ -101,4 +174,15 @@ class Scene:
 @lru_cache(maxsize=2)
 def terrain_of(ground: str) -> Terrain:
     """The terrain of a `ground`, loaded once a process: what is computed on it is kept with it."""
+    if ground == VALLEY_GROUND:
+        return valleys()
     return crater() if ground == THESIS_GROUND else load_terrain(ground)
+
+
+valleys = lru_cache(maxsize=1)(jacksboro)
+
+
+@lru_cache(maxsize=1)
+def picture_camera() -> Camera:
+    """The camera of all pictures."""
+    return load_camera(PICTURE_CAMERA)

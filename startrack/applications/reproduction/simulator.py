@@ -28,7 +28,7 @@ GRID_POINTS = 161  # a side; odd, so that the position itself is a point of the 
 FIRST_HALF_M = 20.0
 CELL_MARGIN, REFINEMENTS = 1.05, 2  # of the grid
 SHACKLETON = Site(body="moon", latitude_rad=float(np.radians(-89.66)), longitude_rad=float(np.radians(129.78)))
-Stream = IntEnum("Stream", "STARS POSITIONS MISTAKES LIT TILT REST DRIVE HEADING")  # of random numbers
+Stream = IntEnum("Stream", "STARS POSITIONS MISTAKES LIT TILT REST DRIVE HEADING ANY_HEADING PICTURE OBSTACLE")
 THESIS: dict[str, Any] = {  # its results, those of the pseudo-gradient if it is not said
     "trials": [  # table 3.1: position errors
         {"mean_m": mean, "sd_m": sd, "max_m": largest}

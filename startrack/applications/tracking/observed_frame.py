@@ -136,6 +136,11 @@ def _informative_rows(located: Located, terrain: Terrain, position_m: Array) -> 
         light = located.sky.light.evidence(located.sky.used)
         rows = Evidence.concatenate(stars, light) if located.by_stars else light
         rows = replace(rows, clock=stars.clock, image_errors=located.sky.errors)
+    return rows_near_skyline(rows, terrain, position_m)
+
+
+def rows_near_skyline(rows: Evidence, terrain: Terrain, position_m: Array) -> Evidence:
+    """The `rows` that say something about the skyline of a `terrain` seen from `position_m` (2,)."""
     azimuth = np.linspace(0.0, 2 * np.pi, 721)
     above = rows.elevation_rad - np.interp(rows.azimuth_rad, azimuth, terrain.horizon_rad(position_m[None], azimuth))
     kept = (np.abs(rows.llr) > MIN_ROW_NATS) | (rows.extended_nats > MIN_ROW_NATS)

@@ -1,4 +1,4 @@
-"""The skylines that the methods get, one in sunlight and one that the stars show in the dark; the grid of the map."""
+"""The skyline that the methods get in sunlight, and the grid of the map."""
 
 from __future__ import annotations
 
@@ -7,16 +7,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, MeasuredSkyline, NotLocated, sector_of
-from startrack.evidence import Skyline, average_shifts
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, MeasuredSkyline, NotLocated
 from startrack.terrain import Terrain
 
 LIT_SIGMA_RAD = 1.0 / 652.0  # one pixel of a 180-degree fisheye of 2048 pixels: the noise that the papers assume
 MAP_STEP_M = 75.0  # between positions of a grid: that of Stein and Medioni (Kua 2008, section 2.2), the only one given
 LEAST_BEARINGS = 3  # of a skyline: two coordinates and one to spare
-MERGED_SECTORS = 5  # 7.5 degrees: about 8 hidden stars of 2142 below the skyline of the thesis's crater
-DARK_SHIFTS_RAD = np.radians(np.arange(-45.0, 45.0, 0.02))  # of the map's skyline, in which stars are looked for
-END_WEIGHT = 1e-6  # of the first and the last shift: a larger one shows that no star stops the skyline on that side
 PROFILE_BLOCK = 4096  # positions traced at once
 
 
@@ -36,34 +32,17 @@ def lit_skyline(
     )
 
 
-def dark_skyline(evidence: Evidence, fix_m: Array, terrain: Terrain) -> MeasuredSkyline:
-    """The skyline that the stars of the `evidence` show about startrack's fix at `fix_m` (2,).
-
-    As `startrack.chain` measures it: the map gives the shape within a sector only, and every shift of it is equally
-    likely before. Its sectors are too narrow for a list of 2142 stars (one in a hundred has stars on both sides within
-    three degrees), so that five of them count as one here, and the shifts reach farther. Known at the middle one of
-    the five, where stars stand on both sides.
-    """
-    horizon = Skyline.trace(fix_m, terrain)
-    above = evidence.elevation_rad - horizon(evidence.azimuth_rad)
-    column = np.searchsorted(DARK_SHIFTS_RAD, above)  # the star is visible at the shifts below its height
-    sums = np.zeros((SECTORS // MERGED_SECTORS, len(DARK_SHIFTS_RAD) + 1))
-    np.add.at(sums, (sector_of(evidence.azimuth_rad) // MERGED_SECTORS, column), evidence.llr)
-    log = sums.sum(axis=1, keepdims=True) - np.cumsum(sums, axis=1)[:, :-1]
-    weight, shift, sigma = average_shifts(log, DARK_SHIFTS_RAD)
-    known = weight[:, [0, -1]].max(axis=1) < END_WEIGHT
-    middle = np.arange(MERGED_SECTORS // 2, SECTORS, MERGED_SECTORS)[known]
-    elevation_rad, sigma_rad, source = np.full(SECTORS, np.nan), np.full(SECTORS, np.inf), np.full(SECTORS, "", "<U9")
-    elevation_rad[middle] = horizon(MIDDLES_RAD[middle]) + shift[known]
-    sigma_rad[middle], source[middle] = sigma[known], "stars"
-    return MeasuredSkyline(azimuth_rad=MIDDLES_RAD, elevation_rad=elevation_rad, sigma_rad=sigma_rad, source=source)
-
-
 def require_bearings(skyline: MeasuredSkyline) -> None:
     """Raises NotLocated for a `skyline` that is known at too few bearings."""
     count = int(np.count_nonzero(skyline.known))
     if count < LEAST_BEARINGS:
         raise NotLocated(f"the skyline is known in {count} sectors, and {LEAST_BEARINGS} are needed")
+
+
+def close_gaps(skyline: MeasuredSkyline) -> Array:
+    """Elevations (SECTORS,) [rad] of a `skyline`, interpolated where it is not known."""
+    known = np.flatnonzero(skyline.known)
+    return np.interp(np.arange(SECTORS), known, skyline.elevation_rad[known], period=SECTORS)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 
 from startrack.applications.reproduction.published.polygons import chains_of, keys_of, near_keys, polygon_vertices
-from startrack.applications.reproduction.published.skylines import MapGrid, require_bearings
+from startrack.applications.reproduction.published.skylines import MapGrid, close_gaps, require_bearings
 from startrack.core.types import SECTORS, Array, Ints, MeasuredSkyline, NotLocated
 
 TOLERANCES_RAD = tuple(float(np.radians(one)) for one in (1.6, 0.8, 0.4))  # of polygons; noise is a fifth of the last
@@ -65,9 +65,7 @@ def locate_by_segments(
     Raises NotLocated where no chain of the `table` is seen, and for a `skyline` at too few bearings.
     """
     require_bearings(skyline)
-    known = np.flatnonzero(skyline.known)
-    whole = np.interp(np.arange(SECTORS), known, skyline.elevation_rad[known], period=SECTORS)
-    votes = table.count_votes(whole, len(grid.points_m))
+    votes = table.count_votes(close_gaps(skyline), len(grid.points_m))
     if not votes.any():
         raise NotLocated("no position has a chain of segments of the skyline")
     best = np.argsort(-votes, kind="stable")[:VERIFIED]

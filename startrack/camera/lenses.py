@@ -32,10 +32,11 @@ class KannalaBrandt(Lens):
 
     def rho(self, angle_rad: Array) -> Array:
         """Radius [focal lengths] at the angles `angle_rad` off the axis, any shape."""
-        a2 = np.square(angle_rad)
-        polynomial = np.zeros_like(a2)
-        for k in reversed(self.k):
-            polynomial = (polynomial + k) * a2
+        angle_rad, polynomial = np.asarray(angle_rad), 0.0
+        if any(self.k):
+            a2 = np.square(angle_rad)
+            for k in reversed(self.k):
+                polynomial = (polynomial + k) * a2
         return angle_rad * (1.0 + polynomial)
 
     def slope(self, angle_rad: Array) -> Array:

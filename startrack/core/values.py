@@ -63,7 +63,7 @@ class Value:
                     raise ValueError(f"{type(self).__name__}.{name}: shape {a.shape}, expected {want} {lengths}")
             if a.dtype.kind == "f" and not may_be_nan and np.isnan(a).any():
                 raise ValueError(f"{type(self).__name__}.{name} holds NaN")
-            a.flags.writeable = False
+            a.setflags(write=False)
             object.__setattr__(self, name, a)
 
     @classmethod

@@ -40,7 +40,7 @@ def binomial_tail(at_least: Ints | int, trials: Ints | int, each: Array | float)
     """P(X >= k) of a binomial variable, k >= 1: the incomplete beta function I_p(k, n - k + 1)."""
     from scipy.special import betainc
 
-    return np.asarray(betainc(at_least, np.maximum(np.asarray(trials) - at_least, 0) + 1, each))
+    return np.asarray(betainc(at_least, np.maximum(trials - at_least, 0) + 1, each))
 
 
 def log_p_value(matched: Ints | int, predicted: Ints | int, each: Array | float, free: int = PATTERN_MATCHES) -> Array:
@@ -49,8 +49,8 @@ def log_p_value(matched: Ints | int, predicted: Ints | int, each: Array | float,
     `each`: probability that one star does. `free`: matches that the hypothesis itself produces (the stars of
     its pattern, the parameters of a fit); they are taken from both numbers.
     """
-    k = np.asarray(matched) - free
-    tail = binomial_tail(np.maximum(k, 1), np.asarray(predicted) - free, each)
+    k = matched - free
+    tail = binomial_tail(np.maximum(k, 1), predicted - free, each)
     return np.where(k > 0, np.log(np.maximum(tail, SMALLEST_PROBABILITY)), 0.0)
 
 

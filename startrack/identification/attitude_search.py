@@ -26,6 +26,11 @@ PREFIXES = (0, 7, 10, 14, 20, 28)  # number of brightest detections that form tr
 WINDOW_RANKS = 24  # ranks of brightness that form triangles beyond these, half of them new in each window
 NEW_RANKS = WINDOW_RANKS // 2
 DEEPEST_RANK = 10 * WINDOW_RANKS
+BRIGHTEST = [(0, done, end) for done, end in pairwise(PREFIXES)]  # ranks: the first, how many are not new, the end
+BEYOND = [
+    (first, WINDOW_RANKS - NEW_RANKS, min(first + WINDOW_RANKS, DEEPEST_RANK))
+    for first in range(PREFIXES[-1] + NEW_RANKS - WINDOW_RANKS, DEEPEST_RANK + NEW_RANKS - WINDOW_RANKS, NEW_RANKS)
+]
 ROUGH_SIDE_RAD, ROUGH_FRACTION = np.radians(20.0), 0.4  # longest sides of short triangles, the second of the field
 PIVOTS = 16  # brightest detections about which triangles of catalogue pairs are tried
 MATCHES_EACH, ROUGH_MATCHES_EACH = 3, 8  # catalogue triangles looked up for a triangle of detections
@@ -100,19 +105,13 @@ class AttitudeSearch:
         then from triangles assembled from catalogue pairs; last from short ones, for rays with errors of `rough_px`:
         over short distances a rough calibration is still accurate.
         """
-        n = len(self.rays_cam)
-        brightest = [(0, done, min(end, n)) for done, end in pairwise(PREFIXES) if done < n]
-        most, overlap = min(n, DEEPEST_RANK), WINDOW_RANKS - NEW_RANKS
-        beyond = [
-            (first, overlap, min(first + WINDOW_RANKS, most))
-            for first in range(PREFIXES[-1] - overlap, most - overlap, NEW_RANKS)
-        ]
-        tolerance = tolerance_px * self.scale.axis_rad_per_px
-        for windows in (brightest, beyond):
+        n, tolerance = len(self.rays_cam), tolerance_px * self.scale.axis_rad_per_px
+        for windows in (BRIGHTEST, BEYOND):
             for deep in (False, True):
                 for first, fresh, end in windows:
-                    index = self.patterns.deep_index if deep else self.patterns.bright_index
-                    yield from self._attitudes_from_triangles(index, first, fresh, end, tolerance)
+                    if first + fresh < n:
+                        index = self.patterns.deep_index if deep else self.patterns.bright_index
+                        yield from self._attitudes_from_triangles(index, first, fresh, end, tolerance)
         yield from self._attitudes_from_pairs(tolerance)
         yield from self._attitudes_from_short_triangles(rough_px * self.scale.axis_rad_per_px)
 

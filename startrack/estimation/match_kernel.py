@@ -20,7 +20,8 @@ def pair_mutually(detection, star, cost, agrees):  # type: ignore[no-untyped-def
     slots = 4
     while slots < 2 * len(star):
         slots *= 2
-    of_slot, is_best = np.full(slots, -1), np.zeros(len(star), np.bool_)
+    of_slot, is_best = np.empty(slots, np.int64), np.zeros(len(star), np.bool_)
+    of_slot[:] = -1
     for i in range(len(star)):
         if cost[i] < np.inf:
             at = star[i] & (slots - 1)  # a hash table with open addressing
@@ -45,15 +46,15 @@ def pair_mutually(detection, star, cost, agrees):  # type: ignore[no-untyped-def
 @njit(cache=True)
 def compare_pairs(detection, star, distance, v_mag, v_sigma_mag, measured_mag, saturated):  # type: ignore[no-untyped-def]
     """`brightness_misfit` (k,) and `one_to_one_pairs` (m,) of CandidatePairs; all arguments are (k,)."""
-    misfit, cost = np.empty(len(star)), np.empty(len(star))
+    misfit, cost, agrees = np.empty(len(star)), np.empty(len(star)), np.empty(len(star), np.bool_)
     for i in range(len(star)):
         dimmed = measured_mag[i] - v_mag[i]
         beyond = max(abs(dimmed) - 2.0 * v_sigma_mag[i], 0.0)
         if saturated[i] and dimmed > 0.0:
             beyond = 0.0
         misfit[i] = beyond / (DIMMED_MAG if dimmed > 0.0 else BRIGHTER_MAG)
-        cost[i] = distance[i] + PX_PER_MAG * beyond
-    return misfit, pair_mutually(detection, star, cost, misfit < 1.0)
+        cost[i], agrees[i] = distance[i] + PX_PER_MAG * beyond, misfit[i] < 1.0
+    return misfit, pair_mutually(detection, star, cost, agrees)
 
 
 @njit(cache=True)

@@ -109,8 +109,8 @@ def rotate_by_inliers(which, detection, distance, variance_px2, rays_cam, rays_i
             first_squared[n], first_stated[n] = squared[i], variance[i]
             n += 1
     if n == 0:
-        return agree, variance, np.eye(3), np.inf
-    extra = np.sort(first_squared[:n])[n // 2] / CHI2_2DOF_MEDIAN - np.sort(first_stated[:n])[n // 2]
+        return agree, variance, np.zeros((3, 3)), np.inf
+    extra = upper_median_of(first_squared, n) / CHI2_2DOF_MEDIAN - upper_median_of(first_stated, n)
     cam, icrs, weight, n = np.empty((m, 3)), np.empty((m, 3)), np.empty(m), 0
     for i in range(m):
         variance[i] += max(extra, SMALLEST_EXTRA_PX2)
@@ -120,8 +120,35 @@ def rotate_by_inliers(which, detection, distance, variance_px2, rays_cam, rays_i
             for a in range(3):
                 cam[n, a], icrs[n, a] = rays_cam[detection[which[i]], a], rays_icrs[which[i], a]
             n += 1
-    refined = rotation_between(cam[:n], icrs[:n], weight[:n])
-    return agree, variance, refined, np.abs(refined - R).max()
+    refined, change = rotation_between(cam[:n], icrs[:n], weight[:n]), 0.0
+    for a in range(3):
+        for b in range(3):
+            change = max(change, abs(refined[a, b] - R[a, b]))
+    return agree, variance, refined, change
+
+
+@njit(cache=True, inner=True)
+def upper_median_of(values, n):  # type: ignore[no-untyped-def]
+    """The upper median of the first `n` values, which are reordered; numpy's sort takes 2 s to compile.
+
+    Source: Hoare 1961, Communications of the ACM 4, 321 (FIND).
+    """
+    low, high, middle = 0, n - 1, n // 2
+    while low < high:
+        pivot, i, j = values[middle], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i, j = i + 1, j - 1
+        if j < middle:
+            low = i
+        if middle < i:
+            high = j
+    return values[middle]
 
 
 @njit(cache=True)

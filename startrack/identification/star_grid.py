@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.core.kernels import njit
+from startrack.core.kernels import njit, read_only
 from startrack.core.types import Array, Ints
 
 FEWEST_CELLS, MOST_CELLS = 32, 64  # on a side of the cube
@@ -34,7 +34,7 @@ class StarGrid:
     def __init__(self, rays_icrs: Array) -> None:
         """`rays_icrs` (n, 3): unit vectors."""
         cells = int(min(max(CELLS_OF_ROOT_1 * np.sqrt(len(rays_icrs)), FEWEST_CELLS), MOST_CELLS))
-        first, star = bin_stars(rays_icrs, cells)
+        first, star = bin_stars(read_only(rays_icrs), cells)
         self._cells = cells, first, star, rays_icrs[star]
 
     def neighbours(self, rays_icrs: Array, chord: float) -> Neighbours:
@@ -113,7 +113,9 @@ def settle_rotation(cam, icrs, hit, squared_radius):  # type: ignore[no-untyped-
     `cam`, `icrs` (k, 3): the rays of pairs of a detection and a star. It begins with the pairs that `hit` (k,), of
     which some may be wrong.
     """
-    R, weight = np.eye(3), np.empty(len(cam))
+    R, weight = np.zeros((3, 3)), np.empty(len(cam))
+    for a in range(3):
+        R[a, a] = 1.0
     for _ in range(SETTLING_ROUNDS):
         hits = 0
         for i in range(len(cam)):

@@ -54,20 +54,29 @@ def _triple_product(rays):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def keep_closest(sides, known, row, found, tolerance, most):  # type: ignore[no-untyped-def]
-    """The pairs of a row of the `sides` (m, 3) and a triangle of the `known` (n, 3) that PatternIndex.candidates gives.
+def largest_differences(sides, known, row, found, tolerance):  # type: ignore[no-untyped-def]
+    """Of pairs (k,) of a row of the `sides` (m, 3) and a triangle of the `known` (n, 3), relative to the shortest side.
 
-    `row`, `found` (k,): pairs of which these are some.
+    Infinite from the `tolerance` on. `row`, `found` (k,): the pairs.
     """
     off = np.empty(len(row))
     for i in range(len(row)):
         a, b = row[i], found[i]
         largest = max(abs(sides[a, 0] - known[b, 0]), abs(sides[a, 1] - known[b, 1]), abs(sides[a, 2] - known[b, 2]))
         off[i] = largest / sides[a, 0] if largest < tolerance else np.inf
-    kept, count, k = np.empty(len(row), np.int64), np.zeros(len(sides), np.int64), 0
-    for i in np.argsort(off, kind="mergesort"):
+    return off
+
+
+@njit(cache=True)
+def keep_closest(order, off, row, rows, most):  # type: ignore[no-untyped-def]
+    """The pairs (k,), in the `order` (k,) of their differences `off`, that are finite and the first `most` of their row.
+
+    `row` (k,): that of each, of `rows` of them.
+    """
+    kept, count, k = np.empty(len(row), np.int64), np.zeros(rows, np.int64), 0
+    for i in order:
         if off[i] < np.inf and count[row[i]] < most:
             count[row[i]] += 1
             kept[k] = i
             k += 1
-    return row[kept[:k]], found[kept[:k]]
+    return kept[:k]

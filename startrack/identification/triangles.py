@@ -9,7 +9,7 @@ import numpy as np
 
 from startrack.core.types import Array, Ints, Stars
 from startrack.identification.star_grid import StarGrid
-from startrack.identification.triangle_kernel import keep_closest
+from startrack.identification.triangle_kernel import keep_closest, largest_differences
 
 CLOSE_PAIR_RAD = np.radians(0.05)  # stars this close are one detection
 LONGEST_SIDE_OF_FIELD = 0.8  # of a field's diameter: longer sides seldom fit into it
@@ -150,8 +150,9 @@ class PatternIndex:
         """
         reach = CUBE_DIAGONAL * tolerance * 2.0 / self.longest_chord
         near = self.grid.neighbours(to_cube(sides, self.longest_chord), reach)
-        row, found = keep_closest(sides, self.sides, near.ray, near.star, tolerance, most)
-        return row, found
+        off = largest_differences(sides, self.sides, near.ray, near.star, tolerance)
+        kept = keep_closest(off.argsort(kind="stable"), off, near.ray, len(sides), most)
+        return near.ray[kept], near.star[kept]
 
 
 def build_index(stars: Stars, field_sr: float, size: PatternSize) -> PatternIndex:

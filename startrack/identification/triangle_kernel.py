@@ -69,7 +69,7 @@ def largest_differences(sides, known, row, found, tolerance):  # type: ignore[no
 
 @njit(cache=True)
 def keep_closest(order, off, row, rows, most):  # type: ignore[no-untyped-def]
-    """The pairs (k,), in the `order` (k,) of their differences `off`, that are finite and the first `most` of their row.
+    """The pairs (k,) of finite differences `off`, in their `order` (k,), that are the first `most` of their row.
 
     `row` (k,): that of each, of `rows` of them.
     """

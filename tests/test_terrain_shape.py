@@ -245,9 +245,6 @@ def test_bounds_of_a_deformed_map_hold():
         found = ground.horizon_rad(points, azimuths[:, None] + turn_rad * rng.uniform(-1, 1, (20, 20)))
         assert np.all(low[:, None] - 3e-6 <= found) and np.all(found <= high[:, None] + 3e-6)
     assert ground.near(centres[0], 20.0, AZIMUTHS) is ground
-    assert ground.horizon_posts(centres[0], AZIMUTHS).horizon_rad == pytest.approx(
-        ground.horizon_rad(centres[0], AZIMUTHS)
-    )
 
 
 def test_an_interpolator_has_the_slopes_of_its_map():

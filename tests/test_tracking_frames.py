@@ -69,31 +69,19 @@ def raise_post(terrain: HeightMap, post: int, by_m: float) -> HeightMap:
     return replace(terrain, maps=(replace(terrain.maps[0], heights_m=heights), *terrain.maps[1:]))
 
 
-@pytest.mark.slow
-def test_the_horizon_rises_with_the_posts_that_make_it(ground):
-    azimuth = np.radians([17.0, 140.0, 255.0])
-    found = ground.horizon_posts(PLACE_M, azimuth)
-    np.testing.assert_allclose(found.rad_per_m.sum(axis=1), [1e-4] * 3, rtol=0.6)
-    here = ground.horizon_rad(PLACE_M[None], azimuth)
-    for k in range(3):
-        strongest = int(np.argmax(found.rad_per_m[k]))
-        changed = raise_post(ground, int(found.post[k, strongest]), 0.2).horizon_rad(PLACE_M[None], azimuth)
-        assert changed[k] - here[k] == pytest.approx(0.2 * found.rad_per_m[k, strongest], rel=0.15)
-
-
 def test_the_horizon_sinks_with_the_posts_about_the_camera(ground):
     azimuth = np.radians([17.0, 140.0, 255.0])
-    found = ground.ground_posts(PLACE_M, azimuth)
+    post, rad_per_m = ground.ground_posts(PLACE_M, azimuth)
     raised_m = 20.0  # horizons are traced to some 1e-7 rad
-    changed = raise_post(ground, int(found.post[0, 2]), raised_m).horizon_rad(PLACE_M[None], azimuth)
+    changed = raise_post(ground, int(post[0, 2]), raised_m).horizon_rad(PLACE_M[None], azimuth)
     np.testing.assert_allclose(
-        changed - ground.horizon_rad(PLACE_M[None], azimuth), raised_m * found.rad_per_m[:, 2], rtol=0.05
+        changed - ground.horizon_rad(PLACE_M[None], azimuth), raised_m * rad_per_m[:, 2], rtol=0.05
     )
 
 
 def test_posts_stand_where_the_map_has_them(ground):
-    found = ground.ground_posts(PLACE_M, np.zeros(1))
-    points = ground.post_positions_m(found.post[0])
+    post, _ = ground.ground_posts(PLACE_M, np.zeros(1))
+    points = ground.post_positions_m(post[0])
     np.testing.assert_allclose(np.sort(np.ptp(points[:, :2], axis=0)), [240, 240], rtol=0.5)
     np.testing.assert_allclose(ground.ground_m(points[:, :2]), points[:, 2], atol=0.1)
     assert np.ptp(points[:, :2] - PLACE_M, axis=0).max() < 400

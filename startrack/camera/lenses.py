@@ -32,12 +32,13 @@ class KannalaBrandt(Lens):
 
     def rho(self, angle_rad: Array) -> Array:
         """Radius [focal lengths] at the angles `angle_rad` off the axis, any shape."""
-        angle_rad, polynomial = np.asarray(angle_rad), 0.0
-        if any(self.k):
-            a2 = np.square(angle_rad)
-            for k in reversed(self.k):
-                polynomial = (polynomial + k) * a2
-        return angle_rad * (1.0 + polynomial)
+        angle_rad = np.asarray(angle_rad)
+        if not any(self.k):
+            return np.asarray(angle_rad * 1.0)
+        a2, polynomial = np.square(angle_rad), np.zeros_like(angle_rad)
+        for k in reversed(self.k):
+            polynomial = (polynomial + k) * a2
+        return np.asarray(angle_rad * (1.0 + polynomial))
 
     def slope(self, angle_rad: Array) -> Array:
         """d rho / d angle [1/rad] at the angles `angle_rad` off the axis, any shape."""

@@ -12,7 +12,7 @@ from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, ImageErr
 from startrack.localization.sector_moments import SectorMoments, measure_moments
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_profiles import HIGH_RAD, ROW_NATS, Profiles, profiles_of
-from startrack.terrain import Terrain
+from startrack.terrain import NO_POST, ExpectedCrests, Terrain
 
 SAMPLES = 6 * SECTORS  # of the skyline around the reference, between which rows are compared with it
 TRACED_RAD = np.radians(0.7)  # rows this near the skyline are compared with its own elevation at their azimuth
@@ -62,35 +62,48 @@ class Neighbourhood:
         return np.asarray(self.terrain.horizon_rad(self.reference_m[None], around)).ravel()
 
     @cached_property
+    def crests(self) -> ExpectedCrests | None:
+        """The skyline at the reference with all errors of posts; None of a ground without them."""
+        return self.terrain.expected_crests(self.reference_m, MIDDLES_RAD)
+
+    @cached_property
+    def expected_rise_rad(self) -> Array:
+        """(SECTORS,) by which errors of posts raise the skyline of the map in the mean: the highest place is seen."""
+        return np.zeros(SECTORS) if self.crests is None else self.crests.rise_rad
+
+    @cached_property
     def map_sigma_rad(self) -> Array:
         """(SECTORS,) error of the map's skyline, as if independent between the sectors.
 
-        Ground of which facts are not stated is rough by ROUGH_RAD besides.
+        Posts that make the skyline at several azimuths err there together: each azimuth is given the variance that the
+        sum over its neighbours has, which is right for errors that go far around the compass, as of a position. What
+        follows no post is common to neighbours as the square of their correlation by posts. Ground of which facts are
+        not stated is rough by ROUGH_RAD besides.
         """
         rough = 0.0 if all(one.is_stated for one in self.terrain.shape_errors) else ROUGH_RAD
-        by_posts = self.post_sigma_rad
-        if by_posts is None:
+        if self.crests is None:
             by_posts = np.asarray(self.terrain.horizon_sigma_rad(self.reference_m[None], MIDDLES_RAD)).ravel()
-        return np.hypot(by_posts, rough)
+            return np.hypot(by_posts, rough)
+        of_posts, own = self._covariance_by_posts(self.crests), self.crests.own_sigma_rad
+        sigma = np.sqrt(np.diag(of_posts))
+        total = of_posts + np.outer(own, own) * np.square(of_posts / np.outer(sigma, sigma))
+        return np.sqrt(np.maximum(total.sum(axis=1), np.diag(total)) + rough**2)
 
     @cached_property
     def post_sigma_rad(self) -> Array | None:
-        """(SECTORS,) the part of `map_sigma_rad` that is from errors of the posts; None of a ground without them.
-
-        Posts that make the skyline at several azimuths err there together: each azimuth is given the variance that the
-        sum over its neighbours has, which is right for errors that go far around the compass, as of a position.
-        """
-        terrain = self.terrain
-        posts = terrain.horizon_posts(self.reference_m, MIDDLES_RAD)
-        if not terrain.height_sigma_m or not np.isfinite(posts.horizon_rad).any():
+        """(SECTORS,) the part of `map_sigma_rad` that follows the posts; None of a ground without their errors."""
+        if self.crests is None:
             return None
-        used = posts.post >= 0
-        numbers, of = np.unique(posts.post[used], return_inverse=True)
-        sector = np.broadcast_to(np.arange(SECTORS)[:, None], posts.post.shape)[used]
-        by_post = posts.rad_per_m[used]
-        total = np.bincount(of, weights=by_post, minlength=len(numbers))
-        variance = np.bincount(sector, weights=by_post * total[of], minlength=SECTORS)
-        return np.asarray(terrain.height_sigma_m * np.sqrt(variance))
+        by_posts = self._covariance_by_posts(self.crests)
+        return np.sqrt(np.maximum(by_posts.sum(axis=1), np.diag(by_posts)))
+
+    def _covariance_by_posts(self, crests: ExpectedCrests) -> Array:
+        """(SECTORS, SECTORS) of the skyline's elevations, as far as they follow the posts."""
+        used = crests.post != NO_POST
+        numbers, of = np.unique(crests.post[used], return_inverse=True)
+        response = np.zeros((SECTORS, len(numbers)))
+        np.add.at(response, (np.nonzero(used)[0], of), crests.rad_per_m[used])
+        return np.asarray(self.terrain.height_sigma_m**2 * response @ response.T)
 
 
 @dataclass(frozen=True, eq=False)

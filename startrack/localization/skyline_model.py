@@ -131,8 +131,8 @@ class SkylineModel:
 
     @cached_property
     def _expected_rise(self) -> Array:
-        """(SECTORS,) by the expected values of the shared errors."""
-        return np.asarray(self.basis.mean @ self.error_slopes_rad)
+        """(SECTORS,) by the expected values of the shared errors, and by errors of posts."""
+        return np.asarray(self.basis.mean @ self.error_slopes_rad + self.around.expected_rise_rad)
 
     def rise_rad(self, parameters: Array) -> Array | None:
         """Rise (SECTORS,) of the skyline above the map's by the shared errors of parameters (2 + a,); None of none."""
@@ -189,7 +189,9 @@ class SkylineModel:
         prior = np.zeros((design.shape[1], design.shape[1]))
         prior[:k, :k] = np.diag(np.r_[np.full(2, self.terrain.reach_m**-2.0), np.ones(k - 2)])
         prior[k:, k:] = np.linalg.inv(image.covariance)
-        found = solve_linear(self.seen.moments, design, np.r_[np.zeros(k), image.mean], prior)
+        moments = self.seen.moments
+        left = moments._replace(mean_rad=moments.mean_rad - self._expected_rise)
+        found = solve_linear(left, design, np.r_[np.zeros(k), image.mean], prior)
         parameters, covariance, weight = found
         return np.r_[parameters[:2] + self.around.reference_m, parameters[2:k]], covariance[:k, :k], weight
 

@@ -34,8 +34,8 @@ def draw_ground(terrain: Terrain, *, rng: np.random.Generator) -> Terrain:
 class ErringGround(ForwardingTerrain):
     """The terrain `whole` with the horizon of one camera wrong by drawn errors.
 
-    Each post about a crest errs by itself and lifts the horizon to first order (the choice of the crest is that of the
-    map); an error that all azimuths share, of `shared_sigma_rad`, is drawn too.
+    Each post errs by itself, and lifts the horizon by the mean of its effect over the errors of all posts. An error
+    that all azimuths share, of `shared_sigma_rad`, is drawn too.
     """
 
     def __init__(self, whole: Terrain, rng: np.random.Generator, shared_sigma_rad: float) -> None:
@@ -48,14 +48,14 @@ class ErringGround(ForwardingTerrain):
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:  # type: ignore[override]
         """Horizon elevation (..., n) [rad] seen from one point (1, 2) at azimuths (n,)."""
-        if self.whole.height_sigma_m == 0.0:
-            return np.asarray(self.whole.horizon_rad(points_m, azimuths_rad)) + self._shared_rad
-        posts = self.whole.horizon_posts(np.reshape(points_m, 2), azimuths_rad)
-        by_post = np.sum(posts.rad_per_m * self._errors_m(posts.post), axis=1)
-        return np.asarray(posts.horizon_rad + self._shared_rad + by_post)
+        found = np.asarray(self.whole.horizon_rad(points_m, azimuths_rad)) + self._shared_rad
+        crests = self.whole.expected_crests(np.reshape(points_m, 2), azimuths_rad)
+        if crests is None:
+            return found
+        return np.asarray(found + crests.rise_rad + np.sum(crests.rad_per_m * self._errors_m(crests.post), axis=1))
 
     def _errors_m(self, posts: Ints) -> Array:
-        """Errors of the heights of posts (n, 4) [m]: each is drawn when its post is first seen."""
+        """Errors of the heights of posts (n, k) [m]: each is drawn when its post is first seen."""
         new = np.setdiff1d(posts, self._post)
         drawn = self._rng.normal(0.0, self.whole.height_sigma_m, len(new))
         drawn[new == NO_POST] = 0.0

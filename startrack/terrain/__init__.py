@@ -9,7 +9,7 @@ from startrack.terrain.checks import require_bounds, require_horizons, require_t
 from startrack.terrain.cylinder import Cylinder
 from startrack.terrain.io import KEYS as TERRAIN_KEYS
 from startrack.terrain.io import MAKERS, files_of_terrain, load_terrain, site_of_terrain, terrain_from_dict
-from startrack.terrain.protocol import NO_POST, ForwardingTerrain, Terrain
+from startrack.terrain.protocol import NO_POST, ExpectedCrests, ForwardingTerrain, Terrain
 from startrack.terrain.raster import EQUIRECTANGULAR, STEREOGRAPHIC, Projection, Raster
 from startrack.terrain.shape import DIAMETER, ShapeError
 
@@ -30,6 +30,7 @@ __all__ = [
     "TERRAIN_KEYS",
     "Cylinder",
     "EarthProjection",
+    "ExpectedCrests",
     "ForwardingTerrain",
     "HeightMap",
     "Projection",

@@ -12,7 +12,7 @@ import numpy as np
 from startrack.core.types import Array
 from startrack.frames import R_from_rotvec
 from startrack.terrain.horizon_kernel import interpolate
-from startrack.terrain.protocol import ForwardingTerrain, HorizonPosts, Terrain
+from startrack.terrain.protocol import ForwardingTerrain, Terrain
 from startrack.terrain.rays import rows_of_rays
 from startrack.terrain.table_cache import TABLES_IN_MEMORY
 from startrack.terrain.traced_map import TracedMap
@@ -113,20 +113,6 @@ class DeformedMap(ForwardingTerrain):
         return self.horizon_rad(points_m, azimuths_rad), self.whole.horizon_spread_rad(points_m, half_m, azimuths_rad)[
             1
         ]
-
-    def horizon_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
-        """Those of the map, with the horizon of this ground; see `Terrain`."""
-        posts = self.whole.horizon_posts(point_m, azimuths_rad)
-        if self._tilt_rad:
-            found = self._turned_rad(point_m, azimuths_rad, self._level_rad(posts.horizon_rad))
-        else:
-            found = self.horizon_rad(point_m, azimuths_rad)
-        return replace(posts, horizon_rad=found)
-
-    def ground_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
-        """Those of the map, with the horizon of this ground; see `Terrain`."""
-        posts = self.whole.ground_posts(point_m, azimuths_rad)
-        return replace(posts, horizon_rad=self.horizon_rad(point_m, azimuths_rad))
 
 
 class Nodes(NamedTuple):

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.types import Array, Bools, Ints
+from startrack.terrain.crest_kernel import POSTS, crests
 from startrack.terrain.derived_maps import DeformedMap, HorizonInterpolator
 from startrack.terrain.ground import cell_posts, post_positions
 from startrack.terrain.horizon_table import AZIMUTH_BINS, HorizonSigma
-from startrack.terrain.protocol import HorizonPosts, Terrain
+from startrack.terrain.protocol import ExpectedCrests, Terrain
 from startrack.terrain.refracted import refraction_errors, refraction_slopes_rad, with_refraction_error
 from startrack.terrain.shape import (
     BIAS,
@@ -176,20 +177,33 @@ class HeightMap(TracedMap):
         centre = np.asarray(centre_m, dtype=np.float64)
         return HorizonInterpolator(self, centre, half_m, np.unique(azimuths_rad), across)
 
-    def horizon_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
-        """The posts about the crests seen from `point_m`; see `Terrain`."""
+    def expected_crests(self, point_m: Array, azimuths_rad: Array) -> ExpectedCrests | None:
+        """By the places along each ray that may stand highest; see `crest_kernel.crests` and `Terrain`."""
+        if self.height_sigma_m == 0.0:
+            return None
+        tan, distance, _ = self.horizons(point_m, azimuths_rad)
+        points, count = np.tile(np.asarray(point_m, dtype=np.float64), (len(tan), 1)), len(tan)
+        mean, own, post, response = *np.empty((2, count)), np.empty((count, POSTS), np.int64), np.empty((count, POSTS))
+        fixed = self.ground, self.camera_height_m, self.height_sigma_m
+        crests(*fixed, points, azimuths_rad, tan, distance, mean, own, post, response)
+        flat = 1.0 / (1.0 + mean * mean)
+        rise = np.arctan(mean) - np.arctan(tan)
+        return ExpectedCrests(rise, flat * np.sqrt(own), post, flat[:, None] * response)
+
+    def crest_posts(self, point_m: Array, azimuths_rad: Array) -> Ints:
+        """See `Terrain`."""
         tan, distance, _ = self.horizons(point_m, azimuths_rad)
         away = distance[:, None] * np.stack([np.sin(azimuths_rad), np.cos(azimuths_rad)], axis=1)
         up = float(self.ground_m(point_m)) + self.camera_height_m + tan * distance
         post, weight = cell_posts(self.site, self.maps, np.column_stack([point_m + away, up]))
-        return HorizonPosts(post, weight / ((1.0 + tan * tan) * distance)[:, None], np.arctan(tan))
+        return np.asarray(post[np.arange(len(post)), np.argmax(weight, axis=1)])
 
-    def ground_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
+    def ground_posts(self, point_m: Array, azimuths_rad: Array) -> tuple[Ints, Array]:
         """The posts about a camera at `point_m`; see `Terrain`."""
         tan, distance, _ = self.horizons(point_m, azimuths_rad)
         post, weight = cell_posts(self.site, self.maps, np.append(point_m, self.ground_m(point_m))[None])
         weights = -weight / ((1.0 + tan * tan) * distance)[:, None]
-        return HorizonPosts(np.repeat(post, len(tan), axis=0), weights, np.arctan(tan))
+        return np.repeat(post, len(tan), axis=0), weights
 
     def post_positions_m(self, posts: Ints) -> Array:
         """See `Terrain`."""

@@ -5,9 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from copy import copy
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,18 +22,13 @@ Progress = Callable[[int, int], None]  # parts done, of how many
 NO_POST = -1
 
 
-@dataclass(frozen=True, eq=False)
-class HorizonPosts:
-    """The four posts about the place where each of n sight lines touches the ground, in the numbering of a terrain."""
+class ExpectedCrests(NamedTuple):
+    """The skyline at n azimuths of ground whose posts err, by the moments of its elevation."""
 
-    post: Ints  # (n, 4); NO_POST where no map reaches
-    rad_per_m: Array  # (n, 4) rise of the horizon with the height of each
-    horizon_rad: Array  # (n,) of the map; NaN of ground without posts
-
-    @classmethod
-    def create_empty(cls, rays: int) -> HorizonPosts:
-        """Of ground without posts, for so many `rays`."""
-        return cls(np.full((rays, 4), NO_POST), np.zeros((rays, 4)), np.full(rays, np.nan))
+    rise_rad: Array  # (n,) mean, above the map's
+    own_sigma_rad: Array  # (n,) of the part that follows no post
+    post: Ints  # (n, k) in the numbering of a terrain; NO_POST where fewer count
+    rad_per_m: Array  # (n, k) mean rise with the height of each
 
 
 class Terrain(ABC):
@@ -154,13 +148,20 @@ class Terrain(ABC):
         """One line of text if the terrain file leaves out errors: the ground then counts as exact."""
         return []
 
-    def horizon_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
-        """The posts of the map that make the horizon seen from `point_m` (2,), at the azimuths (n,)."""
-        return HorizonPosts.create_empty(len(azimuths_rad))
+    def expected_crests(self, point_m: Array, azimuths_rad: Array) -> ExpectedCrests | None:
+        """The skyline seen from `point_m` (2,) at the azimuths (n,), with all errors of posts; None without such."""
+        return None
 
-    def ground_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
-        """As `horizon_posts`, of the ground below a camera at `point_m`: the horizon sinks as it rises."""
-        return HorizonPosts.create_empty(len(azimuths_rad))
+    def crest_posts(self, point_m: Array, azimuths_rad: Array) -> Ints:
+        """The posts (n,) nearest to the map's crests seen from `point_m` (2,) at the azimuths (n,); NO_POST of none."""
+        return np.full(len(azimuths_rad), NO_POST)
+
+    def ground_posts(self, point_m: Array, azimuths_rad: Array) -> tuple[Ints, Array]:
+        """The posts (n, k) of the ground below a camera at `point_m` (2,), and by how much each lowers the horizon.
+
+        The latter is (n, k), negative, at the azimuths (n,) [rad/m].
+        """
+        return np.zeros((len(azimuths_rad), 0), dtype=np.int64), np.zeros((len(azimuths_rad), 0))
 
     def post_positions_m(self, posts: Ints) -> Array:
         """East, north and up (n, 3) in enu of the posts with these numbers (n,)."""

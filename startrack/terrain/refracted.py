@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from startrack.core.types import Array
 from startrack.frames import AIR_KEYS, USUAL_SIGMA_1, Air
-from startrack.terrain.protocol import ForwardingTerrain, HorizonPosts, Terrain
+from startrack.terrain.protocol import ForwardingTerrain, Terrain
 from startrack.terrain.shape import Fact, ShapeError
 
 STAR_REFRACTION = Fact(
@@ -65,13 +63,3 @@ class MisrefractedGround(ForwardingTerrain):
         """As of the whole, about the horizon of this ground; see `Terrain`."""
         middle, half = self.whole.horizon_spread_rad(points_m, half_m, azimuths_rad)
         return self._lowered_rad(middle), half
-
-    def horizon_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
-        """Those of the whole, with the horizon of this ground; see `Terrain`."""
-        posts = self.whole.horizon_posts(point_m, azimuths_rad)
-        return replace(posts, horizon_rad=self._lowered_rad(posts.horizon_rad))
-
-    def ground_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
-        """Those of the whole, with the horizon of this ground; see `Terrain`."""
-        posts = self.whole.ground_posts(point_m, azimuths_rad)
-        return replace(posts, horizon_rad=self._lowered_rad(posts.horizon_rad))

@@ -197,8 +197,7 @@ def _real_floor(context: Context) -> Iterator[Row]:
 
 def simplify_crater(terrain: Terrain) -> tuple[Array, float, float]:
     """Centre (2,), radius and height of the circle [m] through the crests of a `terrain` that its origin sees."""
-    posts = terrain.horizon_posts(np.zeros(2), MIDDLES_RAD)
-    crest = posts.post[np.arange(len(MIDDLES_RAD)), np.argmax(posts.rad_per_m, axis=1)]
+    crest = terrain.crest_posts(np.zeros(2), MIDDLES_RAD)
     points = terrain.post_positions_m(crest[crest != NO_POST])
     a = np.column_stack([2 * points[:, :2], np.ones(len(points))])
     (east, north, rest), *_ = np.linalg.lstsq(a, np.square(points[:, :2]).sum(axis=1), rcond=None)

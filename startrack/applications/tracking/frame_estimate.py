@@ -244,14 +244,15 @@ def clipped_noise(noise: Array, whole: Array) -> Array:
 
 def _posts(model: FrameModel, by_horizon: Array, covariance: Array) -> tuple[Ints, Array]:
     """Posts (c,) of the crests and of the camera's ground, and the response (d, c) of the mean to their heights."""
-    terrain, at = model.model.terrain, model.model.around.reference_m
-    if not terrain.height_sigma_m:
+    terrain, around = model.model.terrain, model.model.around
+    if around.crests is None:
         return np.zeros(0, dtype=np.int64), np.zeros((len(by_horizon), 0))
-    parts = [terrain.horizon_posts(at, MIDDLES_RAD), terrain.ground_posts(at, MIDDLES_RAD)]
-    every = np.concatenate([part.post.ravel() for part in parts])
+    crests = around.crests.post, around.crests.rad_per_m
+    parts = [crests, terrain.ground_posts(around.reference_m, MIDDLES_RAD)]
+    every = np.concatenate([posts.ravel() for posts, _ in parts])
     # Ground higher than the map acts on the evidence as a map lower than the ground.
     response = np.concatenate(
-        [(-by_horizon[:, :, None] * part.rad_per_m).reshape(len(by_horizon), -1) for part in parts], axis=1
+        [(-by_horizon[:, :, None] * rad_per_m).reshape(len(by_horizon), -1) for _, rad_per_m in parts], axis=1
     )
     known = every != NO_POST
     post, of = np.unique(every[known], return_inverse=True)

@@ -19,7 +19,7 @@ from startrack.applications.reproduction.published.skylines import (
     grid_points,
     require_bearings,
 )
-from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Ints, MeasuredSkyline, NotLocated
+from startrack.core.types import MIDDLES_RAD, Array, Ints, MeasuredSkyline, NotLocated
 from startrack.terrain import NO_POST, Terrain
 
 CORRESPONDENCES = 3  # for a pose: two coordinates and the heading, with an angle and elevations to check them
@@ -53,9 +53,8 @@ class MapFeatures:
         """
         found = [np.zeros((0, 3))]
         for view in grid_points(terrain, VIEWS_STEP_M):
-            posts = terrain.horizon_posts(view, MIDDLES_RAD)
-            crest = posts.post[np.arange(SECTORS), np.argmax(posts.rad_per_m, axis=1)]
-            seen = find_features(posts.horizon_rad)
+            crest = terrain.crest_posts(view, MIDDLES_RAD)
+            seen = find_features(terrain.horizon_rad(view[None], MIDDLES_RAD))
             found.append(terrain.post_positions_m(crest[seen[crest[seen] != NO_POST]]))
         points = np.concatenate(found)
         _, cell, count = np.unique(

@@ -10,15 +10,12 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.core.kernels import njit
+from startrack.terrain.block_kernel import FAR_M, NUDGE_M, block_at, exit_of
 from startrack.terrain.ground_kernel import level_of, slope_range, steepness
 from startrack.terrain.horizon_kernel import (
-    FAR_M,
     LOWEST_TAN,
-    NUDGE_M,
     STRAIGHT_M,
     best_in_step,
-    block_at,
-    exit_of,
     height_on_line,
     horizon,
     locate,

@@ -15,7 +15,8 @@ from math import exp, pi, sqrt
 import numpy as np
 
 from startrack.core.kernels import njit, normal_cdf
-from startrack.terrain.horizon_kernel import NUDGE_M, block_at, exit_of, locate, map_cell, surface_place
+from startrack.terrain.block_kernel import NUDGE_M, step_over_blocks
+from startrack.terrain.horizon_kernel import locate, map_cell, surface_place
 
 LOW_SIGMAS = 2.0  # of the crest's post, by which the skyline is surely no lower than the map's
 POSTS = 64  # that one ray follows; the variance by more of them counts as its own
@@ -79,19 +80,12 @@ def fill_octaves(ground, sigma, ray, low, distance, seat, weight, numbers, posts
         else:
             column2, row2 = map_cell(grid, m, e + sin_a, n + cos_a, z + low)
             level = min(level, levels[m] - 1)
-            descending, length = True, 0.0
-            while descending:
-                length = exit_of(column, row, column2 - column, row2 - row, level)
-                top = tops[block_at(blocks, m, level, column, row)] + raised
-                if r - radius + min(climb * length, 0.0) >= top:
-                    s += length
-                    level += 2
-                    descending = False
-                elif level == 0:
-                    descending = False
-                level -= 1
-            if level < 0:
-                level = 0
+            is_over, level, length = step_over_blocks(
+                tops, blocks, m, level, column, row, column2 - column, row2 - row, r - radius, climb, raised
+            )
+            if is_over:
+                s += length
+            else:
                 for part in range(known == s, 3):
                     there = s + 0.5 * part * length
                     add_place(ground, sigma, ray, there, low, seat, weight, numbers, posts_of, responses)

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.core.kernels import njit
-from startrack.terrain.horizon_kernel import block_at, locate, map_cell, surface
+from startrack.terrain.block_kernel import block_at
+from startrack.terrain.horizon_kernel import locate, map_cell, surface
 
 SHIFT_HEIGHT_M = 1000.0  # height of a sight line above the ground that its place on the map allows for
 MAX_TOUCHED = 25  # cells of a part

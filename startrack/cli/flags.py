@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from startrack.cli.flag_types import amount, position_prior, positive_count, positive_number, seconds, time_sigma_s
 from startrack.core import MAX_SPEED_M_S, ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
+from startrack.core.errors import how_to_install
 
 if TYPE_CHECKING:
     from startrack.core.declaration import Key
@@ -132,7 +133,7 @@ def check_localizer(args: argparse.Namespace) -> None:
 def check_extra(args: argparse.Namespace, module: str, extra: str, user: str, hint: str = "") -> None:
     """A usage error where the `module` of an `extra` is missing that the `user` needs; `hint`: what else helps."""
     if find_spec(module) is None:
-        args.usage_error(f"{user} {module}: pip install '.[{extra}]' in a clone of startrack{hint}")
+        args.usage_error(f"{user} {module}: {how_to_install(extra)}{hint}")
 
 
 def check_cluster(args: argparse.Namespace) -> None:

@@ -152,6 +152,11 @@ class BadInput(Exception):
         return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # type: ignore[attr-defined]
 
 
+def how_to_install(extra: str) -> str:
+    """The command that installs an `extra` of pyproject.toml."""
+    return f"pip install '.[{extra}]' in a clone of startrack"
+
+
 class BadOutput(BadInput):
     """A path at which results cannot be written; of a flag it is wrong usage (exit code 2).
 

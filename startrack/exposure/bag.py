@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from startrack.core.errors import BadInput
+from startrack.core.errors import BadInput, how_to_install
 from startrack.core.files import MAX_CAUSE_CHARS, FilePath, printable
 from startrack.core.types import Exposure
 from startrack.exposure.decoding import Decoded, bad_image, check_size, decode_bytes, grey_float32, largest_value
@@ -199,9 +199,7 @@ def _decode(message: Message) -> tuple[Decoded, str | None]:
 def _refusals(path: FilePath, reason: str) -> Iterator[None]:
     """Turn any fault of a bag into BadInput `reason` with the file and the cause in one line."""
     if find_spec("rosbags") is None:
-        raise BadInput(
-            reason, f"{printable(path)}: ROS bags need rosbags: pip install '.[ros]' in a clone of startrack"
-        )
+        raise BadInput(reason, f"{printable(path)}: ROS bags need rosbags: {how_to_install('ros')}")
     try:
         yield
     except _Fault as fault:

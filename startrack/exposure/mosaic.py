@@ -17,6 +17,7 @@ from io import BytesIO
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.errors import how_to_install
 from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array
 from startrack.exposure.decoding import Decoded, bad_image, check_size
@@ -41,7 +42,7 @@ def decode(raw: bytes) -> Decoded:
     are no 2 x 2 mosaic, or if rawpy (extra `raw`) is not installed.
     """
     if find_spec("rawpy") is None:
-        raise bad_image("is a camera raw file, which needs rawpy: pip install '.[raw]' in a clone of startrack")
+        raise bad_image(f"is a camera raw file, which needs rawpy: {how_to_install('raw')}")
     import rawpy
 
     with _discard_stderr(), rawpy.imread(BytesIO(raw)) as file:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from startrack.core.errors import length_text
+from startrack.core.errors import how_to_install, length_text
 from startrack.core.types import Array, BadInput
 
 if TYPE_CHECKING:
@@ -96,8 +96,7 @@ def reference_system(wkt: str) -> pyproj.CRS:
     if find_spec("pyproj") is None:
         raise BadInput(
             "bad_terrain",
-            "maps of the Earth that are not in longitude and latitude of WGS 84 need pyproj: pip install '.[dem]' in a "
-            "clone of startrack",
+            f"maps of the Earth that are not in longitude and latitude of WGS 84 need pyproj: {how_to_install('dem')}",
         )
     return _read_reference_system(wkt)
 

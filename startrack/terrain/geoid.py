@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from startrack.core.errors import how_to_install
 from startrack.core.types import BadInput
 from startrack.frames import Site, latlon_from_enu
 
@@ -26,7 +27,7 @@ def geoid_at(grid: str, site: Site) -> Geoid:
     Raises BadInput (bad_terrain) where PROJ has no such grid, or it does not reach the site.
     """
     if find_spec("pyproj") is None:
-        raise BadInput("bad_terrain", "grids of the geoid need pyproj: pip install '.[dem]' in a clone of startrack")
+        raise BadInput("bad_terrain", f"grids of the geoid need pyproj: {how_to_install('dem')}")
     from pyproj import Transformer
     from pyproj.exceptions import ProjError
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from startrack.core.errors import how_to_install
 from startrack.core.types import MAX_PIXELS, BadInput
 from startrack.frames import MOON_RADIUS_M
 from startrack.terrain.earth_projection import FOOT_M, EarthProjection, is_earth, project_earth
@@ -123,7 +124,7 @@ def _read_with_rasterio(path: Path, near: tuple[float, float] | None) -> Stored:
         raise BadInput(
             "bad_terrain",
             f"{path}: not a GeoTIFF on the Moon in a known projection, or in longitude and latitude of WGS 84, with a "
-            "known compression; other maps need rasterio and pyproj: pip install '.[dem]' in a clone of startrack",
+            f"known compression; other maps need rasterio and pyproj: {how_to_install('dem')}",
         )
     import rasterio
 

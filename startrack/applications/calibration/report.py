@@ -12,9 +12,10 @@ import numpy as np
 from startrack.applications.calibration.acceptance import star_coverage
 from startrack.applications.calibration.record import arcmin_per_px, camera_summary, image_rows, summary
 from startrack.applications.calibration.run import Calibration
+from startrack.core.errors import how_to_install
 from startrack.core.files import write_atomically
 
-NO_PICTURE = "no picture: it needs matplotlib, the extra plots (pip install '.[plots]' in a clone of startrack)"
+NO_PICTURE = f"no picture: it needs matplotlib, the extra plots ({how_to_install('plots')})"
 STYLE = """
 body{font:16px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#1b2430;background:#fff}
 h1{font-size:1.6rem;margin-bottom:.2rem} h2{font-size:1.15rem;margin-top:2rem}

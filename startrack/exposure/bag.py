@@ -36,7 +36,6 @@ class Message(NamedTuple):
     """One message of a topic."""
 
     topic: str
-    kind: str  # such as "nav_msgs/msg/Odometry"
     stamp_ns: int  # of its header: nanoseconds since 1970, UTC
     content: Any  # fields as in the message's definition
     raw: bytes  # as stored
@@ -158,10 +157,31 @@ def read_bag_exposures(path: FilePath, topic: str | None = None, **given: Any) -
         yield _exposure_of(message, where, f"{Path(path).stem}-{number:04d}", str(path), given)
 
 
+def exposure_of_message(content: Any, name: str, **given: Any) -> Exposure:
+    """The exposure of one message, with what `read_bag_exposures` says of encodings and time.
+
+    Args:
+        content: a sensor_msgs/Image or CompressedImage of rclpy or rosbags.
+        name: of the exposure.
+        given: facts that the message does not have: `camera`, `exposure_s` and the like, as in `read_exposure`.
+
+    Raises:
+        BadInput: bad_image with the name and the cause, in one line: an encoding that is not read, a wrong number of
+            bytes, a header without time.
+        ValueError: as `read_bag_exposures`.
+    """
+    try:
+        stamp_ns = _stamp_ns(content)
+    except _Fault as fault:
+        raise BadInput(READING["reason"], f"{printable(name)}: {fault}") from fault
+    message = Message("", stamp_ns, content, bytes(content.data))
+    return _exposure_of(message, printable(name), name, "", given)
+
+
 def _exposure_of(message: Message, where: str, name: str, path: str, given: dict[str, Any]) -> Exposure:
     """The exposure of a message with the facts `given`; a refusal names `where` it is."""
     try:
-        decoded, pattern = _decode(message)
+        decoded, pattern = _decode(message.content)
         time_utc = datetime.fromtimestamp(0, UTC) + timedelta(microseconds=message.stamp_ns // 1000)
         facts = Facts(**{"time_utc": time_utc, "bayer_pattern": pattern, **given})
         return exposure_of_decoded(decoded, facts, raw=message.raw, name=name, path=path)
@@ -169,13 +189,12 @@ def _exposure_of(message: Message, where: str, name: str, path: str, given: dict
         raise BadInput(cause.reason, f"{where}: {cause}") from cause
 
 
-def _decode(message: Message) -> tuple[Decoded, str | None]:
-    """Pixels of a message, and the pattern of its mosaic. Raises BadInput bad_image.
+def _decode(content: Any) -> tuple[Decoded, str | None]:
+    """Pixels of a message's `content`, and the pattern of its mosaic. Raises BadInput bad_image.
 
-    Rows of sensor_msgs/Image may be padded to `step` bytes.
+    Rows of sensor_msgs/Image may be padded to `step` bytes. A CompressedImage alone has a `format`.
     """
-    content = message.content
-    if message.kind == "sensor_msgs/msg/CompressedImage":
+    if hasattr(content, "format"):
         bayer = BAYER_IN_FORMAT.match(str(content.format))
         return decode_bytes(bytes(content.data)), bayer["pattern"].upper() if bayer else None
     form = RAW_ENCODING.fullmatch(str(content.encoding))
@@ -239,11 +258,20 @@ def _open(path: Path, kinds: tuple[str, ...], topic: str | None, flag: str) -> I
 
 def _message(reader: Any, connection: Any, raw: bytes) -> Message:
     content: Any = reader.deserialize(raw, connection.msgtype)
+    try:
+        stamp_ns = _stamp_ns(content)
+    except _Fault as fault:
+        raise _Fault(f"topic {connection.topic}: {fault}") from fault
+    return Message(connection.topic, stamp_ns, content, bytes(raw))
+
+
+def _stamp_ns(content: Any) -> int:
+    """The time of a message's header, nanoseconds since 1970."""
     stamp = content.header.stamp
     stamp_ns = int(stamp.sec) * 10**9 + int(stamp.nanosec)
     if stamp_ns <= 0:
-        raise _Fault(f"topic {connection.topic}: a message's header has no time")
-    return Message(connection.topic, connection.msgtype, stamp_ns, content, bytes(raw))
+        raise _Fault("a message's header has no time")
+    return stamp_ns
 
 
 def _choose_topic(topics: list[tuple[str, str]], kinds: tuple[str, ...], topic: str | None, flag: str) -> str:

@@ -113,13 +113,18 @@ def test_the_response_to_the_bias_is_that_to_raised_rows(ground):
 
 
 @pytest.mark.slow
-def test_the_response_to_a_post_is_that_to_a_lower_map(ground):
-    evidence = rays_at(ground, PLACE_M, np.random.default_rng(3))
+@pytest.mark.parametrize("seed", range(1, 4))
+def test_the_response_to_posts_is_that_to_a_map_with_other_heights(ground, seed):
+    """The 40 posts that move the position most, a metre each, all to the same side: 5 to 16 % less than stated."""
+    evidence = rays_at(ground, PLACE_M, np.random.default_rng(seed))
     here = estimate(evidence, ground)
-    strongest = int(np.argmax(np.linalg.norm(here.by_post[:2], axis=0)))
-    there = estimate(evidence, raise_post(ground, int(here.post[strongest]), -2.0))
-    moved = there.mean[:2] - here.mean[:2]
-    np.testing.assert_allclose(moved, 2.0 * here.by_post[:2, strongest], atol=0.15 * np.linalg.norm(moved) + 0.05)
+    strongest = np.argsort(-np.abs(here.by_post[0]))[:40]
+    sides, changed = np.sign(here.by_post[0, strongest]), ground
+    for post, side in zip(here.post[strongest].tolist(), sides.tolist(), strict=True):
+        changed = raise_post(changed, post, -side)
+    moved = estimate(evidence, changed).mean[:2] - here.mean[:2]
+    stated = here.by_post[:2, strongest] @ sides
+    np.testing.assert_allclose(moved, stated, atol=0.2 * np.linalg.norm(stated))
 
 
 def test_noise_is_positive_definite_and_no_less_than_its_share():

@@ -18,12 +18,12 @@ from jsonschema import Draft202012Validator
 import startrack
 from startrack.applications.horizon import measure_skyline, predicted_visible
 from startrack.applications.horizon.frames import orient_frames
+from startrack.applications.horizon.landscape import interpolate_unknown
 from startrack.applications.horizon.measure import join_skylines, measure_frames
 from startrack.applications.horizon.posterior import limit_llr
 from startrack.applications.horizon.write import (
     check_output,
     csv_text,
-    interpolate_unknown,
     nina_text,
     write_skyline,
 )
@@ -185,7 +185,7 @@ def test_the_brightest_star_counts_as_much_as_a_bright_one():
 
 
 def test_the_csv_has_a_row_a_degree(tmp_path):
-    write_skyline(str(tmp_path / "a.csv"), small_skyline(), LOWELL, overwrite=False)
+    write_skyline(str(tmp_path / "a.csv"), small_skyline(), LOWELL, (), overwrite=False)
     lines = (tmp_path / "a.csv").read_text().splitlines()
     assert lines[0] == "azimuth_deg,elevation_deg,sigma_deg,is_measured,source"
     assert len(lines) == 361
@@ -249,7 +249,7 @@ def test_more_pictures_never_know_fewer_azimuths():
 
 
 def test_the_stellarium_landscape_is_polygonal(tmp_path):
-    write_skyline(f"{tmp_path}/garden/", small_skyline(), LOWELL, overwrite=False)
+    write_skyline(f"{tmp_path}/garden/", small_skyline(), LOWELL, (), overwrite=False)
     settings = configparser.ConfigParser()
     settings.read(tmp_path / "garden/landscape.ini")
     assert settings["landscape"]["type"] == "polygonal"
@@ -263,7 +263,7 @@ def test_the_stellarium_landscape_is_polygonal(tmp_path):
 def test_the_panorama_is_a_picture(tmp_path):
     import cv2
 
-    write_skyline(str(tmp_path / "a.png"), small_skyline(), LOWELL, overwrite=False)
+    write_skyline(str(tmp_path / "a.png"), small_skyline(), LOWELL, (), overwrite=False)
     picture = cv2.imread(str(tmp_path / "a.png"))
     assert picture.shape[1] > 1000
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 20

@@ -47,7 +47,7 @@ def _measure(args: argparse.Namespace) -> Outcome:
         )
         print_left_out(left_out if frames else ())  # else the refusal names them
         found = horizon.measure_frames(frames, left_out, site, show_step)
-    horizon.write_skyline(args.output, found.skyline, site, overwrite=args.overwrite)
+    horizon.write_skyline(args.output, found.skyline, site, found.frames, overwrite=args.overwrite)
     unknown = int((~found.skyline.known).sum())
     varying = int((found.skyline.source == "varies").sum())
     notes = [f"{unknown} of them interpolated"] if horizon.needs_all_azimuths(args.output) and unknown else []

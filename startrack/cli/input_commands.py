@@ -118,7 +118,8 @@ COMMANDS = (
         "horizon", function_at("horizon.run"), "the horizon of a fixed camera from photographs of the night sky",
         "Measure the skyline (obstruction profile) of a fixed camera on the Earth from one or several photographs of "
         "the night sky: from stars seen, stars missing, and the place where the sky's light stops. The suffix of -o "
-        "chooses the format: .csv, .ecsv, .hrz (N.I.N.A.), .png (panorama), none (folder of a Stellarium landscape).",
+        "chooses the format: .csv, .ecsv, .hrz (N.I.N.A.), .png (panorama), none (folder of a Stellarium landscape), "
+        ".zip (one with the photographs below the skyline).",
         {
             "input": (
                 flags.PHOTOGRAPHS, *flags.FACTS, flags.SITE, flags.TERRAIN,

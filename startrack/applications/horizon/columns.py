@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
-from startrack.core.types import Array, Detections, Ints
+from startrack.core.types import Array, Bools, Detections, Ints
 from startrack.frames import off_axis_rad, rays_from_azel
 
 SKYLINE_AZIMUTHS = 360  # of the result, one degree each
@@ -86,8 +87,7 @@ def sample_columns(
     middles = (np.arange(AZIMUTH_COLUMNS) + 0.5 - COLUMNS_PER_AZIMUTH / 2) * (2 * np.pi / AZIMUTH_COLUMNS)
     for k in range(COLUMN_SAMPLES):
         azimuth = middles + ((k + 0.5) / COLUMN_SAMPLES - 0.5) * 2 * np.pi / AZIMUTH_COLUMNS
-        xy, inside = camera.project(rays_from_azel(azimuth[None, :], elevation[:, None]) @ R_cam_enu.T)
-        x, y = (np.ascontiguousarray(xy[..., axis], dtype=np.float32) for axis in (0, 1))
+        x, y, inside = image_points(camera, R_cam_enu, azimuth[None, :], elevation[:, None])
         hidden = ~inside | (cv2.remap(lost, x, y, cv2.INTER_NEAREST) > 0)
         total += np.where(hidden, np.nan, cv2.remap(image_e, x, y, cv2.INTER_LINEAR))
         spread += cv2.remap(noise_e, x, y, cv2.INTER_NEAREST)
@@ -96,6 +96,18 @@ def sample_columns(
     without = replace(columns, light_e=np.where(points, np.nan, columns.light_e))
     around = average_columns(without, WIDTHS[-1][0], FILL_SHARE).light_e
     return replace(columns, light_e=np.where(points, around, columns.light_e))
+
+
+def image_points(
+    camera: Camera, R_cam_enu: Array, azimuth_rad: NDArray[np.floating[Any]], elevation_rad: NDArray[np.floating[Any]]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], Bools]:
+    """Where directions are in the image: x and y [px] as OpenCV takes them, and which are in view.
+
+    `azimuth_rad` and `elevation_rad` have shapes that broadcast to that of the results; `R_cam_enu` is (3, 3).
+    """
+    xy, inside = camera.project(rays_from_azel(azimuth_rad, elevation_rad) @ R_cam_enu.T)
+    x, y = (np.ascontiguousarray(xy[..., axis], dtype=np.float32) for axis in (0, 1))
+    return x, y, inside
 
 
 def _lost_pixels(detections: Detections) -> NDArray[np.uint8]:

@@ -23,7 +23,7 @@ from startrack.camera import Camera
 from startrack.catalog import StarCatalog
 from startrack.core.errors import NoSolution
 from startrack.core.runner import map_in_threads
-from startrack.core.types import Array, Bools, Exposure, MeasuredSkyline
+from startrack.core.types import Array, Bools, Exposure, Ints, MeasuredSkyline
 from startrack.frames import Site, off_axis_rad, rays_from_azel
 
 UNKNOWN_SIGMA_RAD = np.radians(2.0)  # a wider posterior is no measurement, nor is a star farther away
@@ -199,16 +199,28 @@ def _has_step(steps: Sequence[list[Steps]], elevation_rad: Array) -> Bools:
     return np.asarray(_columns_of_bins(found, 0).mean(axis=1) >= 0.5)
 
 
+def skyline_at(skyline: MeasuredSkyline, azimuth_rad: Array) -> Array:
+    """Elevations (n,) [rad] of a `skyline` at azimuths (n,), interpolated between two known ones.
+
+    Beside an unknown one that of the nearest azimuth; not a number where that is unknown.
+    """
+    n = len(skyline)
+    place = np.asarray(azimuth_rad) * (n / (2 * np.pi))
+    low = np.floor(place).astype(np.int64)
+    share = place - low
+    between = (1 - share) * skyline.elevation_rad[low % n] + share * skyline.elevation_rad[(low + 1) % n]
+    return np.asarray(np.where(np.isfinite(between), between, skyline.elevation_rad[_nearest_bin(n, azimuth_rad)]))
+
+
+def _nearest_bin(n: int, azimuth_rad: Array) -> Ints:
+    """Which of `n` azimuths around the compass is the nearest to each of (m,)."""
+    return np.asarray(np.rint(np.asarray(azimuth_rad) * (n / (2 * np.pi))).astype(np.int64) % n)
+
+
 def predicted_visible(skyline: MeasuredSkyline, azimuth_rad: Array, elevation_rad: Array) -> tuple[Bools, Bools]:
     """Whether directions (n,) are above a `skyline`, and which are more than two sigma from it where it is known.
 
     `azimuth_rad` and `elevation_rad` (n,) are apparent directions.
     """
-    n = len(skyline)
-    place = np.asarray(azimuth_rad) * (n / (2 * np.pi))
-    nearest = np.rint(place).astype(np.int64) % n
-    low = np.floor(place).astype(np.int64)
-    share = place - low
-    between = (1 - share) * skyline.elevation_rad[low % n] + share * skyline.elevation_rad[(low + 1) % n]
-    height = elevation_rad - np.where(np.isfinite(between), between, skyline.elevation_rad[nearest])
-    return height > 0, np.abs(height) > 2 * skyline.sigma_rad[nearest]
+    height = elevation_rad - skyline_at(skyline, azimuth_rad)
+    return height > 0, np.abs(height) > 2 * skyline.sigma_rad[_nearest_bin(len(skyline), azimuth_rad)]

@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from startrack.applications.horizon.frames import SkyFrame
+from startrack.applications.horizon.landscape import (
+    GAP_DEG,
+    HORIZON_LIST,
+    LANDSCAPE,
+    TEXTURE,
+    interpolate_unknown,
+    landscape_picture,
+    landscape_text,
+    zip_bytes,
+)
 from startrack.core.errors import BadOutput
 from startrack.core.files import check_output as check_file
 from startrack.core.files import write_atomically
-from startrack.core.types import Array, BadInput, MeasuredSkyline
+from startrack.core.types import Array, MeasuredSkyline
 from startrack.frames import Site
-from startrack.output import png_bytes, skyline_picture, skyline_table_text, skyline_texts_deg
+from startrack.output import encoded_bytes, png_bytes, skyline_picture, skyline_table_text, skyline_texts_deg
 
-SKYLINE_SUFFIXES = (".csv", ".ecsv", ".hrz", ".png")  # and none: the folder of a Stellarium landscape
-LANDSCAPE, HORIZON_LIST = "landscape.ini", "horizon.txt"
-GAP_DEG = -10.0  # altitude of a Stellarium landscape where the skyline is unknown: the gap is seen
-TINY_DEG = 1e-5  # Stellarium draws a polygon with a corner at exactly 0 or 180 degrees badly
+SKYLINE_SUFFIXES = (".csv", ".ecsv", ".hrz", ".png", ".zip")  # and none: the folder of a Stellarium landscape
 
 
 def kind_of(output: str) -> str:
@@ -45,22 +54,40 @@ def needs_all_azimuths(output: str) -> bool:
     return kind_of(output) == ".hrz"
 
 
-def write_skyline(output: str, skyline: MeasuredSkyline, site: Site, *, overwrite: bool) -> tuple[Path, ...]:
+def write_skyline(
+    output: str, skyline: MeasuredSkyline, site: Site, frames: Sequence[SkyFrame], *, overwrite: bool
+) -> tuple[Path, ...]:
     """Write the `skyline` of a `site` in the format of the suffix of `output`; the files.
 
-    Existing files are replaced with `overwrite` only. Raises BadInput if the format cannot hold the skyline.
+    `frames` are the photographs, from which the landscape of a `.zip` is drawn. Existing files are replaced with
+    `overwrite` only. Raises BadInput if the format cannot hold the skyline.
     """
-    files, kind = output_files(output), kind_of(output)
+    files, kind, name = output_files(output), kind_of(output), Path(output).stem
     if kind == ".png":
         data = [png_bytes(skyline_picture(skyline))]
+    elif kind == ".zip":
+        data = [zip_bytes(name, _landscape_files(name, skyline, site, frames))]
     elif kind:
         text_of = {".csv": csv_text, ".ecsv": skyline_table_text, ".hrz": nina_text}[kind]
         data = [text_of(skyline).encode("utf-8")]
     else:
-        data = [landscape_text(Path(output).name, site).encode("utf-8"), horizon_list_text(skyline).encode("utf-8")]
+        data = list(_landscape_files(Path(output).name, skyline, site).values())
     for path, content in zip(files, data, strict=True):
         write_atomically(path, content, overwrite=overwrite)
     return files
+
+
+def _landscape_files(
+    name: str, skyline: MeasuredSkyline, site: Site, frames: Sequence[SkyFrame] = ()
+) -> dict[str, bytes]:
+    """The files of a Stellarium landscape by their names, with a texture where `frames` are given."""
+    made = {
+        LANDSCAPE: landscape_text(name, site, has_texture=bool(frames)).encode("utf-8"),
+        HORIZON_LIST: horizon_list_text(skyline).encode("utf-8"),
+    }
+    if frames:
+        made[TEXTURE] = encoded_bytes(".png", landscape_picture(frames, skyline)[:, :, [2, 1, 0, 3]])
+    return made
 
 
 def csv_text(skyline: MeasuredSkyline) -> str:
@@ -93,37 +120,3 @@ def _rows(skyline: MeasuredSkyline, elevation_rad: Array, form: str) -> list[str
         comments += [f"# {azimuth_deg[run[0]]:g} to {azimuth_deg[run[-1]]:g}: {words}" for run in runs]
     rows = [form.format(*place) for place in zip(azimuth_deg, np.degrees(elevation_rad), strict=True)]
     return ["# azimuth altitude", *comments, *rows]
-
-
-def landscape_text(name: str, site: Site) -> str:
-    """The landscape.ini of a polygonal landscape, as the Stellarium User Guide describes it."""
-    return (
-        "[landscape]\n"
-        f"name = {name}\n"
-        "author = startrack\n"
-        "description = Skyline measured in photographs of the night sky\n"
-        "type = polygonal\n"
-        f"polygonal_horizon_list = {HORIZON_LIST}\n"
-        "polygonal_horizon_list_mode = azDeg_altDeg\n"
-        f"polygonal_angle_rotatez = {TINY_DEG:.5f}\n"
-        "ground_color = 0.15,0.2,0.15\n"
-        "horizon_line_color = 0.4,0.6,0.8\n"
-        "\n"
-        "[location]\n"
-        "planet = Earth\n"
-        f"latitude = {np.degrees(site.latitude_rad):.6f}\n"
-        f"longitude = {np.degrees(site.longitude_rad):.6f}\n"
-        f"altitude = {site.height_m:.0f}\n"
-    )
-
-
-def interpolate_unknown(skyline: MeasuredSkyline) -> Array:
-    """Elevations (n,) with the unknown ones interpolated between their neighbours around the compass.
-
-    Raises BadInput (bad_image, for lack of a better code) if none is known.
-    """
-    known = skyline.known
-    if not known.any():
-        raise BadInput("bad_image", "the skyline is unknown at all azimuths")
-    at, elevation = skyline.azimuth_rad[known], skyline.elevation_rad[known]
-    return np.asarray(np.interp(skyline.azimuth_rad, at, elevation, period=2 * np.pi))

@@ -277,7 +277,7 @@ def png_bytes(picture: NDArray[np.uint8]) -> bytes:
 
 
 def encoded_bytes(suffix: str, pixels: NDArray[np.uint8], *flags: int) -> bytes:
-    """Pixels (H, W, 3 or 4), blue first, as the content of a file with a `suffix`; `flags` are OpenCV's."""
+    """The `pixels` (H, W, 3 or 4), blue first, as the content of a file with a `suffix`; `flags` are OpenCV's."""
     ok, data = cv2.imencode(suffix, pixels, flags)
     if not ok:
         raise RuntimeError(f"OpenCV could not encode a picture as {suffix}")

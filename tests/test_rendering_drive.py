@@ -129,6 +129,7 @@ def test_waypoints_are_read_by_the_names_of_their_columns(tmp_path):
         ("east_m,north_m\n1,2\n1,x\n", "line 3: two finite numbers"),
         ("east_m,north_m\n1,2\n1,nan\n", "line 3: two finite numbers"),
         ("east_m,north_m\n1,2\n1,inf\n", "line 3: two finite numbers"),
+        ("east_m,north_m\n0,0\n1e308,0\n", "a waypoint is infinite, or the path is"),
     ],
 )
 def test_a_path_that_cannot_be_driven_is_refused(tmp_path, text, cause):

@@ -32,8 +32,8 @@ class Drive(Value):
         super().__post_init__()
         if len(self.waypoints_m) < 2:
             raise ValueError(f"{len(self.waypoints_m)} waypoint(s): a path has at least two")
-        if not np.isfinite(self.waypoints_m).all():
-            raise ValueError("a waypoint is infinite")
+        if not np.isfinite(self.distance_m).all():
+            raise ValueError("a waypoint is infinite, or the path is")
         same = np.flatnonzero(np.diff(self.distance_m) == 0)
         if len(same):
             raise ValueError(f"waypoints {same[0] + 1} and {same[0] + 2} are the same")
@@ -43,7 +43,8 @@ class Drive(Value):
     @cached_property
     def distance_m(self) -> Array:
         """Distance (n,) [m] along the path from its first waypoint to each."""
-        return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(self.waypoints_m, axis=0), axis=1)))
+        with np.errstate(over="ignore", invalid="ignore"):  # no finite distance then
+            return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(self.waypoints_m, axis=0), axis=1)))
 
     def count_frames(self, every_s: float) -> int:
         """Exposures from the path's start to its end, one `every_s` [s].

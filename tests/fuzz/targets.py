@@ -8,6 +8,7 @@ import json
 import shutil
 import warnings
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -26,6 +27,8 @@ PROGRAMS = ("ros", "kalibr", "colmap", "opencv")
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_images" / "near-centre"
 MAX_MESSAGE_CHARS = 1200  # with two paths of a temporary folder in it
 OUT_OF_MEMORY = ("MemoryError", "Unable to allocate", "Insufficient memory", "bad_alloc", "cannot allocate")
+NIGHT = "2030-06-01T00:00:00Z"
+PREDICTED = ("--time", NIGHT, "--draws", "1", "--path", "way.csv", "--spacing", "200", "-j", "1")
 COMMANDS = (
     ("locate", "image.png", "--json", "--no-plots"), ("identify", "image.png", "--json", "--no-plots"),
     ("detect", "image.png", "--json", "--no-plots"), ("locate", "image.png", "--no-plots"),
@@ -33,7 +36,15 @@ COMMANDS = (
     ("calibrate", "convert", "camera.toml", "--to", "opencv", "-q"), ("track", "image.png", "--no-plots"),
     ("calibrate", "image.png", "-c", "camera.toml", "-q", "-o"),
     ("horizon", "image.png", "-c", "camera.toml", "--site=34,-111", "-q", "-o"),
+    ("report", "image.fix.json", "-q"),
+    ("predict", "-t", "terrain.toml", "-c", "camera.toml", *PREDICTED, "--no-plots"),
+    ("render", "-t", "terrain.toml", "-c", "camera.toml", "--time", NIGHT, "-q"),
 )  # fmt: skip
+FILES = (  # that are mutated, with the kind of their changes
+    ("png", "image.png"), ("sidecar", "image.json"), ("camera", "camera.toml"), ("terrain", "terrain.toml"),
+    ("sidecar", "image.fix.json"), ("terrain", "way.csv"),
+)  # fmt: skip
+INPUTS = (".png", ".toml", ".json", ".csv")
 REFUSE_SAMPLES = ("horizon",)  # the Moon's sky is no sky of a site on the Earth
 
 
@@ -170,9 +181,7 @@ READERS: dict[str, Callable[[bytes, int, Path], None]] = {
 def run_command(seed: int, index: int, folder: Path) -> str | None:
     """One command on a folder of sound files of which one is mutated; the reason of a refusal. Raises Broken."""
     random = Random(f"{seed}/command/{index}")
-    kind, name = random.choice(
-        (("png", "image.png"), ("sidecar", "image.json"), ("camera", "camera.toml"), ("terrain", "terrain.toml"))
-    )
+    kind, name = random.choice(FILES)
     _write_sound(folder, small=kind == "png")
     (folder / name).write_bytes(mutate(kind, (folder / name).read_bytes(), random))
     with no_access_beside(folder):
@@ -198,8 +207,10 @@ def _run(command: tuple[str, ...], folder: Path) -> str | None:
     """Run a command in this process and judge it; the reason of a refusal."""
     from startrack.cli.main import main
 
-    words = [str(folder / word) if Path(word).suffix in (".png", ".toml") else word for word in command]
-    if command[:2] != ("calibrate", "show"):
+    words = [str(folder / word) if Path(word).suffix in INPUTS else word for word in command]
+    if command[0] == "report":
+        words += ["-o", str(folder / "out" / "report.html")]
+    elif command[:2] != ("calibrate", "show"):
         words += ["-D", str(folder / "out")] if "-o" not in words else [str(folder / f"out.{words[0]}.csv"), "-O"]
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
@@ -210,7 +221,7 @@ def _run(command: tuple[str, ...], folder: Path) -> str | None:
 def _write_sound(folder: Path, *, small: bool) -> None:
     """Image, sidecar, camera and terrain: a `small` image with a few points, or a sample that is located."""
     shutil.rmtree(folder / "out", ignore_errors=True)
-    facts = {"time_utc": "2030-06-01T00:00:00Z", "exposure_s": 1.0}
+    facts = {"time_utc": NIGHT, "exposure_s": 1.0}
     camera = COMMAND_CAMERA
     if small:
         (folder / "image.png").write_bytes(_night())
@@ -221,6 +232,17 @@ def _write_sound(folder: Path, *, small: bool) -> None:
     (folder / "camera.toml").write_text(camera)
     (folder / "terrain.toml").write_text(CYLINDER)
     (folder / "image.json").write_text(json.dumps(facts | {"camera": "camera.toml", "terrain": "terrain.toml"}))
+    (folder / "image.fix.json").write_text(_result_of_sample())
+    (folder / "way.csv").write_text("east_m,north_m\n0,0\n150,0\n")
+
+
+@cache
+def _result_of_sample() -> str:
+    """The record of the sample that is located."""
+    from startrack import locate
+    from startrack.output import result_dict
+
+    return json.dumps(result_dict(locate(SAMPLE.with_suffix(".png")).result))
 
 
 COMMAND_CAMERA = """format = 1

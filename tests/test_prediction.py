@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -70,6 +71,45 @@ def test_the_map_is_a_geotiff_in_the_projection_of_the_terrain(area):
             assert band == pytest.approx(np.ma.filled(np.ma.asarray(table[name]), np.nan), rel=1e-5, nan_ok=True)
 
 
+def test_the_style_shows_a_band_of_the_map_in_classes_of_its_radii(area):
+    rasterio = pytest.importorskip("rasterio")
+    text = (area / "predict.qml").read_text()
+    assert text.startswith("<!DOCTYPE qgis ")
+    renderer = ElementTree.fromstring(text).find("pipe/rasterrenderer")
+    with rasterio.open(area / "predict.tif") as file:
+        band = int(renderer.get("band"))
+        assert file.descriptions[band - 1] == "radius95_m"
+        values = file.read(band)
+    items = renderer.findall("rastershader/colorrampshader/item")
+    bounds_m = [float(item.get("value")) for item in items]
+    assert bounds_m == [*class_bounds_m(values), np.inf]
+    assert all(item.get("label").endswith(" m") for item in items)  # its unit
+    assert len({item.get("color") for item in items}) == len(items) > 1
+
+
+def test_the_protection_level_is_a_band_beyond_the_circles(area):
+    rasterio = pytest.importorskip("rasterio")
+    with rasterio.open(area / "predict.tif") as file:
+        bands = {name: file.read(1 + k) for k, name in enumerate(file.descriptions)}
+    level_m, radius_m = bands["protection_level_m"], bands["radius95_m"]
+    known = np.isfinite(level_m)
+    assert known.sum() >= 3 and (np.isfinite(radius_m) | ~known).all()
+    assert (level_m[known] > 1.2 * radius_m[known]).all()  # 1.05 times the 99.9 % circle, or more
+
+
+def test_a_draw_has_the_protection_level_of_its_position(monkeypatch):
+    from startrack.applications.prediction import draws
+
+    fixes = []
+    real = draws.locate_rays
+    monkeypatch.setattr(draws, "locate_rays", lambda *given: fixes.append(real(*given)) or fixes[-1])
+    conditions = Conditions("fisheye-2048", "shackleton-thesis", (WHEN,), 22.0, 3, "posterior", exposure_s=0.2)
+    predictor = Predictor(load_camera("fisheye-2048"), load_terrain("shackleton-thesis"), conditions)
+    found = predictor.draw(Place(0, 6000.0, 2000.0))
+    assert found["status"].tolist() == [OK]
+    assert found["protection_level_m"].tolist() == [fixes[0].fix.integrity.protection_level_m]
+
+
 def test_the_summary_fits_its_schema_and_the_table(area):
     record = json.loads((area / "predict.json").read_text())
     Draft202012Validator(PREDICTION, format_checker=Draft202012Validator.FORMAT_CHECKER).validate(record)
@@ -84,7 +124,7 @@ def test_the_summary_fits_its_schema_and_the_table(area):
 @pytest.mark.slow
 def test_two_workers_write_the_same_bytes(area, tmp_path):
     assert run(tmp_path, "--spacing", 9000, "--draws", 1, "-j", 2) == 0
-    for name in ("predict.tif", "predict.ecsv", "predict.json", "predict.png"):
+    for name in ("predict.tif", "predict.qml", "predict.ecsv", "predict.json", "predict.png"):
         assert (tmp_path / name).read_bytes() == (area / name).read_bytes(), name
 
 
@@ -184,7 +224,7 @@ def draws_of(status, radius, covariance):
     errors[..., 0] = np.sqrt(np.trace(covariances, axis1=2, axis2=3))  # as large as stated
     return {
         "status": np.array(status), "radius95_m": np.array(radius, dtype=float), "covariance_m2": covariances,
-        "offset_m": errors,
+        "offset_m": errors, "protection_level_m": 2.0 * np.array(radius, dtype=float),
     }  # fmt: skip
 
 
@@ -193,6 +233,7 @@ def test_refused_draws_count_and_a_place_without_positions_has_no_radius():
     status = [[OK, OK, REFUSED], [REFUSED, AMBIGUOUS, REFUSED], [OK, AMBIGUOUS, REFUSED]]
     cells = cells_of_draws(draws_of(status, [[3.0, 9.0, nan], [nan] * 3, [4.0, nan, nan]], [[9.0, 0.0], [0.0, 4.0]]))
     assert cells["radius95_m"] == pytest.approx([9.0, nan, nan], nan_ok=True)
+    assert cells["protection_level_m"] == pytest.approx([18.0, nan, nan], nan_ok=True)
     assert cells["p_ok"] == pytest.approx([2 / 3, 0, 1 / 3])
     assert cells["p_ambiguous"] == pytest.approx([0, 1 / 3, 1 / 3])
     assert cells["p_refused"] == pytest.approx([1 / 3, 2 / 3, 1 / 3])

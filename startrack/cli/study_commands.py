@@ -100,7 +100,7 @@ COMMANDS = (
     Command(
         "predict", function_at("studies.predict"), "expected accuracy over a terrain, before a drive",
         "Predict how well images would be located: evidence of the stars is drawn at every place and located as "
-        "`locate` does. Writes predict.tif, predict.png, predict.ecsv and predict.json. Draws are kept in "
+        "`locate` does. Writes predict.tif, predict.qml, predict.png, predict.ecsv and predict.json. Draws are kept in "
         "OUT/.predict: a stopped run is resumed.",
         {
             "input": (

@@ -21,7 +21,13 @@ from startrack.output.picture.canvas import (
 )
 from startrack.output.picture.maps import MARGIN_PX, SIDE_PX, Map, draw_overview, ellipse_m, relief_picture
 from startrack.output.picture.panorama import horizon_picture, skyline_picture
-from startrack.output.picture.prediction import comparison_picture, path_picture, prediction_picture
+from startrack.output.picture.prediction import (
+    comparison_picture,
+    path_picture,
+    prediction_picture,
+    radius_classes,
+)
+from startrack.output.qgis import qgis_style_text
 from startrack.output.quantities import QUANTITIES, table_columns
 from startrack.output.quantity import (
     ABSENT,
@@ -80,7 +86,8 @@ __all__ = [
     "feature", "file_schema", "fill_frame", "geojson_text", "ground_map", "horizon_picture",
     "identification_dict", "json_text", "lens_text", "list_schema", "markdown_table", "mix_colours", "nice_step",
     "object_schema", "or_null", "page_text", "path_picture", "png_bytes", "prediction_picture", "prepare_folder",
-    "quantity_columns", "record_from", "record_of", "refusal_line", "refused_dict", "relief_picture",
+    "qgis_style_text", "quantity_columns", "radius_classes", "record_from", "record_of", "refusal_line",
+    "refused_dict", "relief_picture",
     "remove_companions", "result_at", "result_dict", "results_under", "rows", "schema_of", "schema_of_kind",
     "show_everywhere", "skyline_picture", "skyline_table_text", "skyline_texts_deg", "stage_values",
     "star_table_text", "summary_line", "table_columns", "verbose_text", "write_annotated", "write_geo",

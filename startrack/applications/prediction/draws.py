@@ -24,7 +24,7 @@ from startrack.simulation import draw_ground, simulate_rays
 from startrack.terrain import Terrain, load_terrain
 
 DRAW_FOLDER = ".predict"
-LOCATED = "radius95_m", "covariance_m2", "offset_m"  # of draws with one position
+LOCATED = "radius95_m", "covariance_m2", "offset_m", "protection_level_m"  # of draws with one position
 DRAW_SOURCES = (  # their content is part of a chunk's key
     "localization/*.py", "simulation/*.py", "evidence/*.py", "rendering/*.py", "terrain/*.py", "chain/measurement.py",
     "applications/prediction/draws.py",
@@ -124,14 +124,14 @@ class Predictor:
     def draw(self, place: Place) -> Chunk:
         """Arrays over the draws (n,) at a place, which depend on the seed, the place and the conditions only.
 
-        `status` (a `Status`), and of draws with one position `radius95_m`, `covariance_m2` (n, 2, 2) and
-        `offset_m` (n, 2), found minus true position; NaN of the others.
+        `status` (a `Status`), and of draws with one position `radius95_m`, `covariance_m2` (n, 2, 2), `offset_m`
+        (n, 2), found minus true position, and `protection_level_m`, infinite without a bound; NaN of the others.
         """
         rows = [self._draw_one(place, draw) for draw in range(len(self.conditions.times_utc))]
         status, *values = map(np.array, zip(*rows, strict=True))
         return {"status": status.astype(np.int8)} | dict(zip(LOCATED, values, strict=True))
 
-    def _draw_one(self, place: Place, draw: int) -> tuple[Status, float, Array, Array]:
+    def _draw_one(self, place: Place, draw: int) -> tuple[Status, float, Array, Array, float]:
         """Row `draw`."""
         series = replace(self._series[draw], east_m=place.east_m, north_m=place.north_m)
         if draw not in self._skies:
@@ -139,7 +139,7 @@ class Predictor:
         scene, rng = series.scene(place.number, sky=self._skies[draw])
         scene = replace(scene, terrain=draw_ground(self.terrain, rng=rng.spawn(1)[0]))
         rays = simulate_rays(scene, self.catalog, self.terrain, rng=rng)
-        nothing = (np.nan, np.full((2, 2), np.nan), np.full(2, np.nan))
+        nothing = (np.nan, np.full((2, 2), np.nan), np.full(2, np.nan), np.nan)
         try:
             fix = locate_rays(rays, self.localizer).fix
         except BadInput:
@@ -148,7 +148,8 @@ class Predictor:
             return Status.REFUSED, *nothing
         if fix.ambiguous:
             return Status.AMBIGUOUS, *nothing
-        return Status.OK, fix.radius95_m, fix.covariance_m2, (fix.position_enu_m - scene.position_enu_m)[:2]
+        level_m = np.inf if fix.integrity is None else fix.integrity.protection_level_m
+        return Status.OK, fix.radius95_m, fix.covariance_m2, (fix.position_enu_m - scene.position_enu_m)[:2], level_m
 
     def _series_of(self, draw: int, catalog: StarCatalog, faint_v_mag: float | None) -> Series:
         conditions = self.conditions

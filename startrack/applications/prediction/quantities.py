@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from startrack.core.types import Array
+from startrack.localization import RISK
 from startrack.output import (
     Quantity,
     Schema,
@@ -50,6 +51,9 @@ CELL_QUANTITIES = (
           "of the mean covariance of the draws that have one position"),
     _cell("sigma_minor_m", "m", "standard deviation across it"),
     _cell("azimuth_deg", "deg", "azimuth of the long axis, from 0 to 180"),
+    _cell("protection_level_m", "m", "median over the draws of the protection level, beyond which the true position "
+          f"lies with probability {RISK:g} at most, also where something stands on no map; a draw without one counts "
+          "as infinite; empty: half of the draws or more have none"),
 )  # fmt: skip
 PATH_QUANTITIES = (  # beside the others, along a path with odometry
     _cell(FILTERED, "m", "95 % radius of the position by the images so far and the odometry between "

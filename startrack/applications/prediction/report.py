@@ -38,13 +38,17 @@ from startrack.output import (
     path_picture,
     png_bytes,
     prediction_picture,
+    qgis_style_text,
     quantity_columns,
+    radius_classes,
 )
 from startrack.terrain import Terrain, load_terrain, write_bands
 
-RECORD_FILE, MAP, CELL_TABLE, MAP_PICTURE = "predict.json", "predict.tif", "predict.ecsv", "predict.png"
+RECORD_FILE, MAP, STYLE = "predict.json", "predict.tif", "predict.qml"
+CELL_TABLE, MAP_PICTURE = "predict.ecsv", "predict.png"
+STYLED = "radius95_m"  # the band that QGIS shows
 COMPARISON_TABLE, COMPARISON_PICTURE = "predict-compare.ecsv", "predict-compare.png"
-PREDICTION_FILES = {MAP, CELL_TABLE, RECORD_FILE, MAP_PICTURE, COMPARISON_TABLE, COMPARISON_PICTURE}
+PREDICTION_FILES = {MAP, STYLE, CELL_TABLE, RECORD_FILE, MAP_PICTURE, COMPARISON_TABLE, COMPARISON_PICTURE}
 NO_RADIUS = "no position at half of the places"
 PATH_CURVES = {FILTERED: "images so far, and odometry", SMOOTHED: "all images, and odometry"}
 SETTINGS = ("kind", "terrain", "camera", "first_time_utc", "last_time_utc", "spacing_m", "places")  # of one prediction
@@ -182,6 +186,8 @@ def write_report(report: Report, out: Path, *, plots: bool) -> list[Path]:
     if isinstance(points, AreaCells):  # the quantities as bands, in the projection of the terrain's map
         bands = {one.key: points.band(report.cells[one.key]) for one in CELL_QUANTITIES}
         write_bands(out / MAP, points.frame, bands)
+        if classes := radius_classes(report.cells[STYLED]):
+            made[STYLE] = qgis_style_text(1 + list(bands).index(STYLED), classes).encode()
     made[CELL_TABLE] = _table(report).encode()
     if plots:
         made[MAP_PICTURE] = png_bytes(_picture(report))

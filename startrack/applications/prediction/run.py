@@ -47,14 +47,20 @@ def cells_of_draws(draws: Chunk) -> Cells:
     status = draws["status"]
     located = (status == Status.OK) & np.isfinite(draws["covariance_m2"]).all(axis=(2, 3))
     shares = [np.mean(status == code, axis=1) for code in Status]
-    radius = np.median(np.where(status == Status.OK, draws["radius95_m"], np.inf), axis=1)
-    radius[~np.isfinite(radius)] = np.nan
-    found = (radius, *shares, *_ellipses(draws["covariance_m2"], located))
+    lengths = (draws[name] for name in ("radius95_m", "protection_level_m"))
+    radius, level = (_known_medians(np.where(status == Status.OK, one, np.inf)) for one in lengths)
+    found = (radius, *shares, *_ellipses(draws["covariance_m2"], located), level)
     cells = {one.key: values for one, values in zip(CELL_QUANTITIES, found, strict=True)}
     # Root mean square of the errors over the stated one.
     error_m2 = np.where(located, np.square(draws["offset_m"]).sum(axis=-1), 0.0).sum(axis=1)
     stated_m2 = np.where(located, np.trace(draws["covariance_m2"], axis1=2, axis2=3), 0.0).sum(axis=1)
     return cells | {ERROR_RATIO: np.sqrt(error_m2 / np.where(stated_m2 > 0.0, stated_m2, np.nan))}
+
+
+def _known_medians(length_m: Array) -> Array:
+    """Medians (k,) over the draws of lengths (k, n); NaN where they are infinite."""
+    median = np.median(length_m, axis=1)
+    return np.where(np.isfinite(median), median, np.nan)
 
 
 def _ellipses(covariance_m2: Array, located: Bools) -> tuple[Array, Array, Array]:

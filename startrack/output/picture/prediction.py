@@ -41,9 +41,9 @@ def prediction_picture(
     box = (MARGIN_PX, HEAD_PX, MARGIN_PX + SIDE_PX, HEAD_PX + SIDE_PX)
     canvas = _headed_canvas(round(box[2] + KEY_PX), round(box[3] + BELOW_PX), title, lines)
     half_m = SEARCH_MARGIN * max(terrain.search_radius_m, terrain.rim_radius_m or 0.0)
-    drawn, bounds_m = Map.of_extent(canvas, box, (0.0, 0.0), half_m), class_bounds_m(radius95_m.heights_m)
-    at = np.rint(np.linspace(0, len(COLOURS) - 1, len(bounds_m) + 1)).astype(int) if bounds_m else [0]
-    colours = [*(COLOURS[k] for k in at), Ink.VERMILLION]  # the last: no position
+    drawn, classes = Map.of_extent(canvas, box, (0.0, 0.0), half_m), radius_classes(radius95_m.heights_m)
+    bounds_m = [bound for bound, _, _ in classes[:-1]]
+    colours = [*([colour for _, _, colour in classes] or COLOURS[:1]), Ink.VERMILLION]  # the last: no position
     radius = _radius_of_pixels(drawn, site, radius95_m)
     inside = _draw_classes(drawn, terrain, np.searchsorted([*bounds_m, np.inf], radius, side="right"), colours)
     drawn.window.line(drawn.canvas_px(ring((0.0, 0.0), terrain.search_radius_m)), Ink.DIM, 2)
@@ -54,13 +54,25 @@ def prediction_picture(
     drawn.draw_distances()
     left, top = box[2] + 1.5 * TEXT_PX, box[1] + TEXT_PX
     top = canvas.paragraph(left, top, "95 of 100 positions lie within", KEY_PX - 3 * TEXT_PX, Ink.PLAIN)
-    texts = [f"{low:g} to {high:g} m" for low, high in pairwise(bounds_m)]
-    texts = [f"less than {bounds_m[0]:g} m", *texts, f"more than {bounds_m[-1]:g} m"] if bounds_m else []
-    entries = [("box", colour, words) for colour, words in zip(colours, texts, strict=False)]
+    entries = [("box", colour, words) for _, words, colour in classes]
     if np.isinf(radius95_m.heights_m).any():
         entries.append(("box", colours[-1], "mostly no position"))
     canvas.legend(left, top + TEXT_PX, KEY_PX - TEXT_PX, entries)
     return canvas.rendered_pixels()
+
+
+def radius_classes(radius_m: NDArray[np.floating[Any]]) -> list[tuple[float, str, Colour]]:
+    """Classes of radii (...): upper bound [m], words and colour, the smallest first; the last bound is infinite.
+
+    Values of `radius_m` that are not finite have no class; without any other there is none.
+    """
+    bounds_m = class_bounds_m(radius_m)
+    if not bounds_m:
+        return []
+    texts = [f"{low:g} to {high:g} m" for low, high in pairwise(bounds_m)]
+    texts = [f"less than {bounds_m[0]:g} m", *texts, f"more than {bounds_m[-1]:g} m"]
+    at = np.rint(np.linspace(0, len(COLOURS) - 1, len(texts))).astype(int)
+    return list(zip([*bounds_m, np.inf], texts, [COLOURS[k] for k in at], strict=True))
 
 
 def class_bounds_m(radius_m: NDArray[np.floating[Any]]) -> list[float]:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -118,6 +119,26 @@ def test_a_mast_in_the_photograph_is_proposed_for_the_mask(exposure, tmp_path, c
     clear = np.ones(1392, dtype=bool)
     clear[760 - 70 - 64 : 760 + 70 + 64] = False
     assert not masked[:700, clear].any()  # trees stand lower in the image
+
+
+@pytest.mark.slow
+def test_a_picture_whose_stars_and_sources_differ_is_left_out_and_named(exposure):
+    """Two thirds of the sky behind cloud, with 220 lamps there."""
+    rng, pixels = np.random.default_rng(4), exposure.pixels_adu.copy()
+    y, x = np.indices(pixels.shape) - np.array(pixels.shape)[:, None, None] / 2
+    hidden = np.abs(np.arctan2(y, x)) < np.radians(120)
+    level = float(np.median(pixels[hidden]))
+    pixels[hidden] = level * (1 + 0.02 * rng.standard_normal(hidden.sum()))
+    lamps, places = np.zeros_like(pixels), np.argwhere(hidden & (np.hypot(x, y) < 0.4 * min(pixels.shape)))
+    lamps[tuple(places[rng.integers(0, len(places), 220)].T)] = 120_000 * rng.uniform(0.3, 1.0, 220)
+    spoiled = replace(exposure, name="spoiled.fits", pixels_adu=pixels + cv2.GaussianBlur(lamps, (0, 0), 1.0))
+    found = calibrate(
+        [exposure, spoiled], load_catalog().brighter_than(8.0), camera=load_camera("lowell-ldt"), site=SITE
+    )
+    assert found.accepted and len(found.joint.frames) == 1
+    (refused,) = found.refused
+    assert (refused.name, refused.reason) == ("spoiled.fits", "inconsistent_evidence")
+    assert "60 % is the least" in refused.message
 
 
 def test_a_picture_of_another_size_is_a_size_mismatch(exposure):

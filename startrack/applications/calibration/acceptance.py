@@ -111,12 +111,6 @@ def rings_and_sectors(camera: Camera, points: Observations) -> tuple[Array, Ints
     return angle, ring, np.minimum((IMAGE_SECTORS * around / (2 * np.pi)).astype(int), IMAGE_SECTORS - 1)
 
 
-def corner_angle_rad(camera: Camera) -> float:
-    """The largest angle off the axis [rad] of the frame's corners."""
-    right, bottom = (side - 0.5 for side in camera.size_px)
-    return float(np.max(camera.angle_rad(np.array([[x, y] for x in (-0.5, right) for y in (-0.5, bottom)]))))
-
-
 def joint_log_p_value(joint: JointFit) -> float:
     """Log-probability (natural) of as many matches by chance.
 

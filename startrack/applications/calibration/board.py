@@ -14,13 +14,13 @@ from startrack.applications.calibration.acceptance import (
     Check,
     CheckedCamera,
     RefusedImage,
-    corner_angle_rad,
     held_out_check,
     map_check,
     minimum_check,
     ring_check,
     rings_and_sectors,
 )
+from startrack.applications.calibration.field_of_view import corner_angle_rad
 from startrack.applications.calibration.initial_states import initial_board_state
 from startrack.core.types import Array, BadInput, Exposure, NotIdentified
 from startrack.estimation.lens_fit import LensFit, fit_state

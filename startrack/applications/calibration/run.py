@@ -10,12 +10,13 @@ from typing import NamedTuple
 import numpy as np
 
 from startrack.applications.calibration.acceptance import (
+    SMALLEST_FRACTION,
     CheckedCamera,
     RefusedImage,
     check_acceptance,
-    corner_angle_rad,
     horizon_checks,
 )
+from startrack.applications.calibration.field_of_view import field_of_view_rad, largest_angle_rad
 from startrack.applications.calibration.photometry import KnownSensor, Photometry, measure_photometry
 from startrack.applications.calibration.shared_errors import widen_covariance
 from startrack.applications.calibration.static_parts import find_obstructions, remove_static_sources
@@ -28,7 +29,7 @@ from startrack.estimation.frame_matching import Frame, frame_of, require_body, r
 from startrack.estimation.joint_fit import FINAL_ROUNDS, JointFit, fit_frames, grow_from_matches
 from startrack.exposure import combine_masks, with_facts
 from startrack.frames import Site
-from startrack.identification import WIDE_FIELD_RAD, Identifier, identify_unknown_lens
+from startrack.identification import Identifier, identify_unknown_lens
 
 BRIGHTEST_IDENTIFIED = 100  # the region growing starts from the inner half of these stars
 Progress = Callable[[str], None]
@@ -108,13 +109,13 @@ def calibrate(
         BadInput: no_time, size_mismatch, no_calibration.
         NotIdentified: the stars of no image are identified.
     """
-    run = _Run(catalog, camera, _field_rad(camera, fov_rad), site, progress)
+    run = _Run(catalog, camera, field_of_view_rad(camera, fov_rad), site, progress)
     frames = _frames(run, exposures)
     _identify_all(run, frames)
     joint, same = _fit_jointly(run)
     joint = widen_covariance(joint)
     fitted = replace(
-        joint.fit.camera, name=name, max_angle_rad=_max_angle_rad(joint.fit.camera, camera, fov_rad),
+        joint.fit.camera, name=name, max_angle_rad=largest_angle_rad(joint.fit.camera, camera, fov_rad),
         refraction=_refraction(site),
     )  # fmt: skip
     joint = replace(joint, fit=replace(joint.fit, camera=fitted))
@@ -146,7 +147,7 @@ def _refraction(site: Site | None) -> str:
 
 
 def count_steps(images: int) -> int:
-    """How often `calibrate` calls its `progress` at most, for so many `images`."""
+    """How often `calibrate` calls its `progress` for so many `images`, if none is left out after the fit."""
     return 2 * images + FINAL_ROUNDS + 1
 
 
@@ -238,22 +239,6 @@ def _identify_first(run: _Run, frame: Frame) -> _IdentifiedFrame:
     return _IdentifiedFrame(frame, camera, R, found)
 
 
-def _field_rad(camera: Camera | None, fov_rad: float | None) -> float:
-    """`fov_rad`, or the approximate camera's: of the image circle where that is wide, else across the frame's width.
-
-    Raises BadInput no_calibration where there is neither.
-    """
-    if fov_rad is not None:
-        return fov_rad
-    if camera is None:
-        raise BadInput("no_calibration", "give the field of view (--fov DEG) or an approximate camera file (-c)")
-    if 2.0 * camera.max_angle_rad >= WIDE_FIELD_RAD:
-        return 2.0 * camera.max_angle_rad
-    width, height = camera.size_px
-    sides = np.array([[-0.5, (height - 1) / 2], [width - 0.5, (height - 1) / 2]])
-    return float(min(np.sum(camera.angle_rad(sides)), 0.99 * WIDE_FIELD_RAD))
-
-
 def identify_with_camera(camera: Camera, frame: Frame) -> tuple[Camera, Identification]:
     """Bright stars identified with an approximate camera or with its mirror image. Raises NotIdentified."""
     identifier = Identifier(whole_field=False)
@@ -273,8 +258,11 @@ def identify_with_camera(camera: Camera, frame: Frame) -> tuple[Camera, Identifi
 
 
 def _fit_jointly(run: _Run) -> tuple[JointFit, tuple[Frame, ...]]:
-    """The joint fit without static sources, and its frames with them; images of the other handedness are left out."""
-    camera, same = run.lead.camera, []
+    """The joint fit without static sources, and its frames with them.
+
+    Images of the other handedness are left out, and those whose stars and sources the lens does not explain.
+    """
+    camera, same = run.lead.camera, list[_IdentifiedFrame]()
     for one in run.identified:
         if one.camera.mirrored == camera.mirrored:
             same.append(one)
@@ -283,12 +271,20 @@ def _fit_jointly(run: _Run) -> tuple[JointFit, tuple[Frame, ...]]:
             run.refuse(one.frame.exposure.name, NotIdentified(text, reason="mirrored"))
     R = np.stack([one.R_cam_icrs for one in same])
     frames = tuple(one.frame for one in same)
-    return fit_frames(remove_static_sources(frames, R), camera, R, run.progress), frames
+    joint = fit_frames(remove_static_sources(frames, R), camera, R, run.progress)
+    explained = [matched.fraction >= SMALLEST_FRACTION for matched in joint.matches]
+    if all(explained) or not any(explained):  # the checks refuse these
+        return joint, frames
+    for one, matched, is_explained in zip(same, joint.matches, explained, strict=True):
+        if not is_explained:
+            text = _unexplained_text(matched.fraction)
+            run.refuse(one.frame.exposure.name, NotIdentified(text, "inconsistent_evidence"))
+    run.identified = [one for one, is_explained in zip(same, explained, strict=True) if is_explained]
+    return _fit_jointly(run)
 
 
-def _max_angle_rad(fitted: Camera, start: Camera | None, fov_rad: float | None) -> float:
-    """Edge of the image circle: as given, else the frame's corner; at most the turning point of the polynomial."""
-    edge = corner_angle_rad(fitted) if start is None else start.max_angle_rad
-    if start is None and fov_rad is not None and fov_rad >= WIDE_FIELD_RAD:
-        edge = 0.5 * fov_rad
-    return float(max(min(edge, fitted.lens.max_invertible_rad), fitted.calibrated_angle_rad))
+def _unexplained_text(fraction: float) -> str:
+    return (
+        f"{100 * fraction:.0f} % of its bright sources are stars, or of its bright stars sources, the larger, and "
+        f"{100 * SMALLEST_FRACTION:.0f} % is the least: it shows cloud or lamps, or its lens or time is another"
+    )

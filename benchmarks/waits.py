@@ -53,7 +53,7 @@ Cost = tuple[float, ...]  # one number, or wall and CPU time
 class Row:
     """A wait: `measure` takes the folder of a code and gives its cost in `unit`, NaN where that code cannot do it.
 
-    `peer` gives the cost of another program on the same input; `runs`: how often, None for as asked.
+    `peer` gives the cost of another program on the same input; `runs`: how often at most.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Row:
     measure: Callable[[Path], Cost]
     unit: str = "s"
     peer: Callable[[], Cost] | None = None
-    runs: int | None = None
+    runs: int = 9
 
 
 def main() -> None:
@@ -76,7 +76,7 @@ def main() -> None:
     rows = []
     with worktree(args.against) as before:
         for row in (row for row in ROWS if any(word in row.name for word in args.only)):
-            rows.append(cells(row, before, row.runs or args.runs))
+            rows.append(cells(row, before, min(row.runs, args.runs)))
             print(*rows[-1], sep="  ", flush=True)
     if args.only == [""]:
         columns = ["what", args.against, "this", "this / that", "peer", "this / peer", "wanted"]
@@ -131,11 +131,19 @@ def process(code: Path, *words: str, **variables: str) -> Cost:
 
 
 def in_process(name: str, code: Path = ROOT) -> Cost:
-    """What the function `name` of `_waited.py` prints last, in a process with the code in a folder; NaN if it fails."""
-    command = [sys.executable, ROOT / "benchmarks/_waited.py", name]
+    """The last number that the function `name` of `_waited.py` prints; NaN if it fails."""
+    return (printed_numbers(name, code)[-1],)
+
+
+def printed_numbers(name: str, code: Path) -> list[float]:
+    """What a function of `_waited.py` prints last, in a process with the code in a folder; NaN if it fails."""
+    command = [sys.executable, str(ROOT / "benchmarks/_waited.py"), name]
     variables = os.environ | {"PYTHONPATH": str(code), "OPENBLAS_NUM_THREADS": "1"}
     done = subprocess.run(command, env=variables, check=False, capture_output=True, text=True)
-    return (float(done.stdout.split()[-1]) if done.returncode == 0 else math.nan,)
+    return [float(word) for word in done.stdout.splitlines()[-1].split()] if done.returncode == 0 else [math.nan]
+
+
+own_map = cache(partial(printed_numbers, "own_map"))  # of the folder of a code
 
 
 def cpu_s() -> float:
@@ -241,55 +249,32 @@ def core_mb(code: Path) -> Cost:
     return (sum(found.values()) / 1e6,)
 
 
+waited = partial(partial, in_process)  # the cost of a function of `_waited.py`
 ROWS = (
     Row("`locate near-wall.png`, whole process, all files", "<= 1.5 s", located),
     Row("`locate near-wall.png --no-plots`, whole process", "<= 1.0 s", lambda code: located(code, "--no-plots")),
-    Row("`locate --no-plots` on Shackleton's floor", "", lambda code: on_floor(code), runs=5),
-    Row(
-        "the same, with a clock right to an hour", "<= 3 s", lambda code: on_floor(code, "--time-sigma", "3600"), runs=3
-    ),
+    Row("`locate --no-plots` on Shackleton's floor", "", on_floor, runs=5),
+    Row("the same, with a clock right to an hour", "<= 3 s", lambda code: on_floor(code, "--time-sigma", "3600"),
+        runs=3),
     Row("the same on Faustini's map, until refused", "<= 8 s", lambda code: on_floor(code, "-t", "faustini"), runs=3),
-    Row(
-        "read to fix; sep", "<= 1 peer", partial(in_process, "read_to_fix"), "ms", partial(in_process, "sep_winpos"), 3
-    ),
-    Row(
-        "detection per Mpx; sep",
-        "<= 8 ms",
-        partial(in_process, "detection_per_mpx"),
-        "ms",
-        partial(in_process, "sep_per_mpx"),
-        3,
-    ),
-    Row(
-        "narrow fields, detect and identify; tetra3rs, thorough",
-        "<= 2 peer",
-        partial(in_process, "narrow_fields"),
-        "ms",
-        partial(in_process, "tetra3rs_narrow_fields"),
-        3,
-    ),
+    Row("read to fix; sep", "<= 1 peer", waited("read_to_fix"), "ms", waited("sep_winpos"), 3),
+    Row("detection per Mpx; sep", "<= 8 ms", waited("detection_per_mpx"), "ms", waited("sep_per_mpx"), 3),
+    Row("narrow fields, detect and identify; tetra3rs, thorough", "<= 2 peer", waited("narrow_fields"), "ms",
+        waited("tetra3rs_narrow_fields"), 3),
     Row("`calibrate`, 17 images of 4 Mpx, 2,000 stars each", "<= 15 s", calibrated, runs=3),
     Row("`horizon`, 4 photographs", "<= 8 s", horizon_of, runs=3),
     Row("`predict`, 10 places x 10 draws on Shackleton's floor", "<= 30 s", predicted, runs=1),
-    Row("a table of horizons, 1500 x 1500 posts of 20 m", "<= 20 s", partial(in_process, "horizon_table"), runs=1),
-    Row("image to fix on a rough map, 9 places: median", "<= 1.5 s", partial(in_process, "own_map"), runs=1),
-    Row("the same: the largest", "<= 4 s", partial(in_process, "own_map_largest"), runs=1),
-    Row("live track on a height map, file to answer", "<= 1 s", partial(in_process, "live_answer"), runs=1),
-    Row(
-        "lost in space from a list; ruststartracker",
-        "<= 1 peer",
-        partial(in_process, "listed_stars"),
-        "ms",
-        partial(in_process, "ruststartracker_listed_stars"),
-        3,
-    ),
-    Row(
-        "identification of the next frame, after detection", "<= 5 ms", partial(in_process, "next_frames"), "ms", runs=3
-    ),
+    Row("a table of horizons, 1500 x 1500 posts of 20 m", "<= 20 s", waited("horizon_table"), runs=1),
+    Row("image to fix on a rough map, 9 places: median", "<= 1.5 s", lambda code: (own_map(code)[-1],), runs=1),
+    Row("the same: the largest", "<= 4 s", lambda code: (own_map(code)[0],), runs=1),
+    Row("live track on a height map, file to answer", "<= 1 s", waited("live_answer"), runs=1),
+    Row("lost in space from a list; ruststartracker", "<= 1 peer", waited("listed_stars"), "ms",
+        waited("ruststartracker_listed_stars"), 3),
+    Row("identification of the next frame, after detection", "<= 5 ms", waited("next_frames"), "ms", runs=3),
     Row("first use, cylinder: compilation", "<= 10 s", partial(first_use, image=lambda: SAMPLE), runs=1),
     Row("first use, height map: compilation", "<= 20 s", partial(first_use, image=height_map_frame), runs=1),
     Row("packages of the core", "<= 760 MB", core_mb, "MB", runs=1),
-)
+)  # fmt: skip
 
 if __name__ == "__main__":
     main()

@@ -17,6 +17,7 @@ from startrack.core import MAX_SPEED_M_S, ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.errors import BAD_INPUT_REASONS, BadInput
 from startrack.core.types import Exposure
 from startrack.estimation.observations import OdometryErrors
+from startrack.identification import Identifier, NearSky
 from startrack.terrain import Terrain
 
 if TYPE_CHECKING:
@@ -116,6 +117,7 @@ def identify(
     flux: ArrayLike | None = None,
     sigma_px: ArrayLike | None = None,
     near_attitude: ArrayLike | None = None,
+    near_sky: ArrayLike | None = None,
 ) -> Solution | IdentifiedCentroids:
     """Stars and attitude of an image, or of a list of centroids. Neither terrain nor time is needed.
 
@@ -131,6 +133,8 @@ def identify(
         sigma_px: of centroids: error per axis, one number or (n,). None: 0.3 px.
         near_attitude: with a camera, a rough attitude R_cam_icrs (3, 3), some degrees off at most: the stars are sought
             there first, and everywhere if they are not there.
+        near_sky: with a camera, right ascension, declination and radius (3,) in degrees, ICRS: the stars are sought
+            only with the optical axis in that part of the sky, and fewer stars suffice.
 
     Returns:
         Of an image a Solution, whose `result.camera` is the camera used or found. Of centroids `IdentifiedCentroids`:
@@ -138,15 +142,18 @@ def identify(
 
     Raises:
         ValueError: both `camera` and `fov` are given, or of centroids neither; arrays of a wrong shape or type; of an
-            image `size_px`, `flux` or `sigma_px`; `size_px` with `camera`; `near_attitude` that is no rotation.
+            image `size_px`, `flux` or `sigma_px`; `size_px` with `camera`; `near_attitude` that is no rotation;
+            `near_sky` that is no part of the sky.
         BadInput: as `locate`.
         NotIdentified: the centroids are not identified.
     """
     if fov is not None and camera is not None:
         raise ValueError("camera= and fov= exclude each other: with fov= the lens is found, with camera= it is known")
-    if fov is not None and near_attitude is not None:
-        raise ValueError("near_attitude= needs camera=: with fov= the lens is not known")
+    for name, prior in (("near_attitude=", near_attitude), ("near_sky=", near_sky)):
+        if fov is not None and prior is not None:
+            raise ValueError(f"{name} needs camera=: with fov= the lens is not known")
     near = None if near_attitude is None else NearAttitude.of(near_attitude)
+    identifier = Identifier(near_sky=None if near_sky is None else NearSky.from_degrees(near_sky))
     of_list = {"size_px": size_px, "flux": flux, "sigma_px": sigma_px}
     given = [f"{name}=" for name, value in of_list.items() if value is not None]
     if given and isinstance(image, str | os.PathLike | Exposure):
@@ -161,13 +168,13 @@ def identify(
             xy_px, camera=None if camera is None else chain.load_camera_input(camera),
             fov_rad=None if fov is None else chain.field_of_view_rad(fov), size_px=size_px, flux=flux,
             sigma_px=sigma_px, stars=apparent_stars(load_catalog(), chain.time_input(time), None),
-            near_R_cam_icrs=None if near is None else near.R_cam_icrs_at(None, None),
+            identifier=identifier, near_R_cam_icrs=None if near is None else near.R_cam_icrs_at(None, None),
         )  # fmt: skip
     exposure = chain.exposure_input(image, time)
     if fov is not None:
         outcome = chain.identify_blind(exposure, chain.field_of_view_rad(fov), load_catalog())
     else:
-        settings = Settings(near_attitude=near)
+        settings = Settings(identifier=identifier, near_attitude=near)
         outcome = chain.identify(exposure, chain.camera_input(camera, exposure), load_catalog(), settings)
     return _solution(outcome, "identification")
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from startrack.core import FIELD_TOLERANCE_1, MAX_COUNT, MAX_EXPOSURE_S
 from startrack.core.declaration import LARGEST, SHOWN_CHARS
+
+if TYPE_CHECKING:
+    from startrack.identification import NearSky
 
 T = TypeVar("T")
 SCHEMES = ("", "tcp", "tls", "ucx", "ws", "wss")  # of Dask's addresses
@@ -117,6 +120,16 @@ def position_prior(text: str) -> tuple[float, float, float]:
     if len(words) != 3:
         raise argparse.ArgumentTypeError(f"{text[:SHOWN_CHARS]!r} is not EAST,NORTH,SIGMA in metres, as -3000,1500,200")
     return number(words[0]), number(words[1]), positive_number(words[2])
+
+
+def near_sky(text: str) -> NearSky:
+    """A part of the sky: right ascension, declination and radius [deg]."""
+    from startrack.identification import NearSky
+
+    try:
+        return NearSky.from_degrees([number(word) for word in text.split(",")])
+    except ValueError as cause:
+        raise argparse.ArgumentTypeError(f"{text[:SHOWN_CHARS]!r}: {cause}") from cause
 
 
 def exposure_times(text: str) -> list[float]:

@@ -9,7 +9,15 @@ from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from startrack.cli.flag_types import amount, position_prior, positive_count, positive_number, seconds, time_sigma_s
+from startrack.cli.flag_types import (
+    amount,
+    near_sky,
+    position_prior,
+    positive_count,
+    positive_number,
+    seconds,
+    time_sigma_s,
+)
 from startrack.core import MAX_SPEED_M_S, ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.errors import how_to_install
 
@@ -184,6 +192,12 @@ NEAR_ATTITUDE = flag(
     "--near-attitude FILE",
     "a result of startrack whose attitude is a rough one, some degrees off at most: the stars are sought there first, "
     "and everywhere if they are not there",
+)
+NEAR_SKY = flag(
+    "--near-sky RA,DEC,RADIUS",
+    "where the camera points, in degrees (ICRS): the stars are sought only with the optical axis within RADIUS of RA, "
+    "DEC; fewer stars suffice (--near-sky=-10,...)",
+    near_sky,
 )
 METHOD = (LOCALIZER, EVIDENCE, NEAR, NEAR_ATTITUDE)
 

@@ -55,7 +55,7 @@ COMMANDS = (
                     lambda text: fields_of_view_rad(text, NARROWEST_DEG, WIDEST_DEG),
                 ),
             ),
-            "method": (flags.NEAR_ATTITUDE,),
+            "method": (Either((flags.NEAR_ATTITUDE, flags.NEAR_SKY)),),
             "output": (
                 *flags.OUTPUT,
                 flag("--catalog-table", "list in NAME.stars.ecsv the stars in the frame that were not identified too"),

@@ -25,7 +25,7 @@ from startrack.core.errors import INTERNAL_ERROR, BadInput, BadOutput
 from startrack.core.files import make_folder, printable
 from startrack.core.types import Exposure, PositionPrior
 from startrack.exposure import split_bag_path
-from startrack.identification import WIDE_FIELD_RAD
+from startrack.identification import WIDE_FIELD_RAD, Identifier
 
 NEEDED_LATER = ("scipy.special", "scipy.spatial", "spiceypy", "PIL.ImageDraw")  # in this order; pictures need the last
 Solve = Callable[[Exposure, Camera | None], chain.Outcome]
@@ -54,7 +54,9 @@ def identify(args: argparse.Namespace) -> int:
     check_fov(args)
     if args.fov is not None and args.near_attitude is not None:
         args.usage_error("--near-attitude needs a camera file: with --fov the lens is not known")
-    settings = chain.Settings(near_attitude=near_attitude_of(args))
+    if args.fov is not None and args.near_sky is not None:
+        args.usage_error("--near-sky needs a camera file: with --fov the lens is not known")
+    settings = chain.Settings(identifier=Identifier(near_sky=args.near_sky), near_attitude=near_attitude_of(args))
 
     def solve(exposure: Exposure, camera: Camera | None) -> chain.Outcome:
         if camera is None:

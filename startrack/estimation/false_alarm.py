@@ -26,9 +26,12 @@ def probability(log_probability: float) -> float:
     return float(np.exp(max(log_probability, SMALLEST_LOG_PROBABILITY)))
 
 
-def log_trials(tried: int) -> float:
-    """Logarithm of the number of hypotheses tried: it is added to the log p-value of the accepted one."""
-    return float(np.log(max(tried, 1)))
+def log_trials(tried: int, part: float = 1.0) -> float:
+    """Logarithm of the number of hypotheses tried: it is added to the log p-value of the accepted one.
+
+    `tried` counts those of the whole sky. Where only a `part` of it is searched, chance proposes that part of them.
+    """
+    return float(np.log(max(tried, 1)) + np.log(part))
 
 
 def coincidence_probability(expected: Array | float) -> Array:
@@ -73,11 +76,11 @@ def log_p_value_bound(distance_px: Array, gate_px: float, predicted: int, densit
     return 0.0 if hits <= expected else float(hits - expected - hits * np.log(hits / expected))
 
 
-def expected_false_alarms(tried: int, matched: Ints | int, rays: int, each: float) -> Array:
+def expected_false_alarms(tried: float, matched: Ints | int, rays: int, each: float) -> Array:
     """Expected number of the `tried` hypotheses at which chance makes `matched` or more rays coincide with stars.
 
-    `matched` (k,) and the trials are without the three of the pattern, `rays` of all detections with them. `each` is
-    the probability that one ray coincides.
+    `matched` (k,) is without the three of the pattern, `rays` of all detections with them. `each` is the probability
+    that one ray coincides.
     """
     return tried * binomial_tail(matched, rays - PATTERN_MATCHES, each)
 

@@ -19,7 +19,6 @@ from startrack.identification.attitude_search import (
     FIRST_GATE_PX,
     GATE_PX,
     INLIER_PX,
-    MIN_MATCHES,
     AttitudeHypothesis,
     Sources,
 )
@@ -64,12 +63,12 @@ def refine_attitude(sources: Sources, hypothesis: AttitudeHypothesis) -> Attitud
         distance = distances_in_gate(xy_px, *sources.camera.project(rays_icrs @ R.T))
         pairs = CandidatePairs(detection, star, distance, v_mag, v_sigma_mag, photometry)
         matched = pairs.one_to_one_pairs
-        if len(matched) < MIN_MATCHES:
+        if len(matched) < sources.min_matches:
             return None
         agree, variance, refined, change = rotate_by_inliers(
             matched, detection, distance, sources.variance_px2, sources.rays_cam, rays_icrs, R
         )
-        if np.count_nonzero(agree) < MIN_MATCHES:
+        if np.count_nonzero(agree) < sources.min_matches:
             return None
         if change / scale.axis_rad_per_px < SETTLED_PX:
             break

@@ -18,9 +18,10 @@ from startrack.estimation.false_alarm import PATTERN_MATCHES, expected_false_ala
 from startrack.frames import wahba
 from startrack.identification.index import CatalogPatterns, PixelScale
 from startrack.identification.near_attitude import agreeing_pairs
+from startrack.identification.near_sky import NearSky
 from startrack.identification.star_grid import Neighbours, rotation_between, settle_rotation
 from startrack.identification.triangle_kernel import are_same_handed, sides_of_few
-from startrack.identification.triangles import PatternIndex, triangles
+from startrack.identification.triangles import PatternIndex, triad_attitude, triangles
 
 PREFIXES = (0, 7, 10, 14, 20, 28)  # number of brightest detections that form triangles, round by round
 WINDOW_RANKS = 24  # ranks of brightness that form triangles beyond these, half of them new in each window
@@ -34,11 +35,13 @@ BEYOND = [
 ROUGH_SIDE_RAD, ROUGH_FRACTION = np.radians(20.0), 0.4  # longest sides of short triangles, the second of the field
 PIVOTS = 16  # brightest detections about which triangles of catalogue pairs are tried
 MATCHES_EACH, ROUGH_MATCHES_EACH = 3, 8  # catalogue triangles looked up for a triangle of detections
+MATCHES_EACH_NEAR_SKY = 200  # of the whole sky, of which those in a stated part of it are tried
 MAX_IMAGE_TRIANGLES, MAX_ROUGH = 20_000, 3000  # short triangles of detections; their matches that are tried
 VERIFIED_DETECTIONS = 256  # detections tested against the stars
 PRETESTED = VERIFIED_DETECTIONS // 4  # detections in the first test of many hypotheses; as many are tested together
 DEPTH_FACTOR = 4  # catalogue stars per detection (of the whole sky): some are hidden or too faint
 MIN_MATCHES = 6
+MIN_MATCHES_NEAR_SKY = 5  # one star beyond a triangle can always be chance
 PLAUSIBLE = 1e-2  # expected false alarms below which a hypothesis is refined; the final limit is tested later
 GATE_PX = 6.0  # from a predicted star, in which detections are matched
 FIRST_GATE_PX = GATE_PX / 2
@@ -60,12 +63,23 @@ class Sources:
     camera: Camera
     scale: PixelScale
     patterns: CatalogPatterns
+    near_sky: NearSky | None = None  # where the camera points; None: anywhere
 
     @cached_property
     def variance_px2(self) -> Array:
         """Variance (n,) of a position, the mean of both axes."""
         covariance = self.centroids.covariance_px2
         return 0.5 * (covariance[:, 0, 0] + covariance[:, 1, 1])
+
+    @property
+    def min_matches(self) -> int:
+        """Fewest stars that an identification may have."""
+        return MIN_MATCHES if self.near_sky is None else MIN_MATCHES_NEAR_SKY
+
+    @property
+    def sky_part(self) -> float:
+        """Part of the sky in which the camera points; of the trials of the whole sky chance gives this part there."""
+        return 1.0 if self.near_sky is None else self.near_sky.part
 
     @property
     def neighbour_radius_rad(self) -> float:
@@ -96,7 +110,7 @@ class AttitudeSearch:
         self.sources, self.rays_cam, self.patterns, self.scale = (
             sources, sources.rays_cam, sources.patterns, sources.scale,
         )  # fmt: skip
-        self.tried = 0  # matching triangles so far
+        self.tried = 0  # matching triangles so far, of the whole sky
 
     def hypotheses(self, tolerance_px: float, rough_px: float) -> Iterator[AttitudeHypothesis]:
         """Attitudes that are unlikely by chance.
@@ -139,7 +153,7 @@ class AttitudeSearch:
         """From triangles of the detections `first` to `end` that have a vertex from the `fresh`-th of them on."""
         some = self.rays_cam[first:end]
         vertices, sides = sides_of_few(some, fresh, index.longest_chord)
-        left, right = index.candidates(sides, tolerance, MATCHES_EACH)
+        left, right = index.candidates(sides, tolerance, self._matches_each(MATCHES_EACH))
         if len(left):
             cam, icrs = some[vertices[left]], index.rays_icrs[index.vertices[right]]
             yield from self._test_triangles(cam, icrs, first, tolerance)
@@ -155,7 +169,8 @@ class AttitudeSearch:
         index = self.patterns.deep_index
         longest = min(ROUGH_SIDE_RAD, ROUGH_FRACTION * self.scale.diameter_rad)
         image = triangles(self.rays_cam[: DEEPEST_RANK // 2], longest, MAX_IMAGE_TRIANGLES)
-        left, right = index.candidates(2 * np.sin(image.sides_rad / 2), tolerance, ROUGH_MATCHES_EACH)
+        most = self._matches_each(ROUGH_MATCHES_EACH)
+        left, right = index.candidates(2 * np.sin(image.sides_rad / 2), tolerance, most)
         self.tried += max(len(left) - MAX_ROUGH, 0)
         left, right = left[:MAX_ROUGH], right[:MAX_ROUGH]
         if len(left):
@@ -166,9 +181,15 @@ class AttitudeSearch:
         """Attitudes that rotate rays icrs (m, 3, 3) to cam (m, 3, 3), tested by bright stars; no mirror images."""
         self.tried += len(cam)
         same = are_same_handed(cam, icrs)
+        if self.sources.near_sky is not None:
+            same &= self.sources.near_sky.contains(triad_attitude(cam, icrs))
         some = self.rays_cam[max(first - WINDOW_RANKS, 0) : first + PRETESTED]
         supported = self._supported_attitudes(cam[same], icrs[same], some, 2.0 * tolerance, self._depth(first))
         yield from self._test_attitudes(supported, first, 2.0 * tolerance)
+
+    def _matches_each(self, most: int) -> int:
+        """`most`, or more where only those that point into a part of the sky are tried."""
+        return most if self.sources.near_sky is None else MATCHES_EACH_NEAR_SKY
 
     def _depth(self, first: int) -> int:
         """Number of the brightest stars that the detections up to some beyond the `first` may be."""
@@ -181,11 +202,11 @@ class AttitudeSearch:
         for R in attitudes:
             near = self._neighbours(R, first)
             hits = min(int(np.count_nonzero(near.chord < radius)), rays)
-            if hits < MIN_MATCHES:
+            if hits < self.sources.min_matches:
                 continue
             if self._false_alarms(hits - PATTERN_MATCHES, rays, near.depth, radius) < PLAUSIBLE:
                 settled = self._settle(R, near, first, radius)
-                if len(settled.star) >= MIN_MATCHES:
+                if len(settled.star) >= self.sources.min_matches:
                     yield settled
 
     def _neighbours(self, R: Array, first: int) -> Neighbours:
@@ -224,4 +245,5 @@ class AttitudeSearch:
 
     def _false_alarms(self, further: Ints | int, rays: int, depth: int, radius: float) -> Array:
         """Expected number of trials in which so many further rays hit one of the `depth` brightest stars by chance."""
-        return expected_false_alarms(self.tried, further, rays, min(depth * radius**2 / 4, 1.0))
+        trials = self.tried * self.sources.sky_part
+        return expected_false_alarms(trials, further, rays, min(depth * radius**2 / 4, 1.0))

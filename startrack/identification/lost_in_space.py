@@ -26,13 +26,13 @@ from startrack.identification.attitude_search import (
     FIRST_GATE_PX,
     GATE_PX,
     INLIER_PX,
-    MIN_MATCHES,
     ONE_SOURCE_SIGMAS,
     AttitudeHypothesis,
     AttitudeSearch,
     Sources,
 )
 from startrack.identification.index import patterns_of, pixel_scale_of
+from startrack.identification.near_sky import NearSky
 
 MAX_FALSE_ALARM = 1e-9  # probability that chance gives an accepted identification
 BRIGHT_DETECTIONS = 300  # brightest detections that decide whether the camera file is right
@@ -48,12 +48,14 @@ class Identifier:
     """Identification by triangles, accepted by its p-value: (Centroids, Camera, Stars, attitude) -> Identification.
 
     An attitude is accepted if chance would give as many coincidences with a probability below `max_false_alarm`, all
-    hypotheses tried included; otherwise NotIdentified is raised.
+    hypotheses tried included; otherwise NotIdentified is raised. With `near_sky` only attitudes that point into that
+    part of the sky are tried: fewer trials, so fewer stars suffice.
     """
 
     max_false_alarm: float = MAX_FALSE_ALARM
     tolerances_px: tuple[float, float] = (0.7, 3.0)  # error of a ray: centroids alone; rough calibration included
     whole_field: bool = True  # refuse a camera that fits only a part of its field; a calibration may begin with one
+    near_sky: NearSky | None = None
 
     def __call__(
         self, centroids: Centroids, camera: Camera, stars: Stars, near_R_cam_icrs: Array | None = None
@@ -66,18 +68,17 @@ class Identifier:
         scale = pixel_scale_of(camera)
         rays_cam = camera.unproject(centroids.xy_px)
         inside = np.flatnonzero(rays_cam[:, 2] >= np.cos(camera.max_angle_rad))
-        if len(inside) < MIN_MATCHES:
-            raise NotIdentified(_describe_few(len(inside), len(centroids), camera), detected=len(inside))
         is_whole = len(inside) == len(centroids)
-        some = centroids if is_whole else centroids.take(inside)
-        sources = Sources(
-            some, rays_cam if is_whole else rays_cam[inside], camera, scale, patterns_of(stars, scale.field_sr)
-        )
+        some, rays_inside = (centroids, rays_cam) if is_whole else (centroids.take(inside), rays_cam[inside])
+        sources = Sources(some, rays_inside, camera, scale, patterns_of(stars, scale.field_sr), self.near_sky)
+        if len(inside) < sources.min_matches:
+            few = _describe_few(len(inside), len(centroids), camera, sources.min_matches)
+            raise NotIdentified(few, detected=len(inside))
         search = AttitudeSearch(sources)
         tolerance_px, rough_px = self.tolerances_px
         tolerance_px = min(max(tolerance_px, TOLERANCE_SIGMAS * upper_median(sources.variance_px2) ** 0.5), rough_px)
         found = None
-        if near_R_cam_icrs is not None:
+        if near_R_cam_icrs is not None and (self.near_sky is None or self.near_sky.contains(near_R_cam_icrs)):
             with suppress(_WrongCamera):  # or a wrong attitude
                 found, _ = self._find_accepted(search, search.hypotheses_near(near_R_cam_icrs, tolerance_px))
         if found is None:
@@ -94,9 +95,11 @@ class Identifier:
                 f"{str(not camera.mirrored).lower()} in the camera file",
                 reason="mirrored",
             )
+        where, advice = ("", "") if self.near_sky is None else (f" within {self.near_sky}", " and where it points")
         raise NotIdentified(
-            f"no attitude explains the {len(inside)} point sources better than chance ({search.tried} tried; "
-            f"{refusal}): check that the camera file is that of this lens",
+            f"no attitude{where} explains the {len(inside)} point "
+            f"sources better than chance ({search.tried} tried; {refusal}): check that the camera file is that of this "
+            f"lens{advice}",
             detected=len(inside),
             tried=search.tried,
         )
@@ -125,12 +128,12 @@ class Identifier:
         pairs = match.pairs
         distance = pairs.distance_px[match.matched]
         named_distance = distance[match.named]
-        if len(named_distance) < MIN_MATCHES:
+        if len(named_distance) < sources.min_matches:
             raise NotIdentified(f"only {len(named_distance)} stars match", matched=len(named_distance))
         rms_px = sqrt(0.5 * (named_distance @ named_distance) / len(named_distance))
         radius_px = min(FIRST_GATE_PX, max(TOLERANCE_SIGMAS * rms_px, SMALLEST_RADIUS_PX))
         hits = int(np.count_nonzero(distance < radius_px))
-        log_p = self._log_p_value(match, hits, radius_px, sources) + log_trials(tried)
+        log_p = self._log_p_value(match, hits, radius_px, sources) + log_trials(tried, sources.sky_part)
         if log_p > log(self.max_false_alarm):
             raise NotIdentified(f"the {hits} stars that match might do so by chance", matched=hits)
         if self.whole_field:
@@ -160,15 +163,16 @@ class Identifier:
         """Log-probability that chance gives as many hits at one attitude."""
         radius_rad = radius_px * sources.scale.axis_rad_per_px
         predicted = max(int(len(match.visible_v_mag) * sources.scale.frame_fraction), hits)
-        density = density_per_sr(sources.rays_cam, min(LOCAL_FRACTION * sources.scale.diameter_rad, CAP_RADIUS_RAD))
+        local = density_per_sr(sources.rays_cam, min(LOCAL_FRACTION * sources.scale.diameter_rad, CAP_RADIUS_RAD))
+        density = max(local, len(sources.rays_cam) / sources.scale.field_sr)  # caps about few detections hold no others
         agreement = agreement_of(sources.centroids, match.visible_v_mag, match.pairs.scale.measured_mag, DIMMED_MAG)
         each = agreement * coincidence_probability(density * np.pi * radius_rad**2)
         return float(log_p_value(hits, predicted, each))
 
 
-def _describe_few(inside: int, given: int, camera: Camera) -> str:
-    """Why the `inside` of the `given` point sources, those within the camera's image circle, do not suffice."""
-    if given < MIN_MATCHES:
+def _describe_few(inside: int, given: int, camera: Camera, needed: int) -> str:
+    """Why the `inside` of the `given` point sources, those within the camera's image circle, are not the `needed`."""
+    if given < needed:
         return f"{given} point sources are too few to identify: expose longer"
     return (
         f"only {inside} of {given} point sources lie in the image circle of camera {camera.name!r} "

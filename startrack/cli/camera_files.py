@@ -16,7 +16,8 @@ import numpy as np
 
 from startrack import camera as cameras
 from startrack.cli.flags import checked_flag
-from startrack.core.files import check_output, file_stem, read_text, write_atomically
+from startrack.core.errors import BadInput
+from startrack.core.files import check_output, file_stem, printable, read_text, write_atomically
 from startrack.core.types import Exposure
 from startrack.exposure import write_exposure
 
@@ -27,7 +28,9 @@ if TYPE_CHECKING:
 RECORD = ".calibration.json"
 REPORTS = (".report.html", ".report.png")
 MASK, HOT_PIXELS = ".mask.png", ".hot-pixels.csv"
-DEFAULT_NAMES = {"colmap": "cameras.txt", "kalibr": "camchain.yaml"}  # of the other programs
+PLATEPAR = "platepar"
+# Of the other programs.
+DEFAULT_NAMES = {"colmap": "cameras.txt", "kalibr": "camchain.yaml", PLATEPAR: "platepar_cmn2010.cal"}
 
 
 def show(args: argparse.Namespace) -> int:
@@ -43,7 +46,12 @@ def show(args: argparse.Namespace) -> int:
 def convert(args: argparse.Namespace) -> int:
     """Convert one camera file; 0."""
     check_name(args)
-    if args.to is not None:
+    if args.to != PLATEPAR and (args.attitude, args.site) != (None, None):
+        args.usage_error(f"--attitude and --site are for --to {PLATEPAR}")
+    if args.to == PLATEPAR:
+        text, note = _platepar(args)
+        default = DEFAULT_NAMES[args.to]
+    elif args.to is not None:
         camera = cameras.load_camera(args.file)
         text = cameras.foreign_text(camera, args.to)
         default = DEFAULT_NAMES.get(args.to, f"{file_stem(camera.name)}.yaml")
@@ -66,6 +74,28 @@ def convert(args: argparse.Namespace) -> int:
     if not args.quiet:
         print(f"{out}{note}")
     return 0
+
+
+def _platepar(args: argparse.Namespace) -> tuple[str, str]:
+    """The text of a platepar, and a note about how well it is the lens. Raises BadInput."""
+    from startrack.chain import read_near_attitude
+    from startrack.cli.images import flag_site
+
+    site = flag_site(args)
+    if args.attitude is None or site is None:
+        return args.usage_error(  # type: ignore[no-any-return]
+            f"--to {PLATEPAR} needs --attitude NAME.identification.json, where the camera pointed and when, and --site "
+            "LAT,LON[,M]: startrack identify IMAGE --time UTC -c CAMERA writes the first"
+        )
+    camera, attitude = cameras.load_camera(args.file), read_near_attitude(args.attitude)
+    if attitude.time_utc is None:
+        raise BadInput("no_time", f"{printable(args.attitude)}: states no time: identify the image again with --time")
+    found = cameras.platepar_of(camera, attitude.R_cam_icrs_at(None, None), attitude.time_utc, site)
+    angle_deg = math.degrees(camera.calibrated_angle_rad)
+    return found.text, (
+        f"; largest errors of its polynomials up to {angle_deg:.1f} degrees off the axis: {found.to_sky_px:.2f} px to "
+        f"the sky, {found.to_image_px:.2f} px to the image; its photometry is RMS's default"
+    )
 
 
 def check_name(args: argparse.Namespace) -> None:

@@ -12,7 +12,7 @@ from stars       startrack calibrate NIGHT.jpg... --fov 180 -o CAMERA.toml   the
 from a board     startrack calibrate board BOARD.png... --pattern 9x6        the lens, from pictures of a chessboard
 check            startrack calibrate verify LATER.jpg -c CAMERA.toml         does the camera file still fit?
 look             startrack calibrate show CAMERA.toml                        the content of a camera file
-other programs   startrack calibrate convert CAMERA.toml --to ros            ros, kalibr, colmap, opencv; --from too"""
+other programs   startrack calibrate convert CAMERA.toml --to ros            ros, kalibr, colmap, opencv; to a platepar"""
 TERRAIN = """usage: startrack terrain ACTION ... (startrack terrain ACTION --help)
 
 look             startrack terrain show shackleton --at 0 0                  properties, relief, a horizon
@@ -81,7 +81,7 @@ COMMANDS = (
                 flag("file FILE", "camera file with --to; the other program's file with --from"),
                 Either(
                     (
-                        flag("--to", "write this format", choices=FORMATS),
+                        flag("--to", "write this format", choices=(*FORMATS, "platepar")),
                         flag("--from", "read this format", choices=FORMATS, dest="source"),
                     ),
                     required=True,
@@ -92,6 +92,12 @@ COMMANDS = (
                     "(default: that of the frame's nearest edge)",
                     limit_type(number, lambda deg: 0 < deg <= 180, "{} is not above 0 and up to 180 degrees"),
                 ),
+                flag(
+                    "--attitude FILE",
+                    "with --to platepar: a NAME.identification.json or NAME.fix.json of this camera, where it pointed "
+                    "and when",
+                ),
+                flags.SITE,
             ),
             "output": (flags.FILE, NAME, flags.DIR, flags.OVERWRITE),
             "more": (flags.JSON, *flags.MORE),

@@ -1,0 +1,189 @@
+"""The platepar of the Raspberry Meteor Station (RMS): lens, pointing and site of a camera at a time.
+
+RMS's model (github.com/CroatianMeteorNetwork/RMS, RMS/Astrometry/CyFunctions.pyx): from the distortion centre the
+radius r of a pixel, in half widths of the frame, becomes r + k1 r^3 + k2 r^5 + k3 r^7 + k4 r^9, which is the angle off
+the axis times `F_scale` [px/deg]. Of the way back it is r - k1 r^3 - ... of that angle. Pixel (0, 0) is the centre of
+the first pixel.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+
+from startrack.camera.camera import Camera, cap_grid
+from startrack.camera.io import REFRACTION_REMOVED
+from startrack.core.types import Array, BadInput
+from startrack.frames import R_enu_icrs, Site, angle_between_rad, azel_from_rays, length_xy, seconds_since_2000
+
+DISTORTION, POWERS = "radial9-odd", (3, 5, 7, 9)
+MAX_PLATEPAR_PX = 0.5  # largest error of RMS's model against the lens; a centroid of a meteor has 0.3 or so
+FIT_POINTS = 2000  # radii
+CHECKED_RAYS = 4000
+RIGHT_PX = 10.0  # from the axis to the pixel that shows its rotation above the horizon
+J2000_DAYS, DAY_S, CENTURY_DAYS = 2451545.0, 86400.0, 36525.0
+FOCAL_EQUAL_1 = 1e-9  # relative difference of fx and fy
+RMS_PHOTOMETRY = {"mag_0": -2.5, "mag_lev": 1.0, "mag_lev_stddev": 0.0, "gamma": 1.0, "vignetting_coeff": 0.001,
+                  "vignetting_fixed": True, "extinction_scale": 0.6}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Platepar:
+    """The text of a platepar, and how well RMS's polynomials are the lens within the calibrated angle."""
+
+    text: str
+    to_sky_px: float  # largest error of a pixel's direction, in pixels on the axis
+    to_image_px: float  # largest error of a direction's pixel
+
+
+def platepar_of(camera: Camera, R_cam_icrs: Array, time: datetime, site: Site) -> Platepar:
+    """The platepar of a `camera` with the attitude `R_cam_icrs` (3, 3) at a `time` and a `site` on the Earth.
+
+    Raises BadInput bad_calibration for a mirrored camera, and where RMS's polynomials differ from the lens by more than
+    MAX_PLATEPAR_PX; no_time outside the years of the ephemeris.
+    """
+    if camera.mirrored:
+        raise BadInput(
+            "bad_calibration",
+            "the camera is mirrored, which no platepar can express: flip the images left to right and calibrate those",
+        )
+    forward, reverse = _polynomials(camera)
+    to_sky_px, to_image_px = _largest_errors_px(camera, forward, reverse)
+    if not max(to_sky_px, to_image_px) <= MAX_PLATEPAR_PX:
+        raise BadInput(
+            "bad_calibration",
+            f"RMS's {DISTORTION} differs from the lens by up to {max(to_sky_px, to_image_px):.2f} px within "
+            f"{np.degrees(camera.calibrated_angle_rad):.1f} degrees of the axis (allowed are {MAX_PLATEPAR_PX:g}): no "
+            "platepar of this lens is of use",
+        )
+    width, height = camera.size_px
+    aspect = camera.focal_px[0] / camera.focal_px[1] - 1.0
+    has_aspect = abs(aspect) > FOCAL_EQUAL_1
+    centre = [2 * camera.centre_px[0] / width - 1.0, 2 * camera.centre_px[1] / height - 1.0]
+    x_fwd, x_rev = ([*centre, *([aspect] if has_aspect else []), *k.tolist()] for k in (forward, reverse))
+    zeros = [0.0] * len(x_fwd)
+    values: dict[str, Any] = {
+        "version": 2, "station_code": "None", "lat": float(np.degrees(site.latitude_rad)),
+        "lon": float(np.degrees(site.longitude_rad)), "elev": site.height_m, "X_res": width, "Y_res": height,
+        "F_scale": float(np.radians(camera.focal_px[0])), "UT_corr": 0, **_fields_of_view_deg(camera),
+        **_pointing(camera, np.asarray(R_cam_icrs, dtype=float), time, site),
+        "distortion_type": DISTORTION, "poly_length": len(x_fwd), "equal_aspect": not has_aspect,
+        "force_distortion_centre": False, "asymmetry_corr": False, "x_poly": x_fwd, "y_poly": zeros,
+        "x_poly_fwd": x_fwd, "x_poly_rev": x_rev, "y_poly_fwd": zeros, "y_poly_rev": zeros, "refraction": False,
+        "measurement_apparent_to_true_refraction": camera.refraction == REFRACTION_REMOVED,
+        "auto_check_fit_refined": False, "auto_recalibrated": False, "star_list": [], **RMS_PHOTOMETRY,
+    }  # fmt: skip
+    return Platepar(json.dumps(values, indent=4, sort_keys=True) + "\n", to_sky_px, to_image_px)
+
+
+def _polynomials(camera: Camera) -> tuple[Array, Array]:
+    """Coefficients k1 to k4 from image to sky, and from sky to image."""
+    top = min(camera.calibrated_angle_rad, camera.lens.max_invertible_rad)
+    angle = np.linspace(0.0, top, FIT_POINTS + 1)[1:]
+    half_widths = 2 * camera.focal_px[0] / camera.size_px[0]
+    radius, straight = camera.lens.rho(angle) * half_widths, angle * half_widths
+    return _odd_terms(radius, straight - radius), _odd_terms(straight, straight - radius)
+
+
+def _odd_terms(radius: Array, bend: Array) -> Array:
+    """Coefficients (4,) of the odd powers of the `radius` (n,) that are the `bend` (n,), by least squares."""
+    scale = radius.max()
+    terms = (radius[:, None] / scale) ** np.array(POWERS)
+    return np.asarray(np.linalg.lstsq(terms, bend, rcond=None)[0] / scale ** np.array(POWERS))
+
+
+def _largest_errors_px(camera: Camera, forward: Array, reverse: Array) -> tuple[float, float]:
+    """Of RMS's model to the sky and to the image, for the pixels of the frame within the calibrated angle."""
+    rays = cap_grid(min(camera.calibrated_angle_rad, camera.lens.max_invertible_rad), CHECKED_RAYS)
+    px, inside = camera.project(rays)
+    rays, px = rays[inside], px[inside]
+    (fx, fy), half = camera.focal_px, camera.size_px[0] / 2
+    x, y = px[:, 0] - camera.centre_px[0], (px[:, 1] - camera.centre_px[1]) * fx / fy
+    angle = (1.0 + _bend_of(np.hypot(x, y) / half, forward)) * np.hypot(x, y) / fx
+    side = np.arctan2(y, x)
+    seen = np.stack([np.sin(angle) * np.cos(side), np.sin(angle) * np.sin(side), np.cos(angle)], axis=1)
+    to_sky = angle_between_rad(seen, rays).max(initial=0.0) * fx
+    off_axis = length_xy(rays[:, 0], rays[:, 1])
+    angle = np.arctan2(off_axis, rays[:, 2])
+    radius = (1.0 - _bend_of(angle * fx / half, reverse)) * angle / np.where(off_axis > 0, off_axis, 1.0)
+    image = np.array(camera.centre_px) + radius[:, None] * rays[:, :2] * [fx, fy]
+    return float(to_sky), float(np.linalg.norm(image - px, axis=1).max(initial=0.0))
+
+
+def _bend_of(radius: Array, k: Array) -> Array:
+    """k1 r^2 + k2 r^4 + ... (n,) at the `radius` (n,) in half widths."""
+    return (radius[:, None] ** (np.array(POWERS) - 1)) @ k
+
+
+def _fields_of_view_deg(camera: Camera) -> dict[str, float]:
+    """Angles across the middle row and column, at most those of the image circle."""
+    (width, height), (cx, cy) = camera.size_px, camera.centre_px
+    ends = np.array([[-0.5, cy], [width - 0.5, cy], [cx, -0.5], [cx, height - 0.5]])
+    left, right, top, bottom = np.minimum(np.degrees(camera.angle_rad(ends)), np.degrees(camera.max_angle_rad)).tolist()
+    return {"fov_h": left + right, "fov_v": top + bottom}
+
+
+def _pointing(camera: Camera, R_cam_icrs: Array, time: datetime, site: Site) -> dict[str, float]:
+    """The axis among the stars and above the horizon, as RMS counts it, and the time [deg, days].
+
+    RMS takes RA_d and dec_d as those of the date, and turns them to J2000 by its own precession and nutation.
+    """
+    days = seconds_since_2000(time) / DAY_S
+    R_j2000_date, R_precession = _rms_precession(days)
+    axis = R_cam_icrs[2]
+    of_date = axis @ R_j2000_date
+    north_cam = R_cam_icrs @ _tangents(axis)[1]
+    position_angle = np.arctan2(north_cam[1], north_cam[0]) + 0.5 * np.pi
+    turned = np.cross(of_date, axis)  # RMS carries this direction along, and compares its angles to the parallels
+    change = _angle_to_parallel(R_precession @ turned, axis) - _angle_to_parallel(turned, of_date)
+    centuries = days / CENTURY_DAYS
+    sidereal_deg = 280.46061837 + 360.98564736629 * days + 0.000387933 * centuries**2 - centuries**3 / 38710000.0
+    R_cam_enu = R_cam_icrs @ R_enu_icrs(site, time).T
+    azimuth, elevation = azel_from_rays(R_cam_enu[2])
+    right = azel_from_rays(camera.unproject(np.add(camera.centre_px, (RIGHT_PX, 0.0))) @ R_cam_enu)
+    turn = np.arctan2(right[1] - elevation, (right[0] - azimuth + np.pi) % (2 * np.pi) - np.pi)
+    ra, dec = np.arctan2(of_date[1], of_date[0]), np.arctan2(of_date[2], np.hypot(of_date[0], of_date[1]))
+    angles = {
+        "RA_d": ra % (2 * np.pi), "dec_d": dec, "pos_angle_ref": (position_angle - change) % (2 * np.pi),
+        "az_centre": azimuth % (2 * np.pi), "alt_centre": elevation, "rotation_from_horiz": turn,
+    }  # fmt: skip
+    degrees = {name: float(np.degrees(angle)) for name, angle in angles.items()}
+    return {"JD": J2000_DAYS + days, "Ho": sidereal_deg % 360.0, **degrees}
+
+
+def _tangents(ray: Array) -> tuple[Array, Array]:
+    """Directions (3,), (3,) of the parallel (to the east) and the meridian (to the north) at a `ray` (3,)."""
+    ra = np.arctan2(ray[1], ray[0])  # 0 at a pole, as in RMS
+    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
+    return east, np.cross(ray, east)
+
+
+def _angle_to_parallel(direction: Array, ray: Array) -> float:
+    """Angle from a `direction` (3,) to the parallel at a `ray` (3,), about it."""
+    east, _ = _tangents(ray)
+    return float(np.arctan2(np.cross(direction, east) @ ray, direction @ east))
+
+
+def _rms_precession(days: float) -> tuple[Array, Array]:
+    """RMS's rotation (3, 3) to J2000 from the date, so many `days` after it, and its part by precession.
+
+    IAU 1976 precession, and the low-precision nutation of Meeus, Astronomical Algorithms, ch. 22, which RMS applies as
+    rotations about x and z: up to 20 arcsec from the true equinox, so that our own rotation would not do.
+    """
+    import erfa
+
+    zeta, z, theta = erfa.prec76(J2000_DAYS, days, J2000_DAYS, 0.0)
+    R_precession = erfa.rz(-z, erfa.ry(theta, erfa.rz(-zeta, np.eye(3))))
+    t = days / CENTURY_DAYS
+    node, sun, moon = np.radians([
+        125.04452 - 1934.136261 * t, 280.4665 + 36000.7698 * t, 218.3165 + 481267.8813 * t,
+    ])  # fmt: skip
+    longitude = -17.2 * np.sin(node) - 1.32 * np.sin(2 * sun) - 0.23 * np.sin(2 * moon) + 0.21 * np.sin(2 * node)
+    obliquity = 9.2 * np.cos(node) + 0.57 * np.cos(2 * sun) + 0.1 * np.cos(2 * moon) - 0.09 * np.cos(2 * node)
+    about_x = erfa.rx(np.radians(obliquity / 3600), np.eye(3))
+    about_z = erfa.rz(-np.radians(longitude / 3600), np.eye(3))
+    return about_z @ about_x @ R_precession, R_precession

@@ -58,7 +58,7 @@ def platepar_of(camera: Camera, R_cam_icrs: Array, time: datetime, site: Site) -
             "bad_calibration",
             f"RMS's {DISTORTION} differs from the lens by up to {max(to_sky_px, to_image_px):.2f} px within "
             f"{np.degrees(camera.calibrated_angle_rad):.1f} degrees of the axis (allowed are {MAX_PLATEPAR_PX:g}): no "
-            "platepar of this lens is of use",
+            "platepar of this lens is of use" + (": it has no decentring" if camera.decentring else ""),
         )
     width, height = camera.size_px
     aspect = camera.focal_px[0] / camera.focal_px[1] - 1.0
@@ -176,8 +176,8 @@ def _rms_precession(days: float) -> tuple[Array, Array]:
     """
     import erfa
 
-    zeta, z, theta = erfa.prec76(J2000_DAYS, days, J2000_DAYS, 0.0)
-    R_precession = erfa.rz(-z, erfa.ry(theta, erfa.rz(-zeta, np.eye(3))))
+    zeta, z, tilt = erfa.prec76(J2000_DAYS, days, J2000_DAYS, 0.0)
+    R_precession = erfa.rz(-z, erfa.ry(tilt, erfa.rz(-zeta, np.eye(3))))
     t = days / CENTURY_DAYS
     node, sun, moon = np.radians([
         125.04452 - 1934.136261 * t, 280.4665 + 36000.7698 * t, 218.3165 + 481267.8813 * t,

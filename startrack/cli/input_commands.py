@@ -12,7 +12,7 @@ from stars       startrack calibrate NIGHT.jpg... --fov 180 -o CAMERA.toml   the
 from a board     startrack calibrate board BOARD.png... --pattern 9x6        the lens, from pictures of a chessboard
 check            startrack calibrate verify LATER.jpg -c CAMERA.toml         does the camera file still fit?
 look             startrack calibrate show CAMERA.toml                        the content of a camera file
-other programs   startrack calibrate convert CAMERA.toml --to ros            ros, kalibr, colmap, opencv; to a platepar"""
+other programs   startrack calibrate convert CAMERA.toml --to ros            ros, kalibr, colmap, opencv, platepar"""
 TERRAIN = """usage: startrack terrain ACTION ... (startrack terrain ACTION --help)
 
 look             startrack terrain show shackleton --at 0 0                  properties, relief, a horizon

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,8 @@ PINHOLE = Camera(
     name="pinhole", size_px=(1280, 720), focal_px=(1500.0, 1500.0), centre_px=(639.5, 359.5), max_angle_rad=0.5,
     calibrated_angle_rad=0.45, lens=Pinhole(),
 )  # fmt: skip
-CAMERAS = [load_camera("fisheye-2048"), load_camera("lowell-ldt"), OBLONG, PINHOLE]
+DECENTRED = replace(load_camera("lowell-ldt"), name="decentred", decentring=Decentring(3e-4, -4e-4))
+CAMERAS = [load_camera("fisheye-2048"), load_camera("lowell-ldt"), OBLONG, PINHOLE, DECENTRED]
 ARCSEC = np.pi / 648_000
 
 
@@ -69,7 +71,8 @@ def rms_directions(plate: dict[str, Any], px: np.ndarray) -> np.ndarray:
     half_x, half_y = plate["X_res"] / 2, plate["Y_res"] / 2
     x = px[:, 0] - half_x - x0 * half_x
     y = (1 + aspect) * (px[:, 1] - half_y - y0 * half_y)
-    r = np.hypot(x, y) / half_x
+    a1, a2 = (rest.pop(0), 2 * np.pi * rest.pop(0)) if plate["asymmetry_corr"] else (0.0, 0.0)
+    r = (np.hypot(x, y) + a1 * y * np.cos(a2) - a1 * x * np.sin(a2)) / half_x
     scale = 1 + sum(k * r ** (2 * i + 2) for i, k in enumerate(rest))
     radius = np.radians(scale * np.hypot(x, y) / plate["F_scale"])
     axis, position_angle = rms_axis_and_north(plate)
@@ -90,13 +93,14 @@ def test_directions_of_pixels_are_those_of_the_camera(camera: Camera, seed: int)
         angle_between_rad(rms_directions(json.loads(found.text), px), camera.unproject(px) @ R) * camera.focal_px[0]
     )
     assert off_px.max() < found.to_sky_px + 0.04  # RMS turns the field by precession alone, not by its nutation
-    assert found.to_sky_px < 0.1
-    assert found.to_image_px < 0.1
+    largest = 0.5 if camera.decentring else 0.1
+    assert found.to_sky_px < largest
+    assert found.to_image_px < largest
 
 
 def test_image_of_a_direction_is_the_pixel() -> None:
     """RMS's way back: r - k1 r^3 - ... of the equidistant radius."""
-    for camera in CAMERAS:
+    for camera in CAMERAS[:-1]:
         found = platepar_of(camera, np.eye(3), TIME, SITE)
         plate = json.loads(found.text)
         rays = cap_grid(camera.calibrated_angle_rad)
@@ -135,7 +139,7 @@ def test_a_lens_that_no_platepar_holds_is_refused() -> None:
     with pytest.raises(BadInput, match=r"differs from the lens by up to \d+\.\d+ px"):
         platepar_of(bent, np.eye(3), TIME, SITE)
     with pytest.raises(BadInput, match="mirrored"):
-        platepar_of(Camera(**{**vars(OBLONG), "mirrored": True}), np.eye(3), TIME, SITE)
+        platepar_of(replace(OBLONG, mirrored=True), np.eye(3), TIME, SITE)
 
 
 def record(folder: Path, time: str | None) -> Path:

@@ -18,12 +18,11 @@ import numpy as np
 from startrack.camera.camera import Camera, cap_grid
 from startrack.camera.io import REFRACTION_REMOVED
 from startrack.core.types import Array, BadInput
-from startrack.frames import R_enu_icrs, Site, angle_between_rad, azel_from_rays, length_xy, seconds_since_2000
+from startrack.frames import R_enu_icrs, R_from_rotvec, Site, azel_from_rays, length_xy, seconds_since_2000
 
-DISTORTION, POWERS = "radial9-odd", (3, 5, 7, 9)
+DISTORTION, POWERS = "radial9-odd", np.array([2, 4, 6, 8])  # of the radius, in the scale
 MAX_PLATEPAR_PX = 0.5  # largest error of RMS's model against the lens; a centroid of a meteor has 0.3 or so
-FIT_POINTS = 2000  # radii
-CHECKED_RAYS = 4000
+FITTED_RAYS = 2000
 RIGHT_PX = 10.0  # from the axis to the pixel that shows its rotation above the horizon
 J2000_DAYS, DAY_S, CENTURY_DAYS = 2451545.0, 86400.0, 36525.0
 FOCAL_EQUAL_1 = 1e-9  # relative difference of fx and fy
@@ -51,28 +50,27 @@ def platepar_of(camera: Camera, R_cam_icrs: Array, time: datetime, site: Site) -
             "bad_calibration",
             "the camera is mirrored, which no platepar can express: flip the images left to right and calibrate those",
         )
-    forward, reverse = _polynomials(camera)
-    to_sky_px, to_image_px = _largest_errors_px(camera, forward, reverse)
+    lens = _fit_lens(camera)
+    to_sky_px, to_image_px = lens.to_sky_px, lens.to_image_px
     if not max(to_sky_px, to_image_px) <= MAX_PLATEPAR_PX:
         raise BadInput(
             "bad_calibration",
             f"RMS's {DISTORTION} differs from the lens by up to {max(to_sky_px, to_image_px):.2f} px within "
             f"{np.degrees(camera.calibrated_angle_rad):.1f} degrees of the axis (allowed are {MAX_PLATEPAR_PX:g}): no "
-            "platepar of this lens is of use" + (": it has no decentring" if camera.decentring else ""),
+            "platepar of this lens is of use",
         )
     width, height = camera.size_px
     aspect = camera.focal_px[0] / camera.focal_px[1] - 1.0
-    has_aspect = abs(aspect) > FOCAL_EQUAL_1
-    centre = [2 * camera.centre_px[0] / width - 1.0, 2 * camera.centre_px[1] / height - 1.0]
-    x_fwd, x_rev = ([*centre, *([aspect] if has_aspect else []), *k.tolist()] for k in (forward, reverse))
+    has_aspect, has_asymmetry = abs(aspect) > FOCAL_EQUAL_1, bool(camera.decentring)
+    x_fwd, x_rev = (_rms_row(camera, p, [aspect] if has_aspect else []) for p in (lens.forward, lens.reverse))
     zeros = [0.0] * len(x_fwd)
     values: dict[str, Any] = {
         "version": 2, "station_code": "None", "lat": float(np.degrees(site.latitude_rad)),
         "lon": float(np.degrees(site.longitude_rad)), "elev": site.height_m, "X_res": width, "Y_res": height,
         "F_scale": float(np.radians(camera.focal_px[0])), "UT_corr": 0, **_fields_of_view_deg(camera),
-        **_pointing(camera, np.asarray(R_cam_icrs, dtype=float), time, site),
+        **_pointing(camera, lens.R_axis_cam @ np.asarray(R_cam_icrs, dtype=float), time, site),
         "distortion_type": DISTORTION, "poly_length": len(x_fwd), "equal_aspect": not has_aspect,
-        "force_distortion_centre": False, "asymmetry_corr": False, "x_poly": x_fwd, "y_poly": zeros,
+        "force_distortion_centre": False, "asymmetry_corr": has_asymmetry, "x_poly": x_fwd, "y_poly": zeros,
         "x_poly_fwd": x_fwd, "x_poly_rev": x_rev, "y_poly_fwd": zeros, "y_poly_rev": zeros, "refraction": False,
         "measurement_apparent_to_true_refraction": camera.refraction == REFRACTION_REMOVED,
         "auto_check_fit_refined": False, "auto_recalibrated": False, "star_list": [], **RMS_PHOTOMETRY,
@@ -80,43 +78,69 @@ def platepar_of(camera: Camera, R_cam_icrs: Array, time: datetime, site: Site) -
     return Platepar(json.dumps(values, indent=4, sort_keys=True) + "\n", to_sky_px, to_image_px)
 
 
-def _polynomials(camera: Camera) -> tuple[Array, Array]:
-    """Coefficients k1 to k4 from image to sky, and from sky to image."""
-    top = min(camera.calibrated_angle_rad, camera.lens.max_invertible_rad)
-    angle = np.linspace(0.0, top, FIT_POINTS + 1)[1:]
-    half_widths = 2 * camera.focal_px[0] / camera.size_px[0]
-    radius, straight = camera.lens.rho(angle) * half_widths, angle * half_widths
-    return _odd_terms(radius, straight - radius), _odd_terms(straight, straight - radius)
+@dataclass(frozen=True)
+class _RmsLens:
+    """RMS's model nearest to a lens: shift [half widths], asymmetry (2 numbers each) and k1 to k4, both ways (8,)."""
+
+    R_axis_cam: Array  # (3, 3) to the camera about RMS's axis
+    forward: Array
+    reverse: Array
+    to_sky_px: float
+    to_image_px: float
 
 
-def _odd_terms(radius: Array, bend: Array) -> Array:
-    """Coefficients (4,) of the odd powers of the `radius` (n,) that are the `bend` (n,), by least squares."""
-    scale = radius.max()
-    terms = (radius[:, None] / scale) ** np.array(POWERS)
-    return np.asarray(np.linalg.lstsq(terms, bend, rcond=None)[0] / scale ** np.array(POWERS))
+def _fit_lens(camera: Camera) -> _RmsLens:
+    """RMS's model of a lens, by least squares over the calibrated angle.
 
+    A decentred lens is not in it. Its axis, centre and asymmetry, which are then free, leave a fifth of the difference.
+    """
+    from scipy.optimize import least_squares
 
-def _largest_errors_px(camera: Camera, forward: Array, reverse: Array) -> tuple[float, float]:
-    """Of RMS's model to the sky and to the image, for the pixels of the frame within the calibrated angle."""
-    rays = cap_grid(min(camera.calibrated_angle_rad, camera.lens.max_invertible_rad), CHECKED_RAYS)
+    rays = cap_grid(min(camera.calibrated_angle_rad, camera.lens.max_invertible_rad), FITTED_RAYS)
     px, inside = camera.project(rays)
-    rays, px = rays[inside], px[inside]
-    (fx, fy), half = camera.focal_px, camera.size_px[0] / 2
-    x, y = px[:, 0] - camera.centre_px[0], (px[:, 1] - camera.centre_px[1]) * fx / fy
-    angle = (1.0 + _bend_of(np.hypot(x, y) / half, forward)) * np.hypot(x, y) / fx
-    side = np.arctan2(y, x)
-    seen = np.stack([np.sin(angle) * np.cos(side), np.sin(angle) * np.sin(side), np.cos(angle)], axis=1)
-    to_sky = angle_between_rad(seen, rays).max(initial=0.0) * fx
-    off_axis = length_xy(rays[:, 0], rays[:, 1])
-    angle = np.arctan2(off_axis, rays[:, 2])
-    radius = (1.0 - _bend_of(angle * fx / half, reverse)) * angle / np.where(off_axis > 0, off_axis, 1.0)
-    image = np.array(camera.centre_px) + radius[:, None] * rays[:, :2] * [fx, fy]
-    return float(to_sky), float(np.linalg.norm(image - px, axis=1).max(initial=0.0))
+    rays, fx, half = rays[inside], camera.focal_px[0], camera.size_px[0] / 2
+    image = (px[inside] - np.array(camera.centre_px)) * [1.0, fx / camera.focal_px[1]] / half
+    free = np.array([bool(camera.decentring)] * 4 + [True] * 4)
+
+    def wide(p: Array, start: int = 0) -> Array:
+        """All eight parameters from those that are free."""
+        full = np.zeros(8)
+        full[free] = p[start:]
+        return full
+
+    def sky(rotation: Array) -> Array:
+        """Equidistant positions [half widths] about the turned axis."""
+        turned = rays @ R_from_rotvec([*rotation, 0.0]).T
+        off_axis = length_xy(turned[:, 0], turned[:, 1])
+        angle = np.arctan2(off_axis, turned[:, 2]) / np.where(off_axis > 0, off_axis, 1.0)
+        return angle[:, None] * turned[:, :2] * fx / half
+
+    def to_sky(p: Array) -> Array:
+        full = wide(p, 2)
+        return (_bent(image - full[:2], full, 1.0) - sky(p[:2] * bool(camera.decentring))).ravel()
+
+    first = least_squares(to_sky, np.zeros(2 + free.sum()))
+    rotation = first.x[:2] * bool(camera.decentring)
+    there = sky(rotation)
+    second = least_squares(lambda p: (_bent(there, wide(p), -1.0) + wide(p)[:2] - image).ravel(), np.zeros(free.sum()))
+    errors = [float(np.hypot(*fit.fun.reshape(-1, 2).T).max() * half) for fit in (first, second)]
+    return _RmsLens(R_from_rotvec([*rotation, 0.0]), wide(first.x, 2), wide(second.x), *errors)
 
 
-def _bend_of(radius: Array, k: Array) -> Array:
-    """k1 r^2 + k2 r^4 + ... (n,) at the `radius` (n,) in half widths."""
-    return (radius[:, None] ** (np.array(POWERS) - 1)) @ k
+def _bent(xy: Array, parameters: Array, sign: float) -> Array:
+    """Positions (n, 2) [half widths] times 1 + `sign` (k1 r^2 + k2 r^4 + ...), r the radius with its asymmetry."""
+    radius = length_xy(xy[:, 0], xy[:, 1]) + xy[:, ::-1] @ parameters[2:4]
+    return np.asarray(xy * (1.0 + sign * (radius[:, None] ** POWERS) @ parameters[4:])[:, None])
+
+
+def _rms_row(camera: Camera, parameters: Array, aspect: list[float]) -> list[float]:
+    """The numbers of RMS's x_poly: centre, aspect and asymmetry where they are in use, k1 to k4."""
+    (width, height), half = camera.size_px, camera.size_px[0] / 2
+    x = camera.centre_px[0] + half * parameters[0]
+    y = camera.centre_px[1] + half * parameters[1] * camera.focal_px[1] / camera.focal_px[0]
+    by_y, by_x = parameters[2:4]  # amplitude times cosine, and minus sine, of an angle in turns
+    asymmetry = [np.hypot(by_x, by_y), np.arctan2(-by_x, by_y) / (2 * np.pi) % 1.0] if camera.decentring else []
+    return [float(v) for v in (2 * x / width - 1.0, 2 * y / height - 1.0, *aspect, *asymmetry, *parameters[4:])]
 
 
 def _fields_of_view_deg(camera: Camera) -> dict[str, float]:

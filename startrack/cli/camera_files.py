@@ -28,9 +28,14 @@ if TYPE_CHECKING:
 RECORD = ".calibration.json"
 REPORTS = (".report.html", ".report.png")
 MASK, HOT_PIXELS = ".mask.png", ".hot-pixels.csv"
-PLATEPAR = "platepar"
+PLATEPAR, INDI_ALLSKY = POINTED = "platepar", "indi-allsky"  # files that hold a pointing too
 # Of the other programs.
-DEFAULT_NAMES = {"colmap": "cameras.txt", "kalibr": "camchain.yaml", PLATEPAR: "platepar_cmn2010.cal"}
+DEFAULT_NAMES = {
+    "colmap": "cameras.txt",
+    "kalibr": "camchain.yaml",
+    PLATEPAR: "platepar_cmn2010.cal",
+    INDI_ALLSKY: "indi-allsky.json",
+}
 
 
 def show(args: argparse.Namespace) -> int:
@@ -46,10 +51,10 @@ def show(args: argparse.Namespace) -> int:
 def convert(args: argparse.Namespace) -> int:
     """Convert one camera file; 0."""
     check_name(args)
-    if args.to != PLATEPAR and (args.attitude, args.site) != (None, None):
-        args.usage_error(f"--attitude and --site are for --to {PLATEPAR}")
-    if args.to == PLATEPAR:
-        text, note = _platepar(args)
+    if args.to not in POINTED and (args.attitude, args.site) != (None, None):
+        args.usage_error(f"--attitude and --site are for --to {' and --to '.join(POINTED)}")
+    if args.to in POINTED:
+        text, note = _pointed(args)
         default = DEFAULT_NAMES[args.to]
     elif args.to is not None:
         camera = cameras.load_camera(args.file)
@@ -76,21 +81,27 @@ def convert(args: argparse.Namespace) -> int:
     return 0
 
 
-def _platepar(args: argparse.Namespace) -> tuple[str, str]:
-    """The text of a platepar, and a note about how well it is the lens. Raises BadInput."""
+def _pointed(args: argparse.Namespace) -> tuple[str, str]:
+    """The text of a file that holds a pointing, and a note about how well it is the lens. Raises BadInput."""
     from startrack.chain import read_near_attitude
     from startrack.cli.images import flag_site
 
     site = flag_site(args)
     if args.attitude is None or site is None:
         return args.usage_error(  # type: ignore[no-any-return]
-            f"--to {PLATEPAR} needs --attitude NAME.identification.json, where the camera pointed and when, and --site "
+            f"--to {args.to} needs --attitude NAME.identification.json, where the camera pointed and when, and --site "
             "LAT,LON[,M]: startrack identify IMAGE --time UTC -c CAMERA writes the first"
         )
     camera, attitude = cameras.load_camera(args.file), read_near_attitude(args.attitude)
     if attitude.time_utc is None:
         raise BadInput("no_time", f"{printable(args.attitude)}: states no time: identify the image again with --time")
-    found = cameras.platepar_of(camera, attitude.R_cam_icrs_at(None, None), attitude.time_utc, site)
+    R_cam_icrs = attitude.R_cam_icrs_at(None, None)
+    if args.to == INDI_ALLSKY:
+        overlay = cameras.virtualsky_of(camera, R_cam_icrs, attitude.time_utc, site)
+        return overlay.text, (
+            f"; VirtualSky's lens is {overlay.largest_px:.1f} px from this one at most, {overlay.rms_px:.1f} px RMS"
+        )
+    found = cameras.platepar_of(camera, R_cam_icrs, attitude.time_utc, site)
     angle_deg = math.degrees(camera.calibrated_angle_rad)
     return found.text, (
         f"; largest errors of its polynomials up to {angle_deg:.1f} degrees off the axis: {found.to_sky_px:.2f} px to "

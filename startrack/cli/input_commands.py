@@ -81,7 +81,7 @@ COMMANDS = (
                 flag("file FILE", "camera file with --to; the other program's file with --from"),
                 Either(
                     (
-                        flag("--to", "write this format", choices=(*FORMATS, "platepar")),
+                        flag("--to", "write this format", choices=(*FORMATS, "platepar", "indi-allsky")),
                         flag("--from", "read this format", choices=FORMATS, dest="source"),
                     ),
                     required=True,
@@ -94,8 +94,8 @@ COMMANDS = (
                 ),
                 flag(
                     "--attitude FILE",
-                    "with --to platepar: a NAME.identification.json or NAME.fix.json of this camera, where it pointed "
-                    "and when",
+                    "with --to platepar and indi-allsky: a NAME.identification.json or NAME.fix.json of this camera, "
+                    "where it pointed and when",
                 ),
                 flags.SITE,
             ),

@@ -22,7 +22,7 @@ from startrack.frames import Site, seconds_since_2000
 
 DRAWN_RAYS = 2000
 LOWEST_RAD = np.radians(5.0)  # elevation to which the drawing is fitted
-TURNS = 8  # about the axis, from which the fit begins
+FIRST_TURNS_RAD = np.arange(8) * np.pi / 4  # about the axis, from which the fit begins
 SIDEREAL_DAYS_DEG = 280.46061837, 360.98564736629  # at J2000, and a day: Meeus, Astronomical Algorithms, ch. 12
 
 
@@ -63,9 +63,7 @@ def virtualsky_of(camera: Camera, R_cam_icrs: Array, time: datetime, site: Site)
     zenith = int(np.argmax(up[up > np.sin(LOWEST_RAD)]))
     middle = px[zenith] - np.array(camera.size_px) / 2
     diameter = 4.0 * np.sin(0.25 * np.pi) * float(np.mean(camera.focal_px))
-    starts = [
-        np.array([turn, 0.0, 0.0, diameter, middle[0], -middle[1]]) for turn in np.arange(TURNS) * 2 * np.pi / TURNS
-    ]
+    starts = [np.array([turn, 0.0, 0.0, diameter, middle[0], -middle[1]]) for turn in FIRST_TURNS_RAD]
     scale = np.array([1e-3, 1e-3, 1e-3, 1.0, 1.0, 1.0])
     fits = [least_squares(lambda p: (drawn_px(p) - px).ravel(), start, x_scale=scale) for start in starts]
     best = min(fits, key=lambda fit: fit.cost).x

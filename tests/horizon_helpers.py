@@ -29,6 +29,9 @@ R_CAM_ENU = np.array([[-1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0]])  # looks at the 
 PRESSURE_HPA = 1010.0 * np.exp(-1000.0 / 8430.0)
 PSF_PX, PEDESTAL, SKY, GROUND, READ_NOISE = 0.9, 300.0, 400.0, 60.0, 8.0
 ZERO_MAG, EXTINCTION_MAG = 14.5, 0.2
+# Clouds before the sky: azimuths from and to, elevations of the lower and the upper edge, in degrees.
+CLOUDS_DEG = ((15, 75, 4, 12), (135, 195, 4, 13), (205, 255, 4, 15), (265, 300, 4, 11), (310, 350, 4, 14))
+CLOUD_PART, MOONLIT_GROUND = 0.6, 170.0  # of the sky's light that a cloud shows; the ground's light in moonlight
 
 
 def bennett_rad(true_rad: np.ndarray) -> np.ndarray:
@@ -48,8 +51,22 @@ def skyline_deg(azimuth_deg: np.ndarray) -> np.ndarray:
     return np.where((azimuth_deg > 100) & (azimuth_deg < 125), 20.0, hills + teeth)
 
 
-def painted_frame(seed: int = 1, time_utc: datetime = TIME, with_stars: bool = True) -> Exposure:
-    """An exposure: the sky with its stars, refracted and dimmed, above the skyline; without stars it is overcast."""
+def cloud_part(azimuth_deg: np.ndarray, elevation_deg: np.ndarray) -> np.ndarray:
+    """Part of the sky's light that is seen in a direction, behind CLOUDS_DEG or beside them."""
+    part = np.ones(azimuth_deg.shape)
+    for first, last, low, high in CLOUDS_DEG:
+        inside = (azimuth_deg > first) & (azimuth_deg < last) & (elevation_deg > low) & (elevation_deg < high)
+        part[inside] = CLOUD_PART
+    return part
+
+
+def painted_frame(
+    seed: int = 1, time_utc: datetime = TIME, with_stars: bool = True, with_clouds: bool = False
+) -> Exposure:
+    """An exposure: the sky with its stars, refracted and dimmed, above the skyline; without stars it is overcast.
+
+    Where there are clouds, they hide stars and the Moon lights the ground.
+    """
     rng = np.random.default_rng(seed)
     width, height = CAMERA.size_px
     light = np.full((height, width), PEDESTAL)
@@ -60,18 +77,21 @@ def painted_frame(seed: int = 1, time_utc: datetime = TIME, with_stars: bool = T
             azimuth, elevation = azel_from_rays(CAMERA.unproject(px) @ R_CAM_ENU)
             is_sky = np.degrees(elevation) > skyline_deg(np.degrees(azimuth))
             lit = CAMERA.angle_rad(px) < CAMERA.max_angle_rad
-            light += np.where(lit, np.where(is_sky, SKY, GROUND), 0.0) / 4
+            sky = SKY * cloud_part(np.degrees(azimuth) % 360, np.degrees(elevation)) if with_clouds else SKY
+            light += np.where(lit, np.where(is_sky, sky, MOONLIT_GROUND if with_clouds else GROUND), 0.0) / 4
     if with_stars:
-        _paint_stars(light, time_utc)
+        _paint_stars(light, time_utc, with_clouds)
     light += rng.normal(size=light.shape) * np.sqrt(light + READ_NOISE**2)
     return Exposure(pixels_adu=light.astype(np.float32), name=f"frame-{seed}", time_utc=time_utc, exposure_s=30.0)
 
 
-def _paint_stars(light: np.ndarray, time_utc: datetime) -> None:
+def _paint_stars(light: np.ndarray, time_utc: datetime, with_clouds: bool) -> None:
     stars = load_catalog().at(time_utc, observer_velocity_m_s(SITE, time_utc))
     azimuth, elevation = azel_from_rays(stars.rays_icrs @ R_enu_icrs(SITE, time_utc).T)
     elevation = bennett_rad(elevation)
     up = (np.degrees(elevation) > skyline_deg(np.degrees(azimuth))) & (stars.v_mag < 7.5)
+    if with_clouds:
+        up &= cloud_part(np.degrees(azimuth) % 360, np.degrees(elevation)) == 1.0
     xy, inside = CAMERA.project(rays_from_azel(azimuth[up], elevation[up]) @ R_CAM_ENU.T)
     air = 1.0 / (np.sin(elevation[up]) + 0.025 * np.exp(-11 * np.sin(elevation[up])))
     flux = 10 ** (-0.4 * (stars.v_mag[up] + EXTINCTION_MAG * air - ZERO_MAG))

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.applications.horizon.agreement import LeftOut
+from startrack.applications.horizon.clouds import cloud_density, cloud_probability
 from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, COLUMNS_PER_AZIMUTH, SKYLINE_AZIMUTHS, WIDTHS
 from startrack.applications.horizon.frames import Progress, SkyFrame, orient_frames
+from startrack.applications.horizon.join import join_skylines
 from startrack.applications.horizon.posterior import (
     WEAKEST_CONTRAST,
     add_step_log_likelihood,
@@ -34,7 +36,8 @@ NEAR_LIGHT_RAD = np.radians(0.3)  # a step this near to the skyline is evidence 
 GAP_SIGNIFICANCE = 5.0  # of light below the skyline that is brighter than usual ground
 DEEPEST_GAP_RAD = np.radians(15.0)
 DECISIVE_LLR = 2.0
-VARIES_SIGMAS = 5.0  # of two pictures' skylines: what differs by more moves (a dome, a crane, a branch)
+
+Measured = tuple[StarLight, list[Steps], Array]  # of one picture: stars, steps of each width, log-likelihood
 
 
 @dataclass(frozen=True)
@@ -81,41 +84,17 @@ def measure_frames(
     for frame, one in zip(frames, map_in_threads(_measure_frame, frames), strict=True):
         progress(f"measured the skyline of {frame.name}")
         measured.append(one)
-    skyline = _skyline_of(frames, measured, site)
+    skyline, _ = _skyline_of(frames, measured, site)
     if len(frames) > 1:
-        alone = [_skyline_of((frame,), [one], site) for frame, one in zip(frames, measured, strict=True)]
-        skyline = join_skylines(skyline, alone)
+        each = [_skyline_of((frame,), [one], site) for frame, one in zip(frames, measured, strict=True)]
+        skyline = join_skylines(skyline, [one for one, _ in each], np.array([cloud for _, cloud in each]))
     return SkylineResult(skyline, frames, left_out)
 
 
-def join_skylines(together: MeasuredSkyline, alone: Sequence[MeasuredSkyline]) -> MeasuredSkyline:
-    """The skyline of all pictures `together`, with what each picture `alone` shows and they do not show alike.
-
-    An azimuth where two pictures differ by more than VARIES_SIGMAS has the highest edge, its sigma, and the source
-    "varies". One that only some pictures know has the value of the most accurate of them.
-    """
-    elevation = np.stack([one.elevation_rad for one in alone])
-    sigma = np.stack([one.sigma_rad for one in alone])
-    bins = np.arange(len(together))
-    high, low = (np.argmax(np.where(np.isfinite(elevation), way * elevation, -np.inf), axis=0) for way in (1.0, -1.0))
-    with np.errstate(invalid="ignore"):
-        apart = elevation[high, bins] - elevation[low, bins]
-        varies = apart > VARIES_SIGMAS * np.hypot(sigma[high, bins], sigma[low, bins])
-    chosen = np.where(varies, high, np.argmin(sigma, axis=0))
-    one = np.isfinite(elevation).any(axis=0) & (varies | ~together.known)
-    source = np.stack([one.source for one in alone])[chosen, bins]
-    return MeasuredSkyline(
-        azimuth_rad=together.azimuth_rad,
-        elevation_rad=np.where(one, elevation[chosen, bins], together.elevation_rad),
-        sigma_rad=np.where(one, sigma[chosen, bins], together.sigma_rad),
-        source=np.select([varies, one], ["varies", source], together.source),
-    )
-
-
 def _skyline_of(
-    frames: Sequence[SkyFrame], measured: Sequence[tuple[StarLight, list[Steps], Array]], site: Site
-) -> MeasuredSkyline:
-    """The skyline that `frames`, each `measured`, show together."""
+    frames: Sequence[SkyFrame], measured: Sequence[Measured], site: Site
+) -> tuple[MeasuredSkyline, Array]:  # fmt: skip
+    """The skyline that `frames`, each `measured`, show together; the probabilities (n,) that its edges are clouds'."""
     stars, steps = [one[0] for one in measured], [one[1] for one in measured]
     total = column_log_prior() + sum(one[2] for one in measured)
     # The columns' posterior as bins of one degree; the errors that the frames share are added once.
@@ -126,21 +105,43 @@ def _skyline_of(
     shared = np.square(_common_sigma_rad(frames, azimuth, elevation, site)) + PLACE_SIGMA_RAD**2
     shared += np.square(_gap_depth(steps, mean))
     by_stars, by_light = _has_star(stars, azimuth, elevation), _has_step(steps, mean)
-    known = (scatter + variation + shared < UNKNOWN_SIGMA_RAD**2) & (by_stars | by_light)
+    spread = scatter + variation + shared
+    known = (spread < UNKNOWN_SIGMA_RAD**2) & (by_stars | by_light)
     # A shorter run than three is a halo or a reflection more often than ground, and beside an unknown bin the ground
     # often rises.
     known &= np.roll(known, 1) & np.roll(known, -1)
+    lowest = float(elevation[known].min()) if known.any() else 0.0
+    cloud = _cloud_probability(measured, azimuth, elevation, mean, lowest)
+    # The skyline behind a cloud's edge may be anywhere down to the lowest bin.
+    known &= spread + cloud * np.square(elevation - lowest) < UNKNOWN_SIGMA_RAD**2
     variance = scatter / COLUMNS_PER_AZIMUTH + np.square(variation) / (variation + WALL_RAD**2) + shared
     source = np.select([by_stars & by_light, by_light, by_stars], ["both", "sky light", "stars"], "")
-    return MeasuredSkyline(
+    skyline = MeasuredSkyline(
         azimuth_rad=azimuth,
         elevation_rad=np.where(known, elevation, np.nan),
         sigma_rad=np.where(known, np.sqrt(variance), np.inf),
         source=np.where(known, source, ""),
     )
+    return skyline, cloud
 
 
-def _measure_frame(frame: SkyFrame) -> tuple[StarLight, list[Steps], Array]:
+def _cloud_probability(
+    measured: Sequence[Measured], azimuth: Array, elevation: Array, mean: Array, lowest_rad: float
+) -> Array:  # fmt: skip
+    """Probability (n,) that the edge at the `azimuth` and `elevation` (n,) of a bin is a cloud's.
+
+    An edge that several pictures show is a cloud's only if it is in each of them, and the clouds of different pictures
+    are independent. `mean`: of the columns; `lowest_rad`: elevation down to which the skyline may be lower.
+    """
+    probability = np.ones(len(elevation))
+    for stars, steps, _ in measured:
+        shows = _has_star([stars], azimuth, elevation) | _has_step([steps], mean)
+        one = cloud_probability(cloud_density(steps[-1], mean), stars, elevation, lowest_rad)
+        probability[shows] *= one[shows]
+    return probability
+
+
+def _measure_frame(frame: SkyFrame) -> Measured:
     """Stars and steps of light of a frame, and the log-likelihood (AZIMUTH_COLUMNS, n) of the skyline by them."""
     light = measure_stars(frame)
     by_width, total = find_steps(frame, light), star_log_likelihood(light.rays, light.missing)

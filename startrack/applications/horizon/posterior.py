@@ -46,13 +46,8 @@ def star_log_likelihood(rays: Evidence, missing: float) -> Array:
     """
     from scipy.special import log_ndtr
 
-    elevation = elevations_rad()
-    n = len(elevation)
-    low = missing + LOW_MISSING * np.exp(-np.maximum(rays.elevation_rad, 0.0) / LOW_SCALE_RAD)
-    low = np.minimum(low, MOST_MISSING)
-    limited = limit_llr(rays.llr, low, SPURIOUS_PROBABILITY)
-    use = (np.abs(limited) > LEAST_LLR) & (rays.elevation_rad > LOWEST_RAD) & (rays.elevation_rad < elevation[-1])
-    rays, limited = rays.take(use), limited[use]
+    n = len(elevations_rad())
+    rays, limited = limited_rows(rays, missing)
     column = column_of(rays.azimuth_rad)
     edge_rad = float(rays.edge_sigma_rad.max(initial=GRID_STEP_RAD))
     half = int(np.ceil(STAR_EDGE_SIGMAS * edge_rad / GRID_STEP_RAD))
@@ -68,6 +63,18 @@ def star_log_likelihood(rays: Evidence, missing: float) -> Array:
     inside = (at >= 0) & (at < n)
     np.add.at(total, (np.broadcast_to(column[:, None], at.shape)[inside], at[inside]), profile[inside])
     return total
+
+
+def limited_rows(rays: Evidence, missing: float) -> tuple[Evidence, Array]:
+    """The rows of stars that say something, and their log-likelihood ratios (m,) limited as `limit_llr` does.
+
+    `missing`: probability that a visible star is not seen (cloud); near the horizon it is larger.
+    """
+    low = missing + LOW_MISSING * np.exp(-np.maximum(rays.elevation_rad, 0.0) / LOW_SCALE_RAD)
+    limited = limit_llr(rays.llr, np.minimum(low, MOST_MISSING), SPURIOUS_PROBABILITY)
+    use = (np.abs(limited) > LEAST_LLR) & (rays.elevation_rad > LOWEST_RAD)
+    use &= rays.elevation_rad < elevations_rad()[-1]
+    return rays.take(use), limited[use]
 
 
 def limit_llr(llr: Array, missing: Array, spurious: float) -> Array:

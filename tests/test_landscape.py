@@ -18,7 +18,7 @@ from startrack.catalog import load_catalog
 from startrack.core.types import BadInput
 from startrack.frames import rays_from_azel
 
-LAMP_DEG = np.array([112.0, 6.0])  # azimuth and elevation of a lamp in front of the dome
+LAMP_DEG = np.array([30.0, 2.0])  # azimuth and elevation of a lamp in front of a hill
 SKY_DEG = 3.0  # above and below the skyline where it is tested
 
 

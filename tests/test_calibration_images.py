@@ -327,6 +327,25 @@ def test_a_site_of_the_header_that_differs_from_the_flag_is_named(tmp_path, caps
         assert "is used" in err and "a: the header's site" in err
 
 
+def test_a_lost_sign_of_the_longitude_is_named(tmp_path, capsys):
+    unit = fits.PrimaryHDU(np.random.default_rng(1).integers(90, 110, (200, 200)).astype(np.int16))
+    unit.header.update({"DATE-AVG": "2018-08-06T05:17:34", "OBSLAT": 34.4773, "OBSLONG": -111.4332})
+    unit.writeto(tmp_path / "a.fits")
+    time = ["--time", "2018-08-06T19:17:34"]
+    main(["calibrate", str(tmp_path / "a.fits"), "--fov", "180", "--site=34.7443,111.4223", *time, "-D", str(tmp_path)])
+    err = capsys.readouterr().err
+    assert "degrees from --site" in err and "with the other sign of the longitude 0.3; east is positive" in err
+    assert "14:00:00 (h:mm:ss) after that of the file" in err
+
+
+def test_a_picture_by_day_is_named(tmp_path, capsys):
+    unit = fits.PrimaryHDU(np.random.default_rng(1).integers(90, 110, (200, 200)).astype(np.int16))
+    unit.header["DATE-AVG"] = "2018-08-06T19:17:34"
+    unit.writeto(tmp_path / "a.fits")
+    main(["calibrate", str(tmp_path / "a.fits"), "--fov", "180", "--site=34.7443,-111.4223", "-D", str(tmp_path)])
+    assert re.search(r"the Sun stands 7\d degrees above the horizon of the site, .*UTC", capsys.readouterr().err)
+
+
 @pytest.mark.slow
 def test_verify_finds_what_the_record_states(written_files, exposure, tmp_path, capsys):
     """The lens of the photograph is scaled so that it must be refused; the site in the record decides on the advice."""

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from startrack.catalog import bodies
+from startrack.catalog import bodies, daylight_warnings
 from startrack.core.types import BadInput
 from startrack.frames import R_enu_icrs, Site, angle_between_rad, parse_utc, rays_from_azel
 
@@ -140,3 +140,24 @@ def test_every_body_is_there_throughout_the_ephemeris(year: int) -> None:
 def test_bodies_outside_the_ephemeris_are_refused() -> None:
     with pytest.raises(BadInput, match="outside 1900 to 2051"):
         bodies(MOON_SITES[0], datetime(1850, 1, 1, tzinfo=UTC))
+
+
+def test_the_sun_above_a_horizon_of_the_earth_is_named():
+    """Its elevation by astropy, every two hours of a day."""
+    from astropy.coordinates import AltAz, EarthLocation, get_sun
+    from astropy.time import Time
+
+    site = Site("earth", np.radians(36.6), np.radians(-84.2), 300.0)
+    place = EarthLocation.from_geodetic(-84.2, 36.6, 300.0)
+    by_day = 0
+    for hour in range(0, 24, 2):
+        time = datetime(2026, 7, 10, hour, tzinfo=UTC)
+        elevation = float(get_sun(Time(time)).transform_to(AltAz(obstime=Time(time), location=place)).alt.deg)
+        warnings = daylight_warnings(site, time)
+        assert len(warnings) == (elevation > 0.0)
+        if warnings:
+            assert abs(float(warnings[0].split("Sun stands ")[1].split()[0]) - elevation) < 0.6
+            by_day += 1
+    assert by_day == 7
+    moon = Site("moon", -1.5, 0.0)
+    assert daylight_warnings(moon, datetime(2026, 7, 10, 17, tzinfo=UTC)) == []

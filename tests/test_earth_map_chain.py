@@ -55,6 +55,14 @@ def test_a_picture_is_located_with_its_latitude_and_longitude(folder):
     assert "target=moon" not in (folder / "out" / "one.kml").read_text()
 
 
+def test_a_picture_by_day_is_named(folder, capsys):
+    terrain, image = str(folder / "ground.toml"), str(folder / "day.png")
+    day = ["--time", "2027-07-10T17:00:00", "--east", "-600", "--north", "150"]
+    assert main(["render", "-t", terrain, "--seed", "4", *day, "-o", image, "-q"]) == 0
+    main(["locate", image, "-t", terrain, "-D", str(folder / "day"), "--no-plots"])
+    assert "degrees above the horizon of the site" in capsys.readouterr().err
+
+
 def test_a_prediction_is_a_map_in_the_projection_of_the_terrain(folder):
     import rasterio
 

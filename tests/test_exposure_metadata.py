@@ -49,6 +49,18 @@ def test_header_alone(image):
     assert exposure.camera == str(image.parent / "header.toml")
 
 
+def test_a_time_of_the_file_that_differs_from_the_given_one_is_named(image, sidecar):
+    of_file = datetime(2020, 1, 1, 0, 0, 10, tzinfo=UTC)
+    assert read_exposure(image, time_utc=of_file + timedelta(seconds=0.5)).warnings == ()
+    (warning,) = read_exposure(image, time_utc=of_file + timedelta(hours=7)).warnings
+    assert warning == "the time used is 7:00:00 (h:mm:ss) after that of the file, 2020-01-01T00:00:10.000000Z"
+    sidecar({"time_utc": "2020-01-01T00:01:10Z"})
+    (warning,) = read_exposure(image, time_utc=of_file).warnings
+    assert "0:01:00 (h:mm:ss) before that of the file" in warning
+    sidecar({"time_utc": "yesterday"})
+    assert read_exposure(image, time_utc=of_file).warnings == ()
+
+
 @pytest.mark.parametrize("key", ["camera", "terrain"])
 @pytest.mark.parametrize("value", ["", 5, ["a"], "x" * 2000, "two\nlines", {"a": "b"}])
 def test_a_sidecar_reference_that_is_no_name_is_refused_in_one_line(image, sidecar, key, value):

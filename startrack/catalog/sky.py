@@ -25,6 +25,7 @@ from startrack.frames import (
     azel_from_rays,
     barycentric_state,
     et_s,
+    format_utc,
     observer_state,
     observer_velocity_m_s,
     rays_from_azel,
@@ -92,6 +93,16 @@ def apparent_bodies(site: Site, time_utc: datetime) -> tuple[Body, ...]:
         return tuple(found)
     R = R_enu_icrs(site, time_utc)
     return tuple(replace(body, ray_icrs=air.refract(body.ray_icrs, R)) for body in found)
+
+
+def daylight_warnings(site: Site, time_utc: datetime) -> list[str]:
+    """A warning where the Sun's centre is above the horizon of a `site` on the Earth at `time_utc`."""
+    if site.body != "earth":
+        return []
+    sun = next(body for body in apparent_bodies(site, time_utc) if body.name == "Sun")
+    elevation_deg = float(np.degrees(azel_from_rays(R_enu_icrs(site, time_utc) @ sun.ray_icrs)[1]))
+    text = f"at {format_utc(time_utc)} the Sun stands {elevation_deg:.0f} degrees above the horizon of the site"
+    return [f"{text}, when no stars are seen: is the time UTC, and the site right?"] if elevation_deg > 0.0 else []
 
 
 def airmass_at(rays_enu: Array, site: Site | None) -> Array | None:

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, Self, TypeAlias, TypeVar, cast
 import numpy as np
 
 from startrack.camera import Camera
+from startrack.catalog import daylight_warnings
 from startrack.chain.near_attitude import NearAttitude
 from startrack.core.errors import Reason
 from startrack.core.types import (
@@ -203,8 +204,9 @@ class Measured(StarRays, Oriented):
 
     @property
     def warnings(self) -> list[str]:
-        """Facts in the image's file that were not used; what the terrain does not cover, and errors it leaves out."""
-        return [*super().warnings, *self.terrain.masked_sectors(), *self.terrain.error_warnings()]
+        """Facts in the image's file that were not used; what the terrain does not cover or state; a Sun that is up."""
+        day = [] if self.exposure.time_utc is None else daylight_warnings(self.site, self.exposure.time_utc)
+        return [*super().warnings, *self.terrain.masked_sectors(), *self.terrain.error_warnings(), *day]
 
 
 class SkyEvidence(NamedTuple):

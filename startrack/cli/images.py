@@ -17,6 +17,7 @@ import numpy as np
 
 from startrack import exposure as images
 from startrack.camera import Camera, load_camera
+from startrack.catalog import daylight_warnings
 from startrack.chain import NearAttitude, read_near_attitude
 from startrack.cli.console import progress
 from startrack.cli.flags import checked_flag
@@ -122,12 +123,20 @@ def flag_site(args: argparse.Namespace) -> Site | None:
 
 
 def site_of(args: argparse.Namespace, exposures: list[Exposure]) -> Site | None:
-    """The site of --site, else of the terrain that a flag or the images name; None if there is none."""
+    """The site of --site, else of the terrain that a flag or the images name; None if there is none.
+
+    Prints on stderr what the files of the `exposures` state and is not used, and where it is day.
+    """
     given = flag_site(args)
     if given is not None and not args.quiet:
         _compare_site(args.site, given, exposures)
     named = next((e.terrain for e in exposures if e.terrain), None)
-    return given if given is not None or named is None else load_terrain(named).site
+    site = given if given is not None or named is None else load_terrain(named).site
+    for one in () if args.quiet else exposures:
+        by_day = [] if site is None or one.time_utc is None else daylight_warnings(site, one.time_utc)
+        for warning in (*one.warnings, *by_day):
+            print(f"{one_line(one.name)}: {warning}", file=sys.stderr, flush=True)
+    return site
 
 
 def _compare_site(flag: str, site: Site, exposures: list[Exposure]) -> None:
@@ -139,10 +148,12 @@ def _compare_site(flag: str, site: Site, exposures: list[Exposure]) -> None:
     here = rays_from_azel(site.longitude_rad, site.latitude_rad)
     # Programs count longitudes to the east or to the west.
     there = rays_from_azel(np.array([longitude, -longitude]), np.array([latitude, latitude]))
-    apart_rad = float(np.min(angle_between_rad(here, there)))
-    if apart_rad > math.radians(SITE_TOLERANCE_DEG):
+    apart_deg, mirrored_deg = np.degrees(angle_between_rad(here, there)).tolist()
+    if min(apart_deg, mirrored_deg) > SITE_TOLERANCE_DEG:
         place = "{:.4f}, {:.4f}".format(*np.degrees([latitude, longitude]))
-        text = f"the header's site {place} is {math.degrees(apart_rad):.1f} degrees from --site {flag}, which is used"
+        text = f"the header's site {place} is {apart_deg:.1f} degrees from --site {flag}, which is used"
+        if mirrored_deg < apart_deg:
+            text += f" (with the other sign of the longitude {mirrored_deg:.1f}; east is positive)"
         print(f"{one_line(name)}: {text}", file=sys.stderr, flush=True)
 
 

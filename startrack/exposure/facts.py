@@ -18,7 +18,7 @@ from startrack.core.declaration import SHOWN_CHARS, value_text
 from startrack.core.files import MAX_CAUSE_CHARS
 from startrack.core.types import BadInput, Exposure, Mask
 from startrack.exposure.sidecar import BAYER_PATTERNS, NAMED_FILES, NUMBERS, SIDECAR, Sidecar, resolve_path
-from startrack.frames import as_utc, parse_utc
+from startrack.frames import as_utc, format_utc, parse_utc
 
 NO_TIME = (
     "the mid-exposure time is not known: give --time UTC, a sidecar NAME.json with time_utc, or a header with it; "
@@ -32,6 +32,7 @@ HEADER_OF = {  # the sidecar's key of a fact and its name in a header: FITS keyw
 # names the hardware.
 SITE_NAMES = (("OBSLAT", "OBSLONG"), ("SITELAT", "SITELONG"), ("LAT-OBS", "LONG-OBS"), ("OBSGEO-B", "OBSGEO-L"))
 _NAMES = ("DATE-OBS", "TIMESYS", *HEADER_OF.values(), *(name for pair in SITE_NAMES for name in pair))
+SAME_TIME_S = 1.0  # between a stated time and that of a file, below which they are the same
 HEADER_KEYS = {name: name for name in _NAMES} | HEADER_OF
 
 
@@ -94,8 +95,8 @@ def with_facts(
 def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts:
     """The metadata of `image` from, in this order: `given` (flags), its sidecar, its header.
 
-    A source is read only for values that the sources before it do not have. An unusable value in a sidecar raises
-    BadInput (bad_image, or no_time); in a header it gives a warning.
+    A source is read only for values that the sources before it do not have, and for a time that differs from the given
+    one. An unusable value in a sidecar raises BadInput (bad_image, or no_time); in a header it gives a warning.
     """
     sidecar = Sidecar.read(image)
     notes = [*given.warnings, *sidecar.warnings]
@@ -113,7 +114,22 @@ def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts
             if value is not None and key in NAMED_FILES:
                 value = resolve_path(image, value)
         found[key] = as_utc(value) if key == "time_utc" and value is not None else value
+    if given.time_utc is not None:
+        notes += _other_time_notes(found["time_utc"], sidecar, header, found["exposure_s"])
     return Facts(**found, site_rad=_header_site_rad(header), warnings=tuple(notes))
+
+
+def _other_time_notes(
+    stated: datetime, sidecar: Sidecar, header: Mapping[str, Any], exposure_s: float | None
+) -> list[str]:  # fmt: skip
+    """What the time in the sidecar, else in the header, differs by from the `stated` one that is used."""
+    with suppress(BadInput):  # a time that cannot be read is none
+        other = sidecar.value("time_utc") or _header_time(header, exposure_s, [])
+        if other is not None and abs(late_s := (stated - as_utc(other)).total_seconds()) >= SAME_TIME_S:
+            way = "after" if late_s > 0 else "before"
+            return [f"the time used is {timedelta(seconds=round(abs(late_s)))} (h:mm:ss) {way} that of the file, "
+                    f"{format_utc(as_utc(other))}"]  # fmt: skip
+    return []
 
 
 def facts_in_text(text: str) -> dict[str, Any]:

@@ -45,7 +45,8 @@ def read_exposure(
     in FITS too; orientation tags are ignored. `time_utc` (mid-exposure), `time_sigma_s` (of the clock), `exposure_s`,
     `camera`, `terrain`, `mask` (path of an 8-bit image), `dark` and `flat` (paths of a dark frame and a flat field)
     replace the values of sidecar and header, which are then not read. The counts are corrected by dark frame and flat
-    field, as in `correct_counts`. `warnings` lists ignored facts and causes.
+    field, as in `correct_counts`. `warnings` lists ignored facts and causes, and a time of the file that differs from
+    `time_utc`.
 
     Raises:
         BadInput: bad_image with file and cause in one line; no_time if a sidecar's time is not UTC; size_mismatch for

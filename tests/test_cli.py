@@ -258,6 +258,25 @@ def test_a_refused_image_leaves_its_reason_in_the_file_too(folder, capsys):
     assert not Path("startrack-out/black.stars.ecsv").exists()
 
 
+@pytest.mark.parametrize(
+    ("command", "flag"),
+    [("locate", "-c"), ("locate", "-t"), ("locate", "--mask"), ("locate", "--flat"), ("identify", "-c"),
+     ("identify", "--mask"), ("detect", "-c"), ("detect", "--mask"), ("detect", "--dark")],
+)  # fmt: skip
+def test_a_file_of_a_flag_that_is_missing_leaves_earlier_results(folder, capsys, command, flag):
+    black_image()
+    assert run(capsys, command, "black.png")[0] == REFUSED
+    out = Path("startrack-out")
+    for suffix in (".wcs", ".stars.ecsv", ".annotated.png"):
+        (out / f"black{suffix}").write_text("of a solution")
+    before = {path: path.read_bytes() for path in out.iterdir()}
+    code, lines, _ = run(capsys, command, "black.png", flag, "./cratr.toml", "--json")
+    assert (code, "cratr.toml" in json.loads(lines[0])["message"]) == (BAD_INPUT, True)
+    assert {path: path.read_bytes() for path in out.iterdir()} == before
+    assert run(capsys, command, "black.png", flag, "./cratr.toml", "-D", "new")[0] == BAD_INPUT
+    assert not Path("new").exists()
+
+
 def test_the_same_image_gives_the_same_bytes(folder, capsys):
     shutil.copy(stars(), "again.png")
     texts = []

@@ -102,13 +102,21 @@ def locate_exposure(exposure: Exposure, settings: Settings | None = None) -> Loc
     Raises BadInput (no_calibration, bad_calibration, bad_terrain) where one is not named or cannot be used.
     """
     start = clock.perf_counter()
+    camera, terrain = load_named(exposure)
+    read_ms = 1e3 * (clock.perf_counter() - start)
+    return add_timing(locate(exposure, camera, terrain, load_catalog(), settings), read=read_ms)
+
+
+def load_named(exposure: Exposure) -> tuple[Camera, Terrain]:
+    """The camera and the terrain that `exposure` names.
+
+    Raises BadInput (no_calibration, bad_calibration, bad_terrain) where one is not named or cannot be used.
+    """
     if exposure.camera is None:
         raise BadInput("no_calibration", "no camera file is known: give -c FILE or a sidecar with camera")
     if exposure.terrain is None:
         raise BadInput("bad_terrain", "no terrain file is known: give -t FILE or a sidecar with terrain")
-    camera, terrain = load_camera(exposure.camera), load_terrain(exposure.terrain)
-    read_ms = 1e3 * (clock.perf_counter() - start)
-    return add_timing(locate(exposure, camera, terrain, load_catalog(), settings), read=read_ms)
+    return load_camera(exposure.camera), load_terrain(exposure.terrain)
 
 
 def identify(

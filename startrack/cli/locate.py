@@ -19,12 +19,12 @@ from startrack.camera import Camera, load_camera
 from startrack.catalog import load_catalog
 from startrack.cli.console import Outcome, print_outcome, refusal_record, worst_code
 from startrack.cli.flags import check_localizer
-from startrack.cli.images import check_fov, compile_beside, near_attitude_of, prepare_reference, read
+from startrack.cli.images import check_fov, compile_beside, near_attitude_of, prepare, read
 from startrack.cli.report import write_page_of_images
 from startrack.core.errors import INTERNAL_ERROR, BadInput, BadOutput
 from startrack.core.files import make_folder, printable
 from startrack.core.types import Exposure, PositionPrior
-from startrack.exposure import split_bag_path
+from startrack.exposure import read_mask, split_bag_path
 from startrack.identification import WIDE_FIELD_RAD, Identifier
 
 NEEDED_LATER = ("scipy.special", "scipy.spatial", "spiceypy", "PIL.ImageDraw")  # in this order; pictures need the last
@@ -107,7 +107,9 @@ def _solve_image(args: argparse.Namespace, path: str, out: Path, solve: Solve) -
     """
     start, is_located = time.perf_counter(), args.command == "locate"
     exposure = read(path, args)
-    camera = None if is_located else _camera_of(args, exposure)
+    camera, terrain = (None, chain.load_named(exposure)[1]) if is_located else (_camera_of(args, exposure), None)
+    if isinstance(exposure.mask, str):
+        read_mask(exposure.mask)  # as the others: an earlier result outlasts a file that cannot be read
     try:
         make_folder(out.parent)
     except BadOutput as cause:
@@ -115,10 +117,9 @@ def _solve_image(args: argparse.Namespace, path: str, out: Path, solve: Solve) -
     remedy = "choose another -D, or replace it with -O"  # before anything is computed
     output.prepare_folder(out, exposure.sha256, overwrite=args.overwrite, remedy=remedy)
     read_s = time.perf_counter() - start
-    if is_located and exposure.time_utc is not None and exposure.camera is not None:
-        terrain = prepare_reference(exposure.terrain, args)
-        if terrain is not None and exposure.terrain is not None:
-            compile_beside(exposure.terrain)
+    if terrain is not None and exposure.terrain is not None and exposure.time_utc is not None:
+        prepare(terrain, args)
+        compile_beside(exposure.terrain)
     start = time.perf_counter()
     result = chain.add_timing(solve(exposure, camera), read=1e3 * read_s)
     more = {"explain": output.explain(result)} if is_located and args.explain else {}

@@ -5,15 +5,18 @@ from __future__ import annotations
 import json
 import os
 
+import cv2
 import pytest
 from astropy.table import Table
 from batch_helpers import frames, stdin_of, task_of
+from earth_helpers import jacksboro
 
 from startrack.applications.batch import images_under, locate_image
 from startrack.applications.batch.find import result_stems
 from startrack.cli.main import main
 from startrack.core.types import BadInput
 from startrack.exposure import read_exposure
+from startrack.terrain import write_map
 
 
 def names(folder, *apart) -> list[str]:
@@ -112,3 +115,22 @@ def test_a_sidecar_in_capitals_counts_where_there_is_no_other(tmp_path):
     assert [locate_image(task)[1], locate_image(task)[1]] == [False, True]
     capital.write_text(json.dumps(facts | {"exposure_s": 3.0}))
     assert not locate_image(task)[1]
+
+
+def test_a_height_map_in_the_folder_is_left_out_and_named(tmp_path, capsys):
+    """The picture beside it is a TIFF too, and a file with a map's suffix that is none is refused as an image."""
+    images = tmp_path / "images"
+    (image,) = frames(images, 1)
+    (images / "a.tif").write_bytes(cv2.imencode(".tif", cv2.imread(str(image), cv2.IMREAD_UNCHANGED))[1].tobytes())
+    (images / "a.json").write_text(image.with_suffix(".json").read_text())
+    (images / "broken.tif").write_bytes(b"II*\0")
+    write_map(images / "valley-1.tif", jacksboro())
+    command = ["batch", str(images), "-D", str(tmp_path / "out"), "-j", "1", "--no-plots"]
+    assert main(command) == 5
+    shown = capsys.readouterr()
+    assert "valley-1.tif: left out, a height map (GeoTIFF)\n" in shown.err
+    assert shown.out.startswith("3 images: 3 refused")
+    for name in ("a.tif", "broken.tif", image.name):
+        (images / name).unlink()
+    assert main(command) == 4
+    assert "no PNG, TIFF" in capsys.readouterr().err

@@ -35,7 +35,8 @@ def test_long_work_without_a_terminal_prints_lines(monkeypatch):
             time.sleep(0.01)
         steps.advance(text="b.png")
     lines = sys.stderr.getvalue().splitlines()
-    assert re.fullmatch(r"horizon of 3 pictures: 1 of 3, measured the skyline of a\.png, \d+ s", lines[0])
+    line = r"horizon of 3 pictures: 1 of 3, measured the skyline of a\.png, \d+ s, about \d+ s left"
+    assert re.fullmatch(line, lines[0])
     time.sleep(0.2)
     assert sys.stderr.getvalue().splitlines() == lines
     with console.progress("table", 3, shown=False):
@@ -114,3 +115,14 @@ def picture(folder, level, sources):
     (folder / "camera.toml").write_text(camera_text(FISHEYE))
     facts = {"time_utc": "2030-01-01T00:00:00Z", "exposure_s": 0.5, "camera": "camera.toml"}
     (folder / "a.json").write_text(json.dumps(facts))
+
+
+def test_a_line_of_work_states_the_time_left():
+    steps = console.Progress(10)
+    assert steps.line(20.0) == "0 of 10, 20 s"
+    steps.advance(4, text="a.png")
+    assert steps.line(20.0) == "4 of 10, a.png, 20 s, about 30 s left"
+    assert steps.line(2000.0) == "4 of 10, a.png, 2000 s, about 50 minutes left"
+    steps.advance(6)
+    assert steps.line(30.0) == "10 of 10, a.png, 30 s"
+    assert console.Progress().line(30.0) == "30 s"

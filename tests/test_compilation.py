@@ -79,6 +79,16 @@ def test_compiling_is_announced_once_and_loading_is_not(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("words", ["terrain show shackleton --no-plots --at 0 0", "render -t shackleton -o {out}"])
+def test_the_first_use_of_a_command_without_images_is_announced(tmp_path, words):
+    script = tmp_path / "command.py"
+    arguments = words.format(out=tmp_path / "a.png").split()
+    script.write_text(f"from startrack.cli.main import main\nassert main({arguments}) == 0\n")
+    _, log = run_script(script, tmp_path / "cache")
+    assert "compiling terrain, once for this installation: 0 of" in log
+
+
+@pytest.mark.slow
 def test_a_kernel_gives_the_same_bytes_compiled_and_loaded(tmp_path):
     """Its sums of reordered terms are those of its own library's code, in the process that compiles its parts too."""
     script = tmp_path / "peaks.py"

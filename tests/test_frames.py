@@ -85,6 +85,21 @@ def test_other_times_are_refused_as_no_time(text: object) -> None:
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "end"),
+    [
+        ("2018-08-05T22:17:34-07:00", "give it in UTC; that is 2018-08-06T05:17:34Z"),
+        ("2018-08-05 22:17:34.25 +0530", "give it in UTC; that is 2018-08-05T16:47:34.250000Z"),
+        ("2018-08-32T22:17:34+01:00", "give it in UTC"),
+        ("0001-01-01T00:00:00+01:00", "give it in UTC"),
+    ],
+)
+def test_a_local_time_is_refused_with_its_utc(text: str, end: str) -> None:
+    with pytest.raises(BadInput, match="is a local time") as error:
+        parse_utc(text)
+    assert str(error.value).endswith(end)
+
+
 @pytest.mark.parametrize("text", ["1500-01-01", "2026-03-01", "20260301", "2026-03-01Z"])
 def test_a_date_without_time_of_day_is_refused_with_advice(text: str) -> None:
     with pytest.raises(BadInput, match="date without a time of day") as error:

@@ -396,10 +396,11 @@ def waypoints(tmp_path):
     return path
 
 
-def test_along_a_path_there_is_a_table_with_distances_and_no_map(waypoints, tmp_path):
+def test_along_a_path_there_is_a_table_with_distances_and_no_map(waypoints, tmp_path, capsys):
     out = tmp_path / "out"
-    flags = ["--exposures", "0.2,0.4", "-j", "1", "-D", str(out), "-q"]
+    flags = ["--exposures", "0.2,0.4", "-j", "1", "-D", str(out)]
     assert main([*FLAGS, *flags, "--path", str(waypoints), "--spacing", "4300", "--draws", "1"]) == 0
+    assert "predict: places: 2, draws at each: 1\n" in capsys.readouterr().err
     table = Table.read(out / "predict.ecsv")
     assert list(table["distance_m"]) == pytest.approx([0, 3000 * 2**0.5], abs=1e-3)
     assert not (out / "predict.tif").exists()

@@ -279,6 +279,9 @@ def test_import_show_and_build(tmp_path, capsys):
     for file in facts["files"]:
         assert np.asarray(Image.open(file)).std() > 5
     assert main(["terrain", "show", str(made), "--at", "9000", "0", "--no-plots"]) == 4
+    line = capsys.readouterr().err
+    assert "E 9000 m, N 0 m is 9000 m from the origin of mine: give a place within its search area, 500 m" in line
+    assert "next:" not in line
 
 
 IMPORT = ["--latitude", "-90", "--longitude", "0", "--radius", "500", "--half", "2500"]

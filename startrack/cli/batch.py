@@ -62,6 +62,10 @@ def _find_images(args: argparse.Namespace) -> tuple[Sequence[Image], Sequence[Im
         listed = sys.stdin.buffer.read()
         paths = os.fsdecode(listed).split("\0" if b"\0" in listed else "\n")  # ended by NUL, or else one a line
         found = batch.listed_images(args.folder, paths, args.dir)
+    maps = set(batch.maps_among({*whole, *found}))
+    found, whole = ([image for image in images if image not in maps] for images in (found, whole))
+    for image in sorted(maps):
+        print(f"{errors.one_line(image.name)}: left out, a height map (GeoTIFF)", file=sys.stderr, flush=True)
     if not found:
         raise BadInput("bad_image", f"{args.folder}: no PNG, TIFF, FITS, JPEG or camera raw images there")
     if args.time is not None and len(found) > 1:

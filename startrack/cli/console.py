@@ -99,9 +99,11 @@ class Progress:
             self._bar.update(self._row, completed=completed, total=total, text=self.text)
 
     def line(self, seconds: float) -> str:
-        """What is done after so many seconds."""
+        """What is done after so many seconds, and the time left at the mean speed of the steps so far."""
         count = f"{self.completed} of {self.total}" if self.total else ""
-        return errors.one_line(", ".join(part for part in (count, self.text, f"{seconds:.0f} s") if part))
+        to_do = (self.total or 0) - self.completed
+        left = f"about {duration_text(seconds * to_do / self.completed)} left" if self.completed and to_do > 0 else ""
+        return errors.one_line(", ".join(part for part in (count, self.text, f"{seconds:.0f} s", left) if part))
 
 
 @contextmanager
@@ -109,7 +111,7 @@ def progress(what: str, total: int | None = None, *, shown: bool = True, jobs: i
     """A bar on stderr with the time left and a text, if `shown`; it disappears at the end.
 
     A line before it says what is done, by the first word of `what`, in `jobs` processes, and how long that may take.
-    Where stderr is no terminal, a line every LINE_S seconds shows that the work goes on.
+    Where stderr is no terminal, a line every LINE_S seconds shows that the work goes on, and the time left.
     """
     if not shown or total == 0:
         yield Progress(total)

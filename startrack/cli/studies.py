@@ -42,6 +42,8 @@ def predict(args: argparse.Namespace) -> int:
     plan = prediction.Plan.of(conditions, inputs, _places(args, conditions))
     out = make_folder(args.dir)
     plan.check_folder(out, overwrite=args.overwrite)
+    if not args.quiet:
+        print(f"predict: places: {len(plan.points.places)}, draws at each: {args.draws}", file=sys.stderr, flush=True)
     prepare(plan.terrain, args)
     if args.cluster is None and not is_compiled():
         compile_kernels(plan.terrain)

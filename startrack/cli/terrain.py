@@ -20,13 +20,14 @@ from startrack.core import files
 from startrack.core.compilation import announce_compilation
 from startrack.core.errors import BadInput
 from startrack.frames import Site, latlon_from_enu
-from startrack.terrain import StateableError, Terrain, load_terrain
+from startrack.terrain import StateableError, Terrain, load_terrain, require_place
 
 Values = dict[tuple[str, str], float | bool]  # by table and key
 
 
 def show(args: argparse.Namespace) -> int:
     """Print a terrain's properties, and draw it; 0."""
+    announce_compilation()
     terrain = load_terrain(args.terrain)
     position = None if args.at is None else (args.at[0], args.at[1])
     facts = _facts_of(terrain) | ({} if position is None else _view_facts(terrain, position))
@@ -117,9 +118,8 @@ def _site_of(terrain: Terrain) -> Site:
 
 def _view_facts(terrain: Terrain, position: tuple[float, float]) -> dict[str, Any]:
     """Ground and horizon at a position (east, north) [m]. Raises BadInput outside the terrain."""
+    require_place(terrain, *position)
     point = np.array([position])
-    if not terrain.allowed(point)[0]:
-        raise BadInput("bad_terrain", f"E {position[0]:g} m, N {position[1]:g} m is outside the terrain")
     ground = float(terrain.ground_m(point)[0])
     horizon = np.degrees(terrain.horizon_rad(point, np.radians(np.arange(720) / 2)))
     lat, lon = latlon_from_enu(_site_of(terrain), *position, ground)

@@ -30,11 +30,21 @@ def parse_utc(text: str) -> datetime:
     if parts is None:
         raise BadInput("no_time", f"{text!r} is not an ISO 8601 date and time such as 2026-03-01T12:00:00Z")
     if parts["suffix"] not in _UTC_SUFFIXES:
-        raise BadInput("no_time", f"{text!r} is a local time (offset {parts['suffix']}): give it in UTC")
+        utc = _utc_text(parts["stamp"] + parts["suffix"])
+        raise BadInput("no_time", f"{text!r} is a local time (offset {parts['suffix']}): give it in UTC{utc}")
     try:
         return datetime.fromisoformat(parts["stamp"]).replace(tzinfo=UTC)
     except ValueError as error:
         raise BadInput("no_time", f"{text!r} is not a valid date and time: {error}") from error
+
+
+def _utc_text(local: str) -> str:
+    """The instant of a `local` time with an offset, for a message; empty where there is no such time."""
+    try:
+        utc = datetime.fromisoformat(local).astimezone(UTC)
+    except (ValueError, OverflowError):
+        return ""
+    return f"; that is {utc.replace(tzinfo=None).isoformat()}Z"
 
 
 def format_utc(time: datetime) -> str:

@@ -21,7 +21,7 @@ from startrack.rendering.compose import draw_hot_pixels
 from startrack.rendering.drive import Drive, draw_odometry
 from startrack.rendering.scene import Scene
 from startrack.rendering.sources import draw_field_stars, draw_v_errors, exposure_for_snr
-from startrack.terrain import Terrain
+from startrack.terrain import Terrain, require_place
 
 if TYPE_CHECKING:
     from startrack.catalog import StarCatalog
@@ -174,11 +174,7 @@ class Series:
                 _, position_m, heading, pitch, roll = first
             else:
                 position_m, heading = self.drive.position_m(after_s), self.drive.heading_rad(after_s)
-        if not bool(self.terrain.allowed(position_m[None])[0]):
-            raise BadInput(
-                "bad_terrain",
-                f"{self.terrain.name}: no camera can stand at {position_m[0]:.0f} m east, {position_m[1]:.0f} north",
-            )
+        require_place(self.terrain, float(position_m[0]), float(position_m[1]))
         height_m = float(self.terrain.ground_m(position_m[None])[0]) + self.terrain.camera_height_m
         pose = Pose(
             time_utc=time,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from startrack.terrain.checks import require_bounds, require_horizons, require_terrain
+from startrack.terrain.checks import require_bounds, require_horizons, require_place, require_terrain
 from startrack.terrain.cylinder import Cylinder
 from startrack.terrain.io import KEYS as TERRAIN_KEYS
 from startrack.terrain.io import MAKERS, files_of_terrain, load_terrain, site_of_terrain, terrain_from_dict
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from startrack.terrain.earth_projection import EarthProjection
     from startrack.terrain.height_map import HeightMap
     from startrack.terrain.import_map import import_maps
+    from startrack.terrain.map_formats import is_geotiff
     from startrack.terrain.map_reading import read_map
     from startrack.terrain.map_writing import write_bands, write_map
     from startrack.terrain.state_file import StateableError, state_errors, stateable_errors
@@ -40,10 +41,12 @@ __all__ = [
     "Terrain",
     "files_of_terrain",
     "import_maps",
+    "is_geotiff",
     "load_terrain",
     "read_map",
     "require_bounds",
     "require_horizons",
+    "require_place",
     "require_terrain",
     "site_of_terrain",
     "state_errors",
@@ -54,7 +57,7 @@ __all__ = [
 ]  # fmt: skip
 _LAZY_MODULES = {  # of names that few programs use: imported at the first use
     "EarthProjection": "earth_projection", "HeightMap": "height_map", "StateableError": "state_file",
-    "import_maps": "import_map", "read_map": "map_reading",
+    "import_maps": "import_map", "is_geotiff": "map_formats", "read_map": "map_reading",
     "state_errors": "state_file", "stateable_errors": "state_file", "write_bands": "map_writing",
     "write_map": "map_writing",
 }  # fmt: skip

@@ -32,6 +32,26 @@ def require_terrain(given: Any) -> Terrain:
     )
 
 
+def require_place(terrain: Terrain, east_m: float, north_m: float) -> None:
+    """Raise BadInput (bad_terrain), with the range allowed, where no camera can stand on a `terrain`.
+
+    The place is `east_m` and `north_m` of the origin [m].
+    """
+    if terrain.allowed(np.array([[east_m, north_m]]))[0]:
+        return
+    away_m, radius_m = float(np.hypot(east_m, north_m)), min(terrain.search_radius_m, terrain.reach_m)
+    place = f"E {east_m:g} m, N {north_m:g} m"
+    if away_m > radius_m:
+        raise BadInput(
+            "bad_terrain",
+            f"{place} is {away_m:.0f} m from the origin of {terrain.name}: give a place within its search area, "
+            f"{radius_m:g} m about the origin",
+        )
+    raise BadInput(
+        "bad_terrain", f"{terrain.name}: no camera can stand at {place} (a steep slope, or the wall): give another"
+    )
+
+
 def require_bounds(terrain: Terrain, low_rad: Array, high_rad: Array) -> None:
     """Raise BadInput (bad_terrain) unless what `horizon_bounds_rad` of a `terrain` gave are bounds.
 

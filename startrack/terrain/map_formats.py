@@ -6,7 +6,7 @@ import logging
 import math
 import re
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -54,6 +54,15 @@ def one_line_refusal(what: str) -> Iterator[None]:
         raise BadInput("bad_terrain", f"{what}: {text}") from cause
     finally:
         log.disabled = False
+
+
+def is_geotiff(path: Path) -> bool:
+    """Whether the file `path` is a TIFF whose first directory has the tag of a map's keys (34735)."""
+    import tifffile
+
+    with suppress(BadInput), one_line_refusal(str(path)), tifffile.TiffFile(path) as file:
+        return bool(file.pages.first.is_geotiff)
+    return False
 
 
 def read_geotiff(path: Path) -> Stored | None:

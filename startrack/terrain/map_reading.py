@@ -51,15 +51,22 @@ def read_map(
         )
     raster = _heights_of(stored, path, scale, offset_m)
     cut = raster if near is None else raster.crop_around(*near, WINDOW_HALF_M[found])
-    if min(cut.heights_m.shape) < 2:
-        x_m, y_m = raster.xy(0.5 * np.array(raster.heights_m.shape))
-        latitude, longitude = np.degrees(raster.projection.latlon_from_xy(x_m, y_m))
-        raise BadInput(
-            "bad_terrain",
-            f"{path}: it is not near the origin: its middle is at latitude {latitude:.2f}, longitude {longitude:.2f}; "
-            "give the latitude and longitude of a place on this map",
-        )
+    _check_near(path, raster, cut.heights_m.shape)
     return cut
+
+
+def _check_near(path: Path, whole: Raster, cut: tuple[int, ...]) -> None:
+    """Raise BadInput bad_terrain, with the place of the `whole` map, where a shape `cut` from it has no two rows."""
+    if min(cut) >= 2:
+        return
+    posts = np.array(whole.heights_m.shape)
+    latitude, longitude = np.degrees(whole.projection.latlon_from_xy(*whole.xy(0.5 * posts)))
+    height_km, width_km = posts * whole.spacings_m / 1000
+    raise BadInput(
+        "bad_terrain",
+        f"{path}: it is not near the origin: its middle is at latitude {latitude:.2f}, longitude {longitude:.2f}, and "
+        f"it is about {width_km:.3g} km x {height_km:.3g} km large; give the latitude and longitude of a place on it",
+    )
 
 
 def _heights_of(stored: Stored, path: Path, scale: float | None, offset_m: float | None) -> Raster:
@@ -68,7 +75,7 @@ def _heights_of(stored: Stored, path: Path, scale: float | None, offset_m: float
     if values.ndim != 2 or min(values.shape) < 2:
         raise BadInput(
             "bad_terrain",
-            f"{path}: too small for a height map, or not near the origin: give the place on it",
+            f"{path}: too small for a height map: {' x '.join(map(str, values.shape))} posts; give a larger one",
         )
     if values.dtype.kind not in "iuf":
         raise BadInput("bad_terrain", f"{path}: values of type {values.dtype} are no heights")
@@ -172,6 +179,8 @@ def _content_of(file: Any, path: Path, near: tuple[float, float] | None, hint: s
     if near is not None:
         rows, columns = raster.window(*near, WINDOW_HALF_M[projection.body])
     shape = rows.stop - rows.start, columns.stop - columns.start
+    if min(file.height, file.width) >= 2:
+        _check_near(path, raster, shape)
     if shape[0] * shape[1] > MAX_PIXELS:
         raise BadInput("bad_terrain", f"{path}: too large; cut it to the area (startrack terrain import --half)")
     if math.prod(file.block_shapes[0]) > MAX_BLOCK_POSTS:  # of which a window is a part

@@ -158,17 +158,22 @@ class Raster:
     @property
     def post_m(self) -> float:
         """Spacing of the posts, the wider of the two [m]."""
+        return float(self.spacings_m.max())
+
+    @property
+    def spacings_m(self) -> Array:
+        """Spacing (2,) of the rows and of the columns in the middle [m]."""
         if isinstance(self.projection, EarthProjection):
             at = np.array(self.heights_m.shape) / 2 + [[0, 0], [0, 1], [1, 0]]
             lat, lon = self.projection.latlon_from_xy(*self.xy(at))
             steps = enu_from_latlon(Site("earth", lat[0], lon[0]), lat[1:], lon[1:])
-            return float(np.linalg.norm(steps, axis=-1).max())
+            return np.linalg.norm(steps, axis=-1)[::-1]
         stretch = np.array([1.0, 1.0])
         if self.projection.kind == EQUIRECTANGULAR:
             _, middle = self.xy(np.array(self.heights_m.shape) / 2)
             latitude = (middle - self.projection.false_y_m) / (self.projection.radius_m * self.projection.scale_y)
             stretch = np.array([np.cos(latitude) / self.projection.scale, 1 / self.projection.scale_y])
-        return float(np.max(np.abs([self.dx_m, self.dy_m]) * stretch))
+        return (np.abs([self.dx_m, self.dy_m]) * stretch)[::-1]
 
     def facts(self) -> dict[str, Any]:
         """File, size, projection and range of the heights, as JSON values."""

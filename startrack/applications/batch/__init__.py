@@ -7,6 +7,7 @@ from startrack.applications.batch.find import (
     images_under,
     listed_images,
     lock_results,
+    maps_among,
     record_path,
     result_stems,
 )
@@ -31,6 +32,6 @@ from startrack.applications.batch.task import (
 
 __all__ = [
     "JOB", "LOCK", "Image", "ImageDone", "Rows", "Task", "belongs_to_other_images", "has_parquet", "images_of_bag",
-    "images_under", "listed_images", "locate_image", "locate_images", "lock_results", "read_task", "record_path",
-    "result_stems", "stored_record", "table_rows", "table_values", "tabled_results", "write_tables",
+    "images_under", "listed_images", "locate_image", "locate_images", "lock_results", "maps_among", "read_task",
+    "record_path", "result_stems", "stored_record", "table_rows", "table_values", "tabled_results", "write_tables",
 ]  # fmt: skip

@@ -14,6 +14,7 @@ from startrack.core.errors import BadInput
 from startrack.core.files import Locked, existing_folder, hold_lock
 from startrack.exposure import PACKING_SUFFIXES, PICTURE_SUFFIXES, BagImage, list_bag_images, stem
 from startrack.output import PICTURES
+from startrack.terrain import is_geotiff
 
 LOCK = ".startrack-batch.lock"
 
@@ -81,6 +82,12 @@ def listed_images(
             known[name] = Image(name, name if taken else of_results, os.path.join(root, name))
         chosen.add(known[name])
     return sorted(chosen)  # with the results' names of a run over the whole folder
+
+
+def maps_among(images: Iterable[Image]) -> list[Image]:
+    """Those of the `images` that are height maps: TIFF files, not packed, with the keys of a GeoTIFF."""
+    tiffs = (image for image in images if Path(image.path).suffix.lower() in (".tif", ".tiff"))
+    return [image for image in tiffs if os.path.isfile(image.path) and is_geotiff(Path(image.path))]
 
 
 def result_stems(images: Sequence[str]) -> list[str]:

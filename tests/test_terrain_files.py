@@ -23,6 +23,7 @@ from startrack.terrain import (
     Raster,
     load_terrain,
     read_map,
+    require_place,
     terrain_from_dict,
     write_map,
 )
@@ -282,6 +283,17 @@ def test_import_show_and_build(tmp_path, capsys):
     line = capsys.readouterr().err
     assert "E 9000 m, N 0 m is 9000 m from the origin of mine: give a place within its search area, 500 m" in line
     assert "next:" not in line
+
+
+def test_a_place_where_no_camera_can_stand_is_refused_with_the_cause(tmp_path):
+    terrain = load_terrain(terrain_file(tmp_path, search={"max_slope_deg": 0.3}))
+    line = np.linspace(0.0, 790.0, 30)
+    steep = next(east for east in line if not terrain.allowed(np.array([[east, 0.0]]))[0])
+    with pytest.raises(BadInput, match=r"hill: no camera can stand at .* \(a steep slope, or the wall\)"):
+        require_place(terrain, float(steep), 0.0)
+    with pytest.raises(BadInput, match=r"is 5000 m from the origin of hill: give a place within .* 800 m"):
+        require_place(terrain, 3000.0, -4000.0)
+    require_place(terrain, 0.0, 0.0)
 
 
 IMPORT = ["--latitude", "-90", "--longitude", "0", "--radius", "500", "--half", "2500"]

@@ -11,6 +11,7 @@ from startrack.cli.main import main
 from startrack.core.errors import Reason, next_step
 
 ACTIONS = {"calibrate": ("board", "verify", "show", "convert"), "terrain": ("show", "import", "build")}
+LOWELL = str(Path(__file__).parents[1] / "sample_images/lowell-2018-08-06.fits.bz2")  # 180 degrees, on the Earth
 SAMPLE = str(Path(__file__).parents[1] / "sample_images/near-wall.png")
 
 
@@ -60,6 +61,22 @@ def test_a_refusal_ends_with_what_to_do(tmp_path: Path, capsys: pytest.CaptureFi
     assert heard.err == ""
 
 
+def test_a_missing_file_needs_no_advice_but_a_similar_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "night-12.png").write_bytes(b"no picture")
+    (tmp_path / "crater.toml").write_text("")
+    out = ["-D", str(tmp_path / "out")]
+    assert main(["locate", str(tmp_path / "other.png"), *out]) == 4
+    assert capsys.readouterr() == ("other.png  refused  bad_image: no such file\n", "")
+    assert main(["locate", str(tmp_path / "nigth-12.png"), *out]) == 4
+    heard = capsys.readouterr()
+    assert heard == ("nigth-12.png  refused  bad_image: no such file: is night-12.png meant?\n", "")
+    assert main(["terrain", "show", str(tmp_path / "cratr.toml")]) == 4
+    assert capsys.readouterr().err.endswith("cratr.toml: no such file: is crater.toml meant?\n")
+    (tmp_path / "link.png").symlink_to(tmp_path / "nowhere")
+    assert main(["locate", str(tmp_path / "link.png"), *out]) == 4
+    assert "no such file\n" in capsys.readouterr().out
+
+
 def test_a_solution_has_no_advice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["identify", SAMPLE, "-D", str(tmp_path), "--json", "--no-plots"]) == 0
     assert "advice" not in json.loads(capsys.readouterr().out)
@@ -70,3 +87,39 @@ def test_advice_is_not_given_twice(reason: Reason) -> None:
     assert next_step(reason, "the file ends after 12 bytes") == reason.advice
     for message in ("no camera file is known: give -c FILE", "wrong terrain, time or camera file?", "see --time-sigma"):
         assert next_step(reason, message) == ""
+
+
+def test_a_wrong_field_of_view_is_advised_to_try_another(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["calibrate", LOWELL, "--fov", "90", "-o", str(tmp_path / "c.toml"), "--no-plots"]) == 3
+    err = capsys.readouterr().err
+    assert "startrack identify --fov 60..200 IMAGE finds it" in err and "the camera file is that of" not in err
+    assert next_step(Reason.NO_STARS, "none", by_fov=True) == Reason.NO_STARS.advice
+
+
+def test_identify_without_a_camera_file_names_the_flag_that_needs_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "sky.fits.bz2").write_bytes(Path(LOWELL).read_bytes())
+    assert main(["identify", str(tmp_path / "sky.fits.bz2"), "-D", str(tmp_path)]) == 4
+    assert "give -c FILE, a sidecar with camera, or --fov DEG" in capsys.readouterr().out
+
+
+def test_a_lens_found_differs_from_no_file_and_leads_to_calibrate(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["identify", LOWELL, "--fov", "180", "-D", str(tmp_path), "--no-plots"]) == 0
+    heard = capsys.readouterr()
+    assert "differs from the camera file" not in heard.err
+    assert "startrack calibrate IMAGE --fov 180 --site LAT,LON -o CAMERA.toml" in heard.out
+
+
+def test_calibrate_names_the_path_of_the_camera_and_the_air_in_its_lens(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["calibrate", LOWELL, "--fov", "180", "-D", str(tmp_path), "--no-plots"]
+    assert main(words) == 0
+    heard = capsys.readouterr()
+    assert heard.out.startswith(f"{tmp_path / 'camera.toml'}  ok  ")
+    assert "the refraction of the air is in the lens: give --site" in heard.err
+    assert main([*words, "-O", "--site=34.7443,-111.4223,2361"]) == 0
+    assert "refraction" not in capsys.readouterr().err

@@ -31,6 +31,14 @@ def test_a_wrong_range_is_wrong_usage(text: str) -> None:
         fields_of_view_rad(text, 3.0, 280.0)
 
 
+@pytest.mark.parametrize("command", ["calibrate", "horizon --site=34,-111 -o a.csv"])
+def test_a_range_where_one_number_counts_is_wrong_usage(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main([*command.split(), LOWELL, "--fov", "150..200"])
+    assert end.value.code == 2
+    assert "'150..200': give one number; startrack identify takes MIN..MAX" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_a_photograph_is_identified_within_a_range(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["identify", LOWELL, "-D", str(tmp_path), "--no-plots", "--fov"]

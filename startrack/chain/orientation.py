@@ -141,16 +141,18 @@ def _identify_at_fovs(detected: Detected, fovs_rad: Array, stars: Stars) -> Iden
     )
 
 
-def solve_orientation(identified: Identified) -> Oriented:
+def solve_orientation(identified: Identified, has_file: bool = True) -> Oriented:
     """The attitude that fits the `identified` stars. Raises NotIdentified.
 
-    Where the stars show that the lens differs from its file the value's camera is the corrected one.
+    Where the stars show that the lens differs from its file the value's camera is the corrected one. Without `has_file`
+    the identification found the camera, and there is nothing that it differs from.
     """
     found, detections = identified.identification, identified.detections
     camera, fit, change_px = correct_lens(
         identified.camera, detections.xy_px[found.detection], detections.covariance_px2[found.detection],
         identified.stars.rays_icrs[found.star], found.R_cam_icrs,
     )  # fmt: skip
+    change_px = change_px if has_file else 0.0
     return extend(identified, Oriented, camera=camera, attitude_fit=fit, lens_change_px=change_px)
 
 

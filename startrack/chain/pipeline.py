@@ -81,7 +81,8 @@ def _orient(
 ) -> Oriented:  # fmt: skip
     """The stages up to the attitude; `identify` gets the sources and `args`."""
     detected = run.run_stage("detect", detect_sources, run.reached, camera, settings.detector)
-    return run.run_stage("attitude", solve_orientation, run.run_stage("identify", identify, detected, *args))
+    identified = run.run_stage("identify", identify, detected, *args)
+    return run.run_stage("attitude", solve_orientation, identified, camera is not None)
 
 
 def _refine(located: Located, is_newer: bool, settings: Settings) -> Located:

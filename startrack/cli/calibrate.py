@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from startrack.applications import calibration
-from startrack.camera import REFRACTION_REMOVED, SENSOR, load_camera, save_camera
+from startrack.camera import REFRACTION_CONTAINED, REFRACTION_REMOVED, SENSOR, load_camera, save_camera
 from startrack.catalog import load_catalog
 from startrack.cli.camera_files import (
     check_camera_output,
@@ -21,10 +21,11 @@ from startrack.cli.flags import checked_flag
 from startrack.cli.images import approximate_camera, check_one_time, flag_site, read, site_of
 from startrack.core.compilation import announce_compilation
 from startrack.core.errors import BadInput, NoSolution
-from startrack.core.files import resolve_named
+from startrack.core.files import printable, resolve_named
 
 MIN_SIDE, MAX_SIDE = 3, 100  # corners or squares of a board
 SENSOR_FLAGS = {"gain_e_per_adu": "gain", "read_noise_e": "read_noise", "bias_adu": "bias"}  # by keys of camera files
+ABOUT_REFRACTION = "of pictures from the Earth the refraction of the air is in the lens: give --site LAT,LON[,M]"
 
 
 def run(args: argparse.Namespace) -> int:
@@ -52,8 +53,8 @@ def run(args: argparse.Namespace) -> int:
         except NoSolution as cause:
             record = calibration.refusal_dict(cause.reason, str(cause))
             write_record(out, record)
-            return print_outcome(args, record, refusal(cause, out.name)[1])
-    record, line = calibration.calibration_dict(found), calibration.summary(found, out.name)
+            return print_outcome(args, record, refusal(cause, printable(out))[1])
+    record, line = calibration.calibration_dict(found), calibration.summary(found, printable(out))
     line += f"\n  {record['message']}" if record["message"] else ""
     if found.accepted:
         about_mask = write_camera(out, found, [found.camera.mask, *(one.mask for one in exposures)])
@@ -64,6 +65,8 @@ def run(args: argparse.Namespace) -> int:
         if about_picture:
             print(about_picture, file=sys.stderr, flush=True)
         print_left_out(found.refused)
+        if found.camera.refraction == REFRACTION_CONTAINED:
+            print(ABOUT_REFRACTION, file=sys.stderr, flush=True)
     if args.verbose:
         line += "".join(f"\n  {note}" for note in found.photometry.notes)
     return print_outcome(args, record, line)
@@ -86,8 +89,8 @@ def run_board(args: argparse.Namespace) -> int:
             found = calibration.calibrate_board(exposures, board, name=args.name or out.stem, progress=show_step)
         except NoSolution as cause:
             record = {"status": "refused", "reason": cause.reason, "message": str(cause), "camera": None}
-            return print_outcome(args, record, refusal(cause, out.name)[1])
-    record, line = calibration.board_dict(found), calibration.board_line(found, out.name)
+            return print_outcome(args, record, refusal(cause, printable(out))[1])
+    record, line = calibration.board_dict(found), calibration.board_line(found, printable(out))
     if found.accepted:
         save_camera(found.camera, out)
         remove_former(out, [one.mask for one in exposures])

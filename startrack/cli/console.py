@@ -55,7 +55,9 @@ def print_outcome(args: argparse.Namespace, record: dict[str, Any], line: str) -
 
 def print_advice(reason: str | None, message: str, args: argparse.Namespace) -> None:
     """What to do after a refusal, on stderr, where its `message` does not contain it; once for each reason."""
-    advice = "" if reason is None or getattr(args, "quiet", False) else errors.next_step(reason, message)
+    if reason is None or getattr(args, "quiet", False):
+        return
+    advice = errors.next_step(reason, message, by_fov=getattr(args, "fov", None) is not None)
     printed: set[str] = vars(args).setdefault("printed_advice", set())
     if advice and advice not in printed:
         printed.add(advice)

@@ -83,6 +83,8 @@ def clock_offset_s(text: str) -> float:
 
 def field_of_view_rad(text: str, narrowest_deg: float = 0.5, widest_deg: float = 360.0) -> float:
     """An angle given in degrees [rad]."""
+    if ".." in text:
+        raise argparse.ArgumentTypeError(f"{text[:SHOWN_CHARS]!r}: give one number; startrack identify takes MIN..MAX")
     if not narrowest_deg <= number(text) <= widest_deg:
         raise argparse.ArgumentTypeError(f"{text} is not between {narrowest_deg:g} and {widest_deg:g} degrees")
     return math.radians(number(text))

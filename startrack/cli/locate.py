@@ -131,7 +131,8 @@ def _solve_image(args: argparse.Namespace, path: str, out: Path, solve: Solve) -
     line = output.summary_line(result, seconds=read_s + time.perf_counter() - start)
     if args.command == "identify" and camera is None and isinstance(result, chain.Oriented):
         fov = _found_fov_text(result.camera, args.fov)
-        line += f"\n  {output.lens_text(result.camera)}; a camera file: startrack calibrate --fov {fov} IMAGE"
+        line += f"\n  {output.lens_text(result.camera)}; a camera file: startrack calibrate IMAGE "
+        line += f"--fov {fov} --site LAT,LON -o CAMERA.toml"
     if args.verbose and args.command != "detect":
         line += "\n" + output.verbose_text(result)
         line += f"\n  written to {out.parent}/{out.name.removesuffix('.fix.json')}.*" if is_located else ""
@@ -146,7 +147,7 @@ def _camera_of(args: argparse.Namespace, exposure: Exposure) -> Camera | None:
         return load_camera(exposure.camera)
     if args.command == "detect":
         return None
-    raise BadInput("no_calibration", "no camera file is known: give -c FILE or a sidecar with camera")
+    raise BadInput("no_calibration", "no camera file is known: give -c FILE, a sidecar with camera, or --fov DEG")
 
 
 def _found_fov_text(camera: Camera, fovs_rad: tuple[float, ...]) -> str:

@@ -8,7 +8,7 @@ that names the key.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from numbers import Real
@@ -19,7 +19,12 @@ from startrack.core.errors import BadInput
 Schema = dict[str, Any]
 LARGEST = 1e12  # default limit of a number's size: no length, flux or count in a file of ours is larger
 SHOWN_CHARS = 40  # of a wrong value in a message
-SIMILAR_KEY_1 = 0.8  # ratio (difflib) from which an unknown key counts as a misspelt one
+SIMILAR_NAME_1 = 0.8  # ratio (difflib) from which an unknown name counts as a misspelt one
+
+
+def similar_name(name: str, known: Iterable[str]) -> str:
+    """The one of the `known` names that is most similar to a misspelt `name`; empty where none is similar."""
+    return next(iter(get_close_matches(name, known, n=1, cutoff=SIMILAR_NAME_1)), "")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,9 +193,9 @@ class Table(Key):
             raise ValueError(f"{name or 'the file'} must be a table of keys, not {value_text(value)}")
         prefix = f"{name}." if name else ""
         for unknown in sorted(str(key) for key in set(value) - set(self.keys)):
-            meant = get_close_matches(unknown.lower(), self.keys, n=1, cutoff=SIMILAR_KEY_1)
+            meant = similar_name(unknown.lower(), self.keys)
             if meant or self.closed:
-                hint = f": is {meant[0]} meant?" if meant else f"; known: {', '.join(self.keys)}"
+                hint = f": is {meant} meant?" if meant else f"; known: {', '.join(self.keys)}"
                 shown = unknown[:SHOWN_CHARS] if unknown.isprintable() else value_text(unknown)
                 raise ValueError(f"{prefix}{shown} is an unknown key{hint}")
         checked = {}

@@ -113,16 +113,25 @@ class Reason(StrEnum):
 
 
 INTERNAL_ERROR = Reason.INTERNAL_ERROR
-ADVICE_IN_MESSAGE = re.compile(  # the imperatives of our messages, a flag, or a question
-    r"\?|(^|\s)--[a-z]"
+ADVICE_IN_MESSAGE = re.compile(  # the imperatives of our messages, a flag, a question, or a name that is wrong
+    r"\?|(^|\s)--[a-z]|: no such file$"
     r"|\b(give|choose|correct|enlarge|expose|find|flip|install|make|replace|run|set|state|try|use|widen) "
+)
+OTHER_FOV_ADVICE = (  # in the place of NOT_IDENTIFIED's, where a field of view is given and no camera file
+    "Try another field of view: startrack identify --fov 60..200 IMAGE finds it; check the focus; expose longer for "
+    "more stars."
 )
 BAD_INPUT_REASONS = frozenset(one for one in Reason if one.exit_code == EXIT_BAD_INPUT)  # BadInput in the library
 
 
-def next_step(reason: str, message: str) -> str:
-    """The advice of a `reason` for a terminal; empty where the `message` itself contains what to do, or a question."""
-    return "" if ADVICE_IN_MESSAGE.search(message) else Reason(reason).advice
+def next_step(reason: str, message: str, *, by_fov: bool = False) -> str:
+    """The advice of a `reason` for a terminal; empty where the `message` itself contains what to do, or a question.
+
+    `by_fov`: whether a field of view is given in the place of a camera file.
+    """
+    if ADVICE_IN_MESSAGE.search(message):
+        return ""
+    return OTHER_FOV_ADVICE if by_fov and reason == Reason.NOT_IDENTIFIED else Reason(reason).advice
 
 
 def exit_code_of(reason: str | None) -> int:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+from startrack.core.declaration import similar_name
 from startrack.core.errors import BadInput, BadOutput, Reason, one_line
 
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -77,7 +78,7 @@ def resolve_named(name_or_path: str | Path, kind: str, reason: str) -> Path:
     if is_path(name_or_path):
         path = Path(name_or_path)
         if not os.path.isfile(path):  # False also for names too long for the file system
-            raise BadInput(reason, f"{path}: no such file")
+            raise BadInput(reason, f"{path}: {missing_text(path)}")
         return path
     path = data_dir(kind) / f"{name_or_path}.toml"
     if not os.path.isfile(path):
@@ -88,6 +89,16 @@ def resolve_named(name_or_path: str | Path, kind: str, reason: str) -> Path:
             "separator",
         )
     return path
+
+
+def missing_text(path: FilePath) -> str:
+    """What is said of a `path` without a file; it names the file of its folder whose name is the most similar."""
+    folder, name = os.path.split(path)
+    there: set[str] = set()
+    with suppress(OSError, ValueError):  # no such folder, or a NUL in its name
+        there = set(os.listdir(folder or ".")) - {name}  # itself: a link to nowhere
+    similar = similar_name(os.fspath(name), sorted(there))
+    return f"no such file: is {printable(similar)} meant?" if similar else "no such file"
 
 
 def read_text(path: FilePath, reason: str, *, max_bytes: int = MAX_TEXT_BYTES) -> str:

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.files import MAX_CAUSE_CHARS, FilePath, printable
+from startrack.core.files import MAX_CAUSE_CHARS, FilePath, missing_text, printable
 from startrack.core.types import MAX_PIXELS, BadInput
 from startrack.exposure.sidecar import RAW_SUFFIXES
 
@@ -159,6 +159,8 @@ def _read_bytes(path: FilePath) -> bytes:
         if status.st_size > MAX_FILE_BYTES:
             raise bad_image(f"is {status.st_size / 1e9:.1f} GB, more than any image startrack reads")
         return Path(path).read_bytes()
+    except FileNotFoundError as error:
+        raise bad_image(missing_text(path)) from error
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise bad_image(f"cannot be opened ({getattr(error, 'strerror', None) or error})") from error
 

@@ -61,20 +61,21 @@ def test_a_refusal_ends_with_what_to_do(tmp_path: Path, capsys: pytest.CaptureFi
     assert heard.err == ""
 
 
-def test_a_missing_file_needs_no_advice_but_a_similar_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_of_a_missing_file_a_similar_name_is_the_advice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "night-12.png").write_bytes(b"no picture")
     (tmp_path / "crater.toml").write_text("")
     out = ["-D", str(tmp_path / "out")]
     assert main(["locate", str(tmp_path / "other.png"), *out]) == 4
-    assert capsys.readouterr() == ("other.png  refused  bad_image: no such file\n", "")
+    advice = "  next: Check the name and the folder of the file.\n"
+    assert capsys.readouterr() == ("other.png  refused  bad_image: No such file\n", advice)
     assert main(["locate", str(tmp_path / "nigth-12.png"), *out]) == 4
     heard = capsys.readouterr()
-    assert heard == ("nigth-12.png  refused  bad_image: no such file: is night-12.png meant?\n", "")
+    assert heard == ("nigth-12.png  refused  bad_image: No such file: is night-12.png meant?\n", "")
     assert main(["terrain", "show", str(tmp_path / "cratr.toml")]) == 4
-    assert capsys.readouterr().err.endswith("cratr.toml: no such file: is crater.toml meant?\n")
+    assert capsys.readouterr().err.endswith("cratr.toml: No such file: is crater.toml meant?\n")
     (tmp_path / "link.png").symlink_to(tmp_path / "nowhere")
     assert main(["locate", str(tmp_path / "link.png"), *out]) == 4
-    assert "no such file\n" in capsys.readouterr().out
+    assert "No such file\n" in capsys.readouterr().out
 
 
 def test_a_solution_has_no_advice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

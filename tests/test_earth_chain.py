@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import datetime
 from typing import Any
 
 import numpy as np
 import pytest
 
 from startrack.camera import REFRACTION_CONTAINED, camera_from_dict, camera_to_dict, load_camera
-from startrack.catalog import load_catalog
+from startrack.catalog import load_catalog, sun_elevation_rad
 from startrack.chain import Located, Outcome, Refused, Settings, locate
 from startrack.core.types import Array, BadInput
 from startrack.frames import LOWEST_PREDICTED_RAD, Air, Site
@@ -52,6 +53,18 @@ def test_a_picture_below_the_air_is_located_with_the_air_alone() -> None:
     assert outcome.warnings == []
     without = solve(exposure, replace(CRATER, site=replace(SITE, stated_air=NO_AIR)))
     assert (without.status, without.reason) == ("refused", "inconsistent_evidence")
+
+
+def test_pictures_are_drawn_at_night_and_times_of_the_moon_as_before() -> None:
+    def times(terrain: Cylinder) -> list[datetime]:
+        series = Series(camera=load_camera("fisheye-2048"), terrain=terrain, catalog=load_catalog(), seed=5)
+        return [series.pose(number).time_utc for number in range(12)]
+
+    assert max(sun_elevation_rad(SITE, time) for time in times(CRATER)) < np.radians(-18.0)
+    on_moon = times(replace(CRATER, site=Site("moon", 0.3, 0.5)))
+    assert on_moon != times(CRATER)
+    dark = [sun_elevation_rad(SITE, time) < np.radians(-18.0) for time in on_moon]
+    assert [time in times(CRATER) for time in on_moon] == dark
 
 
 def test_the_sidecars_air_replaces_the_terrains() -> None:

@@ -11,6 +11,7 @@ from startrack.catalog.sky import (
     daylight_warnings,
     is_below_horizon,
     sky_at,
+    sun_elevation_rad,
 )
 from startrack.catalog.stars import (
     StarCatalog,
@@ -25,5 +26,5 @@ from startrack.catalog.stars import (
 __all__ = [
     "LOWEST_STAR_RAD", "MOST_BELOW_PART", "Sky", "StarCatalog", "airmass_at", "apparent_bodies", "apparent_stars",
     "bodies", "daylight_warnings", "has_deep_catalog", "hipparcos_rows_in_deep", "is_below_horizon", "load_catalog",
-    "load_deep_catalog", "proper_name_designations", "sky_at", "star_names",
+    "load_deep_catalog", "proper_name_designations", "sky_at", "star_names", "sun_elevation_rad",
 ]  # fmt: skip

@@ -95,12 +95,15 @@ def apparent_bodies(site: Site, time_utc: datetime) -> tuple[Body, ...]:
     return tuple(replace(body, ray_icrs=air.refract(body.ray_icrs, R)) for body in found)
 
 
+def sun_elevation_rad(site: Site, time_utc: datetime) -> float:
+    """Elevation [rad] of the Sun's centre above the horizon of a `site` at `time_utc`, refraction included."""
+    sun = next(body for body in apparent_bodies(site, time_utc) if body.name == "Sun")
+    return float(azel_from_rays(R_enu_icrs(site, time_utc) @ sun.ray_icrs)[1])
+
+
 def daylight_warnings(site: Site, time_utc: datetime) -> list[str]:
     """A warning where the Sun's centre is above the horizon of a `site` on the Earth at `time_utc`."""
-    if site.body != "earth":
-        return []
-    sun = next(body for body in apparent_bodies(site, time_utc) if body.name == "Sun")
-    elevation_deg = float(np.degrees(azel_from_rays(R_enu_icrs(site, time_utc) @ sun.ray_icrs)[1]))
+    elevation_deg = np.degrees(sun_elevation_rad(site, time_utc)) if site.body == "earth" else -90.0
     text = f"at {format_utc(time_utc)} the Sun stands {elevation_deg:.0f} degrees above the horizon of the site"
     return [f"{text}, when no stars are seen: is the time UTC, and the site right?"] if elevation_deg > 0.0 else []
 

@@ -14,7 +14,7 @@ from typing import Any
 from uuid import uuid4
 
 from startrack.core.declaration import similar_name
-from startrack.core.errors import BadInput, BadOutput, Reason, one_line
+from startrack.core.errors import MISSING, BadInput, BadOutput, Reason, one_line
 
 PACKAGE = Path(__file__).resolve().parents[1]
 MAX_TEXT_BYTES = 2**20  # camera and terrain files have a few kilobytes
@@ -98,7 +98,7 @@ def missing_text(path: FilePath) -> str:
     with suppress(OSError, ValueError):  # no such folder, or a NUL in its name
         there = set(os.listdir(folder or ".")) - {name}  # itself: a link to nowhere
     similar = similar_name(os.fspath(name), sorted(there))
-    return f"no such file: is {printable(similar)} meant?" if similar else "no such file"
+    return f"{MISSING}: is {printable(similar)} meant?" if similar else MISSING
 
 
 def read_text(path: FilePath, reason: str, *, max_bytes: int = MAX_TEXT_BYTES) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.catalog import apparent_bodies, apparent_stars
+from startrack.catalog import apparent_bodies, apparent_stars, sun_elevation_rad
 from startrack.core import SKY_V_MAG_ARCSEC2
 from startrack.core.types import Array, BadInput, Stars, Value, rotation, vector
 from startrack.estimation.observations import OdometryErrors
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 EXPOSURE_V_MAG = 6.0  # of a star on the axis that the default exposure just shows
 FAINTEST_V_MAG = 10.0  # of the stars in the sky
 RANDOM_TIMES = datetime(2024, 1, 1, tzinfo=UTC), datetime(2034, 1, 1, tzinfo=UTC)
+DARK_SUN_RAD = np.radians(-18.0)  # elevation of the Sun from which its light is none
 MAX_POSITION_TRIES = 1000
 # Streams of the seed. Sky and sensor are the same in every exposure of a series: errors that exposures share.
 Stream = IntEnum("Stream", "SKY SENSOR EXPOSURE ODOMETRY", start=0)
@@ -184,9 +185,14 @@ class Series:
         return pose, rng
 
     def _draw_pose(self, rng: np.random.Generator) -> tuple[datetime, Array, float, float, float]:
-        """Time, position (2,) [m], heading, pitch and roll [rad]. All are drawn: a given one does not change others."""
-        first, last = RANDOM_TIMES
-        time = first + timedelta(microseconds=int(rng.integers((last - first) // timedelta(microseconds=1))))
+        """Time, position (2,) [m], heading, pitch and roll [rad]. All are drawn: a given one does not change others.
+
+        On the Earth the time is one of the astronomical night.
+        """
+        time = _random_time(rng)
+        others, site = rng.spawn(1)[0], self.terrain.site
+        while self.time_utc is None and site and site.body == "earth" and sun_elevation_rad(site, time) > DARK_SUN_RAD:
+            time = _random_time(others)
         position = _random_position(self.terrain, rng)
         heading, direction = rng.uniform(0, 2 * np.pi, 2)
         tilt = self.max_tilt_rad * np.sqrt(rng.random())
@@ -221,6 +227,11 @@ def load_sky_catalog(stars: str) -> StarCatalog:
     from startrack.catalog import has_deep_catalog, load_catalog, load_deep_catalog
 
     return load_deep_catalog() if stars == "gaia" or (stars == "auto" and has_deep_catalog()) else load_catalog()
+
+
+def _random_time(rng: np.random.Generator) -> datetime:
+    first, last = RANDOM_TIMES
+    return first + timedelta(microseconds=int(rng.integers((last - first) // timedelta(microseconds=1))))
 
 
 def _random_position(terrain: Terrain, rng: np.random.Generator) -> Array:

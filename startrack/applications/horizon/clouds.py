@@ -62,10 +62,9 @@ def cloud_probability(density: float, stars: StarLight, elevation_rad: Array, lo
     expected = density * np.maximum(layer_depth(elevation_rad) - layer_depth(np.array(lowest_rad)), 0.0)
     rays, llr = limited_rows(stars.rays, stars.missing)
     azimuth = np.arange(SKYLINE_AZIMUTHS) * (2.0 * np.pi / SKYLINE_AZIMUTHS)
-    behind = np.zeros(SKYLINE_AZIMUTHS)
-    low = rays.elevation_rad < np.max(elevation_rad, initial=lowest_rad)
-    for star, at, value in zip(rays.azimuth_rad[low], rays.elevation_rad[low], llr[low], strict=True):
-        near = np.abs((azimuth - star + np.pi) % (2.0 * np.pi) - np.pi) < BESIDE_RAD
-        behind[near & (elevation_rad > at) & (at > lowest_rad)] += value
+    low = (rays.elevation_rad > lowest_rad) & (rays.elevation_rad < np.max(elevation_rad, initial=lowest_rad))
+    star, at = rays.azimuth_rad[low, None], rays.elevation_rad[low, None]
+    near = np.abs((azimuth - star + np.pi) % (2.0 * np.pi) - np.pi) < BESIDE_RAD  # (stars, SKYLINE_AZIMUTHS)
+    behind = llr[low] @ (near & (elevation_rad > at))
     odds = expected * np.maximum(np.exp(np.minimum(behind, 0.0)), stars.missing)
     return np.asarray(odds / (1.0 + odds))

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.table import Table
+from drive_helpers import render_small_drive
 from jsonschema import Draft202012Validator
 
 import startrack
 from startrack.applications.tracking import TRACK, read_odometry
 from startrack.applications.tracking.observed_frame import decode_frame, encode_frame
-from startrack.camera import load_camera, save_camera
 from startrack.cli.main import main
 from startrack.estimation.trajectory import radius_holding
 from startrack.frames import R_from_quat_xyzw
@@ -37,17 +37,7 @@ def run(*arguments):
 def drive(tmp_path_factory):
     """A folder with images 25 m apart, their odometry, and the truth."""
     folder = tmp_path_factory.mktemp("drive")
-    camera = load_camera("fisheye-2048")
-    from dataclasses import replace
-
-    small = replace(camera, name="small", size_px=(1024, 1024), focal_px=(326.0, 326.0), centre_px=(511.5, 511.5))
-    save_camera(small, folder / "small.toml")
-    (folder / "path.csv").write_text("east_m,north_m\n-6900,4700\n-6850,4700\n-6850,4750\n")
-    code = main([
-        "render", "--path", str(folder / "path.csv"), "--speed", "0.05", "--every", "500", "--seed", "3", "-q",
-        "-c", str(folder / "small.toml"), "-D", str(folder / "frames"),
-    ])  # fmt: skip
-    assert code == 0
+    render_small_drive(folder, "-6900,4700\n-6850,4700\n-6850,4750")
     return folder
 
 

@@ -6,12 +6,11 @@ from datetime import UTC
 
 import numpy as np
 import pytest
+from drive_helpers import render_small_drive
 from page_helpers import ROOT
 
 import startrack
 from startrack.applications.tracking import read_odometry
-from startrack.camera import load_camera, save_camera
-from startrack.cli.main import main
 from startrack.core.errors import BadInput
 from startrack.exposure import exposure_of_message, read_exposure
 from startrack.frames import R_from_quat_xyzw
@@ -33,14 +32,7 @@ def stamp_ns(exposure):
 def drive(tmp_path_factory):
     """Camera file, exposures 25 m apart of which one shows no star, their odometry, and the true poses."""
     folder = tmp_path_factory.mktemp("ros")
-    camera = load_camera("fisheye-2048")
-    small = replace(camera, name="small", size_px=(1024, 1024), focal_px=(326.0, 326.0), centre_px=(511.5, 511.5))
-    save_camera(small, folder / "small.toml")
-    (folder / "path.csv").write_text("east_m,north_m\n-6900,4700\n-6825,4700\n")
-    assert main([
-        "render", "--path", str(folder / "path.csv"), "--speed", "0.05", "--every", "500", "--seed", "3", "-q",
-        "-c", str(folder / "small.toml"), "-D", str(folder / "frames"),
-    ]) == 0  # fmt: skip
+    render_small_drive(folder, "-6900,4700\n-6825,4700")
     exposures = [read_exposure(path) for path in sorted((folder / "frames").glob("*.png"))]
     noise = np.random.default_rng(4).normal(500.0, 20.0, exposures[0].pixels_adu.shape).astype(np.float32)
     exposures[REFUSED] = replace(exposures[REFUSED], pixels_adu=np.rint(noise))

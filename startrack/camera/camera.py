@@ -11,7 +11,7 @@ from startrack.camera.lens import Lens
 from startrack.camera.lenses import KannalaBrandt
 from startrack.camera.optics import Decentring, Sensor
 from startrack.core.obstacles import Obstacles
-from startrack.core.types import Array, Bools, Mask
+from startrack.core.types import Array, BadInput, Bools, Mask
 from startrack.frames import length_xy
 
 # Body x (forward) = image top = -cam y, body y (left) = +cam x, body z (up) = +cam z: it looks at the zenith.
@@ -197,6 +197,16 @@ def lens_jacobian(camera: Camera, rays_cam: Array, order: tuple[str, ...]) -> Ar
             du, dv = radial * u[0], radial * u[1]
         column[0], column[1] = handed_px[0] * du, handed_px[1] * dv
     return np.moveaxis(jacobian, (0, 1), (-1, -2))
+
+
+def require_not_mirrored(camera: Camera) -> None:
+    """Raise BadInput (bad_calibration) for a mirrored `camera`, which files of other programs cannot hold."""
+    if camera.mirrored:
+        raise BadInput(
+            "bad_calibration",
+            "the camera is mirrored, which no other program's format can express: flip the images left to right and "
+            "calibrate those",
+        )
 
 
 def cap_grid(angle_rad: float, points: int = CAP_POINTS) -> Array:

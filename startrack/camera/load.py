@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from startrack.camera.camera import Camera, cap_grid
+from startrack.camera.camera import Camera, cap_grid, require_not_mirrored
 from startrack.camera.formats import FOREIGN_FORMATS, find_program
 from startrack.camera.io import camera_from_dict
 from startrack.camera.optics import Decentring
@@ -67,12 +67,7 @@ def foreign_text(camera: Camera, program: str) -> str:
 
     Raises BadInput bad_calibration for a mirrored camera, and if the format cannot hold the lens.
     """
-    if camera.mirrored:
-        raise BadInput(
-            "bad_calibration",
-            "the camera is mirrored, which no other program's format can express: flip the images left to right and "
-            "calibrate those",
-        )
+    require_not_mirrored(camera)
     distortion = camera.lens.opencv_coefficients
     if distortion is None:
         raise BadInput("bad_calibration", f"no other program's format has the {camera.lens.model} lens")

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from startrack.camera.camera import Camera, cap_grid
+from startrack.camera.camera import Camera, cap_grid, require_not_mirrored
 from startrack.camera.io import REFRACTION_REMOVED
 from startrack.core.types import Array, BadInput
 from startrack.frames import R_enu_icrs, R_from_rotvec, Site, azel_from_rays, length_xy, seconds_since_2000
@@ -25,6 +25,7 @@ MAX_PLATEPAR_PX = 0.5  # largest error of RMS's model against the lens; a centro
 FITTED_RAYS = 2000
 RIGHT_PX = 10.0  # from the axis to the pixel that shows its rotation above the horizon
 J2000_DAYS, DAY_S, CENTURY_DAYS = 2451545.0, 86400.0, 36525.0
+SIDEREAL_DEG = 280.46061837, 360.98564736629  # at J2000, and a day: Meeus, Astronomical Algorithms, ch. 12
 FOCAL_EQUAL_1 = 1e-9  # relative difference of fx and fy
 RMS_PHOTOMETRY = {"mag_0": -2.5, "mag_lev": 1.0, "mag_lev_stddev": 0.0, "gamma": 1.0, "vignetting_coeff": 0.001,
                   "vignetting_fixed": True, "extinction_scale": 0.6}  # fmt: skip
@@ -45,11 +46,7 @@ def platepar_of(camera: Camera, R_cam_icrs: Array, time: datetime, site: Site) -
     Raises BadInput bad_calibration for a mirrored camera, and where RMS's polynomials differ from the lens by more than
     MAX_PLATEPAR_PX; no_time outside the years of the ephemeris.
     """
-    if camera.mirrored:
-        raise BadInput(
-            "bad_calibration",
-            "the camera is mirrored, which no platepar can express: flip the images left to right and calibrate those",
-        )
+    require_not_mirrored(camera)
     lens = _fit_lens(camera)
     to_sky_px, to_image_px = lens.to_sky_px, lens.to_image_px
     if not max(to_sky_px, to_image_px) <= MAX_PLATEPAR_PX:
@@ -165,7 +162,7 @@ def _pointing(camera: Camera, R_cam_icrs: Array, time: datetime, site: Site) -> 
     turned = np.cross(of_date, axis)  # RMS carries this direction along, and compares its angles to the parallels
     change = _angle_to_parallel(R_precession @ turned, axis) - _angle_to_parallel(turned, of_date)
     centuries = days / CENTURY_DAYS
-    sidereal_deg = 280.46061837 + 360.98564736629 * days + 0.000387933 * centuries**2 - centuries**3 / 38710000.0
+    sidereal_deg = SIDEREAL_DEG[0] + SIDEREAL_DEG[1] * days + 0.000387933 * centuries**2 - centuries**3 / 38710000.0
     R_cam_enu = R_cam_icrs @ R_enu_icrs(site, time).T
     azimuth, elevation = azel_from_rays(R_cam_enu[2])
     right = azel_from_rays(camera.unproject(np.add(camera.centre_px, (RIGHT_PX, 0.0))) @ R_cam_enu)

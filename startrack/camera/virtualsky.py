@@ -15,15 +15,14 @@ from datetime import datetime
 
 import numpy as np
 
-from startrack.camera.camera import Camera, cap_grid
-from startrack.camera.platepar import DAY_S
+from startrack.camera.camera import Camera, cap_grid, require_not_mirrored
+from startrack.camera.platepar import DAY_S, SIDEREAL_DEG
 from startrack.core.types import Array, BadInput
 from startrack.frames import Site, seconds_since_2000
 
 DRAWN_RAYS = 2000
 LOWEST_RAD = np.radians(5.0)  # elevation to which the drawing is fitted
 FIRST_TURNS_RAD = np.arange(8) * np.pi / 4  # about the axis, from which the fit begins
-SIDEREAL_DAYS_DEG = 280.46061837, 360.98564736629  # at J2000, and a day: Meeus, Astronomical Algorithms, ch. 12
 
 
 @dataclass(frozen=True)
@@ -42,13 +41,12 @@ def virtualsky_of(camera: Camera, R_cam_icrs: Array, time: datetime, site: Site)
     """
     from scipy.optimize import least_squares
 
-    if camera.mirrored:
-        raise BadInput("bad_calibration", "the camera is mirrored, which VirtualSky cannot express: flip the images")
+    require_not_mirrored(camera)
     rays = cap_grid(min(camera.calibrated_angle_rad, camera.lens.max_invertible_rad), DRAWN_RAYS)
     px, inside = camera.project(rays)
     rays_icrs, px = rays[inside] @ np.asarray(R_cam_icrs, dtype=float), px[inside]
     days = seconds_since_2000(time) / DAY_S
-    sidereal = np.radians((SIDEREAL_DAYS_DEG[0] + SIDEREAL_DAYS_DEG[1] * days) % 360.0) + site.longitude_rad
+    sidereal = np.radians((SIDEREAL_DEG[0] + SIDEREAL_DEG[1] * days) % 360.0) + site.longitude_rad
     up = np.sin(site.latitude_rad) * rays_icrs[:, 2] + np.cos(site.latitude_rad) * (
         rays_icrs[:, 0] * np.cos(sidereal) + rays_icrs[:, 1] * np.sin(sidereal)
     )

@@ -3,6 +3,7 @@
 from startrack.catalog.sky import (
     LOWEST_STAR_RAD,
     MOST_BELOW_PART,
+    NIGHT_RAD,
     Sky,
     airmass_at,
     apparent_bodies,
@@ -24,7 +25,8 @@ from startrack.catalog.stars import (
 )
 
 __all__ = [
-    "LOWEST_STAR_RAD", "MOST_BELOW_PART", "Sky", "StarCatalog", "airmass_at", "apparent_bodies", "apparent_stars",
-    "bodies", "daylight_warnings", "has_deep_catalog", "hipparcos_rows_in_deep", "is_below_horizon", "load_catalog",
+    "LOWEST_STAR_RAD", "MOST_BELOW_PART", "NIGHT_RAD", "Sky", "StarCatalog", "airmass_at", "apparent_bodies",
+    "apparent_stars", "bodies", "daylight_warnings", "has_deep_catalog", "hipparcos_rows_in_deep", "is_below_horizon",
+    "load_catalog",
     "load_deep_catalog", "proper_name_designations", "sky_at", "star_names", "sun_elevation_rad",
 ]  # fmt: skip

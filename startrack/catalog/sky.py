@@ -31,6 +31,7 @@ from startrack.frames import (
     rays_from_azel,
 )
 
+NIGHT_RAD = float(np.radians(-18.0))  # elevation of the Sun below which the sky has no light of it
 LOWEST_STAR_RAD = np.radians(-3.0)  # apparent elevation, as seen from a mountain
 MOST_BELOW_PART = 0.01  # of the identified stars; right sites: 0; a wrong sign of latitude or longitude: 0.3 to 0.5
 DEFAULT_SITE = Site("moon", 0.0, 0.0)  # without a site; at most 0.7 arcsec of aberration off

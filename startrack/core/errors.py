@@ -113,7 +113,7 @@ class Reason(StrEnum):
 
 
 INTERNAL_ERROR = Reason.INTERNAL_ERROR
-ADVICE_IN_MESSAGE = re.compile(  # the imperatives of our messages, a flag, a question, or a name that is wrong
+ADVICE_IN_MESSAGE = re.compile(  # the imperatives of our messages, a flag, or a question
     r"\?|(^|\s)--[a-z]"
     r"|\b(give|choose|correct|enlarge|expose|find|flip|install|make|replace|run|set|state|try|use|widen) "
 )

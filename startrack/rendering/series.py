@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.catalog import apparent_bodies, apparent_stars, sun_elevation_rad
+from startrack.catalog import NIGHT_RAD, apparent_bodies, apparent_stars, sun_elevation_rad
 from startrack.core import SKY_V_MAG_ARCSEC2
 from startrack.core.types import Array, BadInput, Stars, Value, rotation, vector
 from startrack.estimation.observations import OdometryErrors
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 EXPOSURE_V_MAG = 6.0  # of a star on the axis that the default exposure just shows
 FAINTEST_V_MAG = 10.0  # of the stars in the sky
 RANDOM_TIMES = datetime(2024, 1, 1, tzinfo=UTC), datetime(2034, 1, 1, tzinfo=UTC)
-DARK_SUN_RAD = np.radians(-18.0)  # elevation of the Sun from which its light is none
 MAX_POSITION_TRIES = 1000
 # Streams of the seed. Sky and sensor are the same in every exposure of a series: errors that exposures share.
 Stream = IntEnum("Stream", "SKY SENSOR EXPOSURE ODOMETRY", start=0)
@@ -191,7 +190,7 @@ class Series:
         """
         time = _random_time(rng)
         others, site = rng.spawn(1)[0], self.terrain.site
-        while self.time_utc is None and site and site.body == "earth" and sun_elevation_rad(site, time) > DARK_SUN_RAD:
+        while self.time_utc is None and site and site.body == "earth" and sun_elevation_rad(site, time) > NIGHT_RAD:
             time = _random_time(others)
         position = _random_position(self.terrain, rng)
         heading, direction = rng.uniform(0, 2 * np.pi, 2)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from startrack.catalog import apparent_bodies
+from startrack.catalog import NIGHT_RAD, apparent_bodies
 from startrack.core.types import Array
 from startrack.frames import R_enu_icrs, Site, azel_from_rays
 from startrack.terrain import EarthProjection, HeightMap, Raster
@@ -17,7 +17,7 @@ VALLEY_RADIUS_M, HIGHEST_BEYOND_M = 9000.0, 1300.0
 FLOOR_HORIZON_DEG, STEEPEST_RAD = (9.0, 26.0), float(np.radians(15.0))  # mean horizon and slope of a valley floor
 YEAR, DAYS = datetime(2026, 1, 1, tzinfo=UTC), 365
 BELOW_RAD = -np.pi / 2  # the least elevation
-NIGHT_RAD, DARK_RAD = float(np.radians(-18.0)), float(np.radians(-5.0))  # highest Sun and Moon of a dark night
+DARK_RAD = float(np.radians(-5.0))  # elevation of the highest Moon of a dark night
 
 
 def jacksboro(height_sigma_m: float = 0.0) -> HeightMap:

@@ -18,7 +18,8 @@ from startrack.core.declaration import Key, Number
 from startrack.core.types import Array
 
 MAX_INVERSION_STEPS = 60  # near the turning point Newton's steps only halve the error
-INVERSION_TOLERANCE_RAD = 1e-15
+INVERSION_STEP_RAD = 1e-9  # the last one: the error that it leaves is its square
+INVERSION_TOLERANCE_1 = 1e-15  # of the radius
 TURNING_GRID_POINTS = 4001  # over 0 to pi
 WCS_DEGREE, WCS_GRID_POINTS = 13, 401  # of the fitted polynomial; FITS allows PV2_0 to PV2_20
 MAX_WCS_ERROR_1 = 1e-4  # in focal lengths: 20 arcsec on the axis, as much as aberration bends a whole sky
@@ -92,9 +93,9 @@ class Lens(ABC):
             newton = a - step
             # A step that leaves the bracket is replaced by bisection: convergence does not depend on the law's shape.
             following = np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
-            near = np.abs(following - a) <= INVERSION_TOLERANCE_RAD
+            near = np.abs(following - a) <= INVERSION_STEP_RAD
             a = following
-            if np.all(near | (np.abs(excess) <= INVERSION_TOLERANCE_RAD)):
+            if np.all(near | (np.abs(excess) <= INVERSION_TOLERANCE_1)):
                 break
         return a
 

@@ -6,9 +6,9 @@ from math import exp, log, pi, sqrt
 
 import numpy as np
 
-from startrack.core.kernels import njit
+from startrack.core.kernels import REORDERED_SUMS, njit
 
-REACH_SIGMAS = 39.0  # beyond, exp(-z^2 / 2) is zero
+REACH_SIGMAS = 10.0  # beyond, exp(-z^2 / 2) is lost in rounding beside the likelihood of no step
 
 
 @njit(cache=True)
@@ -36,33 +36,44 @@ def add_steps(total, temper, lowest, step, column, place, sigma, weight, passed,
                     break
                 total[c, i] += temper * passed[k]
             k += 1
-        for i in range(n):
-            total[c, i] += temper * (log(mixture[i]) if low <= i < high else log(nothing))
+        for i in range(low):
+            total[c, i] += temper * log(nothing)
+        for i in range(low, high):
+            total[c, i] += temper * log(mixture[i])
+        for i in range(high, n):
+            total[c, i] += temper * log(nothing)
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=REORDERED_SUMS)
 def pass_messages(likelihood, forward, ratio, weight, jump):  # type: ignore[no-untyped-def]
     """Messages (columns, n) that reach each column from those before it, in the order `forward` or against it.
 
-    Between columns a message is convolved with Laplace distributions that fall by `ratio` (m,) per sample and have the
-    sums `weight` (m,); a part `jump` goes anywhere. The exponentials are summed by recursion, upwards and downwards.
+    Between columns a message is convolved with three Laplace distributions that fall by `ratio` (3,) per sample and
+    have the sums `weight` (3,); a part `jump` goes anywhere. The exponentials are summed by recursion, from below and
+    from above. Those six chains take their steps beside each other.
     """
     columns, n = likelihood.shape
     found = np.empty((columns, n))
-    message, after = np.full(n, 1.0 / n), np.empty(n)
+    message, after, from_below = np.full(n, 1.0 / n), np.empty(n), np.empty(n)
+    r0, r1, r2 = ratio[0], ratio[1], ratio[2]
     scale = weight * (1.0 - ratio) / (1.0 + ratio)
+    w0, w1, w2 = scale[0], scale[1], scale[2]
     for number in range(2 * columns):  # the second round starts where the first one ended: the compass is a circle
         c = number % columns if forward else columns - 1 - number % columns
         found[c] = message
-        after[:] = message * likelihood[c]
-        after /= after.sum()
-        message[:] = 0.0
-        for m in range(len(ratio)):
-            up, down = 0.0, 0.0
-            for i in range(n):
-                up = up * ratio[m] + after[i]
-                message[i] += scale[m] * up
-                message[n - 1 - i] += scale[m] * down
-                down = ratio[m] * (down + after[n - 1 - i])
-        message[:] = (1.0 - jump) * message / message.sum() + jump / n
+        for i in range(n):
+            after[i] = message[i] * likelihood[c, i]
+        a0 = a1 = a2 = b0 = b1 = b2 = 0.0
+        for i in range(n):
+            below, above = after[i], after[n - 1 - i]
+            a0, a1, a2 = a0 * r0 + below, a1 * r1 + below, a2 * r2 + below
+            from_below[i] = w0 * a0 + w1 * a1 + w2 * a2
+            message[n - 1 - i] = w0 * b0 + w1 * b1 + w2 * b2
+            b0, b1, b2 = r0 * (b0 + above), r1 * (b1 + above), r2 * (b2 + above)
+        total = 0.0
+        for i in range(n):
+            message[i] += from_below[i]
+            total += message[i]
+        for i in range(n):
+            message[i] = (1.0 - jump) / total * message[i] + jump / n
     return found

@@ -61,10 +61,11 @@ def cloud_probability(density: float, stars: StarLight, elevation_rad: Array, lo
     """
     expected = density * np.maximum(layer_depth(elevation_rad) - layer_depth(np.array(lowest_rad)), 0.0)
     rays, llr = limited_rows(stars.rays, stars.missing)
-    azimuth = np.arange(SKYLINE_AZIMUTHS) * (2.0 * np.pi / SKYLINE_AZIMUTHS)
-    low = (rays.elevation_rad > lowest_rad) & (rays.elevation_rad < np.max(elevation_rad, initial=lowest_rad))
-    star, at = rays.azimuth_rad[low, None], rays.elevation_rad[low, None]
-    near = np.abs((azimuth - star + np.pi) % (2.0 * np.pi) - np.pi) < BESIDE_RAD  # (stars, SKYLINE_AZIMUTHS)
-    behind = llr[low] @ (near & (elevation_rad > at))
+    place = rays.azimuth_rad * (SKYLINE_AZIMUTHS / (2.0 * np.pi))
+    beside = BESIDE_RAD * (SKYLINE_AZIMUTHS / (2.0 * np.pi))  # bins
+    bins = np.rint(place)[:, None] + np.arange(-np.ceil(beside), np.ceil(beside) + 1.0)  # (stars, bins beside)
+    near, number = np.abs(bins - place[:, None]) < beside, bins.astype(np.int64) % SKYLINE_AZIMUTHS
+    near &= (rays.elevation_rad > lowest_rad)[:, None] & (rays.elevation_rad[:, None] < elevation_rad[number])
+    behind = np.bincount(number[near], np.broadcast_to(llr[:, None], near.shape)[near], SKYLINE_AZIMUTHS)
     odds = expected * np.maximum(np.exp(np.minimum(behind, 0.0)), stars.missing)
     return np.asarray(odds / (1.0 + odds))

@@ -86,7 +86,7 @@ def measure_frames(
         measured.append(one)
     skyline, _ = _skyline_of(frames, measured, site)
     if len(frames) > 1:
-        each = [_skyline_of((frame,), [one], site) for frame, one in zip(frames, measured, strict=True)]
+        each = list(map_in_threads(lambda frame, one: _skyline_of((frame,), [one], site), frames, measured))
         skyline = join_skylines(skyline, [one for one, _ in each], np.array([cloud for _, cloud in each]))
     return SkylineResult(skyline, frames, left_out)
 
@@ -185,9 +185,9 @@ def _has_star(stars: Sequence[StarLight], azimuth: Array, elevation: Array) -> B
     found = np.zeros(len(azimuth), dtype=bool)
     for light in stars:
         rays = light.rays.take(np.abs(light.rays.llr) > DECISIVE_LLR)
-        apart = np.abs((rays.azimuth_rad - azimuth[:, None] + np.pi) % (2 * np.pi) - np.pi)
-        near = apart * np.cos(elevation)[:, None] < UNKNOWN_SIGMA_RAD
-        found |= (near & (np.abs(rays.elevation_rad - elevation[:, None]) < UNKNOWN_SIGMA_RAD)).any(axis=1)
+        number, star = np.nonzero(np.abs(rays.elevation_rad - elevation[:, None]) < UNKNOWN_SIGMA_RAD)
+        apart = np.abs((rays.azimuth_rad[star] - azimuth[number] + np.pi) % (2 * np.pi) - np.pi)
+        found[number[apart * np.cos(elevation[number]) < UNKNOWN_SIGMA_RAD]] = True
     return found
 
 

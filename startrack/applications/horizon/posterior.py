@@ -44,7 +44,7 @@ def star_log_likelihood(rays: Evidence, missing: float) -> Array:
 
     `missing`: probability that a visible star is not seen (cloud).
     """
-    from scipy.special import log_ndtr
+    from scipy.special import ndtr
 
     n = len(elevations_rad())
     rays, limited = limited_rows(rays, missing)
@@ -56,12 +56,12 @@ def star_log_likelihood(rays: Evidence, missing: float) -> Array:
     steps = np.zeros((AZIMUTH_COLUMNS, n + 1))
     np.add.at(steps, (column, np.zeros_like(column)), limited)
     np.add.at(steps, (column, np.clip(first, 0, n)), -limited)
-    total = np.cumsum(steps, axis=1)[:, :n]
+    total = np.cumsum(steps[:, :n], axis=1)
     at = first[:, None] + np.arange(2 * half + 1)
     z = (rays.elevation_rad[:, None] - (LOWEST_RAD + GRID_STEP_RAD * at)) / edge_rad
-    profile = np.logaddexp(log_ndtr(z) + limited[:, None], log_ndtr(-z))
+    profile = np.log1p(ndtr(z) * np.expm1(limited)[:, None])
     inside = (at >= 0) & (at < n)
-    np.add.at(total, (np.broadcast_to(column[:, None], at.shape)[inside], at[inside]), profile[inside])
+    np.add.at(total.reshape(-1), (column[:, None] * n + at)[inside], profile[inside])
     return total
 
 

@@ -1,0 +1,58 @@
+"""The posterior of a column: the chain beside sums over every pair of elevations, stars and steps beside formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import norm
+
+from startrack.applications.horizon.columns import column_of, elevations_rad
+from startrack.applications.horizon.posterior import limited_rows, star_log_likelihood
+from startrack.core.types import Evidence
+from startrack.estimation.column_chain import add_steps, pass_messages
+
+RATIO, WEIGHT, JUMP = np.array([0.2, 0.7, 0.95]), np.array([0.5, 0.3, 0.15]), 0.05
+
+
+def test_messages_are_those_of_the_whole_transition_matrix():
+    columns, n = 7, 60
+    likelihood = np.random.default_rng(4).uniform(0.01, 1.0, (columns, n))
+    likelihood[2, 5:40] = 1e-4
+    apart = np.abs(np.arange(n)[:, None] - np.arange(n))
+    move = sum(w * (1 - r) / (1 + r) * r**apart for r, w in zip(RATIO, WEIGHT, strict=True))
+    for forward in (True, False):
+        order = range(columns) if forward else range(columns - 1, -1, -1)
+        expected, message = np.empty((columns, n)), np.full(n, 1.0 / n)
+        for c in [*order, *order]:
+            expected[c] = message
+            after = message * likelihood[c] @ move
+            message = (1.0 - JUMP) * after / after.sum() + JUMP / n
+        np.testing.assert_allclose(pass_messages(likelihood, forward, RATIO, WEIGHT, JUMP), expected, rtol=1e-12)
+
+
+def test_steps_add_the_logarithm_of_their_mixture():
+    lowest, step, n, nothing, temper = -0.1, 0.01, 50, 0.25, 0.6
+    column, place, sigma = np.array([1, 1, 3]), np.array([0.0, 0.2, 0.39]), np.array([0.005, 0.02, 0.004])
+    weight, passed = np.array([0.5, 0.3, 0.7]), np.array([-0.4, 0.2, 0.1])
+    total = np.zeros((4, n))
+    add_steps(total, temper, lowest, step, column, place, sigma, weight, passed, nothing)
+    elevation, expected = lowest + step * np.arange(n), np.zeros((4, n))
+    for c in (1, 3):
+        own = column == c
+        each = norm.pdf(elevation[:, None], place[own], sigma[own]) * weight[own]
+        above = elevation[:, None] < place[own] - 2.0 * sigma[own]
+        expected[c] = temper * (np.log(nothing + each.sum(axis=1)) + (above * passed[own]).sum(axis=1))
+    np.testing.assert_allclose(total, expected, rtol=1e-12, atol=1e-14)
+
+
+def test_stars_add_the_probability_of_each_skyline_at_their_heights():
+    elevation = elevations_rad()
+    azimuth, height = np.radians([10.1, 10.2, 200.0]), np.radians([3.0, 20.0, 1.0])
+    llr, edge = np.array([6.0, -2.0, 5.0]), np.radians(0.05)
+    rays = Evidence(azimuth_rad=azimuth, elevation_rad=height, llr=llr, edge_sigma_rad=np.full(3, edge))
+    found = star_log_likelihood(rays, 0.1)
+    _, limited = limited_rows(rays, 0.1)
+    expected = np.zeros_like(found)
+    for at, star_rad, ratio in zip(column_of(azimuth), height, limited, strict=True):
+        above = norm.cdf((star_rad - elevation) / edge)
+        expected[at] += np.log(above * np.exp(ratio) + 1.0 - above)
+    np.testing.assert_allclose(found, expected, atol=2e-6)  # beyond 5 sigma of an edge the kernel takes it as sharp

@@ -121,16 +121,13 @@ def match_frame(frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: flo
         tree, px, seen, gate_px, star_mag=star_mag, star_sigma_mag=stars.v_sigma_mag[:count],
         detection_mag=source_mag, saturated=found.saturated, limit_mag=limit, tolerance_mag=TOLERANCE_MAG,
     )  # fmt: skip
-
-    def are_alone(some: Ints) -> Bools:
-        return is_isolated(px[some], some, px, seen, stars.v_mag, BLENDED_SIGMAS * found.psf_sigma_px, BLENDED_MAG)
-
-    alone = are_alone(star)
     faintest = float(np.quantile(source_mag[detection], LIMIT_QUANTILE)) if len(detection) else -np.inf
     bright = seen[star_mag[seen] < faintest - DEPTH_BELOW_THRESHOLD_MAG]
     is_open = _is_open_sky(px[bright], found.xy_px[detection], frame.exposure.size_px)
-    expected, single = bright[is_open], are_alone(bright)
-    rate = np.isin(bright[single & is_open], star)
+    both = np.concatenate([star, bright])
+    is_alone = is_isolated(px[both], both, px, seen, stars.v_mag, BLENDED_SIGMAS * found.psf_sigma_px, BLENDED_MAG)
+    alone, single = is_alone[: len(star)], is_alone[len(star) :]
+    expected, rate = bright[is_open], np.isin(bright[single & is_open], star)
     significant = (camera.angle_rad(found.xy_px) < within_rad) & (source_mag < faintest - DEPTH_BELOW_THRESHOLD_MAG)
     return FrameMatches(
         detection=detection[alone],

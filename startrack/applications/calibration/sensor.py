@@ -16,7 +16,7 @@ from startrack.applications.calibration.static_parts import find_hot_pixels, tur
 from startrack.camera import Camera
 from startrack.core.runner import map_in_threads
 from startrack.core.smooth_image import Image
-from startrack.core.statistics import robust_sigma
+from startrack.core.statistics import median, robust_sigma
 from startrack.core.types import Array, Exposure
 from startrack.estimation.joint_fit import JointFit
 from startrack.psf import pixel_profile, stamp_radius
@@ -153,17 +153,15 @@ def _row_statistics(a: Image, b: Image) -> Array:
     the sky and the sensitivities of the pixels do not affect; clipping excludes the stars.
     """
     side = len(a)
-    one, other = (
-        rows[:, : rows.shape[1] // side * side].astype(np.float64).reshape(side, -1, side).swapaxes(0, 1)
-        for rows in (a, b)
-    )
+    one, other = (rows[:, : rows.shape[1] // side * side].reshape(side, -1, side).swapaxes(0, 1) for rows in (a, b))
     step = np.diff(one - other, axis=2).reshape(-1, side * (side - 1))
-    step -= np.median(step, axis=1, keepdims=True)
+    step -= median(step, axis=1)[:, None]
     variance, squared = np.square(robust_sigma(step, 0.0, axis=1)), np.square(step)
     for _ in range(CLIP_ROUNDS):  # clipped to the core of the distribution, without stars
         core = squared < CORE_SIGMA**2 * variance[:, None]
-        variance = np.sum(squared * core, axis=1) / np.maximum(core.sum(axis=1), 1) / CORE_VARIANCE_1
-    return np.stack([0.5 * np.median(one + other, axis=(1, 2)), variance / 4.0])
+        total = np.einsum("nk,nk->n", squared, core, dtype=np.float64)
+        variance = total / np.maximum(np.count_nonzero(core, axis=1), 1) / CORE_VARIANCE_1
+    return np.stack([0.5 * median((one + other).reshape(len(one), -1), axis=1), variance / 4.0])
 
 
 def _fit_line(level: Array, variance: Array) -> PhotonTransfer | None:

@@ -187,12 +187,12 @@ def test_the_brightest_star_counts_as_much_as_a_bright_one():
 def test_the_csv_has_a_row_a_degree(tmp_path):
     write_skyline(str(tmp_path / "a.csv"), small_skyline(), LOWELL, (), overwrite=False)
     lines = (tmp_path / "a.csv").read_text().splitlines()
-    assert lines[0] == "azimuth_deg,elevation_deg,sigma_deg,is_measured,source"
+    assert lines[0] == "azimuth_deg,elevation_deg,sigma_deg,is_measured,source,cloud_probability"
     assert len(lines) == 361
-    assert lines[1] == "0,,,0,"
+    assert lines[1] == "0,,,0,,"
     assert lines[3].split(",")[0] == "2"
     assert float(lines[3].split(",")[1]) == pytest.approx(1.0 + 2 * 9 / 359, abs=1e-4)
-    assert csv_text(small_skyline()).endswith("359,10.0000,0.1000,1,both\n")
+    assert csv_text(small_skyline()).endswith("359,10.0000,0.1000,1,both,0.0000\n")
 
 
 def test_the_ecsv_is_read_by_astropy():
@@ -218,7 +218,7 @@ def test_azimuths_that_are_interpolated_or_differ_are_marked():
     comments = [line for line in nina_text(skyline).splitlines() if line.startswith("#")]
     assert comments[1:3] == ["# 0 to 0: not measured", "# 5 to 6: not measured"]
     assert comments[3] == "# 40 to 42: differs between pictures: the highest edge"
-    assert "40,2.0028,0.1000,1,varies" in csv_text(skyline).splitlines()
+    assert "40,2.0028,0.1000,1,varies,0.0000" in csv_text(skyline).splitlines()
 
 
 def altered(raised_deg: float, azimuths: slice, known: bool = True) -> MeasuredSkyline:

@@ -18,12 +18,13 @@ from startrack.catalog import load_catalog
 from startrack.core.types import Evidence, MeasuredSkyline
 
 
-def skyline(elevation_deg: float | np.ndarray, sigma_deg: float = 0.1) -> MeasuredSkyline:
+def skyline(elevation_deg: float | np.ndarray, sigma_deg: float = 0.1, cloud: float = 0.0) -> MeasuredSkyline:
     elevation = np.radians(np.broadcast_to(elevation_deg, 360).astype(float))
     known = np.isfinite(elevation)
     return MeasuredSkyline(
         azimuth_rad=np.radians(np.arange(360.0)), elevation_rad=elevation,
         sigma_rad=np.where(known, np.radians(sigma_deg), np.inf), source=np.where(known, "sky light", ""),
+        cloud_probability=np.full(360, cloud),
     )  # fmt: skip
 
 
@@ -81,17 +82,19 @@ def test_missing_stars_say_that_an_edge_is_the_grounds():
 
 
 def test_a_clouds_edge_in_one_picture_is_nothing_that_moved():
-    low, high = skyline(2.0), skyline(np.where(np.arange(360) < 40, 9.0, 2.0))
+    low, raised_deg = skyline(2.0), np.where(np.arange(360) < 40, 9.0, 2.0)
     for cloud, count in ((0.2, 0), (0.002, 40)):
-        found = join_skylines(low, [low, high, low], np.full((3, 360), cloud))
+        high = skyline(raised_deg, cloud=cloud)
+        found = join_skylines(low, [low, high, low])
         assert np.count_nonzero(found.source == "varies") == count
         np.testing.assert_allclose(found.elevation_rad, (high if count else low).elevation_rad)
 
 
 def test_pictures_that_differ_widen_what_they_do_not_show_together():
-    nothing, cloud = skyline(np.nan), np.full((2, 360), 0.2)
-    found = join_skylines(nothing, [skyline(2.0, 0.1), skyline(5.0, 0.2)], cloud)
+    nothing = skyline(np.nan)
+    found = join_skylines(nothing, [skyline(2.0, 0.1, 0.2), skyline(5.0, 0.2, 0.3)])
+    np.testing.assert_array_equal(found.cloud_probability, 0.2)
     np.testing.assert_allclose(np.degrees(found.elevation_rad), 2.0)
     np.testing.assert_allclose(np.degrees(found.sigma_rad), np.hypot(0.1, 3.0))
-    alone = join_skylines(nothing, [skyline(2.0, 0.1), nothing], cloud)
+    alone = join_skylines(nothing, [skyline(2.0, 0.1, 0.2), nothing])
     np.testing.assert_allclose(np.degrees(alone.sigma_rad), 0.1)

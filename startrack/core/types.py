@@ -262,6 +262,7 @@ class MeasuredSkyline(Rows):
     elevation_rad: Array = array("n", may_be_nan=True)  # nan where unknown
     sigma_rad: Array = array("n")  # infinite where unknown
     source: NDArray[np.str_] = array("n", dtype=np.str_)  # "stars", "sky light", "both"; "varies"; "" where unknown
+    cloud_probability: Array = array("n", default=0.0)  # that the edge is a cloud's, before a lower skyline
 
     @property
     def known(self) -> Bools:

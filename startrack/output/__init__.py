@@ -55,6 +55,7 @@ from startrack.output.record import (
 )
 from startrack.output.schema import SCHEMAS
 from startrack.output.tables import (
+    cloud_texts,
     ecsv_text,
     quantity_columns,
     skyline_table_text,
@@ -82,7 +83,8 @@ __all__ = [
     "ABSENT", "ARCSEC_PER_RAD", "COMPANIONS", "MARGIN_PX", "PICTURES", "QUANTITIES", "SCHEMAS", "SIDE_PX",
     "SKYLINE_FILES", "TEXT_PX", "TITLE_PX", "Axes", "Box", "Canvas", "Colour", "Column", "Found", "Ink", "Kind",
     "Legend", "Map", "Quantity", "R_body_enu", "Rows", "Schema", "annotate", "boresight_rad", "box_around",
-    "comparison_picture", "detection_dict", "draw_overview", "ecsv_text", "ellipse_m", "encoded_bytes", "explain",
+    "cloud_texts", "comparison_picture", "detection_dict", "draw_overview", "ecsv_text", "ellipse_m", "encoded_bytes",
+    "explain",
     "feature", "file_schema", "fill_frame", "geojson_text", "ground_map", "horizon_picture",
     "identification_dict", "json_text", "lens_text", "list_schema", "markdown_table", "mix_colours", "nice_step",
     "object_schema", "or_null", "page_text", "path_picture", "png_bytes", "prediction_picture", "prepare_folder",

@@ -136,11 +136,13 @@ def names_of(hips: Ints) -> list[str]:
 def skyline_table_text(skyline: MeasuredSkyline) -> str:
     """The table of a `skyline` as ECSV, from north through east; empty where the elevation is not known."""
     azimuth, elevation, sigma = skyline_texts_deg(skyline)
+    clouds = Column("cloud_probability", cloud_texts(skyline), description="that the edge is a cloud's")
     return ecsv_text([
         Column("azimuth_deg", azimuth, unit="deg", description="from north through east"),
         Column("elevation_deg", elevation, unit="deg", description="of the skyline in the image"),
         Column("sigma_deg", sigma, unit="deg", description="standard deviation of the elevation"),
         Column("source", skyline.source, "string", description="stars, sky light, both, varies"),
+        *([clouds] if skyline.cloud_probability.any() else ()),
     ])  # fmt: skip
 
 
@@ -164,3 +166,8 @@ def skyline_texts_deg(skyline: MeasuredSkyline) -> tuple[list[str], list[str], l
     azimuth = [f"{value:g}" for value in np.round(np.degrees(skyline.azimuth_rad), 6)]
     elevations, sigmas = (column_lines("%.4f", values).decode().split("\n")[:-1] for values in (elevation, sigma))
     return azimuth, elevations, sigmas
+
+
+def cloud_texts(skyline: MeasuredSkyline) -> list[str]:
+    """The probability that each edge of a `skyline` is a cloud's, as texts, empty where it is not known."""
+    return [f"{p:.4f}" if known else "" for p, known in zip(skyline.cloud_probability, skyline.known, strict=True)]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from startrack.core.types import Array, MeasuredSkyline
+from startrack.core.types import MeasuredSkyline
 
 # Of a bin whose skyline is another one in another picture (a dome, a crane, a branch). Of 14 pictures the highest edges
 # at a rotating dome are clouds' with probabilities up to 0.013, those of clouds elsewhere with 0.04 to 0.33.
@@ -14,9 +14,7 @@ MOVED_PROBABILITY = 0.03
 MOVED_RAD = np.radians(20.0)  # by anything up to this
 
 
-def join_skylines(
-    together: MeasuredSkyline, alone: Sequence[MeasuredSkyline], cloud: Array | None = None
-) -> MeasuredSkyline:
+def join_skylines(together: MeasuredSkyline, alone: Sequence[MeasuredSkyline]) -> MeasuredSkyline:
     """The skyline of all pictures `together`, with what each picture `alone` shows and they do not show alike.
 
     Where the highest and the lowest edge of two pictures more probably differ because something moved than by their
@@ -27,11 +25,11 @@ def join_skylines(
     Args:
         together: skyline (n,) of all pictures.
         alone: skylines (n,) of the pictures, one by one.
-        cloud: (pictures, n) probability that the edge of a picture is a cloud's; None: no edge is.
     """
-    elevation = np.stack([one.elevation_rad for one in alone])
-    sigma = np.stack([one.sigma_rad for one in alone])
-    cloud = np.zeros(elevation.shape) if cloud is None else cloud
+    elevation, sigma, cloud, sources = (
+        np.stack([getattr(one, name) for one in alone])
+        for name in ("elevation_rad", "sigma_rad", "cloud_probability", "source")
+    )
     bins, shown = np.arange(len(together)), np.isfinite(elevation)
     high, low = (np.argmax(np.where(shown, way * elevation, -np.inf), axis=0) for way in (1.0, -1.0))
     with np.errstate(invalid="ignore"):
@@ -40,12 +38,12 @@ def join_skylines(
         varies = (same < MOVED_PROBABILITY / MOVED_RAD) & (cloud[high, bins] < MOVED_PROBABILITY)
     chosen = np.where(varies, high, np.argmin(sigma, axis=0))
     one = shown.any(axis=0) & (varies | ~together.known)
-    source = np.stack([one.source for one in alone])[chosen, bins]
     off = np.where(shown & ~varies, elevation - elevation[chosen, bins], 0.0)
     scatter = np.sqrt(np.square(off).sum(axis=0) / np.maximum(shown.sum(axis=0) - 1, 1))
     return MeasuredSkyline(
         azimuth_rad=together.azimuth_rad,
         elevation_rad=np.where(one, elevation[chosen, bins], together.elevation_rad),
         sigma_rad=np.where(one, np.hypot(sigma[chosen, bins], scatter), together.sigma_rad),
-        source=np.select([varies, one], ["varies", source], together.source),
+        source=np.select([varies, one], ["varies", sources[chosen, bins]], together.source),
+        cloud_probability=np.where(one, cloud[chosen, bins], together.cloud_probability),
     )

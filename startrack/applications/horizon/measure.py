@@ -37,7 +37,7 @@ GAP_SIGNIFICANCE = 5.0  # of light below the skyline that is brighter than usual
 DEEPEST_GAP_RAD = np.radians(15.0)
 DECISIVE_LLR = 2.0
 
-Measured = tuple[StarLight, list[Steps], Array]  # of one picture: stars, steps of each width, log-likelihood
+Light = tuple[StarLight, list[Steps]]  # of one picture: stars, and steps of each width
 
 
 @dataclass(frozen=True)
@@ -80,25 +80,40 @@ def measure_frames(
     if not frames:
         first = left_out[0]
         raise NoSolution(f"{first.name}: {first.message}", reason=first.reason)
-    measured = []
-    for frame, one in zip(frames, map_in_threads(_measure_frame, frames), strict=True):
+    lights, alone, by_stars, by_steps = list[Light](), list[MeasuredSkyline](), np.zeros(()), np.zeros(())
+    measured = map_in_threads(lambda frame: _measure_frame(frame, site), frames)
+    for frame, (light, single, of_stars, of_steps) in zip(frames, measured, strict=True):
         progress(f"measured the skyline of {frame.name}")
-        measured.append(one)
-    skyline, _ = _skyline_of(frames, measured, site)
+        lights.append(light)
+        alone.append(single)
+        by_stars, by_steps = by_stars + of_stars, by_steps + of_steps
+    skyline = alone[0]
     if len(frames) > 1:
-        each = list(map_in_threads(lambda frame, one: _skyline_of((frame,), [one], site), frames, measured))
-        skyline = join_skylines(skyline, [one for one, _ in each], np.array([cloud for _, cloud in each]))
+        # Other stars stand there in another picture. Steps are the same edges: which of them is the skyline, a second
+        # picture shows no better than the first.
+        together = _skyline_of(frames, lights, by_stars + by_steps / len(frames), site)
+        skyline = join_skylines(together, alone)
     return SkylineResult(skyline, frames, left_out)
 
 
+def _measure_frame(frame: SkyFrame, site: Site) -> tuple[Light, MeasuredSkyline, Array, Array]:
+    """Light and skyline of a frame, and the log-likelihoods (AZIMUTH_COLUMNS, n) by its stars and its steps."""
+    stars = measure_stars(frame)
+    steps, by_stars = find_steps(frame, stars), star_log_likelihood(stars.rays, stars.missing)
+    by_steps = np.zeros_like(by_stars)
+    for found, (_, weight) in zip(steps, WIDTHS, strict=True):
+        add_step_log_likelihood(by_steps, found, weight)
+    light = stars, steps
+    return light, _skyline_of([frame], [light], by_stars + by_steps, site), by_stars, by_steps
+
+
 def _skyline_of(
-    frames: Sequence[SkyFrame], measured: Sequence[Measured], site: Site
-) -> tuple[MeasuredSkyline, Array]:  # fmt: skip
-    """The skyline that `frames`, each `measured`, show together; the probabilities (n,) that its edges are clouds'."""
-    stars, steps = [one[0] for one in measured], [one[1] for one in measured]
-    total = column_log_prior() + sum(one[2] for one in measured)
+    frames: Sequence[SkyFrame], lights: Sequence[Light], log_likelihood: Array, site: Site
+) -> MeasuredSkyline:  # fmt: skip
+    """The skyline by the `log_likelihood` (AZIMUTH_COLUMNS, n) of the `lights` of `frames`."""
+    stars, steps = zip(*lights, strict=True)
+    mean, sigma = combine_columns(column_log_prior() + log_likelihood)
     # The columns' posterior as bins of one degree; the errors that the frames share are added once.
-    mean, sigma = combine_columns(total)
     azimuth = np.radians(np.arange(SKYLINE_AZIMUTHS, dtype=np.float64) * (360.0 / SKYLINE_AZIMUTHS))
     elevation, scatter = (_columns_of_bins(one, 0).mean(axis=1) for one in (mean, np.square(sigma)))
     variation = _columns_of_bins(mean, COLUMNS_PER_AZIMUTH // 2).var(axis=1)  # within one degree to either side
@@ -111,22 +126,22 @@ def _skyline_of(
     # often rises.
     known &= np.roll(known, 1) & np.roll(known, -1)
     lowest = float(elevation[known].min()) if known.any() else 0.0
-    cloud = _cloud_probability(measured, azimuth, elevation, mean, lowest)
+    cloud = _cloud_probability(lights, azimuth, elevation, mean, lowest)
     # The skyline behind a cloud's edge may be anywhere down to the lowest bin.
     known &= spread + cloud * np.square(elevation - lowest) < UNKNOWN_SIGMA_RAD**2
     variance = scatter / COLUMNS_PER_AZIMUTH + np.square(variation) / (variation + WALL_RAD**2) + shared
     source = np.select([by_stars & by_light, by_light, by_stars], ["both", "sky light", "stars"], "")
-    skyline = MeasuredSkyline(
+    return MeasuredSkyline(
         azimuth_rad=azimuth,
         elevation_rad=np.where(known, elevation, np.nan),
         sigma_rad=np.where(known, np.sqrt(variance), np.inf),
         source=np.where(known, source, ""),
+        cloud_probability=cloud,
     )
-    return skyline, cloud
 
 
 def _cloud_probability(
-    measured: Sequence[Measured], azimuth: Array, elevation: Array, mean: Array, lowest_rad: float
+    lights: Sequence[Light], azimuth: Array, elevation: Array, mean: Array, lowest_rad: float
 ) -> Array:  # fmt: skip
     """Probability (n,) that the edge at the `azimuth` and `elevation` (n,) of a bin is a cloud's.
 
@@ -134,20 +149,11 @@ def _cloud_probability(
     are independent. `mean`: of the columns; `lowest_rad`: elevation down to which the skyline may be lower.
     """
     probability = np.ones(len(elevation))
-    for stars, steps, _ in measured:
+    for stars, steps in lights:
         shows = _has_star([stars], azimuth, elevation) | _has_step([steps], mean)
         one = cloud_probability(cloud_density(steps[-1], mean), stars, elevation, lowest_rad)
         probability[shows] *= one[shows]
     return probability
-
-
-def _measure_frame(frame: SkyFrame) -> Measured:
-    """Stars and steps of light of a frame, and the log-likelihood (AZIMUTH_COLUMNS, n) of the skyline by them."""
-    light = measure_stars(frame)
-    by_width, total = find_steps(frame, light), star_log_likelihood(light.rays, light.missing)
-    for found, (_, weight) in zip(by_width, WIDTHS, strict=True):
-        add_step_log_likelihood(total, found, weight)
-    return light, by_width, total
 
 
 def _gap_depth(steps: Sequence[list[Steps]], elevation_rad: Array) -> Array:

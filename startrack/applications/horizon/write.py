@@ -23,7 +23,14 @@ from startrack.core.files import check_output as check_file
 from startrack.core.files import write_atomically
 from startrack.core.types import Array, MeasuredSkyline
 from startrack.frames import Site
-from startrack.output import encoded_bytes, png_bytes, skyline_picture, skyline_table_text, skyline_texts_deg
+from startrack.output import (
+    cloud_texts,
+    encoded_bytes,
+    png_bytes,
+    skyline_picture,
+    skyline_table_text,
+    skyline_texts_deg,
+)
 
 SKYLINE_SUFFIXES = (".csv", ".ecsv", ".hrz", ".png", ".zip")  # and none: the folder of a Stellarium landscape
 
@@ -91,9 +98,11 @@ def _landscape_files(
 
 
 def csv_text(skyline: MeasuredSkyline) -> str:
-    """One row a degree; elevation and sigma are empty where the skyline is unknown, and `is_measured` is 0."""
-    columns = *skyline_texts_deg(skyline), [str(int(known)) for known in skyline.known], skyline.source.tolist()
-    rows = ["azimuth_deg,elevation_deg,sigma_deg,is_measured,source", *map(",".join, zip(*columns, strict=True))]
+    """One row a degree; where the skyline is unknown its numbers are empty, and `is_measured` is 0."""
+    is_measured = [str(int(known)) for known in skyline.known]
+    columns = *skyline_texts_deg(skyline), is_measured, skyline.source.tolist(), cloud_texts(skyline)
+    head = "azimuth_deg,elevation_deg,sigma_deg,is_measured,source,cloud_probability"
+    rows = [head, *map(",".join, zip(*columns, strict=True))]
     return "\n".join(rows) + "\n"
 
 

@@ -17,6 +17,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from astropy.table import QTable
+from jsonschema import ValidationError
+from schema_helpers import check_printed_schema
 
 from startrack.applications.batch import Task, images_under, listed_images, locate_image, write_tables
 from startrack.camera import load_camera, save_camera
@@ -123,6 +125,9 @@ def test_the_tables_agree_with_the_results(night, batch_output):
     assert parquet["east_m"][1] is None
     manifest = json.loads((batch_output / "manifest.json").read_text())
     assert [image["status"] for image in manifest["images"]] == ["ok", "refused", "ok", "ok"]
+    check_printed_schema("manifest", {**manifest, "settings": {}})
+    with pytest.raises(ValidationError, match="image_sha256"):
+        check_printed_schema("manifest", {**manifest, "images": [{"image": "a.png", "result": None, "status": "ok"}]})
     assert str(night) not in (batch_output / "manifest.json").read_text() + (batch_output / "results.ecsv").read_text()
 
 

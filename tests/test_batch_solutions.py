@@ -155,6 +155,34 @@ def test_incomplete_records_are_not_used(folder, monkeypatch, text):
     assert stored_record(result)["reason"] == "no_stars"
 
 
+WRONG_VALUES = [
+    ("stars.detected", "many"), ("stars.identified", 10**400), ("stars", 3), ("timing_ms.detect", []),
+    ("timing_ms", [1]), ("position.east_m", "0"), ("position.covariance_m2", [1]), ("provenance.time_utc", "noon"),
+    ("provenance.camera", 1), ("attitude.quat_xyzw_body_enu", None), ("attitude.sigma_arcsec", {}), ("reason", "text"),
+    ("reason", []), ("message", None), ("message", 1), ("warnings", 1), ("warnings", [1]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("path", "value"), WRONG_VALUES)
+def test_a_record_with_a_value_of_another_kind_is_not_used(batch_done, tmp_path, path, value):
+    record = json.loads((batch_done / "out" / "00.fix.json").read_text())
+    part, _, key = path.rpartition(".")
+    (record[part] if part else record)[key] = value
+    result = tmp_path / "00.fix.json"
+    result.write_text(json.dumps(record))
+    assert stored_record(result) is None
+
+
+@pytest.mark.slow
+def test_an_image_whose_record_was_changed_by_hand_is_located_again(folder, capsys):
+    result = folder / "out" / "00.fix.json"
+    before = json.loads(result.read_text())
+    result.write_text(json.dumps(before | {"timing_ms": {"detect": ""}, "reason": "text"}))
+    assert batch(folder, "-v") == 5
+    assert "internal error" not in "".join(capsys.readouterr())
+    assert json.loads(result.read_text())["position"] == before["position"]
+
+
 def test_warnings_are_counted_and_shown_with_verbose(folder, capsys):
     sidecar = folder / "images" / "01.json"
     sidecar.write_text(json.dumps(json.loads(sidecar.read_text()) | {"exposuer_s": 1.0}))

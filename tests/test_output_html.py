@@ -259,7 +259,13 @@ def test_every_reason_has_a_text():
 
 @pytest.mark.parametrize(
     "damage",
-    ['{"image": "x.png"', '["x"]', '{"image": 3, "status": "ok"}', '{"image": "x.png", "status": "ok", "reason": []}'],
+    [
+        '{"image": "x.png"',
+        "[" * 100_000,
+        '["x"]',
+        '{"image": 3, "status": "ok"}',
+        '{"image": "x.png", "status": "ok", "reason": []}',
+    ],
 )
 def test_files_that_are_no_results_are_named(tmp_path, capsys, damage):
     (tmp_path / "x.fix.json").write_text(damage)
@@ -288,8 +294,9 @@ def test_the_command_reads_the_folder_of_true_positions(results, tmp_path, capsy
     errors = data_of(page.read_text(encoding="utf-8"), "results")["errors"]
     assert errors["count"] == 1
     assert errors["largest_m"] < 100
-    (truth / "small.truth.json").write_text("{}")
-    assert main(["report", str(results), "--truth", str(truth), "-o", str(page)]) == 4
+    for text in ("{}", "[" * 100_000, f'{{"position_enu_m": [{10**400}, 0]}}'):
+        (truth / "small.truth.json").write_text(text)
+        assert main(["report", str(results), "--truth", str(truth), "-o", str(page)]) == 4
     assert main(["report", str(results), "--truth", str(tmp_path / "none")]) == 4
     assert "no such folder of truth" in capsys.readouterr().err
     assert main(["report", str(results), "--truth", str(page)]) == 4

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import pytest
 from jsonschema import Draft202012Validator, ValidationError
+from schema_helpers import unknown_keys
 
 from startrack.camera import camera_to_dict
 from startrack.chain.stages import Measured, Oriented, Refused, extend
@@ -22,19 +23,6 @@ from startrack.rendering import write_truth
 
 def fits_schema(kind, value):
     Draft202012Validator(SCHEMAS[kind], format_checker=Draft202012Validator.FORMAT_CHECKER).validate(value)
-
-
-def unknown_keys(value, schema, path="$"):
-    """Keys of a value that the schema does not name, at any depth."""
-    found = []
-    for one in [schema, *schema.get("anyOf", [])]:
-        if isinstance(value, dict) and "properties" in one:
-            known = one["properties"]
-            found += [f"{path}.{key}" for key in value if key not in known]
-            found += [k for key in value if key in known for k in unknown_keys(value[key], known[key], f"{path}.{key}")]
-        if isinstance(value, list) and isinstance(one.get("items"), dict):
-            found += [key for item in value for key in unknown_keys(item, one["items"], f"{path}[]")]
-    return found
 
 
 def results(result):

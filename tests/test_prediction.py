@@ -144,6 +144,13 @@ def test_a_stopped_run_is_resumed(area, capsys, monkeypatch):
     assert json.loads(capsys.readouterr().out) == json.loads((area / "predict.json").read_text())
 
 
+def test_a_record_that_is_no_prediction_is_replaced(area):
+    before = (area / "predict.json").read_bytes()
+    (area / "predict.json").write_text("[" * 100_000)
+    assert run(area, "--spacing", 9000, "--draws", 1) == 0
+    assert (area / "predict.json").read_bytes() == before
+
+
 def test_a_folder_with_another_prediction_is_kept(area, capsys):
     before = (area / "predict.json").read_bytes()
     assert run(area, "--spacing", 8000, "--draws", 1) == 2

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Sequence
@@ -13,6 +12,7 @@ from startrack.applications.batch import JOB, result_stems, tabled_results
 from startrack.core import REPORTED_IMAGES
 from startrack.core.errors import BadInput
 from startrack.core.files import check_output, existing_folder
+from startrack.core.stored import read_json_object
 from startrack.output import Found, result_at, results_under, write_page
 
 PAGE = "report.html"  # of a folder; of one result NAME.report.html
@@ -88,9 +88,8 @@ def _true_positions(found: Sequence[Found], folder: str | None) -> dict[str, tup
         if path is None:
             continue
         try:
-            truth = json.loads(path.read_text(encoding="utf-8"))
-            east, north = (float(value) for value in truth["position_enu_m"][:2])
-        except (OSError, ValueError, KeyError, TypeError) as cause:
+            east, north = (float(value) for value in (read_json_object(path) or {})["position_enu_m"][:2])
+        except (ValueError, KeyError, TypeError, OverflowError) as cause:
             raise BadInput("bad_image", f"{path}: holds no position_enu_m ({type(cause).__name__})") from cause
         if not (math.isfinite(east) and math.isfinite(north)):
             raise BadInput("bad_image", f"{path}: position_enu_m is not finite")

@@ -10,13 +10,13 @@ from contextlib import AbstractContextManager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
-from zipfile import is_zipfile
 
 import numpy as np
 
 from startrack import __version__
-from startrack.core.files import PACKAGE, write_atomically
+from startrack.core.files import PACKAGE, remove_file
 from startrack.core.runner import TASK_LIMIT_S, Died, Runner, RunStopped
+from startrack.core.stored import read_sealed, write_sealed
 
 Chunk = dict[str, np.ndarray]  # the result of one task, by name
 
@@ -54,23 +54,26 @@ class ChunkStore(Runner[Task, Chunk]):
 
     def chunks(self, what: str, tasks: Sequence[Task]) -> Iterator[Chunk]:
         """The chunks of `what` in the order of the tasks; missing ones are computed. Raises RunStopped."""
-        missing = [task for task in tasks if not is_zipfile(self._path(task))]  # or cut short
+        missing = [task for task in tasks if read_sealed(self._path(task)) is None]
         with self.progress(what, sum(map(len, missing))) as bar:
             for task, chunk in self.results(missing):
                 if isinstance(chunk, Died):
                     raise RunStopped(f"{what}: {chunk.cause}")
                 buffer = io.BytesIO()
                 np.savez_compressed(buffer, **chunk)  # type: ignore[arg-type]
-                write_atomically(self._path(task), buffer.getvalue(), overwrite=True)
+                write_sealed(self._path(task), buffer.getvalue())
                 bar.advance(len(task))
         for task in tasks:
-            with np.load(self._path(task)) as stored:
+            data = read_sealed(self._path(task))
+            if data is None:
+                raise RunStopped(f"{what}: {self._path(task)} was removed or changed meanwhile")
+            with np.load(io.BytesIO(data)) as stored:
                 yield {key: stored[key] for key in stored.files}
 
     def discard(self, tasks: Iterable[Task]) -> None:
-        """Remove the chunks of tasks."""
+        """Remove the chunks of tasks. Raises BadOutput."""
         for task in tasks:
-            self._path(task).unlink(missing_ok=True)
+            remove_file(self._path(task))
 
     def _path(self, task: Task) -> Path:
         return self.folder / f"{self.key(task)}.npz"

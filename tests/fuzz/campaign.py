@@ -19,7 +19,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from . import targets
+from . import commands, targets
 
 HANG_S = 10.0  # one file through a reader
 COMMAND_HANG_S = 60.0  # one file through a whole command
@@ -107,10 +107,10 @@ def _run_process(kind: str, first: int, runs: int, seed: int, folder: Path, hang
 
 def work(kind: str, first: int, runs: int, seed: int, folder: Path) -> None:
     """The process: files `first` to `runs` - 1, under the cap of memory."""
-    if kind != SELF_TEST:
-        targets.prepare(folder)
     if kind == COMMAND:
-        targets.run_sound_commands(folder)  # compiles
+        commands.run_sound_commands(folder)  # compiles
+    elif kind != SELF_TEST:
+        targets.prepare(folder)
     sound_s = _sound_cpu_s(folder) if kind == COMMAND else 0.0
     cap = _bytes_of("VmSize") + MEMORY_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (cap, cap))
@@ -139,9 +139,9 @@ def work(kind: str, first: int, runs: int, seed: int, folder: Path) -> None:
 def _sound_cpu_s(folder: Path) -> float:
     """Processor time of the slowest command on sound files."""
     times = []
-    for words in targets.COMMANDS:
+    for words in commands.COMMANDS:
         began = time.process_time()
-        targets.run_sound(words, folder, small=False)
+        commands.run_sound(words, folder, small=False)
         times.append(time.process_time() - began)
     return max(times)
 
@@ -161,7 +161,7 @@ def _bytes_of(key: str) -> int:
 
 def _one(kind: str, seed: int, index: int, folder: Path) -> str | None:
     if kind == COMMAND:
-        return targets.run_command(seed, index, folder)
+        return commands.run_command(seed, index, folder)
     if kind == SELF_TEST:
         return _fail(index)
     data, number = targets.mutated(kind, seed, index)

@@ -2,50 +2,24 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
-import json
-import shutil
 import warnings
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from random import Random
 from typing import Any
 
 import numpy as np
 
-from startrack.core.errors import BAD_INPUT_REASONS, BadInput, exit_code_of
-from startrack.core.files import data_dir
+from startrack.core.errors import BAD_INPUT_REASONS, BadInput
 
 from .access import Broken, no_access_beside
 from .mutate import mutate
-from .seeds import CYLINDER, FRAME, HEIGHT_MAP, hill_map, seeds
+from .seeds import CYLINDER, HEIGHT_MAP, hill_map, seeds
 
 SUFFIXES = {"png": ".png", "jpeg": ".jpg", "tiff": ".tif", "fits": ".fits", "raw": ".dng"}
 PROGRAMS = ("ros", "kalibr", "colmap", "opencv")
-SAMPLE = Path(__file__).resolve().parents[2] / "sample_images" / "near-centre"
 MAX_MESSAGE_CHARS = 1200  # with two paths of a temporary folder in it
 OUT_OF_MEMORY = ("MemoryError", "Unable to allocate", "Insufficient memory", "bad_alloc", "cannot allocate")
-NIGHT = "2030-06-01T00:00:00Z"
-PREDICTED = ("--time", NIGHT, "--draws", "1", "--path", "way.csv", "--spacing", "200", "-j", "1")
-COMMANDS = (
-    ("locate", "image.png", "--json", "--no-plots"), ("identify", "image.png", "--json", "--no-plots"),
-    ("detect", "image.png", "--json", "--no-plots"), ("locate", "image.png", "--no-plots"),
-    ("terrain", "show", "terrain.toml", "--json", "--no-plots"), ("calibrate", "show", "camera.toml"),
-    ("calibrate", "convert", "camera.toml", "--to", "opencv", "-q"), ("track", "image.png", "--no-plots"),
-    ("calibrate", "image.png", "-c", "camera.toml", "-q", "-o"),
-    ("horizon", "image.png", "-c", "camera.toml", "--site=34,-111", "-q", "-o"),
-    ("report", "image.fix.json", "-q"),
-    ("predict", "-t", "terrain.toml", "-c", "camera.toml", *PREDICTED, "--no-plots"),
-    ("render", "-t", "terrain.toml", "-c", "camera.toml", "--time", NIGHT, "-q"),
-)  # fmt: skip
-FILES = (  # that are mutated, with the kind of their changes
-    ("png", "image.png"), ("sidecar", "image.json"), ("camera", "camera.toml"), ("terrain", "terrain.toml"),
-    ("sidecar", "image.fix.json"), ("terrain", "way.csv"),
-)  # fmt: skip
-INPUTS = (".png", ".toml", ".json", ".csv")
-REFUSE_SAMPLES = ("horizon",)  # the Moon's sky is no sky of a site on the Earth
 
 
 def prepare(folder: Path) -> None:
@@ -173,120 +147,3 @@ READERS: dict[str, Callable[[bytes, int, Path], None]] = {
     "sidecar": _read_sidecar, "camera": _read_camera, "converted": _read_converted, "terrain": _read_terrain,
     "elevation": _read_elevation,
 }  # fmt: skip
-
-
-# --- the whole command -----------------------------------------------------------------------------------------------
-
-
-def run_command(seed: int, index: int, folder: Path) -> str | None:
-    """One command on a folder of sound files of which one is mutated; the reason of a refusal. Raises Broken."""
-    random = Random(f"{seed}/command/{index}")
-    kind, name = random.choice(FILES)
-    _write_sound(folder, small=kind == "png")
-    (folder / name).write_bytes(mutate(kind, (folder / name).read_bytes(), random))
-    with no_access_beside(folder):
-        return _run(random.choice(COMMANDS), folder)
-
-
-def run_sound_commands(folder: Path) -> None:
-    """Every command on sound files, so that all is imported and compiled. Raises Broken."""
-    for words in COMMANDS:
-        run_sound(words, folder, small=True)
-        reason = run_sound(words, folder, small=False)
-        if reason is not None and words[0] not in REFUSE_SAMPLES:
-            raise Broken(f"{words} refuses sound files: {reason}")
-
-
-def run_sound(words: tuple[str, ...], folder: Path, *, small: bool) -> str | None:
-    """One command on sound files, with a `small` image or a sample; the reason of a refusal. Raises Broken."""
-    _write_sound(folder, small=small)
-    return _run(words, folder)
-
-
-def _run(command: tuple[str, ...], folder: Path) -> str | None:
-    """Run a command in this process and judge it; the reason of a refusal."""
-    from startrack.cli.main import main
-
-    words = [str(folder / word) if Path(word).suffix in INPUTS else word for word in command]
-    if command[0] == "report":
-        words += ["-o", str(folder / "out" / "report.html")]
-    elif command[:2] != ("calibrate", "show"):
-        words += ["-D", str(folder / "out")] if "-o" not in words else [str(folder / f"out.{words[0]}.csv"), "-O"]
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main(words)
-    return _judge_command(words, code, out.getvalue(), err.getvalue(), folder)
-
-
-def _write_sound(folder: Path, *, small: bool) -> None:
-    """Image, sidecar, camera and terrain: a `small` image with a few points, or a sample that is located."""
-    shutil.rmtree(folder / "out", ignore_errors=True)
-    facts = {"time_utc": NIGHT, "exposure_s": 1.0}
-    camera = COMMAND_CAMERA
-    if small:
-        (folder / "image.png").write_bytes(_night())
-    else:
-        shutil.copyfile(SAMPLE.with_suffix(".png"), folder / "image.png")
-        facts = json.loads(SAMPLE.with_suffix(".json").read_text())
-        camera = (data_dir("calib") / "fisheye-2048.toml").read_text()
-    (folder / "camera.toml").write_text(camera)
-    (folder / "terrain.toml").write_text(CYLINDER)
-    (folder / "image.json").write_text(json.dumps(facts | {"camera": "camera.toml", "terrain": "terrain.toml"}))
-    (folder / "image.fix.json").write_text(_result_of_sample())
-    (folder / "way.csv").write_text("east_m,north_m\n0,0\n150,0\n")
-
-
-@cache
-def _result_of_sample() -> str:
-    """The record of the sample that is located."""
-    from startrack import locate
-    from startrack.output import result_dict
-
-    return json.dumps(result_dict(locate(SAMPLE.with_suffix(".png")).result))
-
-
-COMMAND_CAMERA = """format = 1
-name = "small"
-size_px = [60, 40]
-focal_px = [30.0, 30.0]
-centre_px = [29.5, 19.5]
-max_angle_deg = 60.0
-[sensor]
-zero_point_e_per_s = 44000.0
-gain_e_per_adu = 0.5
-bias_adu = 100.0
-read_noise_e = 2.5
-"""
-
-
-def _night() -> bytes:
-    """A small picture with some point sources."""
-    import cv2
-
-    y, x = np.mgrid[: FRAME.shape[0], : FRAME.shape[1]]
-    pixels = FRAME.astype(float) / 5
-    for cx, cy in np.random.default_rng(2).uniform(5, 35, (8, 2)):
-        pixels += 900 * np.exp(-0.5 * ((x - cx) ** 2 + (y - cy) ** 2))
-    return bytes(cv2.imencode(".png", pixels.round().astype(np.uint16))[1])
-
-
-def _judge_command(words: list[str], code: int, out: str, err: str, folder: Path) -> str | None:
-    """The reason of a refusal, None for an answer. Raises Broken."""
-    where = f"{words[:2]} code {code}, printed {out[-300:]!r}, {err[-600:]!r}"
-    if code not in (0, 3, 4) or any(mark in out + err for mark in ("Traceback", "internal error", "Warning")):
-        raise Broken(where)
-    if any(mark in out + err for mark in OUT_OF_MEMORY):
-        raise MemoryError(where)
-    partial = [path.name for path in folder.rglob("*.part")]
-    if partial:
-        raise Broken(f"{where}: left {partial}")
-    if "--json" not in words or words[0] == "terrain":
-        if code and not 1 <= len((out + err).splitlines()) <= 12:
-            raise Broken(where)
-        return None if code == 0 else "refused"
-    (line,) = out.splitlines()
-    record = json.loads(line)
-    reason = record["reason"]
-    if exit_code_of(reason) != code or (reason and ("\n" in record["message"] or not record["message"])):
-        raise Broken(where)
-    return reason

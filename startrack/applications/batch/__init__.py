@@ -12,6 +12,7 @@ from startrack.applications.batch.find import (
     result_stems,
 )
 from startrack.applications.batch.tables import (
+    MANIFEST,
     Rows,
     belongs_to_other_images,
     has_parquet,
@@ -31,7 +32,8 @@ from startrack.applications.batch.task import (
 )
 
 __all__ = [
-    "JOB", "LOCK", "Image", "ImageDone", "Rows", "Task", "belongs_to_other_images", "has_parquet", "images_of_bag",
-    "images_under", "listed_images", "locate_image", "locate_images", "lock_results", "maps_among", "read_task",
-    "record_path", "result_stems", "stored_record", "table_rows", "table_values", "tabled_results", "write_tables",
+    "JOB", "LOCK", "MANIFEST", "Image", "ImageDone", "Rows", "Task", "belongs_to_other_images", "has_parquet",
+    "images_of_bag", "images_under", "listed_images", "locate_image", "locate_images", "lock_results", "maps_among",
+    "read_task", "record_path", "result_stems", "stored_record", "table_rows", "table_values", "tabled_results",
+    "write_tables",
 ]  # fmt: skip

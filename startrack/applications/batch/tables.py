@@ -21,14 +21,23 @@ import numpy as np
 from startrack import __version__
 from startrack.applications.batch import task as results
 from startrack.applications.batch.find import Image, record_path, unique_names
-from startrack.applications.batch.task import INPUTS, JOB, Record, Task, is_solved, stored_record, text_of_name
+from startrack.applications.batch.task import INPUTS, JOB, SOLVED, Record, Task, is_solved, stored_record, text_of_name
 from startrack.chain import STAGES, content_sha256
 from startrack.core.files import write_atomically
+from startrack.core.stored import read_json_object
 from startrack.frames import R_from_quat_xyzw, tum_line
-from startrack.output import Column, ecsv_text, table_columns
+from startrack.output import (
+    Column,
+    ecsv_text,
+    file_schema,
+    list_schema,
+    object_schema,
+    or_null,
+    table_columns,
+)
 
 FORMAT = "startrack.manifest/1"
-MANIFEST = "manifest.json"
+MANIFEST_FILE = "manifest.json"
 RESULT = "result"  # in the manifest: path of NAME.fix.json within the folder; null where that is an earlier solution
 TRAJECTORY = "trajectory.tum"
 PARQUET = "results.parquet"
@@ -38,6 +47,21 @@ COLUMNS = [
     *(Column(name, datatype="string", path=(name,)) for name in ("image", "status", "reason")),
     *table_columns(),
 ]
+MANIFEST = file_schema(
+    "Images of a batch",
+    object_schema({
+        "format": {"const": FORMAT},
+        "version": "text",
+        "settings": object_schema({}, "flags of the run"),
+        "images": list_schema(object_schema({
+            "image": "text",
+            RESULT: or_null("text", "path of NAME.fix.json in the folder; null: that is of an earlier run"),
+            "status": {"enum": [*SOLVED, "refused"]},
+            "image_sha256": or_null("text", "of the image's file; null: not read"),
+            JOB: or_null("text", "SHA-256 of all inputs; null: the next run repeats the image"),
+        })),
+    }),
+)  # fmt: skip
 
 
 class Rows(NamedTuple):
@@ -86,7 +110,7 @@ def write_tables(out: Path, records: Sequence[Record], settings: dict[str, Any])
     columns = [replace(one, values=column_values(one, records), description="") for one in COLUMNS]
     made = {"results.ecsv": ecsv_text(columns).encode()} | ({PARQUET: _parquet(records)} if has_parquet() else {})
     made |= {name: "".join(lines).encode() for name, lines in _trajectories(records).items()}
-    made |= {"timings.ecsv": _timings(records), MANIFEST: _manifest(records, settings)}
+    made |= {"timings.ecsv": _timings(records), MANIFEST_FILE: _manifest(records, settings)}
     for former in (out / PARQUET, out / TRAJECTORY, *out.glob("trajectory-*.tum")):
         if former.name not in made:
             with suppress(OSError):
@@ -199,7 +223,7 @@ def tabled_results(out: Path) -> set[str] | None:
 
 
 def _manifest_images(out: Path) -> list[dict[str, Any]] | None:
-    images = (results.read_object(out / MANIFEST) or {}).get("images")
+    images = (read_json_object(out / MANIFEST_FILE) or {}).get("images")
     if not isinstance(images, list):
         return None
     return [one for one in images if isinstance(one, dict) and isinstance(one.get("image"), str)]

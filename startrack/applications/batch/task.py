@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
-import stat
 from collections.abc import Generator, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from startrack import __version__, chain, output
 from startrack.chain import NearAttitude, Outcome, content_sha256
-from startrack.core.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput, one_line
+from startrack.core.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput, Reason, one_line
 from startrack.core.files import FULL_DISK, printable, remove_file
 from startrack.core.runner import Died, Runner, RunStopped
+from startrack.core.stored import read_json_object
 from startrack.core.types import Exposure, PositionPrior
 from startrack.exposure import BagImage, read_bag_image, read_exposure
+from startrack.frames import R_from_quat_xyzw
+from startrack.identification import Identifier, NearSky
 from startrack.localization import require_localizer
 
 JOB = "job_sha256"  # hash of a result's inputs (content of its files, flags, version); null: the next run repeats it
@@ -29,6 +31,8 @@ NEEDED = {  # by the tables, of a record that is ok
     "attitude": ("quat_xyzw_body_enu", "quat_xyzw_cam_icrs", "sigma_arcsec"),
     "provenance": ("time_utc", "image_sha256"),
 }
+TYPES: dict[str, Any] = {"string": str, "int64": int, "float64": (int, float)}  # in JSON, of the tables' columns
+LARGEST_INTEGER = 2**63
 Record = dict[str, Any]
 ImageDone = tuple[Record, bool]  # the record, and whether it was there already
 DISK_ERRORS = FULL_DISK | {errno.EROFS}
@@ -49,6 +53,7 @@ class Task:
     bag_image: BagImage | None = None  # where `path` is BAG#NUMBER
     near: tuple[float, float, float] | None = None  # east, north, sigma [m] of a prior of the position
     near_attitude: NearAttitude | None = None
+    near_sky: NearSky | None = None
 
 
 def locate_images(runner: Runner[Task, ImageDone], tasks: Sequence[Task]) -> Generator[ImageDone, None, None]:
@@ -108,9 +113,10 @@ def _valid_record(task: Task, key: str) -> dict[str, Any] | None:
 
 
 def _key(task: Task, sha256: str) -> str:
+    near_sky = None if task.near_sky is None else astuple(task.near_sky)
     return chain.job_sha256(
         task.path, sha256, task.facts, task.plots, task.localizer, task.evidence, *(task.near or ()),
-        *([] if task.near_attitude is None else [task.near_attitude]),
+        *(one for one in (task.near_attitude, near_sky) if one is not None),
     )  # fmt: skip
 
 
@@ -166,8 +172,9 @@ def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str
         near = None if task.near is None else PositionPrior(*task.near)
         localizer = require_localizer(task.localizer)
         settings = chain.Settings(
-            localizer=localizer, evidence_sources=task.evidence, near=near, near_attitude=task.near_attitude
-        )
+            identifier=Identifier(near_sky=task.near_sky), localizer=localizer, evidence_sources=task.evidence,
+            near=near, near_attitude=task.near_attitude,
+        )  # fmt: skip
         return chain.locate_exposure(exposure, settings), inputs
     except BadInput as cause:
         refused = chain.Refused(reason=cause.reason, message=str(cause), reached=chain.Inputs(exposure=exposure))
@@ -185,7 +192,7 @@ def _unread_record(task: Task, reason: str, message: str, sha256: str) -> dict[s
 
 def stored_record(result: str | Path) -> dict[str, Any] | None:
     """A result's record; None if there is none, or it cannot be read or is incomplete."""
-    record = read_object(Path(result))
+    record = read_json_object(result)
     return record if record is not None and _is_record(record) else None
 
 
@@ -225,17 +232,6 @@ def text_of_name(name: str) -> str:
     return one_line(name.encode("utf-8", "replace").decode("utf-8"))
 
 
-def read_object(file: Path) -> dict[str, Any] | None:
-    """The JSON object in a file; None if it cannot be read, or is nested too deep."""
-    try:
-        if not stat.S_ISREG(file.stat().st_mode):  # reading a pipe would block
-            return None
-        found = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return None
-    return found if isinstance(found, dict) else None
-
-
 def _is_record(found: dict[str, Any]) -> bool:
     """Whether a JSON object has the keys that resuming and the tables need."""
     status, provenance = found.get("status"), found.get("provenance", {})
@@ -243,4 +239,24 @@ def _is_record(found: dict[str, Any]) -> bool:
     if not named or status not in (*SOLVED, "refused") or not isinstance(found.get(INPUTS, {}), dict):
         return False
     parts = NEEDED if status == "ok" else {}
-    return all(isinstance(found.get(part), dict) and found[part].keys() >= set(keys) for part, keys in parts.items())
+    whole = all(isinstance(found.get(part), dict) and found[part].keys() >= set(keys) for part, keys in parts.items())
+    return whole and _has_types(found)
+
+
+def _has_types(found: dict[str, Any]) -> bool:
+    """Whether what is printed, and what the tables and the trajectory take, has the types of a record."""
+    try:
+        numbers = [(TYPES["float64"], one) for one in found.get("timing_ms", {}).values()]
+        texts = [found["message"], *found.get("warnings", ())]
+        columns = [(TYPES[one.datatype], one.value(found)) for one in output.table_columns()]
+        time_utc = found.get("provenance", {}).get("time_utc")
+        if time_utc is not None:
+            datetime.fromisoformat(time_utc)
+        if found["status"] == "ok":
+            R_from_quat_xyzw(found["attitude"]["quat_xyzw_body_enu"])
+    except (TypeError, ValueError, LookupError, AttributeError):
+        return False
+    typed = all(one is None or isinstance(one, kind) for kind, one in (*numbers, *columns))
+    typed &= all(isinstance(one, str) for one in texts)
+    fits = all(abs(one) < LARGEST_INTEGER for _, one in (*numbers, *columns) if isinstance(one, int))
+    return typed and fits and found["reason"] in (None, *Reason)

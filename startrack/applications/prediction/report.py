@@ -28,7 +28,8 @@ from startrack.applications.prediction.quantities import (
 )
 from startrack.applications.prediction.run import add_odometry
 from startrack.core.errors import BadOutput, length_text
-from startrack.core.files import write_atomically
+from startrack.core.files import remove_file, write_atomically
+from startrack.core.stored import read_json_object
 from startrack.estimation.observations import OdometryErrors
 from startrack.frames import format_utc, latlon_from_enu
 from startrack.output import (
@@ -92,12 +93,8 @@ class Plan:
 
     def check_folder(self, out: Path, *, overwrite: bool) -> None:
         """Raise BadOutput if `out` holds a prediction of other places, cameras or times and not `overwrite`."""
-        try:
-            before = json.loads((out / RECORD_FILE).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return
-        now = self.settings
-        differs = [key for key in SETTINGS if not isinstance(before, dict) or before.get(key) != now[key]]
+        before, now = read_json_object(out / RECORD_FILE), self.settings
+        differs = [] if before is None else [key for key in SETTINGS if before.get(key) != now[key]]
         if differs and not overwrite:
             what = f"{out} holds another prediction ({', '.join(differs)} differ)"
             raise BadOutput("bad_image", f"{what}: choose another -D, or replace it with -O")
@@ -201,7 +198,7 @@ def write_report(report: Report, out: Path, *, plots: bool) -> list[Path]:
         write_atomically(out / name, data, overwrite=True)
     names = [*([MAP] if isinstance(points, AreaCells) else []), *made]
     for name in PREDICTION_FILES - set(names):
-        (out / name).unlink(missing_ok=True)
+        remove_file(out / name)
     return [out / name for name in names]
 
 

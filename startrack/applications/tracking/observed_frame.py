@@ -11,14 +11,13 @@ from dataclasses import asdict, dataclass, fields, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeVar
-from zipfile import BadZipFile
 
 import numpy as np
 
 from startrack.applications.tracking.frame_estimate import estimate_frame
 from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.chain import Located, Measured, Outcome, Refused, last_value
-from startrack.core.files import write_atomically
+from startrack.core.stored import read_sealed, write_sealed
 from startrack.core.types import Array, Clock, Evidence, Fix, ImageErrors, ShownError
 from startrack.estimation.observations import FrameEstimate
 from startrack.estimation.trajectory import SIGMAS_95
@@ -157,13 +156,14 @@ class FrameStore:
     def read(self, key: str) -> ObservedFrame | None:
         """The frame stored under `key`; None if there is none, or its file is damaged."""
         try:
-            return decode_frame(self._path(key).read_bytes())
-        except (OSError, ValueError, KeyError, BadZipFile):
+            data = read_sealed(self._path(key))
+            return None if data is None else decode_frame(data)
+        except (ValueError, KeyError):
             return None
 
     def write(self, key: str, frame: ObservedFrame) -> None:
         """Store the `frame` under `key`, complete or not at all. Raises BadInput if that is impossible."""
-        write_atomically(self._path(key), encode_frame(frame), overwrite=True)
+        write_sealed(self._path(key), encode_frame(frame))
 
     def _path(self, key: str) -> Path:
         return self.folder / f"{key}.npz"

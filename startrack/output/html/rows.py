@@ -100,6 +100,8 @@ def _files(root: Path) -> list[Path]:
 
 def _record(path: Path) -> dict[str, Any]:
     """The record of a file. Raises ValueError with the cause where it holds none."""
+    if path.exists() and not path.is_file():  # a pipe would block
+        raise ValueError("is no regular file")
     try:
         # JSON has no NaN and no infinity, but files written or edited elsewhere may: such values are unknown.
         record = json.loads(
@@ -108,7 +110,7 @@ def _record(path: Path) -> dict[str, Any]:
         )  # fmt: skip
     except OSError as cause:
         raise ValueError(f"cannot be opened ({cause.strerror})") from cause
-    except ValueError as cause:
+    except (ValueError, RecursionError) as cause:
         raise ValueError(f"no JSON, or not all of it ({cause})") from cause
     if not isinstance(record, dict):
         raise ValueError("holds no JSON object")

@@ -1,0 +1,40 @@
+"""Files that a later run reads again: data with their hash, and JSON objects. Damaged ones count as missing."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from startrack.core.files import FilePath, write_atomically
+
+SEAL_BYTES = hashlib.sha256().digest_size
+
+
+def write_sealed(path: FilePath, data: bytes) -> None:
+    """Write `data` and behind them their SHA-256, for `read_sealed`, in the place of a file at `path`.
+
+    An archive with it opens as without. Raises as `write_atomically`.
+    """
+    write_atomically(path, data + hashlib.sha256(data).digest(), overwrite=True)
+
+
+def read_sealed(path: FilePath) -> bytes | None:
+    """The data that `write_sealed` wrote to `path`; None where there is no such file, or any byte of it has changed."""
+    try:
+        whole = Path(path).read_bytes() if os.path.isfile(path) else b""  # reading a pipe would block
+    except OSError:
+        return None
+    data, seal = whole[:-SEAL_BYTES], whole[-SEAL_BYTES:]
+    return data if hashlib.sha256(data).digest() == seal else None
+
+
+def read_json_object(path: FilePath) -> dict[str, Any] | None:
+    """The JSON object in the file at `path`; None if it cannot be read, or is nested too deep."""
+    try:
+        found = json.loads(Path(path).read_text(encoding="utf-8")) if os.path.isfile(path) else None
+    except (OSError, ValueError, RecursionError):
+        return None
+    return found if isinstance(found, dict) else None

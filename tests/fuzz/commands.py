@@ -1,0 +1,223 @@
+"""One whole command on files of which one is mutated, and the outcome judged as of a reader."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import shutil
+from functools import cache, partial
+from pathlib import Path
+from random import Random
+from unittest.mock import patch
+
+import numpy as np
+
+from startrack.core.errors import exit_code_of
+from startrack.core.files import data_dir
+from startrack.core.runner import Runner
+
+from .access import Broken, no_access_beside
+from .mutate import TEXTS, mutate
+from .seeds import CYLINDER, FRAME
+from .targets import OUT_OF_MEMORY
+
+SAMPLE = Path(__file__).resolve().parents[2] / "sample_images" / "near-centre"
+NIGHT = "2030-06-01T00:00:00Z"
+PREDICTED = ("--time", NIGHT, "--draws", "1", "--path", "way.csv", "--spacing", "200", "-j", "1")
+COMMANDS = (
+    ("locate", "image.png", "--json", "--no-plots"), ("identify", "image.png", "--json", "--no-plots"),
+    ("detect", "image.png", "--json", "--no-plots"), ("locate", "image.png", "--no-plots"),
+    ("terrain", "show", "terrain.toml", "--json", "--no-plots"), ("calibrate", "show", "camera.toml"),
+    ("calibrate", "convert", "camera.toml", "--to", "opencv", "-q"), ("track", "image.png", "--no-plots"),
+    ("calibrate", "image.png", "-c", "camera.toml", "-q", "-o"),
+    ("horizon", "image.png", "-c", "camera.toml", "--site=34,-111", "-q", "-o"),
+    ("report", "image.fix.json", "-q"), ("batch", ".", "--no-plots", "--report", "-j", "1"),
+    ("reproduce", "fig3.4", "--no-plots", "-j", "1"),
+    ("predict", "-t", "terrain.toml", "-c", "camera.toml", *PREDICTED, "--no-plots"),
+    ("render", "-t", "terrain.toml", "-c", "camera.toml", "--time", NIGHT, "-q"),
+)  # fmt: skip
+FILES = (  # that are mutated, with the kind of their changes
+    ("png", "image.png"), ("sidecar", "image.json"), ("camera", "camera.toml"), ("terrain", "terrain.toml"),
+    ("sidecar", "image.fix.json"), ("terrain", "way.csv"),
+)  # fmt: skip
+RESUMED = ("batch", "predict", "reproduce", "track")  # begin with the results of a run on sound files
+ENTRIES = 0.1  # of the mutations: the file becomes something else
+INPUTS = (".png", ".toml", ".json", ".csv")
+REFUSE_SAMPLES = ("horizon", "batch")  # a sky of the Moon above a site on the Earth; a picture without a sidecar
+
+
+def run_command(seed: int, index: int, folder: Path) -> str | None:
+    """One command on sound files of which one is mutated, in `folder`; the reason of a refusal. Raises Broken.
+
+    Of a command that goes on from its results one of these is mutated as often as an input.
+    """
+    random = Random(f"{seed}/command/{index}")
+    words = random.choice(COMMANDS)
+    results = _results_of(words, folder)
+    stored = [("sidecar" if name.endswith(".json") else "raw", name) for name in results if is_read_again(name)]
+    kind, name = random.choice(stored if stored and random.random() < 0.5 else FILES)
+    here = _begin(words, folder, small=kind == "png" and not results)
+    if random.random() < ENTRIES:
+        _change_entry(here / name, random)
+    else:
+        (here / name).write_bytes(mutate(kind, (here / name).read_bytes(), random))
+    with no_access_beside(folder):
+        return _run(words, here)
+
+
+def is_read_again(name: str) -> bool:
+    """Whether a command reads the result of this `name` when it goes on."""
+    return name.endswith((".json", ".npz"))
+
+
+def _begin(words: tuple[str, ...], folder: Path, *, small: bool) -> Path:
+    """Sound files, and the results that the command goes on from."""
+    here = _write_sound(folder, small=small)
+    for name, data in _results_of(words, folder).items():
+        (here / name).parent.mkdir(parents=True, exist_ok=True)
+        (here / name).write_bytes(data)
+    return here
+
+
+def _change_entry(path: Path, random: Random) -> None:
+    """A file with another name, or a folder, a pipe or a link of its name in its place."""
+    data, act = path.read_bytes(), random.randrange(6)
+    path.unlink()
+    if act == 0:
+        name = random.choice((b"\xff\n.png", b"-D.png", b"\x1b[1m.png", b" .png", 240 * b"x" + b".png", *TEXTS))
+        with contextlib.suppress(OSError, ValueError):  # no name of a file
+            Path(os.fsdecode(os.fsencode(path.parent) + b"/" + name.replace(b"/", b""))).write_bytes(data)
+    elif act == 1:
+        path.mkdir()
+    elif act == 2:
+        os.mkfifo(path)
+    else:
+        path.symlink_to(("nowhere", path.name, "/dev/zero")[act - 3])
+
+
+@cache
+def _results_of(words: tuple[str, ...], folder: Path) -> dict[str, bytes]:
+    """The files that a command of RESUMED on sound files writes, by their paths; none of another."""
+    if words[0] not in RESUMED:
+        return {}
+    here = _write_sound(folder, small=False)
+    _run(words, here)
+    files = (path for path in sorted((here / "out").rglob("*")) if path.is_file())
+    return {path.relative_to(here).as_posix(): path.read_bytes() for path in files}
+
+
+def run_sound_commands(folder: Path) -> None:
+    """Every command on sound files, so that all is imported and compiled. Raises Broken."""
+    for words in COMMANDS:
+        run_sound(words, folder, small=True)
+        reason = run_sound(words, folder, small=False)
+        if reason is not None and words[0] not in REFUSE_SAMPLES:
+            raise Broken(f"{words} refuses sound files: {reason}")
+
+
+def run_sound(words: tuple[str, ...], folder: Path, *, small: bool) -> str | None:
+    """One command on sound files, with a `small` image or a sample; the reason of a refusal. Raises Broken."""
+    return _run(words, _begin(words, folder, small=small))
+
+
+def _run(command: tuple[str, ...], folder: Path) -> str | None:
+    """Run a command in this process and judge it; the reason of a refusal."""
+    from startrack.cli.main import main
+
+    words = [str(folder / word) if word == "." or Path(word).suffix in INPUTS else word for word in command]
+    if command[0] == "report":
+        words += ["-o", str(folder / "out" / "report.html")]
+    elif command[:2] != ("calibrate", "show"):
+        words += ["-D", str(folder / "out")] if "-o" not in words else [str(folder / f"out.{words[0]}.csv"), "-O"]
+    out, err = io.StringIO(), io.StringIO()
+    in_process = patch("startrack.cli.batch.Runner", partial(Runner, in_process=True))  # under our limits
+    with in_process, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = main(words)
+        except SystemExit as stop:  # of wrong usage, such as a folder with results of something else
+            code = int(stop.code or 0)
+    return _judge_command(words, code, out.getvalue(), err.getvalue(), folder)
+
+
+def _write_sound(above: Path, *, small: bool) -> Path:
+    """A new folder of image, sidecar, camera and terrain: a `small` image with a few points, or a sample.
+
+    The sample is located; beside it there is a picture without a sidecar.
+    """
+    folder = above / "files"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    (folder / "sound.png").write_bytes(_night())
+    facts = {"time_utc": NIGHT, "exposure_s": 1.0}
+    camera = COMMAND_CAMERA
+    if small:
+        (folder / "image.png").write_bytes(_night())
+    else:
+        shutil.copyfile(SAMPLE.with_suffix(".png"), folder / "image.png")
+        facts = json.loads(SAMPLE.with_suffix(".json").read_text())
+        camera = (data_dir("calib") / "fisheye-2048.toml").read_text()
+    (folder / "camera.toml").write_text(camera)
+    (folder / "terrain.toml").write_text(CYLINDER)
+    (folder / "image.json").write_text(json.dumps(facts | {"camera": "camera.toml", "terrain": "terrain.toml"}))
+    (folder / "image.fix.json").write_text(_result_of_sample())
+    (folder / "way.csv").write_text("east_m,north_m\n0,0\n150,0\n")
+    return folder
+
+
+@cache
+def _result_of_sample() -> str:
+    """The record of the sample that is located."""
+    from startrack import locate
+    from startrack.output import result_dict
+
+    return json.dumps(result_dict(locate(SAMPLE.with_suffix(".png")).result))
+
+
+COMMAND_CAMERA = """format = 1
+name = "small"
+size_px = [60, 40]
+focal_px = [30.0, 30.0]
+centre_px = [29.5, 19.5]
+max_angle_deg = 60.0
+[sensor]
+zero_point_e_per_s = 44000.0
+gain_e_per_adu = 0.5
+bias_adu = 100.0
+read_noise_e = 2.5
+"""
+
+
+def _night() -> bytes:
+    """A small picture with some point sources."""
+    import cv2
+
+    y, x = np.mgrid[: FRAME.shape[0], : FRAME.shape[1]]
+    pixels = FRAME.astype(float) / 5
+    for cx, cy in np.random.default_rng(2).uniform(5, 35, (8, 2)):
+        pixels += 900 * np.exp(-0.5 * ((x - cx) ** 2 + (y - cy) ** 2))
+    return bytes(cv2.imencode(".png", pixels.round().astype(np.uint16))[1])
+
+
+def _judge_command(words: list[str], code: int, out: str, err: str, folder: Path) -> str | None:
+    """The reason of a refusal, None for an answer. Raises Broken."""
+    where = f"{words[:2]} code {code}, printed {out[-300:]!r}, {err[-600:]!r}"
+    codes = (0, 2, 3, 4, 5) if words[0] in RESUMED else (0, 3, 4)
+    if code not in codes or any(mark in out + err for mark in ("Traceback", "internal error", "Warning")):
+        raise Broken(where)
+    if any(mark in out + err for mark in OUT_OF_MEMORY):
+        raise MemoryError(where)
+    partial = [path.name for path in folder.rglob("*.part")]
+    if partial:
+        raise Broken(f"{where}: left {partial}")
+    if "--json" not in words or words[0] == "terrain":
+        if code and not 1 <= len((out + err).splitlines()) <= 12:
+            raise Broken(where)
+        return None if code == 0 else "refused"
+    (line,) = out.splitlines()
+    record = json.loads(line)
+    reason = record["reason"]
+    if exit_code_of(reason) != code or (reason and ("\n" in record["message"] or not record["message"])):
+        raise Broken(where)
+    return reason

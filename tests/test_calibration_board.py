@@ -8,6 +8,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 import pytest
+from schema_helpers import check_printed_schema
 from scipy.spatial.transform import Rotation
 
 from startrack.applications.calibration.board import Board, Corners, calibrate_board, find_corners
@@ -161,7 +162,9 @@ def test_the_command(chessboards, tmp_path, capsys):
     words = [str(path) for path in sorted(tmp_path.glob("board*.png"))]
     out = tmp_path / "camera.toml"
     assert main(["calibrate", "board", *words, "--pattern", f"{COLUMNS}x{ROWS}", "-o", str(out), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["status"] == "ok"
+    record = json.loads(capsys.readouterr().out)
+    assert record["status"] == "ok"
+    check_printed_schema("calibration", record)
     assert load_camera(out).focal_px[0] == pytest.approx(190, abs=1.5)
 
 

@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 import pytest
 from astropy.io import fits
+from jsonschema import ValidationError
+from schema_helpers import check_printed_schema
 from scipy.spatial import cKDTree
 
 from startrack.applications.calibration import calibrate
@@ -184,7 +186,9 @@ def test_the_record_of_a_refused_calibration_is_replaced(tmp_path):
     write_exposure(tmp_path / "flat.png", picture)
     for _ in range(2):
         assert main(["calibrate", str(tmp_path / "flat.png"), "--fov", "180", "-o", str(tmp_path / "a.toml")]) == 3
-        assert json.loads((tmp_path / "a.calibration.json").read_text())["status"] == "refused"
+        refused = json.loads((tmp_path / "a.calibration.json").read_text())
+        assert refused["status"] == "refused"
+        check_printed_schema("calibration", refused)
 
 
 def test_mask_and_hot_pixels_of_the_former_calibration_are_removed(cold_calibration, tmp_path):
@@ -268,11 +272,22 @@ def test_every_key_of_the_record_is_explained(written_files):
     assert [key for key in sorted(keys) if f"`{key}`" not in formats] == []
 
 
+def test_the_records_fit_their_schema(written_files):
+    record = json.loads((written_files / "new.calibration.json").read_text())
+    check_printed_schema("calibration", record)
+    for key, wrong in (("camera", {}), ("gates", [{"name": "a"}]), ("format", "startrack.fix/1"), ("refused", None)):
+        with pytest.raises(ValidationError):
+            check_printed_schema("calibration", record | {key: wrong})
+
+
 def test_verify_and_show(written_files, capsys):
     photo, site = str(PHOTO), "--site=34.7443,-111.4223,2361"
     assert main(["calibrate", "verify", photo, "-c", str(written_files / "new.toml"), site, "--json"]) == 0
     record = json.loads(capsys.readouterr().out)
     assert (record["status"], record["image"]) == ("ok", PHOTO.name)
+    check_printed_schema("verification", record)
+    with pytest.raises(ValidationError, match="stars"):
+        check_printed_schema("verification", {key: record[key] for key in record if key != "stars"})
     assert record["map_change_px"] < 0.05
     assert main(["calibrate", "show", str(written_files / "new.toml")]) == 0
     assert "decentring" in capsys.readouterr().out
@@ -365,6 +380,8 @@ def test_verify_finds_what_the_record_states(written_files, exposure, tmp_path, 
     assert "was made with a site" in capsys.readouterr().out
     assert main([*words, "--site=34.7443,111.4223,2361"]) == 3
     assert "stars are below the horizon of this site" in capsys.readouterr().out
+    assert main([*words, "--json", "--site=34.7443,111.4223,2361"]) == 3
+    check_printed_schema("verification", json.loads(capsys.readouterr().out))
     with pytest.raises(SystemExit):
         main(["calibrate", "verify", "--help"])
     assert "verify needs --site too" in " ".join(capsys.readouterr().out.split())
@@ -417,7 +434,7 @@ def test_values_of_flags_beyond_all_limits_are_wrong_usage(words, tmp_path, caps
     flag, value = words.split(" ", 1)
     with pytest.raises(SystemExit) as stopped:
         main(["calibrate", str(tmp_path / "none.png"), f"{flag}={value}" if flag[1] == "-" else flag + value])
-    cause = capsys.readouterr().err.splitlines()[-1]
+    cause = capsys.readouterr().err.splitlines()[0]
     assert stopped.value.code == 2
     assert cause.startswith("startrack calibrate: error: ")
     assert flag.strip("-") in cause or "--output" in cause

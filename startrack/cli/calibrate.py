@@ -88,7 +88,7 @@ def run_board(args: argparse.Namespace) -> int:
             board = calibration.Board(columns, rows, args.charuco, args.marker)
             found = calibration.calibrate_board(exposures, board, name=args.name or out.stem, progress=show_step)
         except NoSolution as cause:
-            record = {"status": "refused", "reason": cause.reason, "message": str(cause), "camera": None}
+            record = calibration.refusal_dict(cause.reason, str(cause))
             return print_outcome(args, record, refusal(cause, printable(out))[1])
     record, line = calibration.board_dict(found), calibration.board_line(found, printable(out))
     if found.accepted:
@@ -116,6 +116,6 @@ def verify(args: argparse.Namespace) -> int:
                 found = calibration.verify(exposure, camera, load_catalog(), site, file_has_site=known)
                 outcome = calibration.verify_dict(found), calibration.verify_line(found)
             except NoSolution as cause:
-                outcome = refusal(cause, exposure.name, image=exposure.name)
+                outcome = refusal(cause, exposure.name, format=calibration.VERIFICATION_FORMAT, image=exposure.name)
         worst = max(worst, print_outcome(args, *outcome))
     return worst

@@ -151,11 +151,16 @@ def _self_test() -> str:
 
 def run_schema(args: argparse.Namespace) -> int:
     """Print a schema; 0, or a usage error for an unknown kind."""
+    from startrack.applications.batch import MANIFEST
+    from startrack.applications.calibration import CALIBRATION, VERIFICATION
     from startrack.applications.prediction import PREDICTION
     from startrack.applications.tracking import TRACK
     from startrack.output import SCHEMAS
 
-    schemas = {**SCHEMAS, "predict": PREDICTION, "track": TRACK}
+    schemas = {
+        **SCHEMAS, "calibration": CALIBRATION, "verification": VERIFICATION, "manifest": MANIFEST,
+        "predict": PREDICTION, "track": TRACK,
+    }  # fmt: skip
     if args.name is None:
         print("\n".join(schemas))
     elif args.name in schemas:

@@ -17,12 +17,20 @@ from startrack.applications.calibration.record import (
 )
 from startrack.applications.calibration.report import write_report
 from startrack.applications.calibration.run import Calibration, calibrate, count_steps
-from startrack.applications.calibration.verify import Verification, verify, verify_dict, verify_line
+from startrack.applications.calibration.schema import CALIBRATION, VERIFICATION
+from startrack.applications.calibration.verify import (
+    VERIFICATION_FORMAT,
+    Verification,
+    verify,
+    verify_dict,
+    verify_line,
+)
 from startrack.estimation.lens_fit import fit_lens
 from startrack.estimation.normal_equations import observations
 
 __all__ = [
-    "Board", "Calibration", "KnownSensor", "Verification", "board_dict", "board_line", "calibrate", "calibrate_board",
-    "calibration_dict", "camera_properties", "camera_summary", "count_steps", "fit_lens", "initial_state",
-    "observations", "refusal_dict", "summary", "verify", "verify_dict", "verify_line", "write_report",
+    "CALIBRATION", "VERIFICATION", "VERIFICATION_FORMAT", "Board", "Calibration", "KnownSensor", "Verification",
+    "board_dict", "board_line", "calibrate", "calibrate_board", "calibration_dict", "camera_properties",
+    "camera_summary", "count_steps", "fit_lens", "initial_state", "observations", "refusal_dict", "summary", "verify",
+    "verify_dict", "verify_line", "write_report",
 ]  # fmt: skip

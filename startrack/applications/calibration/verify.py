@@ -18,6 +18,7 @@ from startrack.core.types import Array, Exposure, NotIdentified
 from startrack.estimation.joint_fit import fit_frames, grow_from_matches
 from startrack.frames import Site
 
+VERIFICATION_FORMAT = "startrack.verification/1"
 ALLOWED_PX = 0.3  # acceptable RMS change of the projection: a tenth of it propagates to the position
 CHANGED_SIGMAS = 3.0
 
@@ -115,7 +116,7 @@ def verify_dict(found: Verification) -> dict[str, Any]:
     """The JSON object of `found`, a verification."""
     old, new = found.camera, found.fresh
     return {
-        "format": "startrack.verification/1",
+        "format": VERIFICATION_FORMAT,
         "image": found.image,
         "status": "ok" if found.is_valid else "refused",
         "reason": None if found.is_valid else "inconsistent_evidence",

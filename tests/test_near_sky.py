@@ -160,6 +160,36 @@ def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "within 2 degrees about RA" in refused["message"] and "and where it points" in refused["message"]
 
 
+def test_locate_takes_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["locate", str(SAMPLES / "near-wall.png"), "--no-plots", "--json", "-D", str(tmp_path)]
+    assert main(words) == 0
+    plain = json.loads(capsys.readouterr().out)
+    ra, dec = (plain["attitude"][key] for key in ("ra_deg", "dec_deg"))
+    assert main([*words, f"--near-sky={ra:.2f},{dec:.2f},3"]) == 0
+    assert json.loads(capsys.readouterr().out)["position"] == plain["position"]
+    assert main([*words, f"--near-sky={ra:.2f},{-dec:.2f},3"]) == 3
+    refused = json.loads(capsys.readouterr().out)
+    assert refused["reason"] == "not_identified" and "within 3 degrees about RA" in refused["message"]
+
+
+def test_batch_takes_it_and_repeats_images_for_another(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    exposure, R = painted(0)
+    (tmp_path / "night").mkdir()
+    write_exposure(tmp_path / "night" / "one.fits", exposure)
+    save_camera(replace(TEN_DEGREES, name="ten"), tmp_path / "ten.toml")
+    words = ["batch", str(tmp_path / "night"), "-c", str(tmp_path / "ten.toml"), "-t", "shackleton-thesis", "-j", "1",
+             "--time", "2030-01-01T00:00:00Z", "-D", str(tmp_path / "out")]  # fmt: skip
+    ra, dec = pointing_deg(R)
+    causes = []
+    for near, kept in ((f"{ra:.9f},{-dec:.2f},3", False), (f"{ra:.9f},{-dec:.2f},3", True),
+                       (f"{ra + 1e-7:.9f},{-dec:.2f},3", False)):  # fmt: skip
+        assert main([*words, f"--near-sky={near}"]) == 5
+        assert ("were there already" in capsys.readouterr().out) == kept
+        causes.append(json.loads((tmp_path / "out" / "one.fix.json").read_text())["message"])
+    assert all("within 3 degrees about RA" in cause for cause in causes)
+    assert "3 degrees" in json.loads((tmp_path / "out" / "manifest.json").read_text())["settings"]["near_sky"]
+
+
 @pytest.mark.parametrize(
     ("value", "cause"),
     [("10,20", "RA,DEC,RADIUS"), ("10,20,x", "not a number"), ("10,20,0", "RADIUS 0"), ("10,20,181", "RADIUS 181"),

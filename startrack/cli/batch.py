@@ -123,7 +123,8 @@ def _tasks(found: Sequence[Image], out: Path, facts: dict[str, Any], args: argpa
         Task(
             name=image.name, path=os.path.abspath(image.path), result=str(batch.record_path(here, image)), facts=facts,
             plots=not args.no_plots, overwrite=args.overwrite, localizer=args.localizer,
-            evidence=args.evidence, near=args.near, near_attitude=near_attitude, bag_image=image.bag_image,
+            evidence=args.evidence, near=args.near, near_attitude=near_attitude, near_sky=args.near_sky,
+            bag_image=image.bag_image,
         )
         for image in found
     ]  # fmt: skip
@@ -241,6 +242,8 @@ def _write_tables(args: argparse.Namespace, out: Path, tasks: Sequence[Task], re
     near: dict[str, Any] = {} if args.near is None else {"near": list(args.near)}
     if args.near_attitude is not None:
         near["near_attitude"] = Path(args.near_attitude).name
+    if args.near_sky is not None:
+        near["near_sky"] = str(args.near_sky)
     rows = batch.table_rows(tasks, {record["image"]: record for record in records}, os.path.abspath(out))
     batch.write_tables(out, rows.rows, {**of_flags, **method, **near, "plots": not args.no_plots})
     lacking = {

@@ -199,7 +199,8 @@ NEAR_SKY = flag(
     "DEC; fewer stars suffice (--near-sky=-10,...)",
     near_sky,
 )
-METHOD = (LOCALIZER, EVIDENCE, NEAR, NEAR_ATTITUDE)
+POINTING = Either((NEAR_ATTITUDE, NEAR_SKY))
+METHOD = (LOCALIZER, EVIDENCE, NEAR, POINTING)
 
 ODOMETRY = (
     flag("--odometry-sigma F", "error of a move on each horizontal axis, relative", amount, default=ODOMETRY_SIGMA),

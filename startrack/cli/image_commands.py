@@ -55,7 +55,7 @@ COMMANDS = (
                     lambda text: fields_of_view_rad(text, NARROWEST_DEG, WIDEST_DEG),
                 ),
             ),
-            "method": (Either((flags.NEAR_ATTITUDE, flags.NEAR_SKY)),),
+            "method": (flags.POINTING,),
             "output": (
                 *flags.OUTPUT,
                 flag("--catalog-table", "list in NAME.stars.ecsv the stars in the frame that were not identified too"),

@@ -41,8 +41,9 @@ def locate(args: argparse.Namespace) -> int:
     check_localizer(args)
     near = None if args.near is None else PositionPrior(*args.near)
     settings = chain.Settings(
-        localizer=args.localizer, evidence_sources=args.evidence, near=near, near_attitude=near_attitude_of(args)
-    )
+        identifier=Identifier(near_sky=args.near_sky), localizer=args.localizer, evidence_sources=args.evidence,
+        near=near, near_attitude=near_attitude_of(args),
+    )  # fmt: skip
     code = _run_images(args, "fix", lambda exposure, _: chain.locate_exposure(exposure, settings))
     if args.report:
         write_page_of_images(args.dir, args.images)

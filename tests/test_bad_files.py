@@ -236,7 +236,7 @@ def test_an_output_path_at_fault_is_wrong_usage(tmp_path, capsys, words, fault):
         code = end.code
     out, err = capsys.readouterr()
     assert (code, out) == (2, "")
-    assert "error: " in err.splitlines()[-1] and "Traceback" not in err
+    assert "error: " in err.splitlines()[0] and "Traceback" not in err
     assert sorted(tmp_path.rglob("*")) == before
     assert (tmp_path / f"existing{suffix}").read_text() == "before"
 

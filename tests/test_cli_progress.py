@@ -13,6 +13,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from render_helpers import FISHEYE
 from scipy.spatial.transform import Rotation
 
@@ -84,6 +85,22 @@ def test_expected_stars_are_those_in_the_frame_of_a_clear_sky():
     assert min(counts) > 100
     expected = count_expected_stars(detected, FISHEYE, stars)
     assert expected == pytest.approx(np.mean(counts), rel=0.05)
+
+
+@pytest.mark.parametrize("noise_steps", [0.2, 1.0])
+def test_a_picture_whose_rounding_hides_stars_is_told_from_a_noisy_one(tmp_path, capsys, noise_steps):
+    """A few stars on a dim sky in 8 bits: what helps is finer values, and only where the rounding rules."""
+    rng = np.random.default_rng(5)
+    image, field = np.full((400, 400), 3.0), np.mgrid[:400, :400]
+    for y, x in rng.uniform(20, 380, (9, 2)):
+        image += 60 * np.exp(-0.5 * ((field[0] - y) ** 2 + (field[1] - x) ** 2) / 2.0**2)
+    image += rng.normal(0, noise_steps, image.shape)
+    Image.fromarray(image.round().clip(0, 255).astype(np.uint8)).save(tmp_path / "dim.jpg", quality=95)
+    words = ["--fov", "120", "-D", str(tmp_path), "--no-plots"]
+    assert main(["identify", str(tmp_path / "dim.jpg"), *words]) == 3
+    (line,) = capsys.readouterr().out.splitlines()
+    assert ("below half a step of the pixel values" in line and "raw or 16-bit" in line) == (noise_steps < 0.5)
+    assert line.endswith("moonlight or twilight?") == (noise_steps > 0.5)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NoReturn
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: a second thread waits for work, 0.2 s a start
 
@@ -110,7 +110,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser, also of each command, that reports unknown arguments with its own usage.
+    """A parser, also of each command, that reports wrong usage, unknown arguments too, in a line and names its help.
 
     A list of numbers that begins with a minus sign is a value, not a flag: --near -3000,1500,200.
     """
@@ -125,6 +125,10 @@ class _Parser(argparse.ArgumentParser):
         if unknown:
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return found, unknown
+
+    def error(self, message: str) -> NoReturn:
+        """Print the `message` and the command that shows the usage, and exit."""
+        self.exit(USAGE, f"{self.prog}: error: {message}\ntry '{self.prog} --help'\n")
 
 
 @contextmanager

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from render_helpers import FISHEYE
 
-from startrack.applications.calibration.static_parts import PredictedStars, obstructed_cells
+from startrack.applications.calibration.static_parts import PredictedStars, find_obstructed
 from startrack.camera import load_camera, save_camera
 from startrack.catalog import StarCatalog, load_catalog
 from startrack.chain import Located, are_unchanged, input_hashes, pipeline
 from startrack.cli.main import main
-from startrack.core.types import BadInput, Bools, Exposure
+from startrack.core.types import Array, BadInput, Bools, Exposure
 from startrack.detection import Detector
 from startrack.detection.damage import fill_masked
 from startrack.exposure import (
@@ -230,36 +230,55 @@ def predicted_stars(rng: np.random.Generator, hidden: Bools, rate: float, count:
     height, width = hidden.shape
     xy_px = rng.uniform(0, [width - 1, height - 1], (count, 2))
     columns, rows = np.rint(xy_px).astype(int).T
-    found = (rng.random(count) < rate) & ~hidden[rows, columns]
-    return PredictedStars(np.arange(count), xy_px, found, np.full(count, rate))
+    return PredictedStars(np.arange(count), xy_px, (rng.random(count) < rate) & ~hidden[rows, columns])
 
 
-def test_open_sky_is_hardly_ever_proposed_for_the_mask():
+def light_1(rng: np.random.Generator, hidden: Bools, level_1: float) -> Array:
+    """The light of an uneven sky (H, W) about 1, and `level_1` of it where it is hidden."""
+    return np.where(hidden, level_1, 1.0) * rng.normal(1.0, 0.1, hidden.shape)
+
+
+@pytest.mark.parametrize("darkest", [0.0, 0.7])
+def test_open_sky_is_hardly_ever_proposed_for_the_mask(darkest):
+    """However dark it is."""
     rng, size = np.random.default_rng(8), (1024, 1024)
     nothing = np.zeros(size, dtype=bool)
-    wrong = [obstructed_cells(predicted_stars(rng, nothing, 0.8), ~nothing).any() for _ in range(60)]
+    lights = [rng.uniform(darkest, 1.0, size) for _ in range(60)]
+    wrong = [find_obstructed(predicted_stars(rng, nothing, 0.8), light).any() for light in lights]
     assert sum(wrong) <= 3  # 0.6 expected at most; more than 3 in 0.3 % of such tests
 
 
-def test_what_never_shows_a_star_is_proposed_for_the_mask():
-    size = (1024, 1024)
-    hidden = mast(size, 100)
-    found = obstructed_cells(predicted_stars(np.random.default_rng(9), hidden, 0.9), np.ones(size, dtype=bool))
+@pytest.mark.parametrize("level_1", [0.05, 0.3])
+def test_what_is_dark_and_shows_no_star_is_proposed_and_its_outline_followed(level_1):
+    rng, hidden = np.random.default_rng(9), mast((1024, 1024), 100)
+    stars, light = predicted_stars(rng, hidden, 0.9), light_1(rng, hidden, level_1)
+    found = find_obstructed(stars, light)
     assert np.mean(found[hidden]) > 0.8
-    assert np.count_nonzero(found & ~hidden) < 0.2 * np.count_nonzero(hidden)
+    assert not np.any(found & ~hidden)
+
+
+def test_few_stars_are_no_proof():
+    rng, hidden = np.random.default_rng(9), mast((1024, 1024), 100)
+    light = light_1(rng, hidden, 0.2)
+    assert not find_obstructed(predicted_stars(rng, hidden, 0.9, count=40), light).any()
+    assert find_obstructed(predicted_stars(rng, hidden, 0.9, count=400), light).any()
 
 
 def test_one_star_missed_in_every_frame_is_no_obstruction():
-    many = 500
-    same = PredictedStars(np.zeros(many, int), np.full((many, 2), 300.0), np.zeros(many, bool), np.full(many, 0.9))
-    assert not obstructed_cells(same, np.ones((512, 512), dtype=bool)).any()
+    rng, hidden = np.random.default_rng(9), mast((1024, 1024), 100)
+    stars, light = predicted_stars(rng, hidden, 0.9, count=2_000), light_1(rng, hidden, 0.2)
+    columns, rows = np.rint(stars.xy_px).astype(int).T
+    behind = hidden[rows, columns]
+    beside = 616.0 + rng.uniform(-5.0, 5.0, stars.xy_px.shape)
+    one = replace(stars, star=np.where(behind, 1, stars.star), xy_px=np.where(behind[:, None], beside, stars.xy_px))
+    assert behind.sum() > 50
+    assert find_obstructed(stars, light).any()
+    assert not find_obstructed(one, light).any()
 
 
-def test_what_is_as_bright_as_the_sky_is_not_proposed_and_a_dark_outline_is_followed():
-    size = (1024, 1024)
-    hidden = mast(size, 100)
-    stars = predicted_stars(np.random.default_rng(9), hidden, 0.9)
-    assert not obstructed_cells(stars, np.zeros(size, dtype=bool)).any()
-    found = obstructed_cells(stars, hidden)
-    assert np.mean(found[hidden]) > 0.8
-    assert not np.any(found & ~hidden)
+def test_what_is_as_bright_as_the_sky_is_not_proposed():
+    rng, hidden = np.random.default_rng(9), mast((1024, 1024), 100)
+    stars = predicted_stars(rng, hidden, 0.9)
+    assert not find_obstructed(stars, np.ones(hidden.shape)).any()
+    assert not find_obstructed(stars, light_1(rng, hidden, 0.8)).any()
+    assert not find_obstructed(stars, light_1(rng, ~hidden, 0.2)).any()  # the open sky is the darker part

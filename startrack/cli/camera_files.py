@@ -172,7 +172,7 @@ def write_camera(camera_file: Path, found: Calibration, used_masks: Iterable[str
     pixels = np.where(found.obstructed, 0.0, 255.0).astype(np.float32)
     write_exposure(path, Exposure(pixels_adu=pixels, saturation_adu=255.0), overwrite=True)
     return (
-        f"{path.name}: {100 * found.obstructed.mean():.1f} % of the pixels are dark in places that never show a star; "
+        f"{path.name}: {100 * found.obstructed.mean():.1f} % of the pixels are too dark to be open sky; "
         f'it is not used unless {camera_file.name} has the line mask = "{path.name}" above its first [table]'
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial, reduce
 
 import numpy as np
@@ -12,7 +12,7 @@ from startrack.camera import Camera
 from startrack.core.runner import map_in_threads
 from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Bools, Ints
-from startrack.estimation.frame_matching import Frame, match_frames
+from startrack.estimation.frame_matching import BrightStars, Frame, match_frames
 from startrack.estimation.joint_fit import JointFit
 from startrack.exposure import combine_masks
 
@@ -22,14 +22,13 @@ HOT_SIGMA = 8.0
 MAX_HOT_PIXELS = 20_000
 STAR_RADIUS_PX = 3
 BESIDE = np.array([[0, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0]])  # twice the mean of the four
-CELLS_PX = (128, 64, 32, 16)  # sides; the smallest that have enough stars trace the outline
-MAX_RATE_1 = 0.95  # of bright stars that are detected where the sky is open: variable stars, and errors of catalogues
-MIN_RATE_1 = 0.8  # of a frame that is used: on clear dark nights 0.88 to 0.93, under clouds 0.58 to 0.73
 SKY_RING_1 = 0.03  # width of the rings about the axis, in focal lengths
-DARKER_1 = 0.7  # part of the sky's light at the same angle: trees 0 to 0.65, clouds from 0.93
-LEAST_DARK_1 = 0.25  # part of a cell that is as dark
 LIGHT_SMOOTH_PX = 5  # odd, 5 at most: of the light
-FALSE_ALARM = 0.01  # expected cells of open sky without a star, all tests of a calibration together
+SPOT_PX = 9  # narrower dark spots are noise: 1.6 times the sky's light a pixel masks 0.05 % of open sky (5 px: 0.6 %)
+PLACE_PX = 16  # a star that stays within such a square is one star, however many frames show it
+HALF_1 = 0.5  # of the sky's light: a pixel with more is more sky than obstacle; 1 in 1,000 stars are at less than 0.57
+SHOWN_1 = 0.03  # of bright stars behind trees, found through gaps: 2 of 57 at light below 0.4, four clear nights
+WRONG_1 = 0.001  # largest probability of open sky at a pixel that is proposed
 
 
 def has_turned(one: Array, other: Array, size_px: tuple[int, int]) -> bool:
@@ -97,81 +96,102 @@ class PredictedStars:
     star: Ints  # a number of the star
     xy_px: Array  # (n, 2)
     found: Bools
-    rate: Array  # of such stars detected under the open sky of the frame
+
+    def once(self) -> PredictedStars:
+        """Each star once at each place, found if a frame shows it there."""
+        key = np.column_stack([self.star, (self.xy_px // PLACE_PX).astype(np.int64)])
+        places, first, place = np.unique(key, axis=0, return_index=True, return_inverse=True)
+        found = np.bincount(place.ravel(), self.found, len(places)) > 0
+        return PredictedStars(self.star[first], self.xy_px[first], found)
+
+    def light_1(self, light_1: Array) -> Array:
+        """The light (n,) at the stars, of an image `light_1` (H, W)."""
+        column, row = np.rint(self.xy_px).astype(np.int64).T
+        return light_1[row, column]
 
 
 def find_obstructions(joint: JointFit, frames: Sequence[Frame], level_adu: float | None) -> tuple[Bools | None, str]:
-    """Dark pixels (H, W) in cells that never show a star, None where there are none; and why nothing can be said.
+    """Pixels (H, W) so dark that no star is seen behind them, None where there are none; and why nothing can be said.
 
     `frames` are those of the `joint` fit with all their sources, `level_adu` that without light. Bright stars count,
-    those in masked pixels do not, and frames under clouds are left out.
+    those in masked pixels do not, and frames are left out whose missing stars stand together under bright sky.
     """
-    camera, dark = joint.fit.camera, []
+    camera, parts, total = joint.fit.camera, list[PredictedStars](), np.zeros(joint.fit.camera.size_px[::-1])
     if level_adu is None:
         return None, "the level without light is not known: give --bias"
-    parts = [(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0))]
+    off_axis_1 = _off_axis_1(camera)
     matches = match_frames(frames, camera, joint.fit.R_cam_icrs, camera.calibrated_angle_rad, joint.gate_px)
     for frame, matched in zip(frames, matches, strict=True):
-        bright = matched.bright
-        if bright.rate < MIN_RATE_1:
-            continue
-        mask = combine_masks(frame.exposure.mask, None, camera.size_px, frame.exposure.correction)
-        column, row = np.rint(bright.xy_px).astype(np.int64).T
-        counts = np.ones(len(row), dtype=bool) if mask is None else ~mask.masked[row, column]
-        hip = frame.sky.stars.hip[bright.star[counts]]
-        parts.append((hip, bright.xy_px[counts], bright.found[counts], np.full(len(hip), min(bright.rate, MAX_RATE_1))))
-        dark.append(_light_part(frame, camera, level_adu) < DARKER_1)
-    if not dark:
-        return None, f"no picture shows {100 * MIN_RATE_1:.0f} % of its bright stars: a clear, dark night is needed"
-    predicted = PredictedStars(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    obstructed = obstructed_cells(predicted, np.asarray(np.mean(dark, axis=0) > 0.5))
+        stars, light_1 = _unmasked_stars(frame, matched.bright, camera), _light_1(frame, off_axis_1, level_adu)
+        if _is_clear(stars, light_1):
+            parts.append(stars)
+            total += light_1
+    if not parts:
+        return None, "in no picture most stars beside a missing star are seen: a clear, dark night is needed"
+    predicted = PredictedStars(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(parts[0])))
+    beyond = off_axis_1 > float(camera.lens.rho(np.array(camera.calibrated_angle_rad)))
+    obstructed = find_obstructed(predicted, np.where(beyond, np.inf, total / len(parts)))
     return obstructed if obstructed.any() else None, ""
 
 
-def _light_part(frame: Frame, camera: Camera, level_adu: float) -> Array:
-    """The light (H, W) of a frame above `level_adu`, smoothed, over its median in rings about the axis."""
+def _unmasked_stars(frame: Frame, bright: BrightStars, camera: Camera) -> PredictedStars:
+    """The `bright` stars of a frame that no mask hides."""
+    mask = combine_masks(frame.exposure.mask, None, camera.size_px, frame.exposure.correction)
+    column, row = np.rint(bright.xy_px).astype(np.int64).T
+    counts = np.ones(len(row), dtype=bool) if mask is None else ~mask.masked[row, column]
+    return PredictedStars(frame.sky.stars.hip[bright.star[counts]], bright.xy_px[counts], bright.found[counts])
+
+
+def _is_clear(stars: PredictedStars, light_1: Array) -> bool:
+    """Whether most stars of a frame beside a missed one are found, where the sky has more than its median light.
+
+    Clouds and the Moon hide neighbours together. Obstacles do, too, but they are darker.
+    """
+    from scipy.spatial import cKDTree
+
+    if len(stars.found) < 2:
+        return False
+    nearest = cKDTree(stars.xy_px).query(stars.xy_px, k=2)[1][:, 1]
+    beside_missed = stars.found[~stars.found[nearest] & (stars.light_1(light_1) > 1.0)]
+    return bool(2 * np.count_nonzero(beside_missed) >= len(beside_missed))
+
+
+def _off_axis_1(camera: Camera) -> Array:
+    """Distance of the pixels (H, W) from the centre, in focal lengths."""
+    x, y = ((np.arange(n) - c) / f for n, c, f in zip(camera.size_px, camera.centre_px, camera.focal_px, strict=True))
+    return np.hypot(x, y[:, None])
+
+
+def _light_1(frame: Frame, off_axis_1: Array, level_adu: float) -> Array:
+    """The light (H, W) of a frame above `level_adu`, without small spots, over its median in rings about the axis."""
     import cv2
     from scipy.ndimage import median
 
     light = cv2.medianBlur(np.asarray(frame.exposure.pixels_adu, dtype=np.float32), LIGHT_SMOOTH_PX) - level_adu
-    height, width = light.shape
-    x, y = ((np.arange(n) - c) / f for n, c, f in zip((width, height), camera.centre_px, camera.focal_px, strict=True))
-    ring = (np.hypot(x, y[:, None]) / SKY_RING_1).astype(np.int64)
+    spot = np.ones((SPOT_PX, SPOT_PX), np.uint8)
+    light = np.asarray(cv2.morphologyEx(light, cv2.MORPH_CLOSE, spot), dtype=np.float64)
+    ring = (off_axis_1 / SKY_RING_1).astype(np.int64)
     sky = np.asarray(median(light, ring, np.arange(ring.max() + 1)))[ring]
     return np.asarray(np.divide(light, sky, out=np.ones_like(sky), where=sky > 0))
 
 
-def obstructed_cells(predicted: PredictedStars, dark: Bools) -> Bools:
-    """The `dark` pixels of an image (H, W) in cells where the `predicted` stars are missing.
+def find_obstructed(predicted: PredictedStars, light_1: Array) -> Bools:
+    """The pixels (H, W) that are open sky with a probability below WRONG_1.
 
-    In a cell of open sky each bright star i, counted once however many frames show it there, is missed with probability
-    1 - p_i, where p_i is the rate of detected bright stars in the frame's open sky. The probability that all are missed
-    is the product P. The cell is obstructed where no star is found, P times the number of cells tested is below
-    FALSE_ALARM, and LEAST_DARK_1 of it is dark. Squares of several sides are tested, each at four offsets, and the dark
-    pixels of the obstructed ones joined.
+    `light_1` (H, W) is the light of the pixels as a part of the sky's. Pixels darker than a limit are obstructed. The
+    limit is unknown: there is none, or it lies anywhere from 0 to HALF_1, with equal probabilities. The `predicted`
+    stars decide: of those behind an obstacle SHOWN_1 are found, of the others a part that is unknown. A pixel is open
+    with the probability that the limit is darker than the pixel.
     """
-    obstructed = np.zeros_like(dark)
-    grids = [(side, dx, dy) for side in CELLS_PX for dx in (0, side // 2) for dy in (0, side // 2)]
-    tests = [_test_cells(predicted, *grid, dark.shape[1]) for grid in grids]
-    limit = np.log(FALSE_ALARM / max(sum(len(log_p) for _, log_p in tests), 1))
-    for (side, dx, dy), (corners, log_p) in zip(grids, tests, strict=True):
-        for x, y in corners[log_p < limit].tolist():
-            cell = np.s_[max(y - dy, 0) : y - dy + side, max(x - dx, 0) : x - dx + side]
-            if dark[cell].mean() >= LEAST_DARK_1:
-                obstructed[cell] |= dark[cell]
-    return obstructed
+    from scipy.special import betaln
 
-
-def _test_cells(predicted: PredictedStars, side: int, dx: int, dy: int, width: int) -> tuple[Ints, Array]:
-    """Upper left corners (m, 2) of the cells with stars, shifted by (dx, dy), and log P (m,); 0 where one is found."""
-    column, row = np.rint(predicted.xy_px).astype(np.int64).T
-    column, row = (column + dx) // side, (row + dy) // side
-    columns = width // side + 2
-    stars = int(predicted.star.max(initial=0)) + 1
-    key = (row * columns + column) * stars + predicted.star
-    pairs, first, pair = np.unique(key, return_index=True, return_inverse=True)
-    found = np.bincount(pair, predicted.found, len(pairs)) > 0
-    cells, cell = np.unique(pairs // stars, return_inverse=True)
-    log_p = np.asarray(np.bincount(cell, np.log1p(-predicted.rate[first]), len(cells)), dtype=np.float64)
-    log_p[np.bincount(cell, found, len(cells)) > 0] = 0.0
-    return np.stack([cells % columns, cells // columns], axis=1).astype(np.int64) * side, log_p
+    stars = predicted.once()
+    at_star = np.clip(stars.light_1(light_1), 0.0, HALF_1)
+    order = np.argsort(at_star, kind="stable")
+    limit_1 = np.concatenate([[0.0], at_star[order], [HALF_1]])
+    found, missed = (np.concatenate([[0], np.cumsum(stars.found[order] == seen)]) for seen in (True, False))
+    log_p = found * np.log(SHOWN_1) + missed * np.log1p(-SHOWN_1)  # limits between two stars
+    log_p += betaln(1 + found[-1] - found, 1 + missed[-1] - missed)
+    p = np.exp(log_p - log_p.max())
+    darker = np.cumsum(np.concatenate([HALF_1 * p[:1], np.diff(limit_1) * p]))  # p[0] is that of no limit
+    return np.asarray(np.interp(light_1, limit_1, darker / darker[-1]) < WRONG_1)

@@ -58,14 +58,17 @@ class Decentring:
         """
         if not self:
             return uv
-        centred = uv
+        wanted = uv.reshape(-1, 2)
+        found, moving = wanted.copy(), np.arange(len(wanted))  # those near the law's turning point move longest
         for _ in range(MAX_DECENTRING_STEPS):
-            rho = np.hypot(centred[..., 0], centred[..., 1])
-            st = centred * (angle_rad(rho) / np.where(rho > 0, rho, 1.0))[..., None]
-            before, centred = centred, uv - self.shift(st)
-            if np.max(np.abs(centred - before), initial=0.0) < DECENTRING_TOLERANCE_1:
+            centred = found[moving]
+            rho = np.hypot(centred[:, 0], centred[:, 1])
+            st = centred * (angle_rad(rho) / np.where(rho > 0, rho, 1.0))[:, None]
+            found[moving] = wanted[moving] - self.shift(st)
+            moving = moving[np.abs(found[moving] - centred).max(axis=1) >= DECENTRING_TOLERANCE_1]
+            if not len(moving):
                 break
-        return centred
+        return found.reshape(uv.shape)
 
 
 @dataclass(frozen=True, kw_only=True)

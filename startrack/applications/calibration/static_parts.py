@@ -23,6 +23,7 @@ MAX_HOT_PIXELS = 20_000
 STAR_RADIUS_PX = 3
 BESIDE = np.array([[0, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0]])  # twice the mean of the four
 SKY_RING_1 = 0.03  # width of the rings about the axis, in focal lengths
+RING_EVERY_PX = 3  # of the pixels in rows and columns that give a ring's median
 LIGHT_SMOOTH_PX = 5  # odd, 5 at most: of the light
 SPOT_PX = 9  # narrower dark spots are noise: 1.6 times the sky's light a pixel masks 0.05 % of open sky (5 px: 0.6 %)
 PLACE_PX = 16  # a star that stays within such a square is one star, however many frames show it
@@ -82,7 +83,7 @@ def _excess_sigmas(joint: JointFit, i: int) -> Array:
     excess = image - cv2.medianBlur(image, 5)
     noise = robust_sigma(excess[::3, ::3], 0.0) or 1.0
     # The light of a star or planet spreads over neighbouring pixels, that of a hot pixel does not.
-    sigmas = np.asarray((excess - cv2.filter2D(np.maximum(excess, 0.0), -1, BESIDE)) / noise, dtype=np.float64)
+    sigmas = np.asarray((excess - cv2.filter2D(np.maximum(excess, 0.0), -1, BESIDE)) / np.float32(noise))
     reach = STAR_RADIUS_PX
     for x, y in np.rint(frame.sources.xy_px[joint.matches[i].detection]).astype(int).tolist():
         sigmas[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1] = 0.0
@@ -121,8 +122,9 @@ def find_obstructions(joint: JointFit, frames: Sequence[Frame], level_adu: float
         return None, "the level without light is not known: give --bias"
     off_axis_1 = _off_axis_1(camera)
     matches = match_frames(frames, camera, joint.fit.R_cam_icrs, camera.calibrated_angle_rad, joint.gate_px)
-    for frame, matched in zip(frames, matches, strict=True):
-        stars, light_1 = _unmasked_stars(frame, matched.bright, camera), _light_1(frame, off_axis_1, level_adu)
+    lights = map_in_threads(lambda frame: _light_1(frame, off_axis_1, level_adu), frames)
+    for frame, matched, light_1 in zip(frames, matches, lights, strict=True):
+        stars = _unmasked_stars(frame, matched.bright, camera)
         if _is_clear(stars, light_1):
             parts.append(stars)
             total += light_1
@@ -171,7 +173,8 @@ def _light_1(frame: Frame, off_axis_1: Array, level_adu: float) -> Array:
     spot = np.ones((SPOT_PX, SPOT_PX), np.uint8)
     light = np.asarray(cv2.morphologyEx(light, cv2.MORPH_CLOSE, spot), dtype=np.float64)
     ring = (off_axis_1 / SKY_RING_1).astype(np.int64)
-    sky = np.asarray(median(light, ring, np.arange(ring.max() + 1)))[ring]
+    some = np.s_[::RING_EVERY_PX, ::RING_EVERY_PX]
+    sky = np.asarray(median(light[some], ring[some], np.arange(ring.max() + 1)))[ring]
     return np.asarray(np.divide(light, sky, out=np.ones_like(sky), where=sky > 0))
 
 

@@ -81,7 +81,7 @@ def test_a_wrong_site_or_time_shows_stars_below_the_horizon(exposure, signs, hou
     found = calibrate([picture], load_catalog().brighter_than(8.0), camera=load_camera("lowell-ldt"), site=site)
     (check,) = (one for one in found.checks if "below the horizon" in one.name)
     assert check.passed == found.accepted == (signs == (1, 1) and hours == 0)
-    assert check.reason == "inconsistent_evidence" and "--site (signs) and the time" in check.advice
+    assert check.reason == "inconsistent_evidence" and "--site (signs) and the time (is it UTC?)" in check.advice
     if check.passed:
         assert check.value == 0
     else:

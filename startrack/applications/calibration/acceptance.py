@@ -218,5 +218,5 @@ def horizon_checks(joint: JointFit, catalog: StarCatalog, site: Site | None) -> 
         Check("part of stars below the horizon", part, f"<= {MOST_BELOW_PART}",
               by_chance > np.log(MAX_FALSE_ALARM) or part <= MOST_BELOW_PART, "inconsistent_evidence",
               f"{below} of {len(matched)} stars are "
-              "below the horizon of this site at this time: check --site (signs) and the time"),
+              "below the horizon of this site at this time: check --site (signs) and the time (is it UTC?)"),
     )  # fmt: skip

@@ -125,7 +125,7 @@ def _require_above_horizon(one: Oriented, site: Site) -> None:
         raise BadInput(
             "inconsistent_evidence",
             f"{one.exposure.name}: {below} of {len(rays)} identified stars are below the horizon of this site at this "
-            "time: check --site (signs) and --time",
+            "time: check --site (signs) and --time (is it UTC?)",
         )
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from startrack.frames import Site
 from startrack.terrain import NO_POST, STEREOGRAPHIC, ExpectedCrests, HeightMap, Projection, Raster
+from startrack.terrain.crest_kernel import take_larger
 
 SITE = Site("moon", -1.5, 0.3, 0.0)
 POSTS, POST_M, SIGMA_M = 61, 60.0, 4.0
@@ -100,3 +101,15 @@ def test_small_errors_leave_the_skyline_of_the_map():
 
 def test_exact_ground_has_no_such_moments():
     assert basin(0.0).expected_crests(CAMERA_M, AZIMUTHS) is None
+
+
+def test_a_tangent_of_no_posts_is_none_whatever_its_memory_holds():
+    """Memory with nan made every position on a map with errors of posts impossible, mostly at the first use."""
+    numbers = np.full((2, 4), np.nan)
+    numbers[:, 3] = 0.0, 2.0
+    numbers[1, :3] = 0.3, 1e-6, 0.01
+    posts, responses = np.array([[7, 8, 9], [4, 5, 6]]), np.array([[np.nan] * 3, [0.01, 0.02, np.nan]])
+    take_larger(numbers, posts, responses, 0, 1, 0.5)
+    np.testing.assert_allclose(numbers[0], numbers[1], rtol=1e-12)
+    np.testing.assert_array_equal(posts[0, :2], [4, 5])
+    np.testing.assert_allclose(responses[0, :2], [0.01, 0.02])

@@ -143,6 +143,8 @@ def take_larger(numbers, posts_of, responses, into, other, sigma):
     square, common, whole = 0.0, 0.0, 0.0
     used, count = int(numbers[into, USED]), int(numbers[other, USED])
     post, response = posts_of[into], responses[into]
+    if used == 0:
+        numbers[into] = 0.0
     for i in range(count):
         square += responses[other, i] ** 2
         for j in range(used):

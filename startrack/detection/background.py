@@ -137,7 +137,7 @@ def _scale_weights() -> Image:
 
 
 def smallest_step(image: Image) -> float:
-    """Smallest step between pixel values: the noise cannot be below its rounding error."""
+    """Smallest step between the values of an `image` (H, W): the noise cannot be below its rounding error."""
     values = np.unique(image[:: max(1, image.shape[0] // 64), :: max(1, image.shape[1] // 64)])
     step = float(np.diff(values).min()) if len(values) > 1 else 1.0
     return max(step, 1e-6)

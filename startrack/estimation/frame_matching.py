@@ -76,7 +76,6 @@ class BrightStars:
     star: Ints  # indices into the frame's sky
     xy_px: Array  # (n, 2)
     found: Bools  # whether there is a source of equal brightness
-    rate: float  # of those found where the sky is open
 
 
 @dataclass(frozen=True)
@@ -123,11 +122,10 @@ def match_frame(frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: flo
     )  # fmt: skip
     faintest = float(np.quantile(source_mag[detection], LIMIT_QUANTILE)) if len(detection) else -np.inf
     bright = seen[star_mag[seen] < faintest - DEPTH_BELOW_THRESHOLD_MAG]
-    is_open = _is_open_sky(px[bright], found.xy_px[detection], frame.exposure.size_px)
+    expected = bright[_is_open_sky(px[bright], found.xy_px[detection], frame.exposure.size_px)]
     both = np.concatenate([star, bright])
     is_alone = is_isolated(px[both], both, px, seen, stars.v_mag, BLENDED_SIGMAS * found.psf_sigma_px, BLENDED_MAG)
-    alone, single = is_alone[: len(star)], is_alone[len(star) :]
-    expected, rate = bright[is_open], np.isin(bright[single & is_open], star)
+    alone, single = is_alone[: len(star)], bright[is_alone[len(star) :]]
     significant = (camera.angle_rad(found.xy_px) < within_rad) & (source_mag < faintest - DEPTH_BELOW_THRESHOLD_MAG)
     return FrameMatches(
         detection=detection[alone],
@@ -136,9 +134,7 @@ def match_frame(frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: flo
         expected_found=int(np.isin(expected, star).sum()),
         significant=int(significant.sum()),
         significant_matched=int(np.count_nonzero(significant[detection])),
-        bright=BrightStars(
-            bright[single], px[bright[single]], np.isin(bright[single], star), float(rate.sum() / max(len(rate), 1))
-        ),
+        bright=BrightStars(single, px[single], np.isin(single, star)),
     )
 
 

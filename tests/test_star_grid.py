@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -64,3 +66,19 @@ def test_triangles_are_those_of_a_tree(field_sr: float) -> None:
     assert set(zip(row.tolist(), triangle.tolist(), strict=True)) == expected
     off = np.abs(some[row] - index.sides[triangle]).max(axis=1) / some[row, 0]
     assert (np.diff(off) >= 0).all()
+
+
+def test_a_lookup_within_a_large_tolerance_takes_bounded_memory() -> None:
+    """A camera file of another lens makes tolerances so large that each triangle agrees with thousands of others."""
+    index = CatalogPatterns(sky(), 0.2).deep_index
+    row = np.random.default_rng(8).choice(len(index.sides), 20_000, replace=False)
+    wanted = index.sides[row] * (1.0 + 1e-9)
+    tracemalloc.start()
+    try:
+        left, right = index.candidates(wanted, 0.1 * index.longest_chord, 1)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 200e6
+    exact = left[right == row[left]]
+    assert len(exact) > 0.999 * len(row)

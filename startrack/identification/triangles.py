@@ -18,6 +18,7 @@ PAIRS_WANTED = 180_000
 DEEPEST_PAIR = 5000
 WIDEST_PAIR_RAD = np.radians(110.0)
 CUBE_DIAGONAL = 3.0**0.5  # of differences of three sides, to the largest of them
+MOST_PAIRS_BY_CHANCE = 500_000  # of one lookup; a fisheye of 2048 pixels has 200,000 with a rough calibration
 NARROWEST_PAIR_1 = 0.07  # of the widest; closer pairs determine the roll poorly
 
 
@@ -146,8 +147,11 @@ class PatternIndex:
     def candidates(self, sides: Array, tolerance: float, most: int) -> tuple[Ints, Ints]:
         """Pairs (row of the sides (m, 3), triangle) that agree within the tolerance, best relative agreement first.
 
-        At most `most` for each row, those that agree best.
+        At most `most` for each row, those that agree best. Where chance alone would give more than
+        MOST_PAIRS_BY_CHANCE, the tolerance is smaller: the pairs that agree less than so many others decide nothing.
         """
+        density = len(sides) * len(self.sides) / MOST_PAIRS_BY_CHANCE  # sides spread over an eighth of the cube
+        tolerance = min(tolerance, 0.25 * self.longest_chord / max(density, 1.0) ** (1 / 3))
         reach = CUBE_DIAGONAL * tolerance * 2.0 / self.longest_chord
         near = self.grid.neighbours(to_cube(sides, self.longest_chord), reach)
         off = largest_differences(sides, self.sides, near.ray, near.star, tolerance)

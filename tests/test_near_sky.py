@@ -17,8 +17,11 @@ from startrack.cli.main import main
 from startrack.core.types import Exposure, Identification, NotIdentified
 from startrack.exposure import write_exposure
 from startrack.frames import angle_between_rad
-from startrack.identification import Identifier, NearSky
+from startrack.identification import Identifier, NearSky, identify_unknown_lens
 from startrack.identification.attitude_search import MIN_MATCHES, MIN_MATCHES_NEAR_SKY
+from startrack.identification.hypotheses import HypothesisSearch, Window
+from startrack.identification.lens_guesses import PINHOLE, guess_lenses
+from startrack.identification.similar_triangles import narrow_sizes, patterns_for
 
 SAMPLES = Path(__file__).parents[1] / "sample_images"
 BACKGROUND_E, PSF_PX = 100.0, 1.2
@@ -202,8 +205,68 @@ def test_bad_values_are_wrong_usage(value: str, cause: str, capsys: pytest.Captu
     assert cause in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("others", [["--fov", "180"], ["--near-attitude", "a.json"]])
-def test_it_needs_a_camera_file_and_stands_alone(others: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def unknown(one: Frame, camera: Camera, fov_deg: float, near: NearSky | None) -> Identification | None:
+    try:
+        solution = identify_unknown_lens(one.detections, camera.size_px, np.radians(fov_deg), sky(), near_sky=near)
+    except NotIdentified:
+        return None
+    return solution.identification
+
+
+@pytest.mark.parametrize(
+    ("camera", "fov_deg", "radius_deg", "how"),
+    [(TEN_DEGREES, 9.5, 3.0, {"brightest": 8, "limit": 9.0, "false": 0.5}),
+     (TEN_DEGREES, 10.5, 1.0, {"brightest": 12, "limit": 9.0, "false": 1.0}),
+     (FISHEYE, 176.0, 1.0, {"limit": 4.0, "false": 0.6, "hidden": 0.4})],
+)  # fmt: skip
+def test_a_lens_that_is_not_known_is_found_there_and_nowhere_else(
+    camera: Camera, fov_deg: float, radius_deg: float, how: dict[str, float]
+) -> None:
+    for seed in range(3):
+        one = frame(camera, seed, **{"hidden": 0.0, "false": 0.0} | how)
+        near = near_sky(one.R_cam_icrs, radius_deg, seed)
+        found = unknown(one, camera, fov_deg, near)
+        assert found is not None
+        assert angle_between_rad(found.R_cam_icrs[2], one.R_cam_icrs[2]) < np.radians(0.5)
+        assert near.contains(found.R_cam_icrs)
+        ra, dec = pointing_deg(one.R_cam_icrs)
+        beside = NearSky.from_degrees((ra, dec + 2 * radius_deg * (-1 if dec > 0 else 1), 1.5 * radius_deg))
+        assert (seed > 0 and camera is FISHEYE) or unknown(one, camera, fov_deg, beside) is None
+
+
+def test_a_part_of_the_sky_ends_the_search_of_a_lens_sooner() -> None:
+    tried: dict[str, list[int]] = {"whole": [], "part": []}
+    for seed in range(4):
+        one = frame(TEN_DEGREES, seed, limit=9.0, hidden=0.0, brightest=12, false=3.0)
+        size = TEN_DEGREES.size_px
+        for name, near in (("whole", None), ("part", near_sky(one.R_cam_icrs, 3.0, seed))):
+            search = HypothesisSearch(one.detections.xy_px[:20], size, near, np.radians(0.5))
+            sizes = narrow_sizes(0.03, 10, 0.8)
+            (guess,) = guess_lenses(size, np.radians(10), (PINHOLE,))
+            hypotheses = search.likely_hypotheses(patterns_for(sky(), sizes), guess, Window(0, 0, 20))
+            assert search.near_sky is None or all(
+                search.near_sky.contains(h.R_cam_icrs, search.margin_rad) for h in hypotheses
+            )
+            tried[name].append(len(hypotheses))
+            assert search.log_trials == pytest.approx(
+                np.log(search.tried) + (0.0 if near is None else np.log(near.part))
+            )
+    assert sum(tried["part"]) < sum(tried["whole"])
+
+
+def test_without_a_camera_file_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["identify", str(SAMPLES / "near-wall.png"), "--fov", "180", "--no-plots", "--json", "-D", str(tmp_path)]
+    assert main(words) == 0
+    plain = json.loads(capsys.readouterr().out)
+    ra, dec = (plain["attitude"][key] for key in ("ra_deg", "dec_deg"))
+    assert main([*words, f"--near-sky={ra:.2f},{dec:.2f},3"]) == 0
+    assert json.loads(capsys.readouterr().out)["stars"]["identified"] == plain["stars"]["identified"]
+    assert main([*words, f"--near-sky={ra:.2f},{-dec:.2f},3"]) == 3
+    assert "within 3 degrees about RA" in json.loads(capsys.readouterr().out)["message"]
+
+
+@pytest.mark.parametrize("others", [["--near-attitude", "a.json"]])
+def test_it_stands_alone(others: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(["identify", str(SAMPLES / "near-wall.png"), "--near-sky", "10,20,5", *others])
     assert stop.value.code == 2
@@ -213,5 +276,5 @@ def test_it_needs_a_camera_file_and_stands_alone(others: list[str], capsys: pyte
 def test_bad_values_of_the_library() -> None:
     with pytest.raises(ValueError, match="RADIUS 0"):
         startrack.identify(np.zeros((6, 2)), camera="fisheye-2048", near_sky=(0, 0, 0))
-    with pytest.raises(ValueError, match="near_sky= needs camera="):
-        startrack.identify(np.zeros((6, 2)), fov=90, size_px=(10, 10), near_sky=(0, 0, 5))
+    with pytest.raises(ValueError, match="DEC 91"):
+        startrack.identify(np.zeros((6, 2)), fov=90, size_px=(10, 10), near_sky=(0, 91, 5))

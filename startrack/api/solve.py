@@ -133,8 +133,8 @@ def identify(
         sigma_px: of centroids: error per axis, one number or (n,). None: 0.3 px.
         near_attitude: with a camera, a rough attitude R_cam_icrs (3, 3), some degrees off at most: the stars are sought
             there first, and everywhere if they are not there.
-        near_sky: with a camera, right ascension, declination and radius (3,) in degrees, ICRS: the stars are sought
-            only with the optical axis in that part of the sky, and fewer stars suffice.
+        near_sky: right ascension, declination and radius (3,) in degrees, ICRS: the stars are sought only with the
+            optical axis in that part of the sky. With a camera fewer stars suffice.
 
     Returns:
         Of an image a Solution, whose `result.camera` is the camera used or found. Of centroids `IdentifiedCentroids`:
@@ -149,9 +149,8 @@ def identify(
     """
     if fov is not None and camera is not None:
         raise ValueError("camera= and fov= exclude each other: with fov= the lens is found, with camera= it is known")
-    for name, prior in (("near_attitude=", near_attitude), ("near_sky=", near_sky)):
-        if fov is not None and prior is not None:
-            raise ValueError(f"{name} needs camera=: with fov= the lens is not known")
+    if fov is not None and near_attitude is not None:
+        raise ValueError("near_attitude= needs camera=: with fov= the lens is not known")
     near = None if near_attitude is None else NearAttitude.of(near_attitude)
     identifier = Identifier(near_sky=None if near_sky is None else NearSky.from_degrees(near_sky))
     of_list = {"size_px": size_px, "flux": flux, "sigma_px": sigma_px}
@@ -171,10 +170,10 @@ def identify(
             identifier=identifier, near_R_cam_icrs=None if near is None else near.R_cam_icrs_at(None, None),
         )  # fmt: skip
     exposure = chain.exposure_input(image, time)
+    settings = Settings(identifier=identifier, near_attitude=near)
     if fov is not None:
-        outcome = chain.identify_blind(exposure, chain.field_of_view_rad(fov), load_catalog())
+        outcome = chain.identify_blind(exposure, chain.field_of_view_rad(fov), load_catalog(), settings)
     else:
-        settings = Settings(identifier=identifier, near_attitude=near)
         outcome = chain.identify(exposure, chain.camera_input(camera, exposure), load_catalog(), settings)
     return _solution(outcome, "identification")
 

@@ -18,7 +18,7 @@ from startrack.detection import Detector
 from startrack.estimation.lens_correction import correct_lens
 from startrack.exposure import NO_TIME, are_fractions
 from startrack.frames import Site
-from startrack.identification import check_single_field
+from startrack.identification import NearSky, check_single_field
 from startrack.terrain import Terrain, site_of_terrain
 
 
@@ -107,25 +107,27 @@ def identify_stars(
     )
 
 
-def identify_unknown_lens(detected: Detected, fovs_rad: Array, catalog: StarCatalog) -> Identified:
+def identify_unknown_lens(
+    detected: Detected, fovs_rad: Array, catalog: StarCatalog, near_sky: NearSky | None
+) -> Identified:
     """The same as `identify_stars`, with the camera found from an approximate field of view.
 
     `detected` has the point sources, `catalog` the stars. The first of `fovs_rad` (n,) that identifies the image is
-    taken: an identification is accepted at any of them only where chance would not give it. Raises NotIdentified,
-    TooFewStars.
+    taken: an identification is accepted at any of them only where chance would not give it. `near_sky` (None: not
+    known) is where the optical axis points. Raises NotIdentified, TooFewStars.
     """
     stars = apparent_stars(catalog, detected.exposure.time_utc, None)
     with stating_sky(detected, None, stars):
-        return _identify_at_fovs(detected, fovs_rad, stars)
+        return _identify_at_fovs(detected, fovs_rad, stars, near_sky)
 
 
-def _identify_at_fovs(detected: Detected, fovs_rad: Array, stars: Stars) -> Identified:
+def _identify_at_fovs(detected: Detected, fovs_rad: Array, stars: Stars, near_sky: NearSky | None) -> Identified:
     from startrack.identification import identify_unknown_lens as solve
 
     sources, size_px = detected.detections, detected.exposure.size_px
     for fov_rad in fovs_rad:
         try:
-            found = solve(sources, size_px, float(fov_rad), stars, background=sources.background_e)
+            found = solve(sources, size_px, float(fov_rad), stars, background=sources.background_e, near_sky=near_sky)
         except (NotIdentified, TooFewStars):
             if len(fovs_rad) == 1:
                 raise

@@ -147,12 +147,13 @@ def identify_blind(
     """Stars, attitude and lens of an `exposure` without a camera file, from an approximate field of view alone.
 
     `fov_rad` [rad], one or several that are tried in their order, is the angle across the image's width below 100
-    degrees, from there up that of the whole image circle. `catalog` is the list of stars; `settings` has the detector.
-    The lens found is the value's `camera`.
+    degrees, from there up that of the whole image circle. `catalog` is the list of stars; `settings` has the detector
+    and the part of the sky. The lens found is the value's `camera`.
     """
     run = Run(Inputs(exposure=exposure, catalog_name=catalog.name))
     settings, fovs_rad = settings or Settings(), np.atleast_1d(fov_rad)
-    return run.outcome(lambda: _orient(run, None, settings, identify_unknown_lens, fovs_rad, catalog))
+    near_sky = settings.identifier.near_sky
+    return run.outcome(lambda: _orient(run, None, settings, identify_unknown_lens, fovs_rad, catalog, near_sky))
 
 
 def detect(exposure: Exposure, camera: Camera | None, settings: Settings | None = None) -> Detected | Refused:

@@ -53,14 +53,13 @@ def locate(args: argparse.Namespace) -> int:
 def identify(args: argparse.Namespace) -> int:
     """Identify every image; the exit code of the worst."""
     check_fov(args)
-    for name, prior in (("--near-attitude", args.near_attitude), ("--near-sky", args.near_sky)):
-        if args.fov is not None and prior is not None:
-            args.usage_error(f"{name} needs a camera file: with --fov the lens is not known")
+    if args.fov is not None and args.near_attitude is not None:
+        args.usage_error("--near-attitude needs a camera file: with --fov the lens is not known")
     settings = chain.Settings(identifier=Identifier(near_sky=args.near_sky), near_attitude=near_attitude_of(args))
 
     def solve(exposure: Exposure, camera: Camera | None) -> chain.Outcome:
         if camera is None:
-            return chain.identify_blind(exposure, args.fov, load_catalog())
+            return chain.identify_blind(exposure, args.fov, load_catalog(), settings)
         return chain.identify(exposure, camera, load_catalog(), settings)
 
     return _run_images(args, "identification", solve)

@@ -85,7 +85,7 @@ def identify_centroids(
         saturated: (n,) True where the flux is a lower limit; None: nowhere.
         psf_sigma_px: width of the stars; nearer stars than three times this share one centroid.
         stars: catalogue at the time of the exposure, brightest first; None: Hipparcos at J2000.0, without aberration.
-        identifier: settings of the identification with a camera.
+        identifier: settings of the identification with a camera; without one its `near_sky` alone counts.
         near_R_cam_icrs: a rough attitude (3, 3) of a `camera`, near which the stars are sought first.
 
     Raises:
@@ -105,7 +105,8 @@ def identify_centroids(
         found = (identifier or Identifier())(sources, camera, stars, near_R_cam_icrs)
     elif fov_rad is not None and size_px is not None:
         _require_in_frame(sources.xy_px, size_px)
-        solution = identify_unknown_lens(sources, size_px, fov_rad, stars)
+        near_sky = None if identifier is None else identifier.near_sky
+        solution = identify_unknown_lens(sources, size_px, fov_rad, stars, near_sky=near_sky)
         camera, found = solution.camera, solution.identification
     else:
         raise ValueError("give a camera, or fov_rad= with size_px=")

@@ -8,8 +8,9 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.core.types import Array, Bools, Ints
-from startrack.estimation.false_alarm import PATTERN_MATCHES
+from startrack.estimation.false_alarm import PATTERN_MATCHES, log_trials
 from startrack.identification.lens_guesses import LensGuess, RadialFamily, family_angle, unknown_camera
+from startrack.identification.near_sky import NearSky
 from startrack.identification.region_growing import LensHypothesis
 from startrack.identification.similar_triangles import MAX_DETECTIONS, ShapePatterns
 from startrack.identification.triangles import Triangles, triad_attitude, triangles
@@ -50,11 +51,23 @@ def family_rays(xy_px: Array, guess: LensGuess, focal_px: Array | float, mirrore
 
 
 class HypothesisSearch:
-    """Lens hypotheses from the brightest detections (n, 2), no two of which are close together."""
+    """Lens hypotheses from the brightest detections (n, 2), no two of which are close together.
 
-    def __init__(self, xy_px: Array, size_px: tuple[int, int]) -> None:
+    With `near_sky` only those that may point into that part of the sky, as far as a lens determines the axis from one
+    triangle: to `margin_rad`.
+    """
+
+    def __init__(
+        self, xy_px: Array, size_px: tuple[int, int], near_sky: NearSky | None = None, margin_rad: float = 0.0
+    ) -> None:
         self.xy_px, self.size_px = xy_px[:MAX_DETECTIONS], size_px
-        self.tried = 0
+        self.near_sky, self.margin_rad = near_sky, margin_rad
+        self.tried = 0  # of the whole sky
+
+    @property
+    def log_trials(self) -> float:
+        """Logarithm of the number of hypotheses so far that chance would propose in the part of the sky searched."""
+        return log_trials(self.tried, 1.0 if self.near_sky is None else self.near_sky.part)
 
     def likely_hypotheses(self, patterns: ShapePatterns, guess: LensGuess, window: Window) -> list[LensHypothesis]:
         """The likeliest hypotheses from the window's triangles, by the bright stars near which detections lie."""
@@ -105,6 +118,11 @@ class HypothesisSearch:
         image = image.take(image.vertices.max(axis=1, initial=0) >= window.done - window.first)
         left, right = patterns.triangles.candidates(image)
         self.tried += len(left)
+        if self.near_sky is not None and len(left):
+            pairs = image.take(left), patterns.triangles.triangles.take(right)
+            R = _solve_triangles(patterns, guess, self.xy_px[window.first :], *pairs)[-1]
+            there = self.near_sky.contains(R, self.margin_rad)
+            left, right = left[there], right[there]
         return image, left, right
 
     def _rank_by_stars(

@@ -13,7 +13,6 @@ from startrack.estimation.false_alarm import (
     coincidence_probability,
     density_per_px2,
     log_p_value_bound,
-    log_trials,
 )
 from startrack.estimation.match import CandidatePairs, PhotometricScale, match_nearest
 from startrack.identification.attitude_refinement import agreement_of
@@ -66,12 +65,12 @@ def narrow_lenses(
                 continue
             seen.append(R)
             view = PinholeView(R, camera.focal_px[0], camera.mirrored, camera.size_px, 0.0)
-            lens = _grow_view(view, centroids, stars, search.tried)
+            lens = _grow_view(view, centroids, stars, search.log_trials)
             if lens is not None:
                 yield lens
 
 
-def _grow_view(view: PinholeView, centroids: Centroids, stars: Stars, tried: int) -> VerifiedLens | None:
+def _grow_view(view: PinholeView, centroids: Centroids, stars: Stars, log_trials: float) -> VerifiedLens | None:
     """The view fitted with more stars and smaller gates, and verified; None where too few stars agree."""
     from scipy.spatial import cKDTree
 
@@ -91,11 +90,11 @@ def _grow_view(view: PinholeView, centroids: Centroids, stars: Stars, tried: int
         distorted = len(star) >= MIN_FOR_DISTORTION
         sigma_px = gate_px / GATE_OVER_SIGMA
         view = view.fit(xy[detection], near.rays_icrs[some[star]], sigma_px, distorted, REGION_ROUNDS)
-    lens = _verify_view(view, centroids, near, tried)
+    lens = _verify_view(view, centroids, near, log_trials)
     return None if lens is None else replace(lens, star=number[lens.star])
 
 
-def _verify_view(view: PinholeView, centroids: Centroids, stars: Stars, tried: int) -> VerifiedLens | None:
+def _verify_view(view: PinholeView, centroids: Centroids, stars: Stars, log_trials: float) -> VerifiedLens | None:
     """The view refined with the stars near it of the right brightness, with its p-value; None where few agree."""
     pairs = _candidate_pairs(view, centroids, stars)
     if pairs is None:
@@ -134,7 +133,7 @@ def _verify_view(view: PinholeView, centroids: Centroids, stars: Stars, tried: i
         R_cam_icrs=view.R_cam_icrs,
         detection=pairs.detection[chosen],
         star=pairs.star[chosen],
-        log_p=log_p + log_trials(tried),
+        log_p=log_p + log_trials,
         unexplained=pairs.count_unexplained(centroids.snr, INLIER_PX),
     )
 

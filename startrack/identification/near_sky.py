@@ -45,10 +45,10 @@ class NearSky:
         """Of the whole sky: the probability that an attitude which only chance proposes points here."""
         return float(np.sin(0.5 * self.radius_rad) ** 2)
 
-    def contains(self, R_cam_icrs: Array) -> Bools:
-        """Whether the attitudes `R_cam_icrs` (..., 3, 3) point into it: (...)."""
+    def contains(self, R_cam_icrs: Array, margin_rad: float = 0.0) -> Bools:
+        """Whether the attitudes `R_cam_icrs` (..., 3, 3), known to `margin_rad`, may point into it: (...)."""
         axis = rays_from_azel(0.5 * np.pi - self.ra_rad, self.dec_rad)  # right ascension runs from x to y
-        return np.asarray(angle_between_rad(R_cam_icrs[..., 2, :], axis) <= self.radius_rad)
+        return np.asarray(angle_between_rad(R_cam_icrs[..., 2, :], axis) <= self.radius_rad + margin_rad)
 
     def __str__(self) -> str:
         """For messages."""

@@ -27,6 +27,7 @@ from startrack.identification.lens_guesses import (
 )
 from startrack.identification.lost_in_space import MAX_FALSE_ALARM
 from startrack.identification.narrow_field import narrow_lenses
+from startrack.identification.near_sky import NearSky
 from startrack.identification.region_growing import WIDE_STAGES, GrowthStage, grow, prior_of
 from startrack.identification.similar_triangles import (
     MAX_DETECTIONS,
@@ -69,30 +70,34 @@ class UnknownLensSolution:
 
 def identify_unknown_lens(
     centroids: Centroids, size_px: tuple[int, int], fov_rad: float, stars: Stars, *,
-    tolerance: float = FIELD_TOLERANCE_1, background: NDArray[Any] | None = None,
+    tolerance: float = FIELD_TOLERANCE_1, background: NDArray[Any] | None = None, near_sky: NearSky | None = None,
 ) -> UnknownLensSolution:  # fmt: skip
     """Lens, attitude and matches of `centroids` in a frame of `size_px` (W, H), its field of view known to `tolerance`.
 
     `fov_rad`: below 100 degrees the angle across the frame's width, from there up that of the whole image circle,
     whether the frame clips it or not. `stars` are sorted, brightest first. `background` (H, W): smooth background of
-    the frame, in which the image circle of a fisheye lens is looked for; it narrows the search. An answer is accepted
-    where chance would give as many coincidences with a probability below 1e-9, all trials included. Raises
-    NotIdentified, and ValueError for an impossible field of view.
+    the frame, in which the image circle of a fisheye lens is looked for; it narrows the search. `near_sky`: part of the
+    sky into which the optical axis points; attitudes elsewhere are not tried. An answer is accepted where chance would
+    give as many coincidences with a probability below 1e-9, all trials included. Raises NotIdentified, and ValueError
+    for an impossible field of view.
     """
     if not 0 < fov_rad <= 2 * np.pi:
         raise ValueError(f"fov_rad= is {fov_rad:g}: give radians, more than 0, at most 2 pi")
-    search = _Search(centroids, size_px, fov_rad, stars, tolerance, background)
+    search = _Search(centroids, size_px, fov_rad, stars, tolerance, background, near_sky)
     for lens in search.lenses():
         if lens.log_p < LOG_FALSE_ALARM and len(lens.star) >= search.min_matches:
             camera, R = _fit_with_covariance(lens, centroids, stars.rays_icrs[lens.star], centre=not search.narrow)
+            if near_sky is not None and not near_sky.contains(R):
+                continue
             identification = Identification(
                 detection=lens.detection, star=lens.star, R_cam_icrs=R, unexplained=lens.unexplained,
                 false_alarm_probability=probability(lens.log_p),
             )  # fmt: skip
             return UnknownLensSolution(camera, identification)
     tried = search.hypotheses.tried
+    where = "" if near_sky is None else f" within {near_sky}"
     raise NotIdentified(
-        f"no lens of {np.degrees(fov_rad):.3g} degrees ({100 * tolerance:.0f} % more or less) explains the "
+        f"no lens of {np.degrees(fov_rad):.3g} degrees ({100 * tolerance:.0f} % more or less){where} explains the "
         f"{len(centroids)} point sources better than chance ({tried} patterns tried): {ADVICE}",
         detected=len(centroids),
         tried=tried,
@@ -128,7 +133,7 @@ class _Search:
 
     def __init__(
         self, centroids: Centroids, size_px: tuple[int, int], fov_rad: float, stars: Stars, tolerance: float,
-        background: NDArray[Any] | None,
+        background: NDArray[Any] | None, near_sky: NearSky | None,
     ) -> None:  # fmt: skip
         self.centroids, self.size_px, self.fov_rad, self.stars = centroids, size_px, fov_rad, stars
         self.widest_rad = 0.5 * fov_rad * (1 + tolerance)
@@ -146,7 +151,7 @@ class _Search:
                 f"{self.min_matches}: expose longer, or {ADVICE}",
                 detected=len(centroids),
             )
-        self.hypotheses = HypothesisSearch(self.xy_px[chosen], size_px)
+        self.hypotheses = HypothesisSearch(self.xy_px[chosen], size_px, near_sky, 0.5 * fov_rad * tolerance)
         half = np.tan(fov_rad / 2)
         other = half * size_px[1] / size_px[0]
         # Solid angle of the image circle, or of the frame.
@@ -193,7 +198,7 @@ class _Search:
                     grown = grow(hypothesis, self.xy_px, stars.rays_icrs, stages)
                     if grown is None or (self.wide and grown[2] < self.min_matches):
                         continue
-                    lens = verify(*grown, self.centroids, stars, search.tried, self.widest_rad)
+                    lens = verify(*grown, self.centroids, stars, search.log_trials, self.widest_rad)
                     if lens is not None:
                         yield lens if around is None else replace(lens, star=around[lens.star])
                 if search.tried > max_tried:

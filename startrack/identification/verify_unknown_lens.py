@@ -13,7 +13,6 @@ from startrack.estimation.false_alarm import (
     coincidence_probability,
     density_per_sr,
     log_p_value,
-    log_trials,
 )
 from startrack.estimation.match import (
     DEPTH_BELOW_THRESHOLD_MAG,
@@ -110,12 +109,12 @@ def match_by_flux(
 
 
 def verify(
-    camera: Camera, R: Array, matched: int, centroids: Centroids, stars: Stars, tried: int, widest_rad: float
+    camera: Camera, R: Array, matched: int, centroids: Centroids, stars: Stars, log_trials: float, widest_rad: float
 ) -> VerifiedLens | None:
     """The grown lens refined with all stars and verified; None where too few stars agree.
 
-    `camera`, `R` and the number `matched` are the result of `grow`. `tried`: number of hypotheses so far. `widest_rad`:
-    half the field of view, its tolerance added.
+    `camera`, `R` and the number `matched` are the result of `grow`. `log_trials`: logarithm of the number of
+    hypotheses so far. `widest_rad`: half the field of view, its tolerance added.
     """
     refined = _refine(camera, R, matched, centroids, stars, widest_rad)
     if refined is None:
@@ -144,7 +143,7 @@ def verify(
         R_cam_icrs=R,
         detection=matches.detection[inside],
         star=matches.star[inside],
-        log_p=significance(hits, max(some.predicted, hits), each, free) + log_trials(tried),
+        log_p=significance(hits, max(some.predicted, hits), each, free) + log_trials,
         unexplained=_count_unexplained(centroids, camera, stars, R, matches.zero_mag),
     )
 

@@ -103,6 +103,16 @@ def test_a_picture_whose_rounding_hides_stars_is_told_from_a_noisy_one(tmp_path,
     assert line.endswith("moonlight or twilight?") == (noise_steps > 0.5)
 
 
+@pytest.mark.parametrize("noise_steps", [0.2, 1.0])
+def test_a_picture_without_sources_states_that_rounding_hides_them(tmp_path, capsys, noise_steps):
+    image = np.random.default_rng(5).normal(3.4, noise_steps, (400, 400))
+    Image.fromarray(image.round().clip(0, 255).astype(np.uint8)).save(tmp_path / "dim.png")
+    assert main(["identify", str(tmp_path / "dim.png"), "--fov", "120", "-D", str(tmp_path), "--no-plots"]) == 3
+    (line,) = capsys.readouterr().out.splitlines()
+    assert "no point source" in line
+    assert ("below half a step of the pixel values" in line and "raw or 16-bit" in line) == (noise_steps < 0.5)
+
+
 @pytest.mark.parametrize(
     "flags",
     [["-c", "{camera}"], *(pytest.param(["--fov", fov], marks=pytest.mark.slow) for fov in ("160", "120..170"))],

@@ -10,15 +10,11 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.chain.stages import Detected
 from startrack.core.types import NotIdentified, Stars, TooFewStars
-from startrack.detection import COARSE_STEPS, smallest_step
+from startrack.detection import ROUNDED, is_rounded, smallest_step
 
 STEP_PX = 16  # of the pixels at which the background is looked up
 VISIBLE_SNR = 5.0
 CAUSES = "clouds, moonlight or twilight?"
-ROUNDED = (
-    "the noise is below half a step of the pixel values, whose rounding hides faint stars: give raw or 16-bit "
-    "pictures, a stack of such, or a longer exposure"
-)
 
 
 @contextmanager
@@ -44,16 +40,10 @@ def sky_text(detected: Detected, camera: Camera | None, stars: Stars) -> str:
     clear = "" if expected is None else f" where a clear sky would show about {float(f'{expected:.2g}'):.0f}"
     on_moon = detected.terrain is not None and detected.terrain.air is None
     text = f"Measured: {len(found)} point sources{clear}, background from {low:.0f} to {high:.0f} ADU{of_range}"
-    if is_rounded(detected, camera):
+    gain = 1.0 if camera is None or camera.sensor is None else camera.sensor.gain_e_per_adu
+    if is_rounded(found.noise_e[::STEP_PX, ::STEP_PX] / gain, smallest_step(exposure.recorded_adu)):
         return f"{text}; {ROUNDED}"
     return text if on_moon else f"{text}: {CAUSES}"
-
-
-def is_rounded(detected: Detected, camera: Camera | None) -> bool:
-    """Whether the noise of an image is below COARSE_STEPS of the steps of its values. `camera`: as of `stating_sky`."""
-    gain = 1.0 if camera is None or camera.sensor is None else camera.sensor.gain_e_per_adu
-    noise_adu = np.median(detected.detections.noise_e[::STEP_PX, ::STEP_PX]) / gain
-    return bool(noise_adu < COARSE_STEPS * smallest_step(detected.exposure.recorded_adu))
 
 
 def count_expected_stars(detected: Detected, camera: Camera, stars: Stars) -> float | None:

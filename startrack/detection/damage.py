@@ -33,6 +33,10 @@ FILTERED_CORRELATION = 2 * CORRELATION  # from here on the image itself is filte
 COARSE_STEPS = 0.5  # noise in steps of the values below which rounding rules
 HIGHEST_SIGMAS = 1.0  # of the noise, for the correlation; the lowest is CLIPPED_SIGMA
 FAR_PX = 7  # farther than any filter's kernel reaches
+ROUNDED = (
+    "the noise is below half a step of the pixel values, whose rounding hides faint stars: give raw or 16-bit "
+    "pictures, a stack of such, or a longer exposure"
+)
 FEW_STARS_PERCENTILE = 25.0  # of the tiles' correlations
 ORIGINAL = "give the frame as the sensor recorded it"
 
@@ -82,6 +86,11 @@ def find_damage(exposure: Exposure, camera: Camera | None = None) -> Damage | No
         cause = f"the image is filtered or compressed: neighbouring pixels correlate by {correlation:.2f}"
         return Damage(cause, correlation < FILTERED_CORRELATION)
     return None
+
+
+def is_rounded(noise: Image, step: float) -> bool:
+    """Whether rounding to this `step` hides stars: most of the `noise` (H, W), in its unit, is below half a step."""
+    return bool(np.median(noise) < COARSE_STEPS * step)
 
 
 def _tile_corners(pixels_adu: NDArray[np.float32], camera: Camera | None) -> Ints:

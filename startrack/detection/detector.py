@@ -22,7 +22,7 @@ from startrack.detection.classify import (
     select_brightest_per_position,
     select_stars,
 )
-from startrack.detection.damage import fill_masked, find_dead_parts
+from startrack.detection.damage import ROUNDED, fill_masked, find_dead_parts, is_rounded
 from startrack.detection.deblend import Fitted, fit_all, paint_sources
 from startrack.detection.fit import PointFits, unbin_fits
 from startrack.detection.frame import (
@@ -110,7 +110,7 @@ class Detector:
         if side > 1 or covered_px > CROWDED_PART * image.size:
             frame, stars = self._detect_again(source, candidates, unbin_fits(stars, side))
         if not len(stars.flux):
-            raise TooFewStars(NOTHING_SEEN)
+            raise _nothing_seen(frame)
         saturated = np.zeros(len(stars.flux), dtype=bool)
         if frame.dead is not None:
             column, row = nearest_pixels(stars.xy_px, frame.shape, 0).T
@@ -159,7 +159,7 @@ class Detector:
         lowest = detection_threshold(self.threshold_snr, sigma, noise_skewness(frame)) - FIRST_PASS_LOWER
         peaks = find_peaks(small, sigma / side, lowest, self.max_candidates, known)
         if not len(peaks.centres):
-            raise TooFewStars(NOTHING_SEEN)
+            raise _nothing_seen(frame)
         return peaks
 
     def _select_stars(self, frame: Frame, fitted: Fitted, side: int, sigma: float) -> PointFits:
@@ -193,3 +193,9 @@ class _FrameSource:
             self._kept[side] = background_and_noise(self.image, self.quantum, sigma)
         maps = self._kept[side] if found is None else background_and_noise(self.image - found, self.quantum, sigma)
         return Frame(self.image, *maps, self.dead, self.source_noise, self.masked, found)
+
+
+def _nothing_seen(frame: Frame) -> TooFewStars:
+    """The refusal of a frame without point sources."""
+    is_coarse = is_rounded(frame.noise.whole(), smallest_step(frame.image))
+    return TooFewStars(f"{NOTHING_SEEN} {ROUNDED.capitalize()}" if is_coarse else NOTHING_SEEN)

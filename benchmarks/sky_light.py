@@ -19,14 +19,7 @@ import numpy as np
 from _cameras import EXPOSURE_S, camera_for_share
 from _results import table, write_section
 from _sky_hazards import HAZARDS
-from _sky_scenes import (
-    SEED,
-    bend_camera,
-    degraded_map,
-    map_of_floor,
-    raised_map,
-    uneven_crater,
-)  # fmt: skip
+from _sky_scenes import SEED, bend_camera, degraded_map, map_of_floor, raised_map, uneven_crater  # fmt: skip
 from _sky_view import expose
 
 from startrack.camera import Camera

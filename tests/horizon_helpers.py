@@ -10,14 +10,7 @@ from star_painter import paint
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
 from startrack.core.types import Exposure
-from startrack.frames import (
-    R_enu_icrs,
-    Site,
-    azel_from_rays,
-    observer_velocity_m_s,
-    parse_utc,
-    rays_from_azel,
-)
+from startrack.frames import R_enu_icrs, Site, azel_from_rays, observer_velocity_m_s, parse_utc, rays_from_azel
 
 SITE = Site("earth", np.radians(46.0), np.radians(7.0), 1000.0)
 TIME = parse_utc("2024-10-05T21:00:00Z")

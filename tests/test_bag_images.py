@@ -140,10 +140,7 @@ def test_a_batch_of_a_bag_is_resumed(drive, located, tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("more", "words"),
-    [
-        (["--time", "2030-01-01T00:00:00Z"], "the times of their messages"),
-        (["--files-on-stdin"], "is a ROS bag"),
-    ],
+    [(["--time", "2030-01-01T00:00:00Z"], "the times of their messages"), (["--files-on-stdin"], "is a ROS bag")],
 )
 def test_flags_of_folders_are_wrong_usage_for_a_bag(drive, tmp_path, capsys, more, words):
     with pytest.raises(SystemExit) as usage:

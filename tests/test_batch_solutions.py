@@ -141,8 +141,7 @@ def test_a_run_of_some_images_gives_the_tables_of_all(folder, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "text",
-    ['{"foo": 1}', '{"image": "01.png", "status": "ok", "reason": null}', "[]", '{"image": 1, "status": {}}'],
+    "text", ['{"foo": 1}', '{"image": "01.png", "status": "ok", "reason": null}', "[]", '{"image": 1, "status": {}}']
 )
 def test_incomplete_records_are_not_used(folder, monkeypatch, text):
     result = folder / "out" / "01.fix.json"

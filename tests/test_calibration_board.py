@@ -170,10 +170,7 @@ def test_the_command(chessboards, tmp_path, capsys):
 
 def test_pictures_without_a_board_are_refused(chessboards):
     with pytest.raises(NotIdentified, match="pattern") as refusal:
-        calibrate_board(
-            [draw_picture(POSES[0], lambda position: np.full(position.shape[:-1], 0.5))],
-            CHESSBOARD,
-        )
+        calibrate_board([draw_picture(POSES[0], lambda position: np.full(position.shape[:-1], 0.5))], CHESSBOARD)
     assert refusal.value.reason == "no_stars"
     one = calibrate_board(chessboards[:1], CHESSBOARD)
     assert not one.accepted

@@ -21,12 +21,7 @@ from startrack.applications.horizon.frames import orient_frames
 from startrack.applications.horizon.landscape import interpolate_unknown
 from startrack.applications.horizon.measure import join_skylines, measure_frames
 from startrack.applications.horizon.posterior import limit_llr
-from startrack.applications.horizon.write import (
-    check_output,
-    csv_text,
-    nina_text,
-    write_skyline,
-)
+from startrack.applications.horizon.write import check_output, csv_text, nina_text, write_skyline
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.cli.main import main

@@ -29,14 +29,7 @@ from startrack.localization.obstacle_chain import (
 )
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel
-from startrack.localization.skyline_profiles import (
-    HIGH_RAD,
-    LOW_RAD,
-    ROW_NATS,
-    integral_to,
-    log_at,
-    profiles_of,
-)
+from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS, integral_to, log_at, profiles_of
 from startrack.terrain import Cylinder, Terrain, load_terrain
 
 CRATER = load_terrain("shackleton-thesis")

@@ -431,11 +431,7 @@ def whole_sky(seed: int, n: int = 1500) -> Evidence:
     at = 9000 * np.sqrt(rng.random()) * np.array([1.0, 0.0])
     snr = 0.5 + 5.5 * rng.random(n)
     flux = snr * (elevation > TERRAIN.horizon_rad(at[None], azimuth)) + rng.standard_normal(n)
-    return Evidence(
-        azimuth_rad=azimuth,
-        elevation_rad=elevation,
-        llr=np.clip(snr * flux - snr**2 / 2, -9, 9),
-    )
+    return Evidence(azimuth_rad=azimuth, elevation_rad=elevation, llr=np.clip(snr * flux - snr**2 / 2, -9, 9))
 
 
 def test_rays_below_the_horizontal_say_nothing() -> None:

@@ -21,8 +21,7 @@ FIRST_PLACES = {"haworth floor", "kepler floor"}  # a polar map and one far from
 
 
 @pytest.mark.parametrize(
-    "where",
-    [pytest.param(name, marks=[] if name in FIRST_PLACES else pytest.mark.slow) for name in PLACES],
+    "where", [pytest.param(name, marks=[] if name in FIRST_PLACES else pytest.mark.slow) for name in PLACES]
 )
 def test_a_position_in_a_shipped_crater_is_found(where):
     terrain = load_terrain(f"{where.split()[0]}-rendered")

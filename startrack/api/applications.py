@@ -62,11 +62,7 @@ def calibrate(
 
 
 def measure_horizon(
-    images: Sequence[Image],
-    *,
-    site: Site,
-    camera: str | Camera | None = None,
-    fov: float | Quantity | None = None,
+    images: Sequence[Image], *, site: Site, camera: str | Camera | None = None, fov: float | Quantity | None = None
 ) -> MeasuredSkyline:
     """The horizon (obstruction profile) of a fixed camera on the Earth, from photographs of the night sky.
 

@@ -251,10 +251,7 @@ def with_update(camera: Camera, step: Mapping[str, float]) -> Camera:
     return replace(
         camera,
         focal_px=(float(fx * scale + step.get("fx", 0.0)), float(fy * scale + step.get("fy", 0.0))),
-        centre_px=(
-            float(camera.centre_px[0] + step.get("cx", 0.0)),
-            float(camera.centre_px[1] + step.get("cy", 0.0)),
-        ),
+        centre_px=(float(camera.centre_px[0] + step.get("cx", 0.0)), float(camera.centre_px[1] + step.get("cy", 0.0))),
         lens=camera.lens.with_update(step),
         decentring=Decentring(float(p1), float(p2)),
     )

@@ -15,8 +15,7 @@ ARTEFACT_NAMES = (
 DRIVE_FLAGS = (
     flag("--every SECONDS", "time between the exposures", types.seconds),
     flag(
-        "--path WAYPOINTS",
-        "CSV file of waypoints, columns east_m,north_m: the rover drives along it, its nose forward",
+        "--path WAYPOINTS", "CSV file of waypoints, columns east_m,north_m: the rover drives along it, its nose forward"
     ),
     flag("--speed M_PER_S", "along the path", types.positive_number),
     flag("--odometry-sigma F", "error of the odometry, as a part of each increment (as of `track`)", types.amount),

@@ -9,19 +9,9 @@ import numpy as np
 from startrack.core.kernels import njit
 from startrack.core.types import Array, Bools, Centroids, Ints
 from startrack.estimation.adjust import CHI2_2DOF_MEDIAN, SMALLEST_EXTRA_PX2, STAR_OUTLIER_CHI2
-from startrack.estimation.match import (
-    CandidatePairs,
-    PhotometricScale,
-    brightness_agreement,
-)
+from startrack.estimation.match import CandidatePairs, PhotometricScale, brightness_agreement
 from startrack.estimation.match_kernel import BRIGHTER_MAG
-from startrack.identification.attitude_search import (
-    FIRST_GATE_PX,
-    GATE_PX,
-    INLIER_PX,
-    AttitudeHypothesis,
-    Sources,
-)
+from startrack.identification.attitude_search import FIRST_GATE_PX, GATE_PX, INLIER_PX, AttitudeHypothesis, Sources
 from startrack.identification.star_grid import rotation_between
 
 MATCH_ROUNDS = 4  # of matching and rotating; one suffices if the bright stars determine the attitude

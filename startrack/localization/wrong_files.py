@@ -8,12 +8,7 @@ import numpy as np
 
 from startrack.core.types import Array, Blocked, NotLocated
 from startrack.localization.free_skyline import free_log_likelihood
-from startrack.localization.hypothesis import (
-    GROSS_ROUNDS,
-    Hypothesis,
-    clock_of_other_times,
-    sample_gross_error,
-)
+from startrack.localization.hypothesis import GROSS_ROUNDS, Hypothesis, clock_of_other_times, sample_gross_error
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel
 

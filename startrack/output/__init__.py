@@ -21,12 +21,7 @@ from startrack.output.picture.canvas import (
 )
 from startrack.output.picture.maps import MARGIN_PX, SIDE_PX, Map, draw_overview, ellipse_m, relief_picture
 from startrack.output.picture.panorama import horizon_picture, skyline_picture
-from startrack.output.picture.prediction import (
-    comparison_picture,
-    path_picture,
-    prediction_picture,
-    radius_classes,
-)
+from startrack.output.picture.prediction import comparison_picture, path_picture, prediction_picture, radius_classes
 from startrack.output.qgis import qgis_style_text
 from startrack.output.quantities import QUANTITIES, table_columns
 from startrack.output.quantity import (

@@ -26,15 +26,7 @@ from startrack.chain import STAGES, content_sha256
 from startrack.core.files import write_atomically
 from startrack.core.stored import read_json_object
 from startrack.frames import R_from_quat_xyzw, tum_line
-from startrack.output import (
-    Column,
-    ecsv_text,
-    file_schema,
-    list_schema,
-    object_schema,
-    or_null,
-    table_columns,
-)
+from startrack.output import Column, ecsv_text, file_schema, list_schema, object_schema, or_null, table_columns
 
 FORMAT = "startrack.manifest/1"
 MANIFEST_FILE = "manifest.json"
@@ -43,10 +35,7 @@ TRAJECTORY = "trajectory.tum"
 PARQUET = "results.parquet"
 NOT_IN_TABLES = ("modes", "message", "warnings", "format")
 FILES = ("provenance.camera", "provenance.terrain")  # names or paths of files: the tables hold the stem, no path
-COLUMNS = [
-    *(Column(name, datatype="string", path=(name,)) for name in ("image", "status", "reason")),
-    *table_columns(),
-]
+COLUMNS = [*(Column(name, datatype="string", path=(name,)) for name in ("image", "status", "reason")), *table_columns()]
 MANIFEST = file_schema(
     "Images of a batch",
     object_schema({

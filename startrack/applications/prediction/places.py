@@ -127,8 +127,7 @@ def path_points(drive: Drive, terrain: Terrain, spacing_m: float) -> PathPoints:
     if bad.any():
         east, north = points_m[np.argmax(bad)]
         raise BadInput(
-            "bad_odometry",
-            f"the path leaves the search area of {terrain.name} at {east:.0f} m east, {north:.0f} north",
+            "bad_odometry", f"the path leaves the search area of {terrain.name} at {east:.0f} m east, {north:.0f} north"
         )
     return PathPoints(distance_m, points_m)
 

@@ -11,11 +11,7 @@ from startrack.applications.reproduction.published.cozman_krotkov import Bounded
 from startrack.applications.reproduction.published.kua_drive import Drive, draw_drive
 from startrack.applications.reproduction.published.naval import MapFeatures, map_features
 from startrack.applications.reproduction.published.skylines import MapGrid, lit_skyline, traced_grid
-from startrack.applications.reproduction.published.stein_medioni import (
-    ROUGH_HEADING_RAD,
-    PolygonTable,
-    polygon_table,
-)
+from startrack.applications.reproduction.published.stein_medioni import ROUGH_HEADING_RAD, PolygonTable, polygon_table
 from startrack.applications.reproduction.simulator import PERFECT, Sky, Stream, crater, draw_positions, visible_stars
 from startrack.applications.reproduction.valley import draw_floor, draw_time, jacksboro
 from startrack.camera import Camera, load_camera

@@ -25,15 +25,7 @@ from startrack.applications.tracking.odometry_moves import odometry_moves, odome
 from startrack.applications.tracking.track import Track, estimate_track, smooth_placed, track_of_newest
 from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.catalog import load_catalog
-from startrack.chain import (
-    Located,
-    Settings,
-    input_hashes,
-    job_sha256,
-    load_camera_input,
-    locate,
-    terrain_input,
-)
+from startrack.chain import Located, Settings, input_hashes, job_sha256, load_camera_input, locate, terrain_input
 from startrack.core.errors import BadInput
 from startrack.estimation.observations import USUAL_ODOMETRY, OdometryErrors
 from startrack.exposure import NO_TIME

@@ -23,10 +23,7 @@ from startrack.core.types import MIDDLES_RAD, Array, Ints, MeasuredSkyline, NotL
 from startrack.terrain import NO_POST, Terrain
 
 CORRESPONDENCES = 3  # for a pose: two coordinates and the heading, with an angle and elevations to check them
-FEATURE_REACH, FEATURE_MEAN = (
-    8,
-    5,
-)  # sectors to either side that a feature stands out of, and of a mean
+FEATURE_REACH, FEATURE_MEAN = 8, 5  # sectors to either side that a feature stands out of, and of a mean
 SHARP_RAD = 4.0 * LIT_SIGMA_RAD * float(np.sqrt(1.5 / FEATURE_MEAN))  # least height of a feature, four sigma of it
 VIEWS_STEP_M = 1500.0  # between positions from which the features of the map are collected
 FEATURE_CELL_M = 300.0  # of the map, in which the same corner or peak is seen from several positions

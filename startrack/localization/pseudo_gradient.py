@@ -11,6 +11,8 @@ from startrack.localization.convex_hull import hull_position
 from startrack.localization.rim_plane import point_fix, stars_on_rim_plane
 from startrack.terrain import Terrain
 
+GAIN, MOST_STEPS = 1.0, 200
+
 
 @dataclass(frozen=True)
 class PseudoGradient:
@@ -22,8 +24,8 @@ class PseudoGradient:
     covariance and no circle are stated; the thesis's mean error is 34 m on perfect lists.
     """
 
-    gain: float = 1.0
-    most_steps: int = 200
+    gain: float = GAIN
+    most_steps: int = MOST_STEPS
     most_unexplained: float = 0.02  # part of the list; rendered 4 Mpx frames end with 0.001 to 0.004
 
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix:
@@ -47,7 +49,7 @@ class PseudoGradient:
 
 
 def descend(
-    points_m: Array, seen: Bools, start_m: Array, radius_m: float, gain: float, most_steps: int
+    points_m: Array, seen: Bools, start_m: Array, radius_m: float, gain: float = GAIN, most_steps: int = MOST_STEPS
 ) -> tuple[Array, bool]:
     """Last position (2,) [m], and whether the expected stars became the `seen` ones (n,).
 

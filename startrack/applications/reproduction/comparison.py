@@ -22,7 +22,7 @@ from startrack.applications.reproduction.simulator import SHACKLETON, Stream, vi
 from startrack.chain import Settings
 from startrack.core.chunk_store import Chunk
 from startrack.core.types import Array, Bools, NoSolution
-from startrack.localization import PseudoGradient, descend, hull_position
+from startrack.localization import descend
 
 
 @dataclass(frozen=True)
@@ -103,12 +103,11 @@ COMPARED = {
         lambda scene: estimate_drive(scene)[0], needs_crater=True,
     ),
     "kua-hull": ComparedMethod(
-        "Kua 2008, hull and circle", *STARS, "637 m",
-        lambda scene: hull_position(scene.points_m[scene.seen], scene.crater.wall_m, scene.crater.radius_m),
-        needs_crater=True,
+        "Kua 2008, hull and circle", *STARS, "637 m", lambda scene: scene.hull_m, needs_crater=True
     ),
     "kua-pseudo-gradient": ComparedMethod(
-        "Kua 2008, pseudo-gradient", *STARS, "34.2 m", lambda scene: _descend_from_hull(scene), needs_crater=True
+        "Kua 2008, pseudo-gradient", *STARS, "34.2 m",
+        lambda scene: descend(scene.points_m, scene.seen, scene.hull_m, scene.crater.radius_m)[0], needs_crater=True,
     ),
 }  # fmt: skip
 
@@ -119,14 +118,6 @@ def estimate_drive(scene: Scene) -> tuple[Array, float]:
     vectors = [outermost_stars(scene.points_m[one], scene.crater.wall_m) for one in seen]
     positions, depth_m = locate_by_drive(vectors, scene.drive.legs_m, scene.crater.radius_m)
     return positions[-1], depth_m
-
-
-def _descend_from_hull(scene: Scene) -> Array:
-    """Where the thesis's descent ends, settled or not."""
-    method = PseudoGradient()
-    first = hull_position(scene.points_m[scene.seen], scene.crater.wall_m, scene.crater.radius_m)
-    end, _ = descend(scene.points_m, scene.seen, first, scene.crater.radius_m, method.gain, method.most_steps)
-    return end
 
 
 def methods_on(ground: str) -> dict[str, ComparedMethod]:
@@ -164,7 +155,7 @@ def compare_places(
         for j, method in enumerate(methods.values()):
             if tried[k, j]:
                 began = time.process_time()
-                positions[k, j] = _answer(method, scene)
+                positions[k, j] = _or_nan(method.locate, scene)
                 seconds[k, j] = time.process_time() - began
     return {
         "truth_m": np.stack([scene.truth_m for scene in scenes]), "position_m": positions, "is_tried": tried,
@@ -179,13 +170,13 @@ def _warm_up(ground: str) -> None:
     scene = Scene(0, 0, 0, ground)
     for method in methods_on(ground).values():
         if not method.is_series:
-            _answer(method, scene)
+            _or_nan(method.locate, scene)
 
 
-def _answer(method: ComparedMethod, scene: Scene) -> Array:
-    """The position (2,) [m] by a `method`; NaN where it refuses."""
+def _or_nan(locate: Callable[[Scene], Array], scene: Scene) -> Array:
+    """The answer of a method; NaN where it refuses."""
     try:
-        return method.locate(scene)
+        return locate(scene)
     except NoSolution:
         return np.full(2, np.nan)
 

@@ -28,7 +28,7 @@ from startrack.applications.reproduction.simulator import (
 )
 from startrack.core.chunk_store import Chunk, ChunkStore, Progress, settings_digest
 from startrack.core.types import Array, Bools, Fix, NotLocated
-from startrack.localization import ExactPosterior, PseudoGradient, descend, hull_position
+from startrack.localization import ExactPosterior, descend, hull_position
 from startrack.terrain import Cylinder
 
 FIX_FOLDER = ".chunks"
@@ -130,17 +130,10 @@ def compute_chunk(task: Task) -> Chunk:
 
 
 def _solve_kua(points: Array, seen: list[Bools], cylinder: Cylinder) -> Chunk:
-    method = PseudoGradient()
     hull = np.stack([hull_position(points[one], cylinder.wall_m, cylinder.radius_m) for one in seen])
-    ends = [
-        descend(points, one, first, cylinder.radius_m, method.gain, method.most_steps)
-        for one, first in zip(seen, hull, strict=True)
-    ]
-    return {
-        "hull_m": hull,
-        "refined_m": np.stack([end for end, _ in ends]),
-        "settled": np.array([settled for _, settled in ends]),
-    }
+    ends = [descend(points, one, first, cylinder.radius_m) for one, first in zip(seen, hull, strict=True)]
+    refined, settled = zip(*ends, strict=True)
+    return {"hull_m": hull, "refined_m": np.stack(refined), "settled": np.array(settled)}
 
 
 @dataclass(frozen=True)

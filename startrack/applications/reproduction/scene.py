@@ -19,7 +19,7 @@ from startrack.catalog import load_catalog
 from startrack.chain import Located, Settings, locate
 from startrack.core.types import Array, BadInput, Bools, Evidence, Exposure, MeasuredSkyline, NotLocated
 from startrack.frames import Site
-from startrack.localization import ExactPosterior
+from startrack.localization import ExactPosterior, hull_position
 from startrack.rendering import Series, render
 from startrack.terrain import Cylinder, Terrain, load_terrain
 
@@ -76,6 +76,11 @@ class Scene:
             return visible_stars(self.points_m, self.truth_m, self.crater.radius_m)
         horizon = self.terrain.horizon_rad(np.tile(self.truth_m, (len(self.sky), 1)), self.sky.azimuth_rad)
         return np.asarray(self.sky.elevation_rad > horizon)
+
+    @property
+    def hull_m(self) -> Array:
+        """Kua's first estimate (2,) [m]; computed anew, since methods are timed. Raises NotLocated."""
+        return hull_position(self.points_m[self.seen], self.crater.wall_m, self.crater.radius_m)
 
     @cached_property
     def evidence(self) -> Evidence:

@@ -236,13 +236,13 @@ def check_regular(path: FilePath, reason: str = "bad_image") -> None:
         raise BadOutput(reason, f"{printable(path)}: {cause}")
 
 
-def remove_file(path: FilePath, reason: str = "bad_image") -> None:
-    """Remove a former result, if there is one. Raises BadOutput `reason` if it is no regular file or has to stay."""
-    check_regular(path, reason)
+def remove_file(path: FilePath) -> None:
+    """Remove a former result, if there is one. Raises BadOutput bad_image if it is no regular file or has to stay."""
+    check_regular(path)
     try:
         Path(path).unlink(missing_ok=True)
     except OSError as cause:
-        raise _write_error(cause, reason, path, "cannot be written") from cause
+        raise _write_error(cause, "bad_image", path, "cannot be written") from cause
 
 
 @contextmanager

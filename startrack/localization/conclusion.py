@@ -125,11 +125,13 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
         if not ambiguous:
             integrity = assess_integrity(best.model, parameters, near[:2, :2], clear, covariance, radius999)
     blocked = Blocked(1.0 - clear)
+    is_bias = np.array([one.name == "bias_rad" for one in best.model.errors.listed], dtype=bool)
+    bias_rad = float((shares(best.log_weight) @ best.values[:, is_bias]).sum())
     return Fix(
         position_enu_m=camera_at(middle, terrain), covariance_m2=covariance, radius95_m=radius95, radius999_m=radius999,
         modes=modes, ambiguous=ambiguous, search=explored.search,
         dropped_probability=dropped_probability if dropped_probability < 1.0 else None,
-        horizon_error_rad=_mean_error(best, "bias_rad"), clock=_clock(whole), blocked=blocked if blocked else None,
+        horizon_error_rad=bias_rad, clock=_clock(whole), blocked=blocked if blocked else None,
         integrity=integrity, unstated=_unstated_facts(whole), raised_rad=best.model.rise_rad(parameters),
         at_time_m=parameters[:2], shown=_shown_errors(best),
         samples=_restart_points(whole, explored, dropped_probability),
@@ -180,11 +182,6 @@ def _list_modes(whole: Posterior) -> tuple[Mode, ...]:
     return tuple(sorted(modes, key=lambda mode: -mode.weight))
 
 
-def _mean_error(best: Hypothesis, name: str) -> float:
-    is_named = np.array([one.name == name for one in best.model.errors.listed], dtype=bool)
-    return float((shares(best.log_weight) @ best.values[:, is_named]).sum())
-
-
 def _clock(whole: Posterior) -> ClockError | None:
     """The error of the clock by the points of the best hypothesis."""
     best = whole.best
@@ -233,10 +230,7 @@ def _shown_errors(best: Hypothesis) -> tuple[ShownError, ...]:
 
 
 def _restart_points(whole: Posterior, explored: Explored, dropped_probability: float) -> Explored:
-    """The SUPPORT likeliest points (n, 2) [m, enu] of the best hypothesis, where a later search of the image begins.
-
-    They are those before the error of the clock moves them.
-    """
+    """The SUPPORT likeliest points (n, 2) [m, enu] of the best hypothesis, where a later search of the image begins."""
     one = whole.best
     order = np.argsort(-one.found.log_weight)[:SUPPORT]
     points, log = one.found.points[order, :2], one.found.log_weight[order]

@@ -90,10 +90,7 @@ def _read_ros(text: str) -> dict[str, Any]:
 
 
 def _write_kalibr(camera: Camera, k: Coefficients) -> str:
-    """A camchain of one camera, cam0: pinhole with equidistant distortion for fisheyes; the mount as T_cam_imu.
-
-    T_cam_imu takes points of the rover's body (Kalibr's imu) into the camera.
-    """
+    """A camchain of one camera, cam0: pinhole with equidistant distortion for fisheyes; the mount as T_cam_imu."""
     model, coefficients = ("radtan", (0.0,) * 4) if k is None else ("equidistant", k)
     rows = "".join(f"  - {_yaml_list([*row, 0.0])}\n" for row in np.asarray(camera.R_body_cam).T.tolist())
     return (

@@ -94,10 +94,7 @@ def camera_from_foreign_text(text: str, program: str, name: str, calibrated_angl
 
 
 def _camera(keys: dict[str, Any], name: str) -> Camera:
-    """A camera whose image circle ends at the frame's farthest corner, or where the radius stops rising.
-
-    Raises BadInput bad_calibration for numbers beyond the limits of our own camera files.
-    """
+    """A camera whose image circle ends at the frame's farthest corner, or where the radius stops rising."""
     R_body_cam = keys.pop("R_body_cam", None)
     named = {"name": keys.get("name") or name, "max_angle_deg": SMALL_ANGLE_DEG}
     camera = camera_from_dict(keys | named)  # the limits are checked here
@@ -113,10 +110,7 @@ def _frame_edges(camera: Camera) -> Array:
 
 
 def _nearest_edge_rad(camera: Camera) -> float:
-    """The angle off the axis [rad] of the point of the frame's edge that is nearest to the centre.
-
-    Raises BadInput bad_calibration if the centre is outside the frame.
-    """
+    """The angle off the axis [rad] of the point of the frame's edge that is nearest to the centre."""
     (cx, cy), (x, y) = camera.centre_px, _frame_edges(camera)
     if not (x[0] < cx < x[1] and y[0] < cy < y[1]):
         raise BadInput(

@@ -79,10 +79,7 @@ def _find_images(args: argparse.Namespace) -> tuple[Sequence[Image], Sequence[Im
 def _locate_images(
     found: Sequence[Image], whole: Sequence[Image], out: Path, facts: dict[str, Any], args: argparse.Namespace
 ) -> int:
-    """Locate the images `found` and write the tables of the `whole` folder or bag; the exit code.
-
-    A usage error where `out` holds a batch of other images. Raises BadInput, BadOutput.
-    """
+    """Locate the images `found` and write the tables of the `whole` folder or bag; the exit code."""
     if not args.overwrite and batch.belongs_to_other_images(out, whole):
         args.usage_error(
             f"{out} holds a batch of other images than {args.folder} has now: choose another -D, or replace its "
@@ -230,10 +227,7 @@ class _Shown:
 
 
 def _write_tables(args: argparse.Namespace, out: Path, tasks: Sequence[Task], records: list[dict[str, Any]]) -> None:
-    """Write the tables of the whole folder's `tasks`; print a line on stderr for each kind of result that they lack.
-
-    Raises BadInput if they cannot be written.
-    """
+    """Write the tables of the whole folder's `tasks`; print a line on stderr for each kind of result that they lack."""
     of_flags = {  # without paths of this machine
         key: str(value) if key in ("time_utc", "time_sigma_s", "exposure_s") else Path(value).name
         for key, value in tasks[0].facts.items()

@@ -71,10 +71,7 @@ def detect(args: argparse.Namespace) -> int:
 
 
 def _run_images(args: argparse.Namespace, kind: str, solve: Solve) -> int:
-    """Solve each image, print its outcome, and return the exit code; results are NAME.`kind`.json.
-
-    A BadInput or an internal error of one image is its outcome and does not stop the others.
-    """
+    """Solve each image, print its outcome, and return the exit code; results are NAME.`kind`.json."""
     if args.image_topic is not None and not any(split_bag_path(path) for path in args.images):
         args.usage_error("--image-topic is for ROS bags, and none is given")
     needed = NEEDED_LATER[:-1] if args.no_plots else NEEDED_LATER
@@ -100,10 +97,7 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve) -> int:
 
 
 def _solve_image(args: argparse.Namespace, path: str, out: Path, solve: Solve) -> Outcome:
-    """Read and solve the image, and write its results with the record `out`; only -O replaces those of another image.
-
-    Raises BadInput. A folder that takes no results is a usage error.
-    """
+    """Read and solve the image and write its results with the record `out`; only -O replaces those of another image."""
     start, is_located = time.perf_counter(), args.command == "locate"
     exposure = read(path, args)
     camera, terrain = (None, chain.load_named(exposure)[1]) if is_located else (_camera_of(args, exposure), None)

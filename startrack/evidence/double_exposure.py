@@ -191,10 +191,7 @@ def _best_pair(rows: _Rows, terrain: Terrain, position_m: Array) -> DoubleExposu
 
 
 def _climb(fits: Callable[[Array], Array], start_m: Array, steps_m: Array) -> tuple[float, Array]:
-    """The best fit [nats] near one or two positions (k, 2) [m, enu], and where, in ever smaller steps (s,).
-
-    `fits` maps positions (m, k, 2) to (m,).
-    """
+    """The best fit [nats] near one or two positions (k, 2) [m, enu], and where, in ever smaller steps (s,)."""
     at, best = start_m, float(fits(start_m[None])[0])
     ways = np.einsum("kl,wc->kwlc", np.eye(len(start_m)), CIRCLE[:: MOVE_DIRECTIONS // 8]).reshape(-1, *start_m.shape)
     ways = np.concatenate([ways, np.broadcast_to(CIRCLE[:: MOVE_DIRECTIONS // 8, None], (8, *start_m.shape))])

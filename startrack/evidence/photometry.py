@@ -196,10 +196,7 @@ def _load_stamp(
     image, background, noise, dead, background_side, noise_side, across, down, i, left, top, radius, k, light,
     profile, data, variance, weight,
 ) -> None:  # fmt: skip
-    """Source i: its profile, the pixels without background and neighbours, their variances, and their weights.
-
-    The weight is 1 / variance, and 0 in unusable pixels.
-    """
+    """Source i: its profile, the pixels without background and neighbours, their variances, and their weights."""
     side = 2 * radius + 1
     source, x0, c0 = np.uint64(i), np.uint64(left), np.uint64(k - radius)
     for r in range(side):

@@ -129,10 +129,7 @@ def measure_sky_light(pixels: SkyPixels, horizon: Horizon) -> SkyLight:
 def _sum_pixels(
     pixels: SkyPixels, sector: Ints, levels: SkyLevels, width_px: float
 ) -> tuple[tuple[Array, Array, Array], Array]:
-    """Cells' heights, l and c (SECTORS, LEVELS) of `pixels` (n,) beside an edge of that width; see `_sum_cells`.
-
-    Besides the number of pixels of each sector and the sum of their scales (SECTORS, 2).
-    """
+    """Cells' heights, l and c (SECTORS, LEVELS) of `pixels` (n,) beside an edge of that width; see `_sum_cells`."""
     sums, scale = np.zeros((SECTORS, LEVELS, 3)), np.zeros((SECTORS, 2))
     _sum_cells(
         sector, pixels.height_px, pixels.light_e, pixels.px_per_rad, levels.covered, levels.level_e, levels.slope_e,

@@ -190,10 +190,7 @@ def _exposure_of(message: Message, where: str, name: str, path: str, given: dict
 
 
 def _decode(content: Any) -> tuple[Decoded, str | None]:
-    """Pixels of a message's `content`, and the pattern of its mosaic. Raises BadInput bad_image.
-
-    Rows of sensor_msgs/Image may be padded to `step` bytes. A CompressedImage alone has a `format`.
-    """
+    """Pixels of a message's `content`, and the pattern of its mosaic. Raises BadInput bad_image."""
     if hasattr(content, "format"):
         bayer = BAYER_IN_FORMAT.match(str(content.format))
         return decode_bytes(bytes(content.data)), bayer["pattern"].upper() if bayer else None

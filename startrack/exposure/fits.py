@@ -87,10 +87,7 @@ def _inflate(raw: bytes) -> bytes:
 
 
 def _check_units(read_to: Callable[[int], bytes | bytearray]) -> None:
-    """Refuse numbers of cards, units, axes, fields and bytes that a reader would loop over or allocate for minutes.
-
-    `read_to` returns the file, at least so many of its bytes.
-    """
+    """Refuse numbers of cards, units, axes, fields and bytes that a reader would loop over or allocate for minutes."""
     at = header_bytes = 0
     data_sizes: list[int] = []
     while read_to(at + BLOCK_BYTES)[at : at + 8] in (b"SIMPLE  ", b"XTENSION"):

@@ -108,10 +108,7 @@ def _upsample(level: Picture, shape: tuple[int, ...]) -> Picture:
 
 
 def _gains(excess: Picture, spoilt: NDArray[np.bool_] | None) -> Array:
-    """Gain of each phase (4,), their mean 1, from star pixels, each with the same weight whatever its star's flux.
-
-    All 1 if there are too few stars.
-    """
+    """Gain of each phase (4,), their mean 1, from star pixels, each with the same weight whatever its star's flux."""
     import cv2
 
     local = cv2.blur(excess, (STAR_BOX_PX, STAR_BOX_PX))

@@ -130,10 +130,7 @@ class Track:
         return float(TIME_STEP_RAD / np.linalg.norm(self.clock.turn_rad_s))
 
     def _likely_times(self) -> list[tuple[float, Array]]:
-        """Likely times [s later], the best first, each with a position (2,) [m, enu].
-
-        Raises NotLocated (insufficient_geometry, outside_search_area).
-        """
+        """Likely times [s later], the best first, each with a position (2,) [m, enu]."""
         low, high = self.limits_s
         times = np.linspace(low, high, 2 * int(np.ceil(0.5 * (high - low) / self.step_s)) + 1)
         if len(times) > MOST_SCANNED:
@@ -165,10 +162,7 @@ class Track:
     def _settle_time(
         self, later_s: float, position_m: Array, found_s: list[float]
     ) -> tuple[float, float, Array] | None:
-        """The time that the rows show about a time [s later], the logarithm of its share, and the best position.
-
-        None on the way to one of the times `found_s`.
-        """
+        """The time that the rows show about a time [s later], the logarithm of its share, and the best position."""
         low, high = self.limits_s
         for _ in range(TIME_ROUNDS):
             if any(abs(later_s - time_s) < 0.5 * self.step_s for time_s in found_s):

@@ -242,10 +242,7 @@ class Search:
         return np.concatenate([part[0] for part in kept]), np.concatenate([part[1] for part in kept])
 
     def _climb(self, centres: Array, half: float) -> bool:
-        """Whether a better position than the best known is near the boxes (n, 2) with the best average.
-
-        It is not sought where the best known one explains all sectors.
-        """
+        """Whether a better position than the best known is near the boxes (n, 2) with the best average."""
         if explains_sectors(self.guess, self.likelihood):
             return False
         average = self.likelihood.average.score(self.likelihood.terrain, centres, half)

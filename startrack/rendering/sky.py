@@ -176,10 +176,7 @@ def _is_above_horizon(east: Array, north: Array, up: Array, azimuths: Array, tan
 
 
 def _lens_table(scene: Scene) -> tuple[Array, Array, Array, Array]:
-    """Per radius rho [focal lengths]: sky light per pixel [e], sin a / rho and cos a.
-
-    The rim of the image circle is as sharp as the PSF.
-    """
+    """Per radius rho [focal lengths]: sky light per pixel [e], sin a / rho and cos a."""
     from scipy.special import ndtr
 
     camera = scene.camera

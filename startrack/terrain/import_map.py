@@ -143,10 +143,7 @@ def import_maps(
 
 
 def _geoid_values(grid: str, values: dict[str, Any]) -> dict[str, Any]:
-    """The keys of [dem] that state the geoid at the origin of a terrain file's `values`, by a `grid` of PROJ.
-
-    Raises BadInput (bad_terrain).
-    """
+    """The keys of [dem] that state the geoid at the origin of a terrain file's `values`, by a `grid` of PROJ."""
     if values["body"] != "earth":
         raise BadInput("bad_terrain", "heights above a geoid are those of maps of the Earth")
     at = values["origin"]

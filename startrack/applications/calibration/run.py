@@ -258,10 +258,7 @@ def identify_with_camera(camera: Camera, frame: Frame) -> tuple[Camera, Identifi
 
 
 def _fit_jointly(run: _Run) -> tuple[JointFit, tuple[Frame, ...]]:
-    """The joint fit without static sources, and its frames with them.
-
-    Images of the other handedness are left out, and those whose stars and sources the lens does not explain.
-    """
+    """The joint fit without static sources, and its frames with them."""
     camera, same = run.lead.camera, list[_IdentifiedFrame]()
     for one in run.identified:
         if one.camera.mirrored == camera.mirrored:

@@ -182,10 +182,7 @@ def _sweep(
     context: Context, name: str, key: str, standard: float, x: Sequence[float], title: str, also: str,
     also_of: Callable[[float], str],
 ) -> Artefact:  # fmt: skip
-    """The mean errors of all methods over the setting `key` of the tasks, which has the values `x`.
-
-    The table has the column `also` too, `also_of` each value.
-    """
+    """The mean errors of all methods over the setting `key` of the tasks, which has the values `x`."""
     words, skies, per_sky = key.replace("_", " "), context.size.sweep_skies, context.size.sweep_per_sky
 
     def collect(value: float, method: str) -> list[MethodErrors]:

@@ -55,15 +55,8 @@ class Row:
         errors, found = self.errors_m, error_statistics(self.errors_m)
         mean = f"{found['mean_m']:.1f} ± {errors.std(ddof=1) / np.sqrt(len(errors)):.1f}"
         refused = f"{len(self.drawn_m) - len(errors)} of {len(self.drawn_m)}"
-        return [
-            str(self.page),
-            self.way,
-            self.places,
-            mean,
-            f"{np.median(errors):.1f}",
-            f"{found['max_m']:.0f}",
-            refused,
-        ]
+        median, largest = f"{np.median(errors):.1f}", f"{found['max_m']:.0f}"
+        return [str(self.page), self.way, self.places, mean, median, largest, refused]
 
 
 def proposals(context: Context) -> Artefact:
@@ -118,10 +111,7 @@ def best_of_grid(points_m: Array, seen: Bools, end_m: Array, radius_m: float) ->
 
 
 def _descend_from_hull(points_m: Array, seen: Bools, wall_m: float, radius_m: float) -> tuple[Array, bool]:
-    method = PseudoGradient()
-    return descend(
-        points_m, seen, hull_position(points_m[seen], wall_m, radius_m), radius_m, method.gain, method.most_steps
-    )
+    return descend(points_m, seen, hull_position(points_m[seen], wall_m, radius_m), radius_m)
 
 
 def _behind_obstacle(context: Context) -> Iterator[Row]:
@@ -205,10 +195,7 @@ def simplify_crater(terrain: Terrain) -> tuple[Array, float, float]:
 
 
 def _locate_on_floor(scene: Scene, centre_m: Array, radius_m: float, rim_m: float, is_flat: bool) -> Array:
-    """Position (2,) [m] by hull and descent; the depth is that below the rim, of the map's middle or at the estimate.
-
-    NaN where the estimate is not inside the rim.
-    """
+    """Position (2,) [m] by hull and descent; the depth is that of the map's middle, or of the estimate."""
     sky, position = scene.sky, centre_m
     for _ in range(1 if is_flat else FLOOR_ROUNDS):
         wall = rim_m - float(scene.terrain.ground_m(position[None])[0]) - scene.terrain.camera_height_m

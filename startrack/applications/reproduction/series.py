@@ -50,10 +50,7 @@ def locate_by_stops(scene: Scene) -> Array:
 def _observe(
     scene: Scene, positions_m: Array, moves_m: Array, every_s: dict[str, float]
 ) -> tuple[list[ObservedFrame], TrackErrors]:
-    """Exposures at positions (n, 2), and the errors that they share; the first is searched, the others by moves.
-
-    The moves (n - 1, 2) are measured ones. Raises NotLocated where the first has no single position.
-    """
+    """Exposures at positions (n, 2), and the errors that they share; the first is searched, the others by moves."""
     terrain, catalog = scene.terrain, load_catalog()
     frames: list[ObservedFrame] = []
     start = scene.pictures.pose(0).time_utc

@@ -84,10 +84,7 @@ def _doubt(
     modes: Sequence[Sequence[FrameEstimate]], best: Explanation, found: Smoothed | None,
     others: Sequence[Explanation], height_sigma_m: float,
 ) -> tuple[Array, Explanation | None]:  # fmt: skip
-    """Probability (n,) of explanations of another position of each frame, and the likeliest of these explanations.
-
-    `found` is the estimate by the `best` one.
-    """
+    """Probability (n,) of explanations of another position of each frame, and the likeliest of these explanations."""
     doubt, rival = np.zeros(len(best.mode)), None
     share = np.array([one.share for one in others])
     differs = np.array([(one.mode != best.mode) | (best.mode < 0) for one in others]).reshape(len(others), len(doubt))

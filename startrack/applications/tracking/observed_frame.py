@@ -126,10 +126,7 @@ def _image_fixes(fix: Fix, terrain: Terrain) -> tuple[ImageFix, ...]:
 
 
 def _informative_rows(located: Located, terrain: Terrain, position_m: Array) -> Evidence:
-    """The rows that say something about the skyline seen from a position (2,), with the errors of the image.
-
-    They are those of the stars and of the sky's light that the position is from.
-    """
+    """The rows that say something about the skyline seen from a position (2,), with the errors of the image."""
     stars = rows = replace(located.evidence(), near=None)
     if located.sky is not None:
         light = located.sky.light.evidence(located.sky.used)

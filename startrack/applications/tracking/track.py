@@ -233,10 +233,7 @@ def _track_frame(frame: ObservedFrame, mode: int, attitude_fits: bool) -> TrackF
 def _trajectory(
     position_m: Array, covariance_m2: Array, terrain: Terrain, alone: Mapping[int, Sequence[ImageFix]]
 ) -> Trajectory:
-    """Positions (n, 2) and covariances (n, 2, 2) as a trajectory.
-
-    Those of the frames in `alone` are by one image: the only one of its fixes is what is known of them.
-    """
+    """Positions (n, 2) and covariances (n, 2, 2) as a trajectory."""
     known = np.sqrt(np.trace(covariance_m2, axis1=1, axis2=2)) < UNKNOWN_SIGMA_M
     position = np.full((len(position_m), 3), np.nan)
     for k in np.flatnonzero(known):

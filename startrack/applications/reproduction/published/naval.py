@@ -105,10 +105,7 @@ def locate_by_features(skyline: MeasuredSkyline, terrain: Terrain, features: Map
 
 
 def _poses(bearing_rad: Array, elevation_rad: Array, terrain: Terrain, features: MapFeatures) -> Array:
-    """Poses (n, 3), east and north [m] and heading [rad], from which three features of the map are those seen.
-
-    None for three `bearing_rad` (3,) of which two are close together: they determine it badly.
-    """
+    """Poses (n, 3), east and north [m] and heading [rad], from which three features of the map are those seen."""
     order = np.argsort(bearing_rad)
     bearing, elevation = bearing_rad[order], elevation_rad[order]
     between = np.diff(bearing, append=bearing[0] + 2 * np.pi)

@@ -23,6 +23,7 @@ from schema_helpers import check_printed_schema
 from startrack.applications.batch import Task, images_under, listed_images, locate_image, write_tables
 from startrack.camera import load_camera, save_camera
 from startrack.catalog import load_catalog
+from startrack.chain import Settings
 from startrack.cli.main import main
 from startrack.core.errors import BadInput
 from startrack.exposure import write_exposure, write_sidecar
@@ -185,11 +186,11 @@ def test_a_localizer_is_one_class_and_one_line_in_the_list(night, tmp_path, monk
     monkeypatch.setitem(LOCALIZERS, "fixed", FixedPosition)
     image = night / "images" / "späti" / "b.png"
     task = Task("b.png", str(image), str(tmp_path / "b.fix.json"), plots=False)
-    record, _ = locate_image(replace(task, localizer="fixed"))
+    record, _ = locate_image(replace(task, settings=Settings(localizer="fixed")))
     assert (record["position"]["east_m"], record["position"]["north_m"]) == (123.0, 45.0)
     assert record["provenance"]["localizer"] == "fixed"
     assert record["position"]["dropped_probability"] is None
-    assert locate_image(replace(task, localizer="fixed")) == (record, True)
+    assert locate_image(replace(task, settings=Settings(localizer="fixed"))) == (record, True)
     other, kept = locate_image(task)  # another localizer gives another result
     assert not kept
     assert other["position"]["east_m"] != 123.0

@@ -19,7 +19,7 @@ from startrack.applications import batch
 from startrack.applications.batch import Image, ImageDone, Task
 from startrack.cli.console import discard_stdout, progress
 from startrack.cli.flags import check_cluster, check_localizer
-from startrack.cli.images import absolute_facts, compile_kernels, near_attitude_of, prepare_reference
+from startrack.cli.images import absolute_facts, compile_kernels, prepare_reference, settings_of
 from startrack.cli.report import write_page_of
 from startrack.core import errors
 from startrack.core.compilation import is_compiled
@@ -115,13 +115,11 @@ def _locate_images(
 
 
 def _tasks(found: Sequence[Image], out: Path, facts: dict[str, Any], args: argparse.Namespace) -> list[Task]:
-    here, near_attitude = Path(os.path.abspath(out)), near_attitude_of(args)
+    here, settings = Path(os.path.abspath(out)), settings_of(args)
     return [
         Task(
             name=image.name, path=os.path.abspath(image.path), result=str(batch.record_path(here, image)), facts=facts,
-            plots=not args.no_plots, overwrite=args.overwrite, localizer=args.localizer,
-            evidence=args.evidence, near=args.near, near_attitude=near_attitude, near_sky=args.near_sky,
-            bag_image=image.bag_image,
+            plots=not args.no_plots, overwrite=args.overwrite, settings=settings, bag_image=image.bag_image,
         )
         for image in found
     ]  # fmt: skip

@@ -18,7 +18,7 @@ import numpy as np
 from startrack import exposure as images
 from startrack.camera import Camera, load_camera
 from startrack.catalog import daylight_warnings
-from startrack.chain import NearAttitude, read_near_attitude
+from startrack.chain import NearAttitude, Settings, read_near_attitude
 from startrack.cli.console import progress
 from startrack.cli.flags import checked_flag
 from startrack.core.compilation import announce_compilation, is_compiled
@@ -26,9 +26,10 @@ from startrack.core.errors import BadInput, one_line
 from startrack.core.files import is_path
 from startrack.core.runner import count_cores
 from startrack.core.table_text import column_lines, join_columns
-from startrack.core.types import Evidence, Exposure, NotLocated
+from startrack.core.types import Evidence, Exposure, NotLocated, PositionPrior
 from startrack.estimation.observations import OdometryErrors
 from startrack.frames import Site, angle_between_rad, parse_utc, rays_from_azel
+from startrack.identification import Identifier
 from startrack.terrain import TERRAIN_KEYS, Terrain, load_terrain
 
 SITE_TOLERANCE_DEG = 0.1  # as far as an azimuth of a skyline may be wrong
@@ -94,6 +95,14 @@ def check_fov(args: argparse.Namespace) -> None:
 def near_attitude_of(args: argparse.Namespace) -> NearAttitude | None:
     """The rough attitude of --near-attitude; None without it. Raises BadInput (bad_image)."""
     return None if args.near_attitude is None else read_near_attitude(args.near_attitude)
+
+
+def settings_of(args: argparse.Namespace) -> Settings:
+    """The settings that the flags of `locate` and `batch` state. Raises BadInput (bad_image) as `near_attitude_of`."""
+    return Settings(
+        identifier=Identifier(near_sky=args.near_sky), localizer=args.localizer, evidence_sources=args.evidence,
+        near=None if args.near is None else PositionPrior(*args.near), near_attitude=near_attitude_of(args),
+    )  # fmt: skip
 
 
 def check_one_time(args: argparse.Namespace) -> None:

@@ -19,11 +19,11 @@ from startrack.camera import Camera, load_camera
 from startrack.catalog import load_catalog
 from startrack.cli.console import Outcome, print_outcome, refusal_record, worst_code
 from startrack.cli.flags import check_localizer
-from startrack.cli.images import check_fov, compile_beside, near_attitude_of, prepare, read
+from startrack.cli.images import check_fov, compile_beside, near_attitude_of, prepare, read, settings_of
 from startrack.cli.report import write_page_of_images
 from startrack.core.errors import INTERNAL_ERROR, BadInput, BadOutput
 from startrack.core.files import make_folder, printable
-from startrack.core.types import Exposure, PositionPrior
+from startrack.core.types import Exposure
 from startrack.exposure import read_mask, split_bag_path
 from startrack.identification import WIDE_FIELD_RAD, Identifier
 
@@ -39,11 +39,7 @@ def locate(args: argparse.Namespace) -> int:
             f"--fov {args.fov} IMAGE... -o CAMERA.toml, then startrack locate -c CAMERA.toml"
         )
     check_localizer(args)
-    near = None if args.near is None else PositionPrior(*args.near)
-    settings = chain.Settings(
-        identifier=Identifier(near_sky=args.near_sky), localizer=args.localizer, evidence_sources=args.evidence,
-        near=near, near_attitude=near_attitude_of(args),
-    )  # fmt: skip
+    settings = settings_of(args)
     code = _run_images(args, "fix", lambda exposure, _: chain.locate_exposure(exposure, settings))
     if args.report:
         write_page_of_images(args.dir, args.images)

@@ -12,16 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from startrack import __version__, chain, output
-from startrack.chain import NearAttitude, Outcome, content_sha256
+from startrack.chain import Outcome, content_sha256
 from startrack.core.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput, Reason, one_line
 from startrack.core.files import FULL_DISK, printable, remove_file
 from startrack.core.runner import Died, Runner, RunStopped
 from startrack.core.stored import read_json_object
-from startrack.core.types import Exposure, PositionPrior
+from startrack.core.types import Exposure
 from startrack.exposure import BagImage, read_bag_image, read_exposure
 from startrack.frames import R_from_quat_xyzw
-from startrack.identification import Identifier, NearSky
-from startrack.localization import require_localizer
+from startrack.localization import localizer_name
 
 JOB = "job_sha256"  # hash of a result's inputs (content of its files, flags, version); null: the next run repeats it
 INPUTS = "inputs"  # camera and terrain files that the result was made with: path from the image to SHA-256
@@ -48,12 +47,8 @@ class Task:
     facts: dict[str, Any] = field(default_factory=dict)  # from flags, by the parameters of `read_exposure`
     plots: bool = True
     overwrite: bool = False  # locate it again even if a valid result is there
-    localizer: str = "posterior"  # of startrack.localization.LOCALIZERS
-    evidence: str = "both"  # of startrack.chain.stages.EVIDENCE_SOURCES
+    settings: chain.Settings = field(default_factory=chain.Settings)
     bag_image: BagImage | None = None  # where `path` is BAG#NUMBER
-    near: tuple[float, float, float] | None = None  # east, north, sigma [m] of a prior of the position
-    near_attitude: NearAttitude | None = None
-    near_sky: NearSky | None = None
 
 
 def locate_images(runner: Runner[Task, ImageDone], tasks: Sequence[Task]) -> Generator[ImageDone, None, None]:
@@ -113,10 +108,12 @@ def _valid_record(task: Task, key: str) -> dict[str, Any] | None:
 
 
 def _key(task: Task, sha256: str) -> str:
-    near_sky = None if task.near_sky is None else astuple(task.near_sky)
+    settings, near_sky = task.settings, task.settings.identifier.near_sky
+    near = () if settings.near is None else astuple(settings.near)
+    pointing = (settings.near_attitude, None if near_sky is None else astuple(near_sky))
     return chain.job_sha256(
-        task.path, sha256, task.facts, task.plots, task.localizer, task.evidence, *(task.near or ()),
-        *(one for one in (task.near_attitude, near_sky) if one is not None),
+        task.path, sha256, task.facts, task.plots, localizer_name(settings.localizer), settings.evidence_sources,
+        *near, *(one for one in pointing if one is not None),
     )  # fmt: skip
 
 
@@ -169,13 +166,7 @@ def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str
     # Before the files are read, so that a change in between is noticed.
     inputs = chain.input_hashes(task.path, [exposure.camera], exposure.terrain, exposure.mask, exposure.obstacles)
     try:
-        near = None if task.near is None else PositionPrior(*task.near)
-        localizer = require_localizer(task.localizer)
-        settings = chain.Settings(
-            identifier=Identifier(near_sky=task.near_sky), localizer=localizer, evidence_sources=task.evidence,
-            near=near, near_attitude=task.near_attitude,
-        )  # fmt: skip
-        return chain.locate_exposure(exposure, settings), inputs
+        return chain.locate_exposure(exposure, task.settings), inputs
     except BadInput as cause:
         refused = chain.Refused(reason=cause.reason, message=str(cause), reached=chain.Inputs(exposure=exposure))
         return output.result_dict(refused), inputs

@@ -13,8 +13,8 @@ from test_calibration_fit import CENTRE_PX, FOCAL_PX, ROUGH, simulate_frames
 
 from startrack.applications.calibration import fit_lens, observations
 from startrack.applications.calibration.shared_errors import FLOOR_PX, birge_ratio, nights, widen_covariance
-from startrack.applications.calibration.verify import CHANGED_SIGMAS, difference_px
-from startrack.camera import Camera, cap_grid, projection_covariance_px2
+from startrack.applications.calibration.verify import CHANGED_SIGMAS
+from startrack.camera import Camera, cap_grid, difference_px, projection_covariance_px2
 from startrack.core.types import Array
 from startrack.estimation.joint_fit import JointFit
 

@@ -13,8 +13,7 @@ from startrack.applications.calibration import KnownSensor, calibrate
 from startrack.applications.calibration.photometry import measure_photometry
 from startrack.applications.calibration.sensor import fit_photon_transfer
 from startrack.applications.calibration.throughput import StarFluxes, fit_throughput
-from startrack.applications.calibration.verify import difference_px
-from startrack.camera import Camera, KannalaBrandt, Sensor, cap_grid
+from startrack.camera import Camera, KannalaBrandt, Sensor, cap_grid, difference_px
 from startrack.catalog import load_catalog
 from startrack.core.types import Exposure
 from startrack.frames import airmass

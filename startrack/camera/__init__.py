@@ -4,6 +4,7 @@ from startrack.camera.camera import (
     Camera,
     cap_grid,
     compensating_rotation,
+    difference_px,
     lens_jacobian,
     projection_covariance_px2,
     with_covariance,
@@ -30,6 +31,6 @@ __all__ = [
     "MIN_THROUGHPUT_1", "REFRACTION_CONTAINED", "REFRACTION_REMOVED", "SENSOR", "Camera", "Decentring", "KannalaBrandt",
     "Lens", "Pinhole", "Platepar", "Sensor", "VirtualSkyOverlay", "camera_from_dict", "camera_from_foreign_text",
     "camera_keys", "camera_text", "camera_to_dict", "cap_grid", "compensating_rotation", "decentring_rms_px",
-    "default_lens", "foreign_text", "lens_jacobian", "lens_kinds", "load_camera", "platepar_of",
+    "default_lens", "difference_px", "foreign_text", "lens_jacobian", "lens_kinds", "load_camera", "platepar_of",
     "projection_covariance_px2", "save_camera", "virtualsky_of", "with_covariance", "with_update",
 ]  # fmt: skip

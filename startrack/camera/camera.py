@@ -217,6 +217,14 @@ def cap_grid(angle_rad: float, points: int = CAP_POINTS) -> Array:
     return np.stack([r * np.cos(GOLDEN_ANGLE_RAD * i), r * np.sin(GOLDEN_ANGLE_RAD * i), z], axis=-1)
 
 
+def difference_px(one: Camera, other: Camera, rays_cam: Array) -> Array:
+    """Pixels (n, 2) of `other` minus those of `one` at `rays_cam` (n, 3), the best rotation between them removed."""
+    change = (other.project_unlimited(rays_cam) - one.project_unlimited(rays_cam)).reshape(-1)
+    by_rotation = one.jacobian_px_per_rad(rays_cam).reshape(-1, 3)
+    rest = change - by_rotation @ np.linalg.lstsq(by_rotation, change, rcond=None)[0]
+    return np.asarray(rest.reshape(-1, 2), dtype=np.float64)
+
+
 def compensating_rotation(camera: Camera, order: tuple[str, ...]) -> Array:
     """Rotation (3, m) of the camera [rad per parameter] that best compensates a change of each parameter in `order`.
 

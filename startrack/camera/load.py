@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from startrack.camera.camera import Camera, cap_grid, require_not_mirrored
+from startrack.camera.camera import Camera, cap_grid, difference_px, require_not_mirrored
 from startrack.camera.formats import FOREIGN_FORMATS, find_program
 from startrack.camera.io import camera_from_dict
 from startrack.camera.optics import Decentring
@@ -122,9 +122,6 @@ def _nearest_edge_rad(camera: Camera) -> float:
 
 def decentring_rms_px(camera: Camera) -> float:
     """RMS difference [px] over the calibrated cap to the camera without decentring, the best rotation removed."""
-    grid = cap_grid(camera.calibrated_angle_rad)
     centred = replace(camera, decentring=Decentring())
-    difference = (camera.project(grid)[0] - centred.project(grid)[0]).reshape(-1)
-    rotation = centred.jacobian_px_per_rad(grid).reshape(-1, 3)
-    rest = difference - rotation @ np.linalg.lstsq(rotation, difference, rcond=None)[0]
-    return float(np.sqrt(np.mean(np.sum(rest.reshape(-1, 2) ** 2, axis=1))))
+    difference = difference_px(centred, camera, cap_grid(camera.calibrated_angle_rad))
+    return float(np.sqrt(np.mean(np.sum(difference**2, axis=1))))

@@ -11,10 +11,10 @@ import numpy as np
 from startrack.applications.calibration.acceptance import horizon_checks
 from startrack.applications.calibration.run import identify_with_camera, load_frame
 from startrack.applications.calibration.shared_errors import widen_covariance
-from startrack.camera import Camera, cap_grid, projection_covariance_px2
+from startrack.camera import Camera, cap_grid, difference_px, projection_covariance_px2
 from startrack.catalog import StarCatalog
 from startrack.core.files import printable
-from startrack.core.types import Array, Exposure, NotIdentified
+from startrack.core.types import Exposure, NotIdentified
 from startrack.estimation.joint_fit import fit_frames, grow_from_matches
 from startrack.frames import Site
 
@@ -102,14 +102,6 @@ def verify(
         has_site=frame.sky.includes_refraction,
         file_has_site=file_has_site,
     )
-
-
-def difference_px(one: Camera, other: Camera, rays_cam: Array) -> Array:
-    """Pixels (n, 2) of `other` minus those of `one` at the rays (n, 3), the best rotation between them removed."""
-    change = (other.project_unlimited(rays_cam) - one.project_unlimited(rays_cam)).reshape(-1)
-    by_rotation = one.jacobian_px_per_rad(rays_cam).reshape(-1, 3)
-    rest = change - by_rotation @ np.linalg.lstsq(by_rotation, change, rcond=None)[0]
-    return np.asarray(rest.reshape(-1, 2), dtype=np.float64)
 
 
 def verify_dict(found: Verification) -> dict[str, Any]:

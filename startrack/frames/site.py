@@ -13,16 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from startrack.core.types import Array, BadInput
+from startrack.frames import orientation
 from startrack.frames.air import Air
-from startrack.frames.orientation import (
-    EARTH_SPIN_RAD_S,
-    NAIF,
-    R_itrs_icrs,
-    R_mcmf_icrs,
-    R_mcmf_icrs_rate_1_s,
-    barycentric_state,
-    et_s,
-)
 
 MOON_RADIUS_M = 1_737_400.0  # sphere of the LOLA maps, IAU 2015
 
@@ -137,7 +129,7 @@ def R_enu_icrs(site: Site, time: datetime) -> Array:
         BadInput: "no_time" outside the years that the ephemeris covers (1900 to 2050).
         RuntimeError: a package that carries the ephemeris is missing.
     """
-    R_fixed_icrs = R_mcmf_icrs(time) if site.body == "moon" else R_itrs_icrs(time)
+    R_fixed_icrs = orientation.R_mcmf_icrs(time) if site.body == "moon" else orientation.R_itrs_icrs(time)
     return R_enu_fixed(site) @ R_fixed_icrs
 
 
@@ -171,12 +163,12 @@ def observer_state(site: Site, time: datetime) -> tuple[Array, Array]:
     Raises: as R_enu_icrs.
     """
     r_fixed_m = position_fixed_m(site)
-    centre_m, velocity_m_s = barycentric_state(NAIF[site.body], et_s(time))
+    centre_m, velocity_m_s = orientation.barycentric_state(orientation.NAIF[site.body], orientation.et_s(time))
     if site.body == "moon":
-        R_fixed_icrs, spin_m_s = R_mcmf_icrs(time), r_fixed_m @ R_mcmf_icrs_rate_1_s(time)
+        R_fixed_icrs, spin_m_s = orientation.R_mcmf_icrs(time), r_fixed_m @ orientation.R_mcmf_icrs_rate_1_s(time)
     else:
-        R_fixed_icrs = R_itrs_icrs(time)
-        spin_m_s = np.cross([0.0, 0.0, EARTH_SPIN_RAD_S], r_fixed_m) @ R_fixed_icrs
+        R_fixed_icrs = orientation.R_itrs_icrs(time)
+        spin_m_s = np.cross([0.0, 0.0, orientation.EARTH_SPIN_RAD_S], r_fixed_m) @ R_fixed_icrs
     return centre_m + r_fixed_m @ R_fixed_icrs, velocity_m_s + spin_m_s
 
 

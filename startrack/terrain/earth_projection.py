@@ -13,13 +13,13 @@ from numpy.typing import ArrayLike
 
 from startrack.core.errors import how_to_install, length_text
 from startrack.core.types import Array, BadInput
+from startrack.frames import EARTH_RADIUS_M
 
 if TYPE_CHECKING:
     import pyproj
 
 WGS84_CODE = 4326
 EARTH_RADII_M = 6_300_000.0, 6_450_000.0  # semi-major axes of all ellipsoids that maps of the Earth are on
-EARTH_MEAN_RADIUS_M = 6_371_008.8  # IUGG
 FOOT_M = 0.3048
 SCALE_STEP_M = 100.0  # over which the scale of a map is measured
 UNNAMED = "unnamed", "unknown"  # names that decoders give
@@ -52,7 +52,7 @@ class EarthProjection:
     def units_per_m(self, latitude_rad: float) -> tuple[float, float]:
         """Map units of a metre on the ground along x and y at `latitude_rad`; of projected maps near their middle."""
         lat, lon = (latitude_rad, 0.0) if self.middle_x is not None else self.near
-        step = SCALE_STEP_M / EARTH_MEAN_RADIUS_M
+        step = SCALE_STEP_M / EARTH_RADIUS_M
         x, y = self.xy_from_latlon(
             np.array([lat, lat, lat + step]), lon + step / np.cos(lat) * np.array([0.0, 1.0, 0.0])
         )

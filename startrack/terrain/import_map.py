@@ -13,8 +13,7 @@ import numpy as np
 from startrack.core.errors import BadOutput, length_text
 from startrack.core.files import check_output, data_dir
 from startrack.core.types import BadInput
-from startrack.frames import Site
-from startrack.terrain.earth_projection import EARTH_MEAN_RADIUS_M
+from startrack.frames import EARTH_RADIUS_M, Site
 from startrack.terrain.geoid import geoid_at
 from startrack.terrain.height_map import HeightMap
 from startrack.terrain.io import terrain_from_dict
@@ -238,7 +237,7 @@ def _place_warnings(maps: Sequence[Raster], values: dict[str, Any]) -> list[str]
         return found
     reach_m = max(0.5 * min(one.heights_m.shape) * one.post_m for one in maps)
     highest_m = values["dem"].get("highest_beyond_m", EARTH_HIGHEST_M) - values["origin"]["height_m"]
-    beyond_rad = float(np.arctan((highest_m - 0.5 * reach_m**2 / EARTH_MEAN_RADIUS_M) / reach_m))
+    beyond_rad = float(np.arctan((highest_m - 0.5 * reach_m**2 / EARTH_RADIUS_M) / reach_m))
     if beyond_rad > SEEN_BEYOND_RAD:
         found.append(
             f"the maps end about {length_text(reach_m)} from the origin: ground beyond could stand up to "

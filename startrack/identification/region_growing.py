@@ -166,7 +166,12 @@ class PinholeView:
         """Pixels (n, 2) of rays (n, 3) less than 90 degrees off the axis, and which lie in the frame."""
         cam = rays_icrs @ self.R_cam_icrs.T
         plane = cam[:, :2] / np.maximum(cam[:, 2], 1e-6)[:, None]
-        px = self._pixels(plane)
+        focal_px = np.array([-self.focal_px if self.mirrored else self.focal_px, self.focal_px])
+        ratio = np.ones(len(plane))  # of the radius to that of a pinhole
+        if self.distortion:
+            radius = np.sqrt(np.einsum("ni,ni->n", plane, plane))
+            ratio += self.distortion * (np.arctan(radius) ** 3 / np.maximum(radius, 1e-12))
+        px = np.asarray(plane * ratio[:, None] * focal_px + self.centre_px)
         half = 0.5 * np.array(self.size_px)
         return px, (np.abs(px - self.centre_px) <= half).all(axis=1) & (cam[:, 2] > 0)
 
@@ -188,20 +193,3 @@ class PinholeView:
         camera = unknown_camera(self.size_px, self.focal_px, (x, y), lens, self.mirrored)
         corner = float(camera.angle_rad(np.array([-0.5, -0.5])))
         return replace(camera, max_angle_rad=corner, calibrated_angle_rad=corner)
-
-    @property
-    def _signed_focal_px(self) -> Array:
-        return np.array([-self.focal_px if self.mirrored else self.focal_px, self.focal_px])
-
-    def _pixels(self, plane: Array) -> Array:
-        return np.asarray(plane * self._radius_ratio(plane)[:, None] * self._signed_focal_px + self.centre_px)
-
-    def _radius_ratio(self, plane: Array) -> Array:
-        """Radius over that of a pinhole (n,), at positions (n, 2) of the pinhole's plane."""
-        return 1.0 + self.distortion * _cube(plane) if self.distortion else np.ones(len(plane))
-
-
-def _cube(plane: Array) -> Array:
-    """Cube of the angle off the axis over the radius (n,) at positions (n, 2) of a pinhole's plane."""
-    radius = np.sqrt(np.einsum("ni,ni->n", plane, plane))
-    return np.asarray(np.arctan(radius) ** 3 / np.maximum(radius, 1e-12))

@@ -43,7 +43,6 @@ def simulate_rays(
     *,
     time_utc: datetime | None = None,
     time_sigma_s: float | None = TIME_SIGMA_S,
-    photometry: StarEvidence | None = None,
     rng: np.random.Generator,
 ) -> StarRays:
     """The photometry of the catalogue's stars in the image of a `scene`, drawn without its pixels.
@@ -56,12 +55,11 @@ def simulate_rays(
         terrain: the map (None: the scene's terrain, which is the ground).
         time_utc: the stated time (None: the true one).
         time_sigma_s: its stated error (None: nobody states it).
-        photometry: settings of the evidence.
         rng: of the noise.
 
     Raises BadInput: bad_terrain and no_time where scene or map lack what relates the stars to the ground.
     """
-    ground, photometry = scene.terrain, photometry or StarEvidence()
+    ground = scene.terrain
     if ground is None:
         raise BadInput("bad_terrain", "the scene has no terrain: nothing hides the stars")
     terrain = terrain or ground
@@ -107,7 +105,7 @@ def simulate_rays(
     light = Starlight(xy_px, light_e, sensor.psf_sigma_px).measure(
         found.sources(visible), variance, sensor.gain_e_per_adu * (sensor.saturation_adu - sensor.bias_adu), rng=rng
     )
-    measured = mask_unpredictable(photometry.judge(found, light), terrain)
+    measured = mask_unpredictable(StarEvidence().judge(found, light), terrain)
     sigma_s = TIME_SIGMA_S if time_sigma_s is None else time_sigma_s
     clock = clock_at(site, when, sigma_s, is_stated=time_sigma_s is not None)
     return StarRays(terrain=terrain, R_enu_icrs=R_enu, clock=clock, light=measured)

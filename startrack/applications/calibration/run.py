@@ -116,7 +116,7 @@ def calibrate(
     joint = widen_covariance(joint)
     fitted = replace(
         joint.fit.camera, name=name, max_angle_rad=largest_angle_rad(joint.fit.camera, camera, fov_rad),
-        refraction=_refraction(site),
+        refraction=REFRACTION_CONTAINED if site is None else "" if site.air is None else REFRACTION_REMOVED,
     )  # fmt: skip
     joint = replace(joint, fit=replace(joint.fit, camera=fitted))
     progress("measuring throughput and sensor")
@@ -137,13 +137,6 @@ def calibrate(
         obstructed=obstructed,
         no_mask_because=no_mask_because,
     )
-
-
-def _refraction(site: Site | None) -> str:
-    """The `refraction` of a camera that pictures from a `site` have calibrated; empty where there is no air."""
-    if site is None:
-        return REFRACTION_CONTAINED
-    return "" if site.air is None else REFRACTION_REMOVED
 
 
 def count_steps(images: int) -> int:
@@ -274,14 +267,11 @@ def _fit_jointly(run: _Run) -> tuple[JointFit, tuple[Frame, ...]]:
         return joint, frames
     for one, matched, is_explained in zip(same, joint.matches, explained, strict=True):
         if not is_explained:
-            text = _unexplained_text(matched.fraction)
+            text = (
+                f"{100 * matched.fraction:.0f} % of its bright sources are stars, or of its bright stars sources, the "
+                f"larger, and {100 * SMALLEST_FRACTION:.0f} % is the least: it shows cloud or lamps, or its lens or "
+                "time is another"
+            )
             run.refuse(one.frame.exposure.name, NotIdentified(text, "inconsistent_evidence"))
     run.identified = [one for one, is_explained in zip(same, explained, strict=True) if is_explained]
     return _fit_jointly(run)
-
-
-def _unexplained_text(fraction: float) -> str:
-    return (
-        f"{100 * fraction:.0f} % of its bright sources are stars, or of its bright stars sources, the larger, and "
-        f"{100 * SMALLEST_FRACTION:.0f} % is the least: it shows cloud or lamps, or its lens or time is another"
-    )

@@ -62,11 +62,7 @@ def draw_time(
     """A time with Sun and Moon at elevations in the ranges `sun_rad` and `moon_rad` [rad] at a `site`, by `rng`."""
     while True:
         when = YEAR + timedelta(days=float(rng.uniform(0, DAYS)))
-        at = {one.name: elevation_of(one.ray_icrs, site, when) for one in apparent_bodies(site, when)}
+        R = R_enu_icrs(site, when)
+        at = {one.name: float(azel_from_rays(R @ one.ray_icrs)[1]) for one in apparent_bodies(site, when)}
         if sun_rad[0] <= at["Sun"] <= sun_rad[1] and moon_rad[0] <= at["Moon"] <= moon_rad[1]:
             return when
-
-
-def elevation_of(ray_icrs: Array, site: Site, when: datetime) -> float:
-    """Elevation [rad] of the direction `ray_icrs` (3,) at a `site` and time `when`."""
-    return float(azel_from_rays(R_enu_icrs(site, when) @ ray_icrs)[1])

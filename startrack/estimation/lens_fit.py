@@ -11,18 +11,7 @@ import numpy as np
 
 from startrack.camera import Camera, with_covariance
 from startrack.core.types import Array, Bools, NotIdentified
-from startrack.estimation.adjust import (
-    SMALLEST_EXTRA_PX2,
-    CameraState,
-    Scheme,
-    Solution,
-    State,
-    adjust,
-    cauchy_loss,
-    chi_square,
-    extra_variance_px2,
-    inverse_covariance,
-)
+from startrack.estimation import adjust
 from startrack.estimation.lens_models import (
     LEAST_SQUARES,
     LensModel,
@@ -39,7 +28,9 @@ from startrack.frames import off_axis_rad
 MIN_LENS_STARS = 12
 WRONG_MATCH_CHI2 = 20.0  # two axes: rejects one good star in 20,000
 CAUCHY_CHI2 = 5.0  # chi-square at which the robust loss has halved a star's weight
-ROBUST = Scheme(loss=cauchy_loss(CAUCHY_CHI2), settled_px=2e-3)  # this fit only separates wrong matches from right ones
+ROBUST = adjust.Scheme(
+    loss=adjust.cauchy_loss(CAUCHY_CHI2), settled_px=2e-3
+)  # this fit only separates wrong matches from right ones
 ROBUST_ROUNDS = 4
 FIRST_SIGMA_PX = 1.0
 SCATTER_SIGMAS = 3.0  # deviation of a chi-square up to which it is chance
@@ -83,12 +74,12 @@ def fit_lens(
     pixels and a centred lens.
     Raises NotIdentified where fewer than 12 observations agree with each other.
     """
-    state = State(camera=start, R_cam_icrs=np.asarray(R_cam_icrs, dtype=np.float64))
+    state = adjust.State(camera=start, R_cam_icrs=np.asarray(R_cam_icrs, dtype=np.float64))
     return fit_state(state, points, coefficients=coefficients, square=square)
 
 
 def fit_state(
-    state: CameraState, points: Observations, *, coefficients: int | None = None, square: bool = False
+    state: adjust.CameraState, points: Observations, *, coefficients: int | None = None, square: bool = False
 ) -> LensFit:
     """The same as fit_lens, from a state; that of boards has positions beside the attitudes."""
     if len(points) < MIN_LENS_STARS:
@@ -99,11 +90,11 @@ def fit_state(
         robust_state, extra_px2 = state, FIRST_SIGMA_PX**2
         for k in range(ROBUST_ROUNDS):  # the polynomial grows
             free = model_of(robust_state.camera, 1 + k if coefficients is None else min(coefficients, 1 + k)).free
-            robust = adjust(robust_state, points, free, ROBUST, extra_px2=extra_px2)
+            robust = adjust.adjust(robust_state, points, free, ROBUST, extra_px2=extra_px2)
             robust_state = robust.state
-            extra_px2 = extra_variance_px2(robust.residual_px, points.covariance_px2, robust.parameters)
-        inverse = inverse_covariance(points.covariance_px2, extra_px2)
-        used = chi_square(robust.residual_px, inverse) < WRONG_MATCH_CHI2
+            extra_px2 = adjust.extra_variance_px2(robust.residual_px, points.covariance_px2, robust.parameters)
+        inverse = adjust.inverse_covariance(points.covariance_px2, extra_px2)
+        used = adjust.chi_square(robust.residual_px, inverse) < WRONG_MATCH_CHI2
         good = points.take(used)
         if len(good) < MIN_LENS_STARS:
             raise NotIdentified(f"only {len(good)} of {len(points)} matched stars agree on a lens", matched=len(good))
@@ -115,18 +106,22 @@ def fit_state(
 
 
 def _finish(
-    model: LensModel, best: Solution, points: Observations, used: Bools, candidates: tuple[ModelScore, ...]
+    model: LensModel, best: adjust.Solution, points: Observations, used: Bools, candidates: tuple[ModelScore, ...]
 ) -> LensFit:
     """The last fit, with sigmas that the scatter supports, its covariance, and the held-out residuals."""
     good = points.take(used)
     dof = max(2 * len(good) - best.parameters, 1)
-    stated = inverse_covariance(good.covariance_px2, SMALLEST_EXTRA_PX2)
-    chi2 = float(np.sum(chi_square(best.residual_px, stated)))
+    stated = adjust.inverse_covariance(good.covariance_px2, adjust.SMALLEST_EXTRA_PX2)
+    chi2 = float(np.sum(adjust.chi_square(best.residual_px, stated)))
     believed = is_chance(chi2, dof)
     extra_px2 = (
-        0.0 if believed else extra_variance_px2(best.residual_px, good.covariance_px2, best.parameters, by_sum=True)
+        0.0
+        if believed
+        else adjust.extra_variance_px2(best.residual_px, good.covariance_px2, best.parameters, by_sum=True)
     )
-    last = adjust(best.state, good, model.free, LEAST_SQUARES, extra_px2=max(extra_px2, SMALLEST_EXTRA_PX2))
+    last = adjust.adjust(
+        best.state, good, model.free, LEAST_SQUARES, extra_px2=max(extra_px2, adjust.SMALLEST_EXTRA_PX2)
+    )
     rays = last.state.rays_cam(points)
     off_axis = off_axis_rad(rays)
     residual = last.state.residual_px(points, rays)

@@ -12,16 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.types import TIME_SIGMA_S, Bools, Exposure
+from startrack.exposure import decoding
 from startrack.exposure.correction import correct_counts, correction_warnings, mask_of
-from startrack.exposure.decoding import (
-    COLOUR_WARNING,
-    Decoded,
-    bad_image,
-    check_size,
-    decode_file,
-    grey_float32,
-    largest_value,
-)
 from startrack.exposure.facts import Facts, resolve_facts
 from startrack.exposure.mosaic import MOSAIC_WARNING, equalize_mosaic
 from startrack.exposure.sidecar import stem
@@ -53,7 +45,7 @@ def read_exposure(
             a dark frame or flat field of another size.
         ValueError: `time_sigma_s` is no usable number of seconds.
     """
-    raw, decoded = decode_file(path)
+    raw, decoded = decoding.decode_file(path)
     given = Facts(
         time_utc=time_utc, time_sigma_s=time_sigma_s, exposure_s=exposure_s, camera=camera, terrain=terrain, mask=mask,
         dark=dark, flat=flat,
@@ -62,14 +54,14 @@ def read_exposure(
     return exposure_of_decoded(decoded, facts, raw=raw, name=stem(Path(path)), path=os.fspath(path))
 
 
-def exposure_of_decoded(decoded: Decoded, facts: Facts, *, raw: bytes, name: str, path: str) -> Exposure:
+def exposure_of_decoded(decoded: decoding.Decoded, facts: Facts, *, raw: bytes, name: str, path: str) -> Exposure:
     """The exposure of pixels `decoded` from the bytes `raw`, with its `facts`, `name` (stem) and `path`.
 
     They are corrected by the dark frame and the flat field of the facts; then the pixels of a mosaic are equalized.
     Raises BadInput (bad_image, size_mismatch) for a dark frame or flat field that cannot be used.
     """
     pixels, correction, notes = decoded.pixels_adu, None, decoded.warnings
-    colour_already = decoded.mosaic is None and COLOUR_WARNING in decoded.warnings
+    colour_already = decoded.mosaic is None and decoding.COLOUR_WARNING in decoded.warnings
     mosaic = not colour_already and bool(decoded.mosaic or facts.bayer_pattern)
     if facts.dark is not None or facts.flat is not None:
         pixels, correction = correct_counts(pixels, decoded.saturation_adu, facts.dark, facts.flat, mosaic=mosaic)
@@ -108,17 +100,19 @@ def exposure_of(
     """
     flat_grey = pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3)
     if not flat_grey or pixels.dtype.kind not in "uif":
-        raise bad_image(f"an array of {pixels.dtype} {pixels.shape}; startrack takes numbers (H, W) or (H, W, 3)")
-    check_size(pixels.shape[1], pixels.shape[0])
+        raise decoding.bad_image(
+            f"an array of {pixels.dtype} {pixels.shape}; startrack takes numbers (H, W) or (H, W, 3)"
+        )
+    decoding.check_size(pixels.shape[1], pixels.shape[0])
     if masked is not None:  # the values there, which may be anything, are no part of the exposure
         pixels = np.where(masked, pixels.dtype.type(0), pixels)
-    grey, notes = grey_float32(pixels)
+    grey, notes = decoding.grey_float32(pixels)
     return Exposure(
         pixels_adu=grey,
         name=name,
         time_utc=time_utc,
         mask=None if masked is None else mask_of(masked if masked.ndim == 2 else np.any(masked, axis=2)),
-        saturation_adu=largest_value(pixels.dtype),
+        saturation_adu=decoding.largest_value(pixels.dtype),
         sha256=hashlib.sha256(f"{pixels.dtype.str} {pixels.shape}".encode() + pixels.tobytes()).hexdigest(),
         warnings=notes,
     )

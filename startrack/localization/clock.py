@@ -10,18 +10,9 @@ import numpy as np
 
 from startrack.core.types import Array, Clock, Evidence, NotLocated
 from startrack.frames import Air, R_from_rotvec, Site, sky_rotvec_rad, turn_sky, ut1_sigma_s
+from startrack.localization import search
 from startrack.localization.horizon_bias import LinearSolution, at_likeliest_bias
 from startrack.localization.likelihood import PositionLikelihood
-from startrack.localization.search import (
-    BEAMS,
-    SCORED,
-    Explored,
-    Guess,
-    choose_apart,
-    last_boxes,
-    local_posterior,
-    refine_boxes,
-)
 from startrack.localization.shared_errors import is_noticeable
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain
@@ -145,7 +136,7 @@ class Track:
         for one in scanned:
             if not any(one.leads_to(other, self.step_s) for other in scanned):
                 likelihood = self._likelihood(one.later_s)
-                guess = refine_boxes(likelihood, one.centres_m, one.half_m)
+                guess = search.refine_boxes(likelihood, one.centres_m, one.half_m)
                 found.append((guess.best + self._log_offset(one.later_s, likelihood), one.later_s, guess.points_m[0]))
         found.sort(key=lambda one: -one[0])
         return [(later_s, position) for fit, later_s, position in found if fit > found[0][0] - TRACKED_NATS]
@@ -153,8 +144,8 @@ class Track:
     def _scan(self, later_s: float) -> Scan:
         """The best boxes at a time [s later]."""
         likelihood = self._likelihood(later_s)
-        centres, half = last_boxes(likelihood, *BEAMS[0])
-        points = centres[:SCORED][np.asarray(self.terrain.allowed(centres[:SCORED]))]
+        centres, half = search.last_boxes(likelihood, *search.BEAMS[0])
+        points = centres[: search.SCORED][np.asarray(self.terrain.allowed(centres[: search.SCORED]))]
         scores = likelihood.exact_scores(points) if len(points) else np.zeros(0)
         fit = float(scores.max(initial=-np.inf)) + self._log_offset(later_s, likelihood)
         return Scan(later_s, fit, points[np.argmax(scores)] if len(points) else np.zeros(2), centres, half)
@@ -174,7 +165,7 @@ class Track:
                 break
         likelihood = self._likelihood(later_s)
         points = position_m[None]
-        _, guess = at_likeliest_bias(likelihood, Guess(points, likelihood.exact_scores(points)))
+        _, guess = at_likeliest_bias(likelihood, search.Guess(points, likelihood.exact_scores(points)))
         return later_s, guess.best + self._log_offset(later_s, likelihood), guess.points_m[0]
 
     def _log_offset(self, later_s: float, likelihood: PositionLikelihood) -> float:
@@ -200,17 +191,19 @@ def is_linear(clock: Clock, error_s: float) -> bool:
     return abs(error_s) * float(np.linalg.norm(clock.turn_rad_s)) <= LINEAR_TURN_RAD
 
 
-def explore_times(plain: PositionLikelihood, evidence: Evidence, clock: Clock) -> list[tuple[Evidence, Explored]]:
+def explore_times(
+    plain: PositionLikelihood, evidence: Evidence, clock: Clock
+) -> list[tuple[Evidence, search.Explored]]:
     """The rows turned to each likely time that a wide clock allows, and the boxes there.
 
     `plain` is the likelihood of the search. Raises NotLocated as `Track` does.
     """
     later_s, log_share, way_m = Track(evidence, plain.terrain, clock).likely_way()
-    found: list[tuple[Evidence, Explored]] = []
+    found: list[tuple[Evidence, search.Explored]] = []
     for at in _peaks(later_s, log_share, clock):
         rows = turn_evidence(evidence, float(later_s[at]), plain.terrain.air)
-        guess = Guess(way_m[at][None], np.zeros(1))
-        found.append((rows, local_posterior(plain.with_rows(rows), guess, -np.inf)))
+        guess = search.Guess(way_m[at][None], np.zeros(1))
+        found.append((rows, search.local_posterior(plain.with_rows(rows), guess, -np.inf)))
     return found
 
 
@@ -239,4 +232,4 @@ def _fit(model: SkylineModel) -> float:
 def _peaks(later_s: Array, fits: Array, clock: Clock) -> list[int]:
     """The likeliest times that are apart from each other."""
     apart_s = TIME_STEP_RAD / float(np.linalg.norm(clock.turn_rad_s))
-    return choose_apart(later_s[:, None], fits, apart_s, TIME_NATS, MOST_TIMES)
+    return search.choose_apart(later_s[:, None], fits, apart_s, TIME_NATS, MOST_TIMES)

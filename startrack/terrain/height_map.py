@@ -10,23 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.types import Array, Bools, Ints
+from startrack.terrain import shape
 from startrack.terrain.crest_kernel import POSTS, crests
 from startrack.terrain.derived_maps import DeformedMap, HorizonInterpolator
 from startrack.terrain.ground import cell_posts, post_positions
 from startrack.terrain.horizon_table import AZIMUTH_BINS, HorizonSigma
 from startrack.terrain.protocol import ExpectedCrests, Terrain
 from startrack.terrain.refracted import refraction_errors, refraction_slopes_rad, with_refraction_error
-from startrack.terrain.shape import (
-    BIAS,
-    CAMERA_ERROR,
-    EXACT,
-    REFRACTION,
-    STRETCH,
-    ShapeError,
-    errors_by_name,
-    select_slopes,
-    vertical_fact,
-)
 from startrack.terrain.traced_map import TracedMap
 
 COMMON_PER_POST = 3.0
@@ -41,10 +31,10 @@ class HeightMap(TracedMap):
 
     height_sigma_m: float = Terrain.height_sigma_m  # of single posts, independent of each other
     horizon_sigma_common_rad: float | None = None  # of an error that all azimuths share; None: see common_sigma_rad
-    stretch_sigma_1: float | None = EXACT  # of the factor of tan H, less 1; None: not stated, see `terrain.shape`
-    vertical_sigma_rad: float | None = EXACT  # of a tilt of the whole map, of each of two axes
-    camera_height_sigma_m: float | None = EXACT
-    terrestrial_refraction_sigma_1: float | None = EXACT
+    stretch_sigma_1: float | None = shape.EXACT  # of the factor of tan H, less 1; None: not stated, see `terrain.shape`
+    vertical_sigma_rad: float | None = shape.EXACT  # of a tilt of the whole map, of each of two axes
+    camera_height_sigma_m: float | None = shape.EXACT
+    terrestrial_refraction_sigma_1: float | None = shape.EXACT
     most_slope_rad: float = np.pi / 2  # a rover does not stand on steeper ground
     glare_rad: Sectors = ()  # lit by the Sun: no evidence there
     unstated_errors: tuple[str, ...] = ()
@@ -71,16 +61,16 @@ class HeightMap(TracedMap):
         return float(np.hypot(own, COMMON_PER_POST * own if known is None else known))
 
     @cached_property
-    def shape_errors(self) -> tuple[ShapeError, ...]:  # type: ignore[override]
+    def shape_errors(self) -> tuple[shape.ShapeError, ...]:  # type: ignore[override]
         """Bias, stretch, tilt, height of the camera, refraction. The bias needs the table of horizons.
 
         The camera stands as much too high as the ground between four posts is.
         """
         return (
-            *BIAS.shape_errors(self.common_sigma_rad), *STRETCH.shape_errors(self.stretch_sigma_1),
-            *vertical_fact(self.site.body).shape_errors(self.vertical_sigma_rad),
-            *CAMERA_ERROR.shape_errors(self.camera_height_sigma_m, beside=BETWEEN_POSTS * self.height_sigma_m),
-            *REFRACTION.shape_errors(self.terrestrial_refraction_sigma_1), *refraction_errors(self.air),
+            *shape.BIAS.shape_errors(self.common_sigma_rad), *shape.STRETCH.shape_errors(self.stretch_sigma_1),
+            *shape.vertical_fact(self.site.body).shape_errors(self.vertical_sigma_rad),
+            *shape.CAMERA_ERROR.shape_errors(self.camera_height_sigma_m, beside=BETWEEN_POSTS * self.height_sigma_m),
+            *shape.REFRACTION.shape_errors(self.terrestrial_refraction_sigma_1), *refraction_errors(self.air),
         )  # fmt: skip
 
     def shape_slopes_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
@@ -96,11 +86,13 @@ class HeightMap(TracedMap):
             "vertical_north_rad": np.cos(azimuths_rad), "camera_height_m": -(1.0 / distance) * flat,
             "terrestrial_refraction_1": distance / (2 * self.ground.radius_m) * flat,
         }  # fmt: skip
-        return select_slopes(self.shape_errors, slopes | refraction_slopes_rad(self.air, np.arctan(tan)), np.shape(tan))
+        return shape.select_slopes(
+            self.shape_errors, slopes | refraction_slopes_rad(self.air, np.arctan(tan)), np.shape(tan)
+        )
 
     def with_shape(self, values: Array) -> Terrain:
         """The ground with these errors; see `Terrain`."""
-        errors = errors_by_name(self.shape_errors, values)
+        errors = shape.errors_by_name(self.shape_errors, values)
         refraction_1 = errors.pop("refraction_1", 0.0)
         return with_refraction_error(DeformedMap(self, **errors), refraction_1)
 

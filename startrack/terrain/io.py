@@ -16,24 +16,12 @@ from startrack.core.files import parse_toml, printable, read_text, resolve_named
 from startrack.core.obstacles import Obstacles, read_obstacles
 from startrack.core.types import BadInput
 from startrack.frames import AIR_TABLE, Site
+from startrack.terrain import shape
 from startrack.terrain.cylinder import CYLINDER_KEYS, Cylinder
 from startrack.terrain.protocol import Terrain
-from startrack.terrain.shape import (
-    AMOUNT,
-    BIAS,
-    CAMERA_ERROR,
-    CYLINDER_FACTS,
-    EARTH_HIGHEST_M,
-    LENGTH,
-    MAX_LENGTH_M,
-    REFRACTION,
-    REFRACTION_1,
-    STRETCH,
-    VERTICAL,
-)
 
 FILE = Text(max_chars=4000)
-HEIGHT = Number(low=-MAX_LENGTH_M, high=MAX_LENGTH_M)
+HEIGHT = Number(low=-shape.MAX_LENGTH_M, high=shape.MAX_LENGTH_M)
 KEYS = Table(
     keys={
         "format": Choice(values=(1,), default=1),
@@ -58,11 +46,11 @@ KEYS = Table(
             keys={
                 "file": Either(kinds=(FILE, List(each=FILE, least=1, most=100)), required=True,
                                description="finest first"),
-                "height_sigma_m": replace(AMOUNT, description="of single posts, independent of each other; if absent "
-                                          "0, with a warning"),
-                **{fact.key: fact.limits for fact in (BIAS, STRETCH, VERTICAL)},
+                "height_sigma_m": replace(shape.AMOUNT, description="of single posts, independent of each other; if "
+                                          "absent 0, with a warning"),
+                **{fact.key: fact.limits for fact in (shape.BIAS, shape.STRETCH, shape.VERTICAL)},
                 "scale": Number(low=-1e6, high=1e6, description="metres per unit, where the files do not state it"),
-                "offset_m": Number(low=-MAX_LENGTH_M, high=MAX_LENGTH_M,
+                "offset_m": Number(low=-shape.MAX_LENGTH_M, high=shape.MAX_LENGTH_M,
                                    description="height of value 0, where the files do not state it"),
                 "geoid_m": replace(HEIGHT, description="height of the geoid above the ellipsoid at the origin, if "
                                    "heights are above the geoid; earth only"),
@@ -76,9 +64,10 @@ KEYS = Table(
             AIR_TABLE,
             keys={
                 **AIR_TABLE.keys,
-                "terrestrial_refraction": Number(low=-1.0, high=0.8, default=REFRACTION_1, description="curvature of a "
-                                                 "level sight line to the ground, relative to the Earth's"),
-                REFRACTION.key: REFRACTION.limits,
+                "terrestrial_refraction": Number(low=-1.0, high=0.8, default=shape.REFRACTION_1,
+                                                 description="curvature of a level sight line to the ground, "
+                                                             "relative to the Earth's"),
+                shape.REFRACTION.key: shape.REFRACTION.limits,
             },
         ),
         "obstacles": replace(FILE, description="CSV file, relative to this one: azimuth_deg from north through east, "
@@ -86,14 +75,14 @@ KEYS = Table(
         "rover": Table(
             default={},
             keys={
-                "camera_height_m": replace(AMOUNT, default=1.5),
-                CAMERA_ERROR.key: CAMERA_ERROR.limits,
+                "camera_height_m": replace(shape.AMOUNT, default=1.5),
+                shape.CAMERA_ERROR.key: shape.CAMERA_ERROR.limits,
             }
         ),
         "search": Table(
             default={},
             keys={
-                "radius_m": LENGTH,
+                "radius_m": shape.LENGTH,
                 "max_slope_deg": Number(low=0.0, high=90.0, above=True, default=90.0),
                 "glare_deg": List(each=List(each=Number(low=-720.0, high=720.0), count=2),
                                   description="azimuth ranges that the Sun lights"),
@@ -200,7 +189,7 @@ def _obstacles(keys: dict[str, Any], folder: Path) -> tuple[Obstacles | None, tu
 def _make_cylinder(keys: dict[str, Any], name: str, site: Site, folder: Path) -> Cylinder:
     obstacles, files = _obstacles(keys, folder)
     cylinder, rover = keys["cylinder"], keys["rover"]
-    sigmas: dict[str, Any] = {fact.key: cylinder.get(fact.key) for fact in CYLINDER_FACTS}
+    sigmas: dict[str, Any] = {fact.key: cylinder.get(fact.key) for fact in shape.CYLINDER_FACTS}
     if cylinder.get("exact", False):
         wrong = [key for key, sigma in sigmas.items() if sigma]
         if wrong:
@@ -242,10 +231,10 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
         air = keys.get("air", {})
         maps = tuple(above_ellipsoid(one, site, dem.get("geoid_m", 0.0), dem.get("geoid_slope_arcsec")) for one in maps)
         on_earth = {
-            "terrestrial_refraction_1": air.get("terrestrial_refraction", REFRACTION_1),
-            "terrestrial_refraction_sigma_1": air.get(REFRACTION.key),
+            "terrestrial_refraction_1": air.get("terrestrial_refraction", shape.REFRACTION_1),
+            "terrestrial_refraction_sigma_1": air.get(shape.REFRACTION.key),
         }
-    default_highest = EARTH_HIGHEST_M if site.body == "earth" else -np.inf
+    default_highest = shape.EARTH_HIGHEST_M if site.body == "earth" else -np.inf
     return HeightMap(
         name=name,
         site=site,

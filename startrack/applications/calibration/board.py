@@ -8,18 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from startrack.applications.calibration.acceptance import (
-    IMAGE_RINGS,
-    STARS_PER_RING,
-    Check,
-    CheckedCamera,
-    RefusedImage,
-    held_out_check,
-    map_check,
-    minimum_check,
-    ring_check,
-    rings_and_sectors,
-)
+from startrack.applications.calibration import acceptance
 from startrack.applications.calibration.field_of_view import corner_angle_rad
 from startrack.applications.calibration.initial_states import initial_board_state
 from startrack.core.types import Array, BadInput, Exposure, NotIdentified
@@ -86,7 +75,7 @@ def _find_charuco(grey: Any, board: Board) -> Corners | None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoardCalibration(CheckedCamera):
+class BoardCalibration(acceptance.CheckedCamera):
     """A lens calibrated with boards, and its acceptance checks."""
 
     fit: LensFit
@@ -106,14 +95,16 @@ def calibrate_board(
     """
     found: list[Corners] = []
     images: list[str] = []
-    refused: list[RefusedImage] = []
+    refused: list[acceptance.RefusedImage] = []
     for exposure in exposures:
         if exposure.size_px != exposures[0].size_px:
             raise BadInput("size_mismatch", f"{exposure.name} has another size than {exposures[0].name}")
         progress(f"searching the board in {exposure.name}")
         seen = find_corners(exposure, board)
         if seen is None:
-            refused.append(RefusedImage(name=exposure.name, reason="no_stars", message="the board was not found"))
+            refused.append(
+                acceptance.RefusedImage(name=exposure.name, reason="no_stars", message="the board was not found")
+            )
         else:
             found.append(seen)
             images.append(exposure.name)
@@ -133,15 +124,18 @@ def calibrate_board(
     )
 
 
-def _check_acceptance(fit: LensFit, points: Observations, pictures: int) -> tuple[Check, ...]:
+def _check_acceptance(fit: LensFit, points: Observations, pictures: int) -> tuple[acceptance.Check, ...]:
     """All checks, the most informative first."""
-    ring = rings_and_sectors(fit.camera, points.take(fit.used))[1]
-    rings, used = int(np.sum(np.bincount(ring, minlength=IMAGE_RINGS) >= STARS_PER_RING)), int(fit.used.sum())
+    ring = acceptance.rings_and_sectors(fit.camera, points.take(fit.used))[1]
+    rings, used = (
+        int(np.sum(np.bincount(ring, minlength=acceptance.IMAGE_RINGS) >= acceptance.STARS_PER_RING)),
+        int(fit.used.sum()),
+    )
     tilt = "more pictures: the board tilted by 30 degrees and more, near and far, and in every corner of the image"
     return (
-        minimum_check("pictures with a board", pictures, MIN_PICTURES, "insufficient_geometry", tilt),
-        minimum_check("corners", used, MIN_CORNERS, "insufficient_geometry", tilt),
-        held_out_check(fit.held_out_rms_px, "a flat board and sharp pictures are needed"),
-        ring_check("rings with corners", rings, tilt),
-        map_check(fit.camera, tilt),
+        acceptance.minimum_check("pictures with a board", pictures, MIN_PICTURES, "insufficient_geometry", tilt),
+        acceptance.minimum_check("corners", used, MIN_CORNERS, "insufficient_geometry", tilt),
+        acceptance.held_out_check(fit.held_out_rms_px, "a flat board and sharp pictures are needed"),
+        acceptance.ring_check("rings with corners", rings, tilt),
+        acceptance.map_check(fit.camera, tilt),
     )  # fmt: skip

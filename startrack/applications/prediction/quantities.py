@@ -8,19 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from startrack import output
 from startrack.core.types import Array
 from startrack.localization import RISK
-from startrack.output import (
-    Quantity,
-    Schema,
-    file_schema,
-    list_schema,
-    object_schema,
-    or_null,
-    record_from,
-    schema_of,
-    schema_of_kind,
-)
 
 Cells = dict[str, Array]  # the quantities of places (k,), by the names of CELL_QUANTITIES; and ERROR_RATIO
 FORMAT = "startrack.prediction/1"
@@ -29,9 +19,9 @@ ERROR_RATIO, FILTERED, SMOOTHED = "error_ratio", "radius95_filtered_m", "radius9
 UNKNOWN = "over the places; null: half of the places or more have no radius"
 
 
-def _cell(name: str, unit: str, description: str, form: str = "%.6g") -> Quantity:
+def _cell(name: str, unit: str, description: str, form: str = "%.6g") -> output.Quantity:
     """A quantity of places, a band and a column."""
-    return Quantity(name, unit, dict, itemgetter(name), description, "number", form=form)
+    return output.Quantity(name, unit, dict, itemgetter(name), description, "number", form=form)
 
 
 PLACE_QUANTITIES = (
@@ -73,9 +63,11 @@ def _error_ratio(cells: Cells) -> float | None:
     return float(np.sqrt(np.nanmean(np.square(ratio)))) if np.isfinite(ratio).any() else None
 
 
-def _cells_quantity(key: str, unit: str, value: Callable[[Cells], Any], description: str, **more: Any) -> Quantity:
+def _cells_quantity(
+    key: str, unit: str, value: Callable[[Cells], Any], description: str, **more: Any
+) -> output.Quantity:
     """A quantity of the summary of places."""
-    return Quantity(key, unit, dict, value, description, **{"schema": "chance", "form": "%.6g", **more})
+    return output.Quantity(key, unit, dict, value, description, **{"schema": "chance", "form": "%.6g", **more})
 
 
 def _share_below(bound: int) -> Callable[[Cells], float]:
@@ -103,37 +95,37 @@ SUMMARY_QUANTITIES = (
 
 def summarize_cells(cells: Cells) -> dict[str, Any]:
     """The summary of the places in `cells`, by the keys of the schema."""
-    return record_from(SUMMARY_QUANTITIES, cells)
+    return output.record_from(SUMMARY_QUANTITIES, cells)
 
 
-SUMMARY = schema_of(SUMMARY_QUANTITIES)
-VARIANT: Schema = object_schema({
+SUMMARY = output.schema_of(SUMMARY_QUANTITIES)
+VARIANT: output.Schema = output.object_schema({
     "camera": "text",
     "exposure_s": "positive",
-    "limiting_v_mag": schema_of_kind("number", "of a star on the axis at 5 sigma"),
+    "limiting_v_mag": output.schema_of_kind("number", "of a star on the axis at 5 sigma"),
     "summary": SUMMARY,
 })  # fmt: skip
-DEPTH: Schema = object_schema({
+DEPTH: output.Schema = output.object_schema({
     "target_radius95_m": "positive",
-    "share": schema_of_kind("chance", "of the places that must reach the target"),
-    "exposure_s": or_null("positive", "shortest that reaches the target; null: none within the limits"),
-    "limiting_v_mag": or_null("number", "of this exposure: a star on the axis at 5 sigma"),
-    "tried": list_schema(object_schema({"exposure_s": "positive", "share": "chance"})),
+    "share": output.schema_of_kind("chance", "of the places that must reach the target"),
+    "exposure_s": output.or_null("positive", "shortest that reaches the target; null: none within the limits"),
+    "limiting_v_mag": output.or_null("number", "of this exposure: a star on the axis at 5 sigma"),
+    "tried": output.list_schema(output.object_schema({"exposure_s": "positive", "share": "chance"})),
 })  # fmt: skip
-ALONG_PATH: Schema = object_schema({
-    "sigma": schema_of_kind("number", "error of a move on each axis, as a part of its length"),
-    "floor_m": schema_of_kind("number", "beside that, in quadrature"),
-    f"median_{FILTERED}": or_null("positive", UNKNOWN),
-    f"median_{SMOOTHED}": or_null("positive", "the same, by all images"),
+ALONG_PATH: output.Schema = output.object_schema({
+    "sigma": output.schema_of_kind("number", "error of a move on each axis, as a part of its length"),
+    "floor_m": output.schema_of_kind("number", "beside that, in quadrature"),
+    f"median_{FILTERED}": output.or_null("positive", UNKNOWN),
+    f"median_{SMOOTHED}": output.or_null("positive", "the same, by all images"),
 })  # fmt: skip
-INPUTS: Schema = {
+INPUTS: output.Schema = {
     "type": "object",
-    "additionalProperties": schema_of_kind("text"),
+    "additionalProperties": output.schema_of_kind("text"),
     "description": "SHA-256 of the camera's, terrain's and map files by name; shipped ones belong to the version",
 }
-PREDICTION = file_schema(
+PREDICTION = output.file_schema(
     "Summary of expected accuracy",
-    object_schema(
+    output.object_schema(
         {
             "format": {"const": FORMAT},
             "kind": {"enum": ["area", "path"]},
@@ -150,8 +142,8 @@ PREDICTION = file_schema(
             "seed": "count",
             "localizer": "text",
             "summary": SUMMARY,
-            "provenance": object_schema({"version": "text", "inputs": INPUTS}),
+            "provenance": output.object_schema({"version": "text", "inputs": INPUTS}),
         },
-        optional={"variants": list_schema(VARIANT), "depth": DEPTH, "odometry": ALONG_PATH},
+        optional={"variants": output.list_schema(VARIANT), "depth": DEPTH, "odometry": ALONG_PATH},
     ),
 )

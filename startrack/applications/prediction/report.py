@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from startrack import __version__
+from startrack import __version__, output
 from startrack.applications.prediction.draws import Conditions, predictor_of
 from startrack.applications.prediction.places import AreaCells, PathPoints
 from startrack.applications.prediction.quantities import (
@@ -32,17 +32,6 @@ from startrack.core.files import remove_file, write_atomically
 from startrack.core.stored import read_json_object
 from startrack.estimation.observations import OdometryErrors
 from startrack.frames import format_utc, latlon_from_enu
-from startrack.output import (
-    Column,
-    comparison_picture,
-    ecsv_text,
-    path_picture,
-    png_bytes,
-    prediction_picture,
-    qgis_style_text,
-    quantity_columns,
-    radius_classes,
-)
 from startrack.terrain import Terrain, load_terrain, write_bands
 
 RECORD_FILE, MAP, STYLE = "predict.json", "predict.tif", "predict.qml"
@@ -183,16 +172,16 @@ def write_report(report: Report, out: Path, *, plots: bool) -> list[Path]:
     if isinstance(points, AreaCells):  # the quantities as bands, in the projection of the terrain's map
         bands = {one.key: points.band(report.cells[one.key]) for one in CELL_QUANTITIES}
         write_bands(out / MAP, points.frame, bands)
-        if classes := radius_classes(report.cells[STYLED]):
-            made[STYLE] = qgis_style_text(1 + list(bands).index(STYLED), classes).encode()
+        if classes := output.radius_classes(report.cells[STYLED]):
+            made[STYLE] = output.qgis_style_text(1 + list(bands).index(STYLED), classes).encode()
     made[CELL_TABLE] = _table(report).encode()
     if plots:
-        made[MAP_PICTURE] = png_bytes(_picture(report))
+        made[MAP_PICTURE] = output.png_bytes(_picture(report))
     if report.variants:
         made[COMPARISON_TABLE] = _comparison_table(report.variants).encode()
         if plots:
             title = f"Cameras and exposures at the same places: {report.plan.terrain.name}"
-            made[COMPARISON_PICTURE] = png_bytes(comparison_picture(report.variants, title))
+            made[COMPARISON_PICTURE] = output.png_bytes(output.comparison_picture(report.variants, title))
     made[RECORD_FILE] = (json.dumps(report.record, indent=1) + "\n").encode()
     for name, data in made.items():
         write_atomically(out / name, data, overwrite=True)
@@ -213,19 +202,19 @@ def _table(report: Report) -> str:
         values |= zip(
             ("latitude_deg", "longitude_deg"), np.degrees(latlon_from_enu(site, east_m, north_m, up_m)), strict=True
         )
-    return ecsv_text(quantity_columns((*PLACE_QUANTITIES, *CELL_QUANTITIES, *PATH_QUANTITIES), values))
+    return output.ecsv_text(output.quantity_columns((*PLACE_QUANTITIES, *CELL_QUANTITIES, *PATH_QUANTITIES), values))
 
 
 def _comparison_table(variants: list[dict[str, Any]]) -> str:
     """One row a camera and exposure: the summary of the same places."""
     rows = [{**one, **one["summary"]} for one in variants]
     columns = [
-        Column("camera", datatype="string", path=("camera",)),
-        Column("exposure_s", unit="s", form="%.6g", path=("exposure_s",)),
-        Column("limiting_v_mag", unit="mag", form="%.3f", path=("limiting_v_mag",)),
+        output.Column("camera", datatype="string", path=("camera",)),
+        output.Column("exposure_s", unit="s", form="%.6g", path=("exposure_s",)),
+        output.Column("limiting_v_mag", unit="mag", form="%.3f", path=("limiting_v_mag",)),
     ]
     columns += [column for quantity in SUMMARY_QUANTITIES for column in quantity.table_columns]
-    return ecsv_text([replace(one, values=[one.value(row) for row in rows], description="") for one in columns])
+    return output.ecsv_text([replace(one, values=[one.value(row) for row in rows], description="") for one in columns])
 
 
 def _picture(report: Report) -> Any:
@@ -239,6 +228,6 @@ def _picture(report: Report) -> Any:
     draws = f"{s['draws']} draws every {s['spacing_m']:.4g} m"
     caption = [f"camera {s['camera']}, {s['exposure_s']:.3g} s, {times} UTC, {draws}"]
     if isinstance(points, AreaCells):
-        return prediction_picture(report.plan.terrain, points.site, points.raster(radius), title, caption)
+        return output.prediction_picture(report.plan.terrain, points.site, points.raster(radius), title, caption)
     curves = {words: cells[name] for name, words in PATH_CURVES.items() if name in cells}
-    return path_picture(points.distance_m, radius, cells["p_ok"], title, caption, curves)
+    return output.path_picture(points.distance_m, radius, cells["p_ok"], title, caption, curves)

@@ -12,20 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from startrack.applications.reproduction import simulator
 from startrack.applications.reproduction.artefact import Context
 from startrack.applications.reproduction.comparison import compare_places
 from startrack.applications.reproduction.scene import THESIS_GROUND
-from startrack.applications.reproduction.simulator import (
-    ASPECT_RATIO,
-    MAGNITUDE,
-    PERFECT,
-    Mistakes,
-    Sky,
-    cell_centroid,
-    crater,
-    draw_positions,
-    visible_stars,
-)
 from startrack.core.chunk_store import Chunk, ChunkStore, Progress, settings_digest
 from startrack.core.types import Array, Bools, Fix, NotLocated
 from startrack.localization import ExactPosterior, descend, hull_position
@@ -58,9 +48,9 @@ class Task:
     sky: int
     start: int
     stop: int
-    magnitude: float = MAGNITUDE
-    aspect_ratio: float = ASPECT_RATIO
-    mistakes: Mistakes = PERFECT
+    magnitude: float = simulator.MAGNITUDE
+    aspect_ratio: float = simulator.ASPECT_RATIO
+    mistakes: simulator.Mistakes = simulator.PERFECT
     ground: str = THESIS_GROUND  # of all methods
     series_every: int = 1  # see `compare_places`
 
@@ -99,10 +89,10 @@ def compute_chunk(task: Task) -> Chunk:
     """
     if task.method == ALL_METHODS:
         return compare_places(task.seed, task.sky, task.start, task.stop, task.ground, task.series_every)
-    sky, cylinder = Sky.draw(task.seed, task.sky, task.magnitude), crater(task.aspect_ratio)
+    sky, cylinder = simulator.Sky.draw(task.seed, task.sky, task.magnitude), simulator.crater(task.aspect_ratio)
     points, radius_m = sky.project_to_rim_plane(cylinder), cylinder.radius_m
-    truth = draw_positions(task.seed, task.sky, task.start, task.stop)
-    seen = [visible_stars(points, position, radius_m) for position in truth]
+    truth = simulator.draw_positions(task.seed, task.sky, task.start, task.stop)
+    seen = [simulator.visible_stars(points, position, radius_m) for position in truth]
     if task.method == OURS:
         evidence = [
             task.mistakes.evidence(sky, task.mistakes.draw_list(one, task.seed, task.sky, task.start + k))
@@ -121,7 +111,7 @@ def compute_chunk(task: Task) -> Chunk:
     if task.method == KUA:
         own = _solve_kua(points, seen, cylinder)
     elif task.method == BOUND:
-        own = {"centroid_m": np.stack([cell_centroid(points, position, radius_m) for position in truth])}
+        own = {"centroid_m": np.stack([simulator.cell_centroid(points, position, radius_m) for position in truth])}
     else:
         fixes = [fix_or_none(k) for k in range(len(truth))]
         found = [fix.position_enu_m[:2] for fix in fixes if fix is not None]

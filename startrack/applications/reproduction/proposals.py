@@ -8,19 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from startrack.applications.reproduction import simulator
 from startrack.applications.reproduction.artefact import Artefact, Context, markdown_table
 from startrack.applications.reproduction.methods import error_statistics
 from startrack.applications.reproduction.scene import Scene, terrain_of
-from startrack.applications.reproduction.simulator import (
-    PERFECT,
-    THESIS,
-    Sky,
-    Stream,
-    crater,
-    directions,
-    draw_positions,
-    visible_stars,
-)
 from startrack.core.types import MIDDLES_RAD, Array, Bools, NotLocated
 from startrack.localization import ExactPosterior, PseudoGradient, descend, hull_position
 from startrack.output import Column
@@ -74,18 +65,18 @@ def proposals(context: Context) -> Artefact:
         name="proposals", title="What the thesis proposes", line=f"{len(rows)} rows",
         text=f"Position errors, with the standard error of the mean; thesis 34.2 m. Seed {context.seed}.\n\n"
         + markdown_table(head, [one.cells() for one in rows]),
-        columns=tuple(columns), values={"thesis": THESIS["overall"], "reproduced": values},
+        columns=tuple(columns), values={"thesis": simulator.THESIS["overall"], "reproduced": values},
     )  # fmt: skip
 
 
 def _wandering(context: Context) -> Iterator[Row]:
     """Page 12: a grid of points about the estimate where the descent wanders."""
-    cylinder = crater()
+    cylinder = simulator.crater()
     ends, best, settled = [], [], []
     for sky in range(context.size.skies):
-        points = Sky.draw(context.seed, sky).project_to_rim_plane(cylinder)
-        for truth in draw_positions(context.seed, sky, 0, min(context.size.per_sky, WANDERING_PER_SKY)):
-            seen = visible_stars(points, truth, cylinder.radius_m)
+        points = simulator.Sky.draw(context.seed, sky).project_to_rim_plane(cylinder)
+        for truth in simulator.draw_positions(context.seed, sky, 0, min(context.size.per_sky, WANDERING_PER_SKY)):
+            seen = simulator.visible_stars(points, truth, cylinder.radius_m)
             end, is_settled = _descend_from_hull(points, seen, cylinder.wall_m, cylinder.radius_m)
             found = end if is_settled else best_of_grid(points, seen, end, cylinder.radius_m)
             ends.append(np.hypot(*(end - truth)))
@@ -106,7 +97,7 @@ def best_of_grid(points_m: Array, seen: Bools, end_m: Array, radius_m: float) ->
     grid = end_m + np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     distance = np.hypot(*(points_m + end_m).T)
     near = np.abs(distance - radius_m) < 2 * SEARCHED_M  # the other stars are the same from all of the grid
-    wrong = [np.count_nonzero(visible_stars(points_m[near], one, radius_m) != seen[near]) for one in grid]
+    wrong = [np.count_nonzero(simulator.visible_stars(points_m[near], one, radius_m) != seen[near]) for one in grid]
     return np.asarray(grid[np.array(wrong) == min(wrong)].mean(axis=0))
 
 
@@ -116,18 +107,18 @@ def _descend_from_hull(points_m: Array, seen: Bools, wall_m: float, radius_m: fl
 
 def _behind_obstacle(context: Context) -> Iterator[Row]:
     """Page 21: stars along the skyline only, where something on no map hides a part of the sky."""
-    cylinder = crater()
+    cylinder = simulator.crater()
     wall_m, radius_m = cylinder.wall_m, cylinder.radius_m
     errors: dict[str, list[float]] = {}
     for sky in range(context.size.skies):
-        stars = Sky.draw(context.seed, sky)
+        stars = simulator.Sky.draw(context.seed, sky)
         points = stars.project_to_rim_plane(cylinder)
-        for number, truth in enumerate(draw_positions(context.seed, sky, 0, context.size.compared_per_sky)):
-            rng = np.random.default_rng([context.seed, Stream.OBSTACLE, sky, number])
+        for number, truth in enumerate(simulator.draw_positions(context.seed, sky, 0, context.size.compared_per_sky)):
+            rng = np.random.default_rng([context.seed, simulator.Stream.OBSTACLE, sky, number])
             middle = rng.uniform(0.0, 2 * np.pi)
             turn = np.abs((stars.azimuth_rad - middle + np.pi) % (2 * np.pi) - np.pi)
             hidden = (turn < 0.5 * OBSTACLE_WIDTH_RAD) & (stars.elevation_rad < OBSTACLE_TOP_RAD)
-            seen = visible_stars(points, truth, radius_m) & ~hidden
+            seen = simulator.visible_stars(points, truth, radius_m) & ~hidden
             plain, _ = _descend_from_hull(points, seen, wall_m, radius_m)
             found = {
                 "pseudo-gradient": plain,
@@ -135,7 +126,9 @@ def _behind_obstacle(context: Context) -> Iterator[Row]:
                 "by those beside the obstacle": descend_by_skyline(points, seen, plain, radius_m, skips=True),
             }
             try:
-                found["startrack"] = ExactPosterior()(PERFECT.evidence(stars, seen), cylinder).position_enu_m[:2]
+                found["startrack"] = ExactPosterior()(simulator.PERFECT.evidence(stars, seen), cylinder).position_enu_m[
+                    :2
+                ]
             except NotLocated:
                 found["startrack"] = np.full(2, np.nan)
             for way, position in found.items():
@@ -201,7 +194,7 @@ def _locate_on_floor(scene: Scene, centre_m: Array, radius_m: float, rim_m: floa
         wall = rim_m - float(scene.terrain.ground_m(position[None])[0]) - scene.terrain.camera_height_m
         if wall <= 0.0:
             return np.full(2, np.nan)
-        points = wall / np.tan(sky.elevation_rad)[:, None] * directions(sky.azimuth_rad)
+        points = wall / np.tan(sky.elevation_rad)[:, None] * simulator.directions(sky.azimuth_rad)
         found, _ = _descend_from_hull(points, scene.seen, wall, radius_m)
         position = centre_m + found
         if np.hypot(*found) >= radius_m:

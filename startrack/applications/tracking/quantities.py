@@ -8,21 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from startrack import output
 from startrack.applications.tracking.track import Track, TrackFrame
 from startrack.core.errors import Reason
 from startrack.core.types import Array
 from startrack.frames import format_utc, latlon_from_enu
-from startrack.output import (
-    ABSENT,
-    Kind,
-    Quantity,
-    file_schema,
-    list_schema,
-    object_schema,
-    or_null,
-    record_from,
-    schema_of,
-)
 
 FORMAT = "startrack.track/1"
 STATUSES = ("used", "left_out", "refused")
@@ -43,11 +33,11 @@ class FrameValues(NamedTuple):
 
 
 def _frame(
-    key: str, unit: str, form: str, description: str, value: Value, schema: Kind = "number", known: bool = False
-) -> Quantity:
+    key: str, unit: str, form: str, description: str, value: Value, schema: output.Kind = "number", known: bool = False
+) -> output.Quantity:
     """A quantity of a frame; one that is not always `known` may be None."""
-    before = ABSENT if known else None
-    return Quantity(key, unit, FrameValues, value, description, schema, before, form=form)
+    before = output.ABSENT if known else None
+    return output.Quantity(key, unit, FrameValues, value, description, schema, before, form=form)
 
 
 def _number(array: Callable[[FrameValues], Array], *at: int, convert: Callable[[Any], Any] = float) -> Value:
@@ -64,7 +54,7 @@ def _quaternion(axis: int) -> Value:
     return lambda v: None if v.frame.quat_xyzw_body_enu is None else float(v.frame.quat_xyzw_body_enu[axis])
 
 
-def _trajectory(name: str, prefix: str, when: str) -> list[Quantity]:
+def _trajectory(name: str, prefix: str, when: str) -> list[output.Quantity]:
     elements: list[tuple[Any, ...]] = [
         *((f"{axis}_m", "m", "%.4f", f"{axis} of the camera, {when}", "position_enu_m", k)
           for k, axis in enumerate(("east", "north", "up"))),
@@ -114,31 +104,35 @@ STATED_SIZE = "and how much larger than its file states; null where that is take
 
 def size_schema(key: str) -> dict[str, Any]:
     """Schema of the depth or the width of a crater, whose value is under `key`."""
-    return object_schema({
+    return output.object_schema({
         key: "positive", "sigma_m": "positive", "error_percent": "number", "sigma_percent": "positive"
     })  # fmt: skip
 
 
-TRACK = file_schema(
+TRACK = output.file_schema(
     "Trajectory of a camera",
-    object_schema({
+    output.object_schema({
         "format": {"const": FORMAT},
         "terrain": "text",
         "at_rest": "flag",
-        "odometry": or_null(
-            object_schema({
+        "odometry": output.or_null(
+            output.object_schema({
                 "file": "text", "sigma": "positive", "floor_m": "positive",
-                "fault": or_null("text", "for which it is left out as a whole"),
+                "fault": output.or_null("text", "for which it is left out as a whole"),
             }),
             "its file and stated errors",
         ),
-        "counts": object_schema(dict.fromkeys(("frames", *STATUSES, "slips"), "count")),
-        "horizon": object_schema({"error_deg": "number", "sigma_deg": "positive"}, "true horizon less the map's"),
-        "clock": or_null(object_schema({"offset_s": "number", "sigma_s": "positive"}), "true time less the stated one"),
-        "depth": or_null(size_schema("depth_m"), f"of a crater, {STATED_SIZE}"),
-        "width": or_null(size_schema("diameter_m"), f"of a crater, {STATED_SIZE}"),
-        "frames": list_schema(schema_of(FRAME_QUANTITIES, units=True)),
-        "provenance": object_schema({"version": "text"}),
+        "counts": output.object_schema(dict.fromkeys(("frames", *STATUSES, "slips"), "count")),
+        "horizon": output.object_schema(
+            {"error_deg": "number", "sigma_deg": "positive"}, "true horizon less the map's"
+        ),
+        "clock": output.or_null(
+            output.object_schema({"offset_s": "number", "sigma_s": "positive"}), "true time less the stated one"
+        ),
+        "depth": output.or_null(size_schema("depth_m"), f"of a crater, {STATED_SIZE}"),
+        "width": output.or_null(size_schema("diameter_m"), f"of a crater, {STATED_SIZE}"),
+        "frames": output.list_schema(output.schema_of(FRAME_QUANTITIES, units=True)),
+        "provenance": output.object_schema({"version": "text"}),
     }),
 )  # fmt: skip
 
@@ -148,4 +142,4 @@ def frame_records(track: Track) -> list[dict[str, Any]]:
     latlon_rad, site = np.full((len(track.frames), 2), np.nan), track.terrain.site
     if site is not None:
         latlon_rad = np.stack(latlon_from_enu(site, *track.smoothed.position_enu_m.T), axis=-1)
-    return [record_from(FRAME_QUANTITIES, FrameValues(track, latlon_rad, k)) for k in range(len(track.frames))]
+    return [output.record_from(FRAME_QUANTITIES, FrameValues(track, latlon_rad, k)) for k in range(len(track.frames))]

@@ -10,25 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from startrack import __version__
+from startrack import __version__, output
 from startrack.applications.tracking.quantities import FORMAT, FRAME_QUANTITIES, STATUSES, frame_records
 from startrack.applications.tracking.track import CrestHeights, SizeError, Track, Trajectory
 from startrack.applications.tracking.track_map import known_points, track_extent
 from startrack.core.files import write_atomically
 from startrack.core.types import Array
 from startrack.frames import R_from_quat_xyzw, tum_line
-from startrack.output import (
-    Column,
-    ecsv_text,
-    feature,
-    fill_frame,
-    geojson_text,
-    ground_map,
-    json_text,
-    quantity_columns,
-)
 
-TRACK_FILES = ("track.tum", "track.filtered.tum", "track.ecsv", "track.geojson", "track.json", "track.crests.ecsv")
 HERE = Path(__file__).parent
 PAGE_SCRIPTS = ("basics.js", "view.js", "input.js", "map.js")  # of the page of results
 RELIEF_MARGIN = 1.35  # of the map, beyond its edge where the window is wide
@@ -81,11 +70,11 @@ def write_track(
     made: dict[str, bytes] = {
         "track.tum": tum_text(track, track.smoothed).encode(),
         "track.filtered.tum": tum_text(track, track.filtered).encode(),
-        "track.ecsv": ecsv_text(quantity_columns(FRAME_QUANTITIES, columns)).encode(),
+        "track.ecsv": output.ecsv_text(output.quantity_columns(FRAME_QUANTITIES, columns)).encode(),
         "track.geojson": track_geojson(track, record["frames"]).encode(),
         "track.crests.ecsv": crests_table(track).encode(),
         **(pictures or {}),
-        "track.json": json_text(record).encode(),  # last: it exists where all others do
+        "track.json": output.json_text(record).encode(),  # last: it exists where all others do
     }
     for name, data in made.items():
         write_atomically(out / name, data, overwrite=True)
@@ -111,22 +100,24 @@ def crests_table(track: Track) -> str:
         ("error_m", crests.error_m, "%.4f", "height of the ground less the map's"),
         ("sigma_m", crests.sigma_m, "%.4f", "standard deviation of error_m"),
     )
-    post = Column("post", crests.post, "int64", form="%d", description="number of the post in the terrain's maps")
-    return ecsv_text([post, *(Column(name, values, unit="m", form=form, description=text)
+    post = output.Column(
+        "post", crests.post, "int64", form="%d", description="number of the post in the terrain's maps"
+    )
+    return output.ecsv_text([post, *(output.Column(name, values, unit="m", form=form, description=text)
                               for name, values, form, text in lengths)])  # fmt: skip
 
 
 def track_geojson(track: Track, records: Sequence[dict[str, Any]]) -> str:
     """track.geojson: a line through the smoothed positions of a `track`, and a point for each of its `records`."""
     points = [
-        feature("Point", [one["longitude_deg"], one["latitude_deg"]], one)
+        output.feature("Point", [one["longitude_deg"], one["latitude_deg"]], one)
         for one in records
         if one["latitude_deg"] is not None
     ]
     places = [point["geometry"]["coordinates"] for point in points]
-    line = feature("LineString", places, {"name": "smoothed track", "terrain": track.terrain.name})
+    line = output.feature("LineString", places, {"name": "smoothed track", "terrain": track.terrain.name})
     site = track.terrain.site
-    return geojson_text([*([line] if len(places) > 1 else []), *points], "" if site is None else site.body)
+    return output.geojson_text([*([line] if len(places) > 1 else []), *points], "" if site is None else site.body)
 
 
 def track_page(track: Track, picture_png: bytes, *, title: str, odometry_m: Array | None = None) -> str:
@@ -155,9 +146,9 @@ def track_page(track: Track, picture_png: bytes, *, title: str, odometry_m: Arra
         "odometry": None if odometry_m is None else np.round(known_points(odometry_m), 3).tolist(),
         "crater": track.crater_texts,
         "terrain": track.terrain.name,
-        "terrains": {track.terrain.name: ground_map(track.terrain, (east_m, north_m), RELIEF_MARGIN * half_m)},
+        "terrains": {track.terrain.name: output.ground_map(track.terrain, (east_m, north_m), RELIEF_MARGIN * half_m)},
         "world": [east_m - half_m, north_m - half_m, east_m + half_m, north_m + half_m],
         "picture": f"data:image/png;base64,{base64.b64encode(picture_png).decode('ascii')}",
     }
     style, script = ((HERE / name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
-    return fill_frame(f"{title} · startrack", {"results": head}, PAGE_SCRIPTS, style=style, script=script)
+    return output.fill_frame(f"{title} · startrack", {"results": head}, PAGE_SCRIPTS, style=style, script=script)

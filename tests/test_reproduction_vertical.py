@@ -4,8 +4,13 @@ import numpy as np
 import pytest
 
 from startrack.applications.reproduction.published.malay import REST_TILT_ARCSEC, draw_readings, locate_at_rest
-from startrack.applications.reproduction.published.sigel_wettergreen import INCLINOMETER_ARCSEC, locate_by_inclinometer
-from startrack.applications.reproduction.published.vertical import position_of_vertical, tilt_vertical, vertical_at
+from startrack.applications.reproduction.published.vertical import (
+    INCLINOMETER_ARCSEC,
+    locate_by_inclinometer,
+    position_of_vertical,
+    tilt_vertical,
+    vertical_at,
+)
 from startrack.applications.reproduction.simulator import SHACKLETON, draw_positions
 from startrack.frames import R_enu_fixed, Site, latlon_from_enu, sphere_radius_m
 from startrack.output import ARCSEC_PER_RAD

@@ -1,4 +1,4 @@
-"""Projections of maps of the Earth: longitude and latitude of WGS 84, or any reference system that pyproj knows."""
+"""By pyproj: projections of maps of the Earth (longitude and latitude of WGS 84 without it), and grids of the geoid."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import warnings
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from startrack.core.errors import how_to_install, length_text
 from startrack.core.types import Array, BadInput
-from startrack.frames import EARTH_RADIUS_M
+from startrack.frames import EARTH_RADIUS_M, Site, latlon_from_enu
 
 if TYPE_CHECKING:
     import pyproj
@@ -23,6 +23,7 @@ EARTH_RADII_M = 6_300_000.0, 6_450_000.0  # semi-major axes of all ellipsoids th
 FOOT_M = 0.3048
 SCALE_STEP_M = 100.0  # over which the scale of a map is measured
 UNNAMED = "unnamed", "unknown"  # names that decoders give
+BASE_M = 10_000.0  # from the site to the points that give the slope: the grids have posts every 2 to 30 km
 AREA_DEG = 1.0  # about a place, for the choice of a datum's transformation
 
 
@@ -166,3 +167,34 @@ def _lacking(group: Any, name: str) -> str:
         grids = ", ".join(grid.short_name for grid in best.grids if not grid.available)
         text += f"; PROJ's grid {grids} gives {length_text(best.accuracy)} (projsync --file {grids})"
     return text
+
+
+class Geoid(NamedTuple):
+    """The geoid above the ellipsoid: its height at a site, and how it rises there to the east and to the north."""
+
+    height_m: float
+    slope_arcsec: tuple[float, float]
+
+
+def geoid_at(grid: str, site: Site) -> Geoid:
+    """The geoid at a `site` on the Earth by a `grid`: a name that PROJ finds, or the path of a GTX or GeoTIFF grid.
+
+    Raises BadInput (bad_terrain) where PROJ has no such grid, or it does not reach the site.
+    """
+    if find_spec("pyproj") is None:
+        raise BadInput("bad_terrain", f"grids of the geoid need pyproj: {how_to_install('dem')}")
+    from pyproj import Transformer
+    from pyproj.exceptions import ProjError
+
+    try:
+        shift = Transformer.from_pipeline(f"+proj=vgridshift +grids={grid} +multiplier=1")
+    except ProjError as cause:
+        advice = f"projsync --file {grid} fetches those of PROJ"
+        raise BadInput("bad_terrain", f"{grid}: PROJ finds no such grid of the geoid: {advice}") from cause
+    east_m, north_m = BASE_M * np.array([[0, -1, 1, 0, 0], [0, 0, 0, -1, 1]])
+    latitude, longitude = latlon_from_enu(site, east_m, north_m, np.zeros(5))
+    here, west, east, south, north = shift.transform(longitude, latitude, np.zeros(5), radians=True)[2]
+    if not np.isfinite([here, west, east, south, north]).all():
+        raise BadInput("bad_terrain", f"{grid}: this grid of the geoid does not reach the origin")
+    slope = np.degrees(np.arctan([(east - west) / (2 * BASE_M), (north - south) / (2 * BASE_M)])) * 3600.0
+    return Geoid(float(here), (float(slope[0]), float(slope[1])))

@@ -14,12 +14,11 @@ from startrack.core.errors import BadOutput, length_text
 from startrack.core.files import check_output, data_dir
 from startrack.core.types import BadInput
 from startrack.frames import EARTH_RADIUS_M, Site
-from startrack.terrain.geoid import geoid_at
+from startrack.terrain.earth_projection import geoid_at
 from startrack.terrain.height_map import HeightMap
 from startrack.terrain.io import terrain_from_dict
 from startrack.terrain.map_comparison import compare_with_finest, crest_angle_rad_per_m
-from startrack.terrain.map_error import carried_spacing, error_between_posts_m
-from startrack.terrain.map_products import find_product
+from startrack.terrain.map_error import carried_spacing, error_between_posts_m, find_product
 from startrack.terrain.map_reading import read_map
 from startrack.terrain.map_writing import write_map
 from startrack.terrain.raster import Raster

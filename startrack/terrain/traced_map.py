@@ -19,7 +19,7 @@ from startrack.terrain.horizon_kernel import surfaces
 from startrack.terrain.horizon_table import AZIMUTH_BINS, FIELDS, HorizonTable, Square
 from startrack.terrain.protocol import Progress, Terrain
 from startrack.terrain.raster import Projection, Raster
-from startrack.terrain.rays import flatten, flatten_rays, rows_of_rays
+from startrack.terrain.rays import flatten, flatten_rays, rows_of_rays, run_in_threads
 from startrack.terrain.table_cache import (
     TABLES_IN_MEMORY,
     discard_table,
@@ -28,7 +28,6 @@ from startrack.terrain.table_cache import (
     path_of_table,
 )
 from startrack.terrain.table_kernel import box_bounds, horizons, sector_bounds
-from startrack.terrain.threads import run_in_threads
 
 CELL_M = 200.0  # cells of the table are no wider
 MAX_CELLS_ACROSS = 128

@@ -13,9 +13,9 @@ import numpy as np
 from startrack.applications.reproduction.published.kua_drive import locate_by_drive, outermost_stars
 from startrack.applications.reproduction.published.malay import draw_readings, locate_at_rest
 from startrack.applications.reproduction.published.naval import locate_by_features
-from startrack.applications.reproduction.published.sigel_wettergreen import locate_by_inclinometer
 from startrack.applications.reproduction.published.stein_medioni import locate_by_segments
 from startrack.applications.reproduction.published.talluri_aggarwal import locate_by_four_bearings
+from startrack.applications.reproduction.published.vertical import locate_by_inclinometer
 from startrack.applications.reproduction.scene import THESIS_GROUND, Scene, terrain_of
 from startrack.applications.reproduction.series import locate_by_rest, locate_by_stops
 from startrack.applications.reproduction.simulator import SHACKLETON, Stream, visible_stars

@@ -31,13 +31,9 @@ Outcome = tuple[dict[str, Any], str]  # of an image: the JSON object, and the li
 
 def refusal(cause: BadInput | NoSolution, name: str, **first: Any) -> Outcome:
     """The outcome of an image or file `name` that was refused; `first` stands at the beginning of the JSON object."""
-    line = f"{errors.one_line(name)}  refused {cause.reason}: {cause}"
-    return refusal_record(cause.reason, str(cause), **first), line
-
-
-def refusal_record(reason: str, message: str, **first: Any) -> dict[str, Any]:
-    """The JSON object of what was refused; `first` stands at its beginning."""
-    return {**first, "status": "refused", "reason": reason, "message": message, "advice": Reason(reason).advice}
+    reason, message = cause.reason, str(cause)
+    record = {**first, "status": "refused", "reason": reason, "message": message, "advice": Reason(reason).advice}
+    return record, f"{errors.one_line(name)}  refused {reason}: {message}"
 
 
 def print_outcome(args: argparse.Namespace, record: dict[str, Any], line: str) -> int:

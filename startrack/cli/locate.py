@@ -17,7 +17,7 @@ from startrack import chain, output
 from startrack.applications.batch import result_stems
 from startrack.camera import Camera, load_camera
 from startrack.catalog import load_catalog
-from startrack.cli.console import Outcome, print_outcome, refusal_record, worst_code
+from startrack.cli.console import Outcome, print_outcome, worst_code
 from startrack.cli.flags import check_localizer
 from startrack.cli.images import check_fov, compile_beside, near_attitude_of, prepare, read, settings_of
 from startrack.cli.report import write_page_of_images
@@ -72,19 +72,19 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve) -> int:
         args.usage_error("--image-topic is for ROS bags, and none is given")
     needed = NEEDED_LATER[:-1] if args.no_plots else NEEDED_LATER
     Thread(target=lambda: [importlib.import_module(name) for name in needed]).start()
-    codes, first = set(), {"format": f"startrack.{kind.removesuffix('s')}/1"}
+    codes = set()
     for path, stem in zip(args.images, result_stems(args.images), strict=True):
         name = Path(path).name
         try:
             record, line = _solve_image(args, path, Path(args.dir) / f"{stem}.{kind}.json", solve)
         except BadInput as cause:
-            record = refusal_record(cause.reason, str(cause), **first, image=name)
+            record = output.refused_dict(path, cause.reason, str(cause), kind.removesuffix("s"))
             line = output.refusal_line(path, cause.reason, str(cause))
         except Exception as cause:
             if args.verbose:
                 raise
             message = f"internal error: {type(cause).__name__}: {cause} (-v shows the traceback)"
-            record = refusal_record(INTERNAL_ERROR, message, **first, image=name)
+            record = output.refused_dict(path, INTERNAL_ERROR, message, kind.removesuffix("s"))
             line = f"{printable(name)}  {message}"
         for warning in () if args.quiet else record.get("warnings", ()):
             print(f"{printable(name)}: {warning}", file=sys.stderr, flush=True)

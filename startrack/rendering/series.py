@@ -16,12 +16,12 @@ from startrack.catalog import NIGHT_RAD, apparent_bodies, apparent_stars, sun_el
 from startrack.core import SKY_V_MAG_ARCSEC2
 from startrack.core.types import Array, BadInput, Stars, Value, rotation, vector
 from startrack.estimation.observations import OdometryErrors
-from startrack.frames import R_body_enu_from_heading_pitch_roll, R_enu_icrs, Site, sky_rotvec_rad
+from startrack.frames import R_body_enu_from_heading_pitch_roll, R_enu_icrs, sky_rotvec_rad
 from startrack.rendering.compose import draw_hot_pixels
 from startrack.rendering.drive import Drive, draw_odometry
 from startrack.rendering.scene import Scene
 from startrack.rendering.sources import draw_field_stars, draw_v_errors, exposure_for_snr
-from startrack.terrain import Terrain, require_place
+from startrack.terrain import Terrain, require_place, require_site
 
 if TYPE_CHECKING:
     from startrack.catalog import StarCatalog
@@ -112,7 +112,7 @@ class Series:
         Raises BadInput: bad_terrain when no position can be found, no_time outside the ephemeris.
         """
         pose, rng = self._pose_and_rng(number)
-        time, site, exposure_s = pose.time_utc, self._site(), self.exposure_used_s
+        time, site, exposure_s = pose.time_utc, require_site(self.terrain), self.exposure_used_s
         stars, v_error_mag = sky or self.draw_sky(time)
         sensor_rng = np.random.default_rng([self.seed, Stream.SENSOR])
         scene = Scene(
@@ -139,11 +139,6 @@ class Series:
             terrain_ref=self.terrain_ref,
         )
         return scene, rng
-
-    def _site(self) -> Site:
-        if self.terrain.site is None:
-            raise BadInput("bad_terrain", f"terrain {self.terrain.name} has no site: its sky is not known")
-        return self.terrain.site
 
     def pose(self, number: int) -> Pose:
         """Time and pose of exposure `number`. Raises BadInput (bad_terrain: no camera can stand there; no_time)."""
@@ -205,7 +200,7 @@ class Series:
 
         Raises BadInput (bad_terrain) where the terrain has no site.
         """
-        site = self._site()
+        site = require_site(self.terrain)
         rng = np.random.default_rng([self.seed, Stream.SKY])
         stars = apparent_stars(self.catalog, time, site)
         errors = np.zeros(len(stars))

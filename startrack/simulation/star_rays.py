@@ -30,7 +30,7 @@ from startrack.localization import clock_at
 from startrack.psf import noise_area_px
 from startrack.rendering import Scene, flux_e, sky_e_per_s, sky_gradient
 from startrack.simulation.starlight import Starlight
-from startrack.terrain import Terrain
+from startrack.terrain import Terrain, require_site
 
 EXACT_RAD = np.radians(2.0)  # from the skyline; farther, its elevations at one azimuth in 15 arcmin decide
 UNDECIDED_RAD = np.radians(0.2)  # from the skyline: here the visibility of a neighbour is not known
@@ -63,12 +63,11 @@ def simulate_rays(
     if ground is None:
         raise BadInput("bad_terrain", "the scene has no terrain: nothing hides the stars")
     terrain = terrain or ground
-    if terrain.site is None:
-        raise BadInput("bad_terrain", f"terrain {terrain.name} has no site: its sky is not known")
+    site = require_site(terrain)
     if scene.time_utc is None:
         raise BadInput("no_time", "the time of the scene is not known")
     camera, when = scene.camera, time_utc or scene.time_utc
-    sensor, site = scene.sensor, terrain.site
+    sensor = scene.sensor
     skyline = Skyline.trace(scene.position_enu_m[:2], ground, SKYLINE_POINTS)
     shining, angle_rad = _shining_stars(scene, ground, skyline)
     v_mag, error_mag = scene.stars.v_mag[shining], scene.v_error_mag[shining]

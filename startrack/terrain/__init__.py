@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from startrack.terrain.checks import require_bounds, require_horizons, require_place, require_terrain
+from startrack.terrain.checks import require_bounds, require_horizons, require_place, require_site, require_terrain
 from startrack.terrain.cylinder import Cylinder
 from startrack.terrain.io import KEYS as TERRAIN_KEYS
 from startrack.terrain.io import MAKERS, files_of_terrain, load_terrain, site_of_terrain, terrain_from_dict
@@ -26,8 +26,8 @@ __all__ = [
     "DIAMETER", "EQUIRECTANGULAR", "MAKERS", "NO_POST", "STEREOGRAPHIC", "TERRAIN_KEYS", "Cylinder", "EarthProjection",
     "ExpectedCrests", "ForwardingTerrain", "HeightMap", "Projection", "Raster", "ShapeError", "StateableError",
     "Terrain", "files_of_terrain", "import_maps", "is_geotiff", "load_terrain", "read_map", "require_bounds",
-    "require_horizons", "require_place", "require_terrain", "site_of_terrain", "state_errors", "stateable_errors",
-    "terrain_from_dict", "write_bands", "write_map",
+    "require_horizons", "require_place", "require_site", "require_terrain", "site_of_terrain", "state_errors",
+    "stateable_errors", "terrain_from_dict", "write_bands", "write_map",
 ]  # fmt: skip
 _LAZY_MODULES = {  # of names that few programs use: imported at the first use
     "EarthProjection": "earth_projection", "HeightMap": "height_map", "StateableError": "state_file",

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from startrack.core.types import Array, BadInput, Bools
+from startrack.frames import Site
 from startrack.terrain.protocol import Terrain
 
 BOUNDS_ROUNDING_RAD = 1e-9  # by which a least horizon may exceed the greatest
@@ -30,6 +31,13 @@ def require_terrain(given: Any) -> Terrain:
         f"{type(given).__name__} is no terrain{lacks}: give a file, a name, or an object of a class derived from "
         "startrack.Terrain",
     )
+
+
+def require_site(terrain: Terrain) -> Site:
+    """The site of a `terrain`. Raises BadInput (bad_terrain) where it has none."""
+    if terrain.site is None:
+        raise BadInput("bad_terrain", f"terrain {terrain.name} has no site: its sky is not known")
+    return terrain.site
 
 
 def require_place(terrain: Terrain, east_m: float, north_m: float) -> None:

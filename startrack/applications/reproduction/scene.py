@@ -17,11 +17,10 @@ from startrack.applications.reproduction.valley import draw_floor, draw_time, ja
 from startrack.camera import Camera, load_camera
 from startrack.catalog import load_catalog
 from startrack.chain import Located, Settings, locate
-from startrack.core.types import Array, BadInput, Bools, Evidence, Exposure, MeasuredSkyline, NotLocated
-from startrack.frames import Site
+from startrack.core.types import Array, Bools, Evidence, Exposure, MeasuredSkyline, NotLocated
 from startrack.localization import ExactPosterior, hull_position
 from startrack.rendering import Series, render
-from startrack.terrain import Cylinder, Terrain, load_terrain
+from startrack.terrain import Cylinder, Terrain, load_terrain, require_site
 
 THESIS_GROUND, VALLEY_GROUND = "", "jacksboro"  # the thesis's crater; valleys of the Earth
 PICTURE_CAMERA = "fisheye-2048"
@@ -40,13 +39,6 @@ class Scene:
     @cached_property
     def terrain(self) -> Terrain:
         return terrain_of(self.ground)
-
-    @property
-    def site(self) -> Site:
-        """Raises BadInput (bad_terrain) where the terrain has none."""
-        if self.terrain.site is None:
-            raise BadInput("bad_terrain", f"terrain {self.terrain.name} has no site: its sky is not known")
-        return self.terrain.site
 
     @cached_property
     def crater(self) -> Cylinder:
@@ -144,7 +136,8 @@ class Scene:
     def pictures(self) -> Series:
         """Pictures from here, in a night without Moon on the Earth, at any time on the Moon."""
         draws, (east, north) = self.draws(Stream.PICTURE), self.truth_m.tolist()
-        when = draw_time(self.site, rng=draws) if self.site.body == "earth" else None
+        site = require_site(self.terrain)
+        when = draw_time(site, rng=draws) if site.body == "earth" else None
         return Series(
             camera=picture_camera(), terrain=self.terrain, catalog=load_catalog().brighter_than(PICTURE_V_MAG),
             seed=int(draws.integers(1 << 30)), time_utc=when, east_m=east, north_m=north, faint_v_mag=PICTURE_V_MAG,

@@ -21,6 +21,7 @@ from startrack.catalog import load_catalog
 from startrack.chain import locate_rays
 from startrack.core.types import Array, NotLocated
 from startrack.simulation import simulate_rays
+from startrack.terrain import require_site
 
 REST_EXPOSURES = 6
 REST_EVERY_S = {"moon": 12 * 3600.0, "earth": 327.0}  # three days on the Moon, half an hour on the Earth
@@ -56,7 +57,7 @@ def _observe(
     start = scene.pictures.pose(0).time_utc
     moved = np.pad(np.cumsum(moves_m, axis=0), ((1, 0), (0, 0)))
     for k, (east, north) in enumerate(positions_m.tolist()):
-        when = start + timedelta(seconds=k * every_s[scene.site.body])
+        when = start + timedelta(seconds=k * every_s[require_site(terrain).body])
         exposed, rng = replace(scene.pictures, time_utc=when, east_m=east, north_m=north).scene(k)
         rays = simulate_rays(exposed, catalog, terrain, rng=rng)
         if not frames:

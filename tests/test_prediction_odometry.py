@@ -27,14 +27,19 @@ def cells_of(major, minor, azimuth_deg):
 
 
 def normal_equations(covariances, frames):
-    """Covariance (2, 2) of each of the first `frames` positions, by images with `covariances` and the moves."""
-    H = np.zeros((2 * frames, 2 * frames))
+    """Covariance (2, 2) of each of the first `frames` positions, by images with `covariances` and the moves.
+
+    The last two unknowns are the errors of scale and of heading that all moves share.
+    """
+    H = np.zeros((2 * frames + 2, 2 * frames + 2))
+    H[-2:, -2:] = np.eye(2) / SIGMA_1**2
     for k in range(frames):
         part = slice(2 * k, 2 * k + 2)
         if covariances[k] is not None:
             H[part, part] += np.linalg.inv(covariances[k])
-    for k, length in enumerate(np.linalg.norm(np.diff(POSITION_M[:frames], axis=0), axis=1)):
-        difference = np.zeros((2, 2 * frames))
+    for k, (east, north) in enumerate(np.diff(POSITION_M[:frames], axis=0)):
+        length, difference = np.hypot(east, north), np.zeros((2, 2 * frames + 2))
+        difference[:, -2:] = -np.array([[east, -north], [north, east]])
         difference[:, 2 * k : 2 * k + 2], difference[:, 2 * k + 2 : 2 * k + 4] = -np.eye(2), np.eye(2)
         H += difference.T @ difference / ((SIGMA_1 * length) ** 2 + FLOOR_M**2)
     whole = np.linalg.inv(H)

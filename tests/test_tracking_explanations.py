@@ -137,6 +137,23 @@ def test_odometry_that_is_wrong_as_a_whole_is_left_out_and_named(name):
     assert named > 0.8 * DRAWS
 
 
+@pytest.mark.parametrize(("scale", "turn_deg"), [(1.05, 0.0), (0.9, 0.0), (1.0, 5.0), (1.2, 0.0)])
+def test_moves_share_errors_of_scale_and_heading(scale, turn_deg):
+    """Errors of 5 to 20 % where 2 % are stated: they are estimated, and circles hold."""
+    worst, off_m = [], []
+    for seed in range(DRAWS):
+        position, frames, odometry = drive(np.random.default_rng([31, seed]))
+        turned = Rotation.from_quat(odometry.quat_xyzw) * Rotation.from_rotvec([0.0, 0.0, np.radians(turn_deg)])
+        odometry = replace(changed(odometry, scale * odometry.position_m), quat_xyzw=turned.as_quat())
+        track = estimate_track(frames, CRATER, SHARED, odometry=odometry)
+        assert not track.odometry_fault
+        worst.append(worst_in_circles(track, position))
+        off_m.append(np.linalg.norm(track.smoothed.position_enu_m[:, :2] - position, axis=1).mean())
+    assert max(worst) < 1.5
+    assert np.count_nonzero(np.array(worst) > 1.0) <= 2
+    assert np.mean(off_m) < 0.9 * SIGMA_M  # single images: 1.25 sigma
+
+
 def test_odometry_faster_than_any_rover_is_refused():
     _, frames, odometry = drive(np.random.default_rng(5))
     with pytest.raises(BadInput, match=r"faster than 10 m/s.*--max-speed") as refusal:

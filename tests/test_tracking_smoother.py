@@ -14,10 +14,16 @@ from startrack.estimation.observations import Observations, Steps
 from startrack.estimation.trajectory import TrackFilter, smooth
 
 
+def with_shared_moves(drive: Drive) -> Drive:
+    """The drive with errors of scale and heading that all its moves share."""
+    move_m = drive.steps.move_m
+    return replace(drive, steps=replace(drive.steps, by_shared_m=0.05 * np.stack([move_m, move_m[:, ::-1]], axis=-1)))
+
+
 def least_squares(drive: Drive, frames: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions, shared errors and heights as unknowns of one linear problem, and their covariance."""
-    k, posts = len(drive.shared), len(drive.height_error_m)
-    size = 2 * frames + k + posts
+    k, posts, moves = len(drive.shared), len(drive.height_error_m), drive.steps.by_shared_m.shape[-1]
+    size = 2 * frames + k + posts + moves
     rows, values = [], []
 
     def add(design: np.ndarray, value: np.ndarray, covariance: np.ndarray) -> None:
@@ -34,17 +40,20 @@ def least_squares(drive: Drive, frames: int) -> tuple[np.ndarray, np.ndarray]:
     for i in range(frames - 1):
         design = np.zeros((2, size))
         design[:, 2 * i : 2 * i + 2], design[:, 2 * i + 2 : 2 * i + 4] = -np.eye(2), np.eye(2)
+        if moves:
+            design[:, -moves:] = -drive.steps.by_shared_m[i]
         add(design, drive.steps.move_m[i], STEP_SIGMA_M**2 * np.eye(2))
-    priors = np.concatenate([np.ones(k), np.full(posts, HEIGHT_SIGMA_M)])
-    add(np.eye(size)[2 * frames :], np.zeros(k + posts), np.diag(priors**2))
+    priors = np.concatenate([np.ones(k), np.full(posts, HEIGHT_SIGMA_M), np.ones(moves)])
+    add(np.eye(size)[2 * frames :], np.zeros(len(priors)), np.diag(priors**2))
     A, b = np.vstack(rows), np.concatenate(values)
     solution = np.linalg.lstsq(A, b, rcond=None)[0]
     return solution, np.linalg.inv(A.T @ A)
 
 
-@pytest.mark.parametrize("shared_count", [0, 1, 2])
-def test_the_smoother_is_least_squares_with_all_unknowns(shared_count):
+@pytest.mark.parametrize(("shared_count", "by_moves"), [(0, False), (1, False), (2, True), (0, True)])
+def test_the_smoother_is_least_squares_with_all_unknowns(shared_count, by_moves):
     drive = simulate_drive(np.random.default_rng(1), 7, shared_count)
+    drive = with_shared_moves(drive) if by_moves else drive
     found = smooth(Observations.of(drive.estimates, HEIGHT_SIGMA_M), drive.steps)
     solution, covariance = least_squares(drive, 7)
     posts = 14 + shared_count + found.post
@@ -57,14 +66,16 @@ def test_the_smoother_is_least_squares_with_all_unknowns(shared_count):
         np.testing.assert_allclose(found.covariance_m2[i], covariance[part, part], atol=1e-6)
 
 
-def test_the_filter_is_the_smoother_of_the_frames_so_far():
+@pytest.mark.parametrize("by_moves", [False, True])
+def test_the_filter_is_the_smoother_of_the_frames_so_far(by_moves):
     drive = simulate_drive(np.random.default_rng(2), 9)
-    state = TrackFilter(1, HEIGHT_SIGMA_M)
+    drive = with_shared_moves(drive) if by_moves else drive
+    state = TrackFilter(1, HEIGHT_SIGMA_M, drive.steps.by_shared_m.shape[-1])
     for k, estimate in enumerate(drive.estimates):
         if k:
-            state.predict(drive.steps.move_m[k - 1], STEP_SIGMA_M)
+            state.predict(drive.steps, k - 1)
         state.update(estimate)
-        steps = Steps(drive.steps.move_m[:k], drive.steps.sigma_m[:k])
+        steps = Steps(drive.steps.move_m[:k], drive.steps.sigma_m[:k], drive.steps.by_shared_m[:k])
         batch = smooth(Observations.of(drive.estimates[: k + 1], HEIGHT_SIGMA_M), steps)
         np.testing.assert_allclose(state.position_m, batch.position_m[-1], atol=1e-4)
         np.testing.assert_allclose(state.covariance_m2, batch.covariance_m2[-1], atol=1e-4)
@@ -78,28 +89,11 @@ def test_the_filter_forgets_posts_without_a_jump(monkeypatch):
     state = TrackFilter(1, HEIGHT_SIGMA_M)
     for k, estimate in enumerate(drive.estimates):
         if k:
-            state.predict(drive.steps.move_m[k - 1], STEP_SIGMA_M)
+            state.predict(drive.steps, k - 1)
         state.update(estimate)
         assert len(state.mean) <= 3 + 24
         np.testing.assert_allclose(state.position_m, whole[k], atol=1e-4)
         np.testing.assert_allclose(state.covariance_m2, covariance[k], atol=1e-4)
-
-
-def test_predictions_by_the_others_are_those_without_the_frame_or_the_move():
-    drive = simulate_drive(np.random.default_rng(3), 6)
-    whole = smooth(Observations.of(drive.estimates, HEIGHT_SIGMA_M), drive.steps)
-    without = smooth(
-        Observations.of([None if k == 2 else e for k, e in enumerate(drive.estimates)], HEIGHT_SIGMA_M), drive.steps
-    )
-    unknown = np.where(np.arange(5) == 3, np.inf, drive.steps.sigma_m)
-    loose = smooth(Observations.of(drive.estimates, HEIGHT_SIGMA_M), replace(drive.steps, sigma_m=unknown))
-    move = drive.steps.move_m[3] - (loose.position_m[4] - loose.position_m[3])
-    np.testing.assert_allclose(whole.step_residual_m[3], move, atol=1e-3)
-    state_less = drive.estimates[2].response @ np.concatenate([without.position_m[2], without.shared])
-    known = np.isin(without.post, drive.estimates[2].post)
-    heights = dict(zip(without.post[known], without.post_error_m[known], strict=True))
-    by_posts = drive.estimates[2].by_post @ [heights.get(post, 0.0) for post in drive.estimates[2].post]
-    np.testing.assert_allclose(whole.frame_residual[2], drive.estimates[2].mean - state_less - by_posts, atol=1e-5)
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ the observations' noise correlated, with the covariance G S G^T.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -55,7 +55,10 @@ class FrameEstimate:
 
 @dataclass(frozen=True)
 class OdometryErrors:
-    """Errors of moves, independent on each horizontal axis; by default those of a usual rover's odometry."""
+    """Errors of moves, independent on each horizontal axis; by default those of a usual rover's odometry.
+
+    All moves share a further error of their scale and one of their heading, each as large as the relative one.
+    """
 
     sigma_1: float = ODOMETRY_SIGMA  # standard deviation, relative to the length of a move
     floor_m: float = ODOMETRY_FLOOR_M  # beside that, in quadrature
@@ -69,12 +72,20 @@ class OdometryErrors:
 USUAL_ODOMETRY = OdometryErrors()
 
 
+def moves_by_scale_and_heading(move_m: Array) -> Array:
+    """Changes (..., d, 2) of moves (..., d), d at least 2, by a scale larger by 1 and a heading larger by 1 rad."""
+    turned = np.zeros_like(move_m)
+    turned[..., 0], turned[..., 1] = -move_m[..., 1], move_m[..., 0]
+    return np.stack([move_m, turned], axis=-1)
+
+
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Moves between successive frames, in enu, each with an independent error."""
+    """Moves between successive frames, in enu, each with an independent error, and with errors that all share."""
 
     move_m: Array  # (n - 1, 2)
     sigma_m: Array  # (n - 1,) on each axis; infinite where the move is not known
+    by_shared_m: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))  # (n - 1, 2, f) by one sigma of each
 
     @classmethod
     def unknown(cls, frames: int) -> Steps:

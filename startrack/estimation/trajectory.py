@@ -22,17 +22,25 @@ DIRECTIONS = 256  # over half a turn
 
 @dataclass(eq=False)
 class TrackFilter:
-    """Estimates after the frames so far; `predict` and `update` in the order of time."""
+    """Estimates after the frames so far; `predict` and `update` in the order of time.
+
+    The state: the last position, the shared errors, those that all moves share, and posts.
+    """
 
     shared_count: int
     height_sigma_m: float
+    moves_count: int = 0  # of errors that all moves share
     mean: Array = field(init=False)
     covariance: Array = field(init=False)
     posts: dict[int, int] = field(default_factory=dict)  # number of a post to its place in the state
 
     def __post_init__(self) -> None:
-        self.mean = np.zeros(2 + self.shared_count)
-        self.covariance = np.diag([UNKNOWN_M**2] * 2 + [1.0] * self.shared_count)
+        self.mean = np.zeros(self._first_post)
+        self.covariance = np.diag([UNKNOWN_M**2] * 2 + [1.0] * (self._first_post - 2))
+
+    @property
+    def _first_post(self) -> int:
+        return 2 + self.shared_count + self.moves_count
 
     @property
     def position_m(self) -> Array:
@@ -44,12 +52,18 @@ class TrackFilter:
         """(2, 2) of the last frame."""
         return self.covariance[:2, :2].copy()
 
-    def predict(self, move_m: Array, sigma_m: float) -> None:
-        """The camera moved by (2,) in enu, with an error of `sigma_m` on each axis; infinite: anywhere."""
+    def predict(self, steps: Steps, number: int) -> None:
+        """The camera made the move of this `number`; one that is not known leads anywhere."""
+        sigma_m, move_m = float(steps.sigma_m[number]), steps.move_m[number]
         if not np.isfinite(sigma_m):
             self.mean[:2] = 0.0
             self.covariance[:2], self.covariance[:, :2] = 0.0, 0.0
             sigma_m = UNKNOWN_M
+        elif self.moves_count:
+            shared, by = slice(2 + self.shared_count, self._first_post), steps.by_shared_m[number]
+            move_m = move_m + by @ self.mean[shared]
+            self.covariance[:2] += by @ self.covariance[shared]
+            self.covariance[:, :2] += self.covariance[:, shared] @ by.T
         self.mean[:2] += move_m
         self.covariance[[0, 1], [0, 1]] += sigma_m**2
 
@@ -62,7 +76,7 @@ class TrackFilter:
         for number in estimate.post.tolist():  # the last ones of the dictionary are the latest
             self.posts[number] = self.posts.pop(number)
         if len(self.posts) > MOST_POSTS:  # those that were not seen for the longest time are left out
-            kept, first = list(self.posts)[-(3 * MOST_POSTS // 4) :], 2 + self.shared_count
+            kept, first = list(self.posts)[-(3 * MOST_POSTS // 4) :], self._first_post
             place = np.append(np.arange(first), [self.posts[number] for number in kept])
             self.mean, self.covariance = self.mean[place], self.covariance[np.ix_(place, place)]
             self.posts = {number: first + k for k, number in enumerate(kept)}
@@ -95,11 +109,6 @@ class Smoothed:
     covariance_m2: Array  # (n, 2, 2)
     shared: Array  # (k,) in standard deviations of their priors
     shared_covariance: Array  # (k, k)
-    joint_m2: Array  # (n, 2, n, 2) covariance of all positions
-    step_residual_m: Array  # (n - 1, 2) of each move, where the other data predict it
-    step_variance_m2: Array  # (n - 1, 2, 2) of that prediction
-    frame_residual: Array  # (frames, 2 + k) of the observations used, where the others predict them
-    frame_covariance: Array  # (frames, 2 + k, 2 + k) of that residual
     post: Ints  # (c,) numbers of the posts that the observations depend on
     post_error_m: Array  # (c,)
     post_sigma_m: Array  # (c,)
@@ -109,49 +118,31 @@ def smooth(observations: Observations, steps: Steps) -> Smoothed:
     """The best positions and shared errors, with their covariances. Cost: the third power of the number of frames."""
     n, known = observations.count, np.isfinite(steps.sigma_m)
     weight = np.where(known, 1.0 / np.square(np.where(known, steps.sigma_m, 1.0)), 0.0)
-    information, target = observations.information.copy(), observations.target.copy()
+    size, more = len(observations.target), steps.by_shared_m.shape[-1]
+    information, target = np.eye(size + more), np.append(observations.target, np.zeros(more))
+    information[:size, :size] = observations.information
     for axis in range(2):
         left, right = 2 * np.arange(n - 1) + axis, 2 * np.arange(n - 1) + 2 + axis
         for a, b, sign in ((left, left, 1.0), (right, right, 1.0), (left, right, -1.0), (right, left, -1.0)):
             information[a, b] += sign * weight
         np.subtract.at(target, left, weight * steps.move_m[:, axis])
         np.add.at(target, right, weight * steps.move_m[:, axis])
+    if more:
+        by, left = steps.by_shared_m.reshape(-1, more), np.arange(2 * (n - 1))
+        weighted = np.repeat(weight, 2)[:, None] * by
+        for at, sign in ((left, 1.0), (left + 2, -1.0)):
+            information[at, size:] += sign * weighted
+            information[size:, at] += sign * weighted.T
+        information[size:, size:] += weighted.T @ by
+        target[size:] -= weighted.T @ steps.move_m.ravel()
     covariance = inverse(information)
-    best = covariance @ target
+    best, covariance = (covariance @ target)[:size], covariance[:size, :size]
     position, blocks = best[: 2 * n].reshape(n, 2), covariance[: 2 * n, : 2 * n].reshape(n, 2, n, 2)
     pull = observations.inverse_covariance @ observations.value - observations.weighted_design @ best
     return Smoothed(
-        position, blocks[range(n), :, range(n)], best[2 * n :], covariance[2 * n :, 2 * n :], blocks,
-        *_predicted_steps(position, blocks, steps, weight), *_predicted_frames(observations, pull, covariance),
-        observations.posts, *_posts(observations, pull, covariance),
+        position, blocks[range(n), :, range(n)], best[2 * n :], covariance[2 * n :, 2 * n :], observations.posts,
+        *_posts(observations, pull, covariance),
     )  # fmt: skip
-
-
-def _predicted_steps(position_m: Array, blocks: Array, steps: Steps, weight: Array) -> tuple[Array, Array]:
-    """Residuals (n - 1, 2) and covariances (n - 1, 2, 2) of the moves by all data but the move itself."""
-    here = np.arange(len(weight))
-    covariance = blocks[here, :, here] + blocks[here + 1, :, here + 1] - blocks[here, :, here + 1]
-    covariance -= blocks[here + 1, :, here]
-    residual = steps.move_m - np.diff(position_m, axis=0)
-    # Just less than the whole weight: a move that nothing else predicts stays invertible.
-    without = np.linalg.inv(np.linalg.inv(covariance) - (1.0 - 1e-9) * weight[:, None, None] * np.eye(2))
-    return np.asarray(residual + np.einsum("n,nij,nj->ni", weight, without, residual)), np.asarray(without)
-
-
-def _predicted_frames(observations: Observations, pull: Array, covariance: Array) -> tuple[Array, Array]:
-    """Residuals (frames, p) and their covariances (frames, p, p) of the observations by all data but each itself.
-
-    With P = V^-1 - V^-1 A H^-1 A^T V^-1 the residual of a block is P_ii^-1 (P m)_i, and P_ii^-1 its covariance.
-    """
-    p, count = observations.size, len(observations.frames)
-    spread = observations.weighted_design @ covariance
-    residual, variance = np.empty((count, p)), np.empty((count, p, p))
-    for k in range(count):
-        part = slice(p * k, p * (k + 1))
-        within = observations.inverse_covariance[part, part] - spread[part] @ observations.weighted_design[part].T
-        variance[k] = np.linalg.pinv(within, hermitian=True)
-        residual[k] = variance[k] @ pull[part]
-    return residual, variance
 
 
 def _posts(observations: Observations, pull: Array, covariance: Array) -> tuple[Array, Array]:

@@ -32,7 +32,13 @@ from startrack.camera import Camera, load_camera
 from startrack.core.chunk_store import Chunk, ChunkStore
 from startrack.core.statistics import error_ellipse
 from startrack.core.types import Array, Bools
-from startrack.estimation.observations import FrameEstimate, Observations, OdometryErrors, Steps
+from startrack.estimation.observations import (
+    FrameEstimate,
+    Observations,
+    OdometryErrors,
+    Steps,
+    moves_by_scale_and_heading,
+)
 from startrack.estimation.trajectory import TrackFilter, radius_holding, smooth
 from startrack.rendering import exposure_for_snr
 from startrack.terrain import Terrain
@@ -96,13 +102,13 @@ def add_odometry(position_m: Array, cells: Cells, errors: OdometryErrors) -> Cel
         for covariance, is_known in zip(ellipse_m2(cells), known, strict=True)
     ]
     move_m = np.diff(position_m, axis=0)
-    steps = Steps(move_m, errors.sigma_m(move_m))
+    steps = Steps(move_m, errors.sigma_m(move_m), errors.sigma_1 * moves_by_scale_and_heading(move_m))
     filtered = smoothed = np.full((len(known), 2, 2), np.inf)
     if known.any():
-        state, filtered = TrackFilter(0, 0.0), filtered.copy()
+        state, filtered = TrackFilter(0, 0.0, steps.by_shared_m.shape[-1]), filtered.copy()
         for k, estimate in enumerate(estimates):
             if k:
-                state.predict(move_m[k - 1], float(steps.sigma_m[k - 1]))
+                state.predict(steps, k - 1)
             if estimate is not None:
                 state.update(estimate)
             if known[: k + 1].any():

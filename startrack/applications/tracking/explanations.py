@@ -49,7 +49,8 @@ class Moves:
         delta, sigma = self.delta_m[: len(anchor)], self.sigma_m[: len(anchor)]
         move = np.einsum("nij,nj->ni", self.turn[anchor], delta)[:, :2]
         known = np.isfinite(move).all(axis=1) & np.isfinite(sigma) & (not self.fault)
-        return Steps(np.where(known[:, None], move, 0.0), np.where(known, sigma, np.inf))
+        shared = np.where(known[:, None, None], (self.turn[anchor] @ self.freedom_m[: len(anchor)])[:, :2], 0.0)
+        return Steps(np.where(known[:, None], move, 0.0), np.where(known, sigma, np.inf), shared)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +69,7 @@ class Explanation:
     def steps(self) -> Steps:
         """The moves with their errors, those that slipped with a larger one."""
         steps = self.moves.steps(self.anchor)
-        return Steps(steps.move_m, np.where(self.slipped, np.hypot(steps.sigma_m, SLIP_SIGMA_M), steps.sigma_m))
+        return replace(steps, sigma_m=np.where(self.slipped, np.hypot(steps.sigma_m, SLIP_SIGMA_M), steps.sigma_m))
 
 
 @dataclass(eq=False)

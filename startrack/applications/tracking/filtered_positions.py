@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from startrack.applications.tracking.contradictions import RobustTrack, disagrees, smooth_robustly
-from startrack.applications.tracking.explanations import Explanations, Moves
+from startrack.applications.tracking.explanations import FREEDOMS, Explanations, Moves
 from startrack.applications.tracking.frame_estimate import (
     FRAME_REACH_SIGMAS,
     LEAST_FRAME_HALF_M,
@@ -38,7 +38,7 @@ class OnlineTrack:
     """Positions at the time of each frame; `add` in the order of time. Without contradictions a Kalman filter."""
 
     def __init__(self, shared_count: int, height_sigma_m: float) -> None:
-        self.filter = TrackFilter(shared_count, height_sigma_m)
+        self.filter = TrackFilter(shared_count, height_sigma_m, FREEDOMS)
         self.is_vouched = True  # whether explanations of another position of the last frame are unlikely together
         self._explanations = Explanations(shared_count, height_sigma_m)
         self._modes: list[Modes] = []
@@ -64,11 +64,11 @@ class OnlineTrack:
         moved = [(), *zip(best.slipped.tolist(), best.anchor.tolist(), [best.moves.fault] * (n - 1), strict=True)]
         decided = [(mode, *move) for mode, move in zip(best.mode.tolist(), moved, strict=True)]
         if decided[:-1] != self._decided:  # another explanation of the frames before is likelier now
-            self.filter = TrackFilter(self.filter.shared_count, self.filter.height_sigma_m)
+            self.filter = TrackFilter(self.filter.shared_count, self.filter.height_sigma_m, FREEDOMS)
             self._decided = []
         for k in range(len(self._decided), n):
             if k:
-                self.filter.predict(steps.move_m[k - 1], float(steps.sigma_m[k - 1]))
+                self.filter.predict(steps, k - 1)
             if best.mode[k] >= 0:
                 self.filter.update(self._modes[k][best.mode[k]])
         self._decided = decided

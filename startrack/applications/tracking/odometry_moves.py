@@ -12,10 +12,11 @@ from startrack.applications.tracking.explanations import FREEDOMS, ODOMETRY_WRON
 from startrack.applications.tracking.observed_frame import ObservedFrame
 from startrack.applications.tracking.odometry import Odometry
 from startrack.core.types import Array
-from startrack.estimation.observations import OdometryErrors, Steps
+from startrack.estimation.observations import OdometryErrors, Steps, moves_by_scale_and_heading
 
 UNITS = (1e-3, 1e3, 0.01, 0.3048)  # by which lengths in mm, km, cm or feet become metres
-SIMILAR_SIGMA_1 = 0.1  # of the scale, and of a turn about the vertical [rad], of odometry that is nearly right
+# Errors of scale and of heading [rad] that all moves share are those of one move, or with this probability larger.
+LARGER_PROBABILITY, LARGER_SIGMA_1 = 0.2, 0.1
 APART_SIGMA_M = 300.0  # of one image from the one before on each axis, by nothing but that both are of one drive
 AXES = ((1, 0, 2), (2, 1, 0), (0, 2, 1), (1, 2, 0), (2, 0, 1))  # orders that are not x y z
 
@@ -64,18 +65,22 @@ def odometry_moves(
     right = moves("", position, Q)
     east, north = np.eye(FREEDOMS).reshape(2, 3, FREEDOMS)
     similar, linear = np.zeros_like(unknown.freedom_m), np.zeros_like(unknown.freedom_m)
-    similar[..., 0] = SIMILAR_SIGMA_1 * shows_scale * right.delta_m
-    similar[:, :2, 1] = SIMILAR_SIGMA_1 * right.delta_m[:, :2] @ [[0.0, 1.0], [-1.0, 0.0]]
+    similar[..., :2] = moves_by_scale_and_heading(right.delta_m) * [shows_scale, 1.0]
     linear[:, 0], linear[:, 1] = right.delta_m @ east, right.delta_m @ north
+    sizes = ((1.0 - LARGER_PROBABILITY, errors.sigma_1), (LARGER_PROBABILITY, max(errors.sigma_1, LARGER_SIGMA_1)))
     named = [moves(fault, *poses) for fault, poses in faults.items()]
     wrong = [
-        replace(right, fault="a wrong scale or heading", freedom_m=similar),
         replace(unknown, fault="other axes, quaternions or lengths", freedom_m=linear, sigma_m=right.sigma_m),
         replace(unknown, fault="an unknown fault", sigma_m=apart),
     ]
     prior = np.log(ODOMETRY_WRONG_PROBABILITY / (len(wrong) + 1))
     return [
-        replace(right, log_prior=float(np.log1p(-ODOMETRY_WRONG_PROBABILITY))),
+        *(
+            replace(
+                right, freedom_m=size_1 * similar, log_prior=float(np.log(part * (1.0 - ODOMETRY_WRONG_PROBABILITY)))
+            )
+            for part, size_1 in sizes
+        ),
         *(replace(one, log_prior=float(prior - np.log(len(named)))) for one in named),
         *(replace(one, log_prior=float(prior)) for one in wrong),
     ]

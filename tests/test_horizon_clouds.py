@@ -9,9 +9,10 @@ import pytest
 from horizon_helpers import CAMERA, SITE, painted_frame, skyline_deg
 
 from startrack.applications.horizon import measure_skyline
-from startrack.applications.horizon.clouds import cloud_density, cloud_probability, layer_depth
+from startrack.applications.horizon.clouds import cloud_density, cloud_probability, cloud_sigma_rad, layer_depth
 from startrack.applications.horizon.columns import AZIMUTH_COLUMNS
 from startrack.applications.horizon.join import join_skylines
+from startrack.applications.horizon.posterior import sky_likelihood_ratio
 from startrack.applications.horizon.skylight import Steps
 from startrack.applications.horizon.starlight import StarLight
 from startrack.catalog import load_catalog
@@ -33,6 +34,11 @@ def stars(azimuth_deg: float, elevation_deg: np.ndarray, llr: float, missing: fl
     azimuth = np.full(elevation.shape, np.radians(azimuth_deg))
     rays = Evidence(azimuth_rad=azimuth, elevation_rad=elevation, llr=np.full(elevation.shape, llr))
     return StarLight(rays, np.zeros((0, 2)), np.zeros(0), missing)
+
+
+def steps(column: np.ndarray, elevation_deg: float, log_ratio: float) -> Steps:
+    values = np.radians(elevation_deg), 1e-3, -0.3, log_ratio, 9.0
+    return Steps(column, *(np.full(len(column), value) for value in values))
 
 
 @pytest.mark.slow
@@ -58,9 +64,7 @@ def test_a_layer_is_foreshortened():
 def test_the_sky_above_the_skyline_is_counted():
     count = 300
     column = np.arange(count) * 4 % AZIMUTH_COLUMNS
-    edges = Steps(
-        column, np.full(count, np.radians(12.0)), np.full(count, 1e-3), np.full(count, -0.3), np.full(count, 9.0)
-    )
+    edges = steps(column, 12.0, -0.3)
     low, high = np.zeros(AZIMUTH_COLUMNS), np.full(AZIMUTH_COLUMNS, np.radians(12.0))
     found = cloud_density(edges, low)
     sky = layer_depth(np.radians(20.0)) - layer_depth(np.radians(3.0))
@@ -69,16 +73,37 @@ def test_the_sky_above_the_skyline_is_counted():
     assert cloud_density(replace(edges, contrast=-edges.contrast), low) < 0.1 * found  # brighter below: no ground
 
 
-def test_missing_stars_say_that_an_edge_is_the_grounds():
-    edge = np.full(360, np.radians(12.0))
-    behind = np.arange(6.0, 11.0)
-    alone = cloud_probability(0.1, stars(180.0, np.zeros(0), 0.0), edge, 0.0)
-    hidden = cloud_probability(0.1, stars(180.0, behind, -9.0), edge, 0.0)
+def test_missing_stars_and_darkness_say_that_an_edge_is_the_grounds():
+    columns, behind = np.arange(AZIMUTH_COLUMNS), np.arange(6.0, 11.0)
+
+    def probability(light: StarLight, elevation_deg: float = 12.0, log_ratio: float = -0.5) -> np.ndarray:
+        edge = np.radians(elevation_deg)
+        found = steps(columns, elevation_deg, log_ratio)
+        return cloud_probability(found, light, np.full(len(columns), edge), np.full(360, edge), 0.0)
+
+    clear = stars(180.0, np.zeros(0), 0.0)
+    alone, hidden = probability(clear), probability(stars(180.0, behind, -9.0))
     assert hidden[180] < 0.02 * alone[180]  # unless one cloud hides them all: a hundredth
     assert hidden[0] == alone[0]
-    cloudy = cloud_probability(0.1, stars(180.0, behind, -9.0, missing=0.5), edge, 0.0)
-    assert cloudy[180] > 10 * hidden[180]
-    assert cloud_probability(0.1, stars(180.0, behind, -9.0), np.zeros(360), 0.0).max() == 0.0  # nothing is lower
+    assert probability(stars(180.0, behind, -9.0, missing=0.5))[180] > 10 * hidden[180]
+    assert probability(clear, 0.0).max() == 0.0  # nothing is lower
+    assert probability(clear, log_ratio=-0.15)[0] > 5 * alone[0] > 50 * probability(clear, log_ratio=-1.2)[0]
+
+
+def test_two_sigma_hold_the_part_of_a_skyline_that_is_behind_a_cloud():
+    rng, probability = np.random.default_rng(1), np.array([0.001, 0.0455, 0.1, 0.3, 0.8])
+    sigma = cloud_sigma_rad(probability, np.full(5, np.radians(6.0)))
+    below = np.where(rng.random((100_000, 5)) < probability, rng.uniform(0.0, np.radians(6.0), (100_000, 5)), 0.0)
+    beyond = np.mean(below > 2.0 * sigma, axis=0)
+    np.testing.assert_allclose(beyond, np.minimum(probability, 0.0455), atol=0.002)
+    assert sigma[:2].tolist() == [0.0, 0.0]
+
+
+def test_what_is_behind_a_step_in_the_sky_is_sky():
+    ratio = sky_likelihood_ratio(np.log([1.0, 0.9, 0.7, 0.37, 0.2]))
+    assert np.all(np.diff(ratio) < 0)
+    assert ratio[1] > 10 > 1 > ratio[3]
+    np.testing.assert_allclose(sky_likelihood_ratio(np.log([1 / 0.7, 1 / 0.2])), ratio[[2, 4]])  # a lit ground
 
 
 def test_a_clouds_edge_in_one_picture_is_nothing_that_moved():

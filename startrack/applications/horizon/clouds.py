@@ -3,14 +3,15 @@
 A cloud's edge is as sharp and as long as a skyline, and every column of azimuth shows it alike: columns are no
 independent witnesses of which edge is the skyline. A picture's sky above the skyline shows how many such edges it has.
 Those in front of a lower skyline are a Poisson process of the same density, which the stars behind the edge thin out.
+Below a cloud's edge is sky, hardly darker than above; ground is darker.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, SKYLINE_AZIMUTHS
-from startrack.applications.horizon.posterior import limited_rows
+from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, COLUMNS_PER_AZIMUTH, SKYLINE_AZIMUTHS
+from startrack.applications.horizon.posterior import limited_rows, sky_likelihood_ratio
 from startrack.applications.horizon.skylight import Steps
 from startrack.applications.horizon.starlight import StarLight
 from startrack.core.types import Array
@@ -24,6 +25,8 @@ CLEAR_OF_GROUND_RAD, HIGHEST_CLOUD_RAD = np.radians(3.0), np.radians(20.0)
 # A layer of clouds is foreshortened towards the horizon, by 1 / sin^2 of the elevation; below this one no further.
 FLAT_RAD = np.radians(8.0)
 LEAST_EDGES = 4.0  # columns with an edge that a picture without any is taken to have
+NEAR_EDGE_RAD = np.radians(0.3)  # a step this near to an edge is the edge
+BEYOND_TWO_SIGMA = 0.0455  # probability of an error of more than two sigma
 BESIDE_RAD = np.radians(1.5)  # of azimuth: stars this near to a bin are behind its edge
 
 
@@ -48,18 +51,33 @@ def cloud_density(steps: Steps, skyline_rad: Array) -> float:
     return (count + LEAST_EDGES) / max(seen, least)  # where little sky is seen, little is known of its clouds
 
 
-def cloud_probability(density: float, stars: StarLight, elevation_rad: Array, lowest_rad: float) -> Array:
+def edge_likelihood_ratio(steps: Steps, skyline_rad: Array) -> Array:
+    """Likelihood ratio (SKYLINE_AZIMUTHS,) of a cloud's edge to the ground's, by the light below the edge in each bin.
+
+    `skyline_rad`: elevations (AZIMUTH_COLUMNS,) of the edge; 1 where none of the `steps` of the picture is near it.
+    """
+    near = np.abs(steps.elevation_rad - skyline_rad[steps.column]) < NEAR_EDGE_RAD
+    of_bin = steps.column[near] // COLUMNS_PER_AZIMUTH
+    number, total = (np.bincount(of_bin, part, SKYLINE_AZIMUTHS) for part in (None, steps.log_ratio[near]))
+    return np.where(number > 0, sky_likelihood_ratio(total / np.maximum(number, 1)), 1.0)
+
+
+def cloud_probability(
+    steps: Steps, stars: StarLight, skyline_rad: Array, elevation_rad: Array, lowest_rad: float
+) -> Array:  # fmt: skip
     """Probability (SKYLINE_AZIMUTHS,) that an edge at `elevation_rad` is a cloud's, before a skyline at `lowest_rad`.
 
-    Stars missing behind the edge say that it is ground's, unless one cloud hides them all.
+    Stars missing behind the edge say that it is ground's, unless one cloud hides them all, and so does darkness.
 
     Args:
-        density: of the picture, by `cloud_density`.
+        steps: of the picture, in the widest averages.
         stars: of the picture.
+        skyline_rad: elevations (AZIMUTH_COLUMNS,) of the edge.
         elevation_rad: (SKYLINE_AZIMUTHS,) of the edge in each bin; infinite or nan ones have no meaning.
         lowest_rad: the lowest elevation that the skyline may have.
     """
-    expected = density * np.maximum(layer_depth(elevation_rad) - layer_depth(np.array(lowest_rad)), 0.0)
+    depth = np.maximum(layer_depth(elevation_rad) - layer_depth(np.array(lowest_rad)), 0.0)
+    expected = cloud_density(steps, skyline_rad) * depth * edge_likelihood_ratio(steps, skyline_rad)
     rays, llr = limited_rows(stars.rays, stars.missing)
     place = rays.azimuth_rad * (SKYLINE_AZIMUTHS / (2.0 * np.pi))
     beside = BESIDE_RAD * (SKYLINE_AZIMUTHS / (2.0 * np.pi))  # bins
@@ -69,3 +87,11 @@ def cloud_probability(density: float, stars: StarLight, elevation_rad: Array, lo
     behind = np.bincount(number[near], np.broadcast_to(llr[:, None], near.shape)[near], SKYLINE_AZIMUTHS)
     odds = expected * np.maximum(np.exp(np.minimum(behind, 0.0)), stars.missing)
     return np.asarray(odds / (1.0 + odds))
+
+
+def cloud_sigma_rad(probability: Array, height_rad: Array) -> Array:
+    """Sigma (n,) of an edge that is a cloud's with a `probability` (n,), its two sigma held with 95.45 %.
+
+    The skyline behind a cloud's edge is anywhere down to `height_rad` (n,) below it.
+    """
+    return np.asarray(0.5 * height_rad * (1.0 - BEYOND_TWO_SIGMA / np.maximum(probability, BEYOND_TWO_SIGMA)))

@@ -9,8 +9,8 @@ import numpy as np
 from startrack.core.types import MeasuredSkyline
 
 # Of a bin whose skyline is another one in another picture (a dome, a crane, a branch). Of 14 pictures the highest edges
-# at a rotating dome are clouds' with probabilities up to 0.013, those of clouds elsewhere with 0.04 to 0.33.
-MOVED_PROBABILITY = 0.03
+# at a rotating dome are clouds' with probabilities of 0.001 to 0.01, those of clouds elsewhere with 0.02 to 0.65.
+MOVED_PROBABILITY = 0.007
 MOVED_RAD = np.radians(20.0)  # by anything up to this
 
 

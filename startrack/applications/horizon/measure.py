@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.applications.horizon.agreement import LeftOut
-from startrack.applications.horizon.clouds import cloud_density, cloud_probability
+from startrack.applications.horizon.clouds import NEAR_EDGE_RAD, cloud_probability, cloud_sigma_rad
 from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, COLUMNS_PER_AZIMUTH, SKYLINE_AZIMUTHS, WIDTHS
 from startrack.applications.horizon.frames import Progress, SkyFrame, orient_frames
 from startrack.applications.horizon.join import join_skylines
@@ -32,7 +32,6 @@ UNKNOWN_SIGMA_RAD = np.radians(2.0)  # a wider posterior is no measurement, nor 
 PLACE_SIGMA_RAD = np.radians(0.04)  # a quarter of a usual pixel: the edge's place depends on how the ground is lit
 WALL_RAD = np.radians(1.0)  # variation from which one elevation does not describe a bin
 WEATHER_1 = 0.1  # of the refraction: what the weather changes
-NEAR_LIGHT_RAD = np.radians(0.3)  # a step this near to the skyline is evidence for it
 GAP_SIGNIFICANCE = 5.0  # of light below the skyline that is brighter than usual ground
 DEEPEST_GAP_RAD = np.radians(15.0)
 DECISIVE_LLR = 2.0
@@ -117,19 +116,19 @@ def _skyline_of(
     azimuth = np.radians(np.arange(SKYLINE_AZIMUTHS, dtype=np.float64) * (360.0 / SKYLINE_AZIMUTHS))
     elevation, scatter = (_columns_of_bins(one, 0).mean(axis=1) for one in (mean, np.square(sigma)))
     variation = _columns_of_bins(mean, COLUMNS_PER_AZIMUTH // 2).var(axis=1)  # within one degree to either side
-    shared = np.square(_common_sigma_rad(frames, azimuth, elevation, site)) + PLACE_SIGMA_RAD**2
-    shared += np.square(_gap_depth(steps, mean))
+    added = np.square(_common_sigma_rad(frames, azimuth, elevation, site)) + PLACE_SIGMA_RAD**2
+    added += np.square(_gap_depth(steps, mean))
     by_stars, by_light = _has_star(stars, azimuth, elevation), _has_step(steps, mean)
-    spread = scatter + variation + shared
-    known = (spread < UNKNOWN_SIGMA_RAD**2) & (by_stars | by_light)
+    known = (scatter + variation + added < UNKNOWN_SIGMA_RAD**2) & (by_stars | by_light)
     # A shorter run than three is a halo or a reflection more often than ground, and beside an unknown bin the ground
     # often rises.
     known &= np.roll(known, 1) & np.roll(known, -1)
     lowest = float(elevation[known].min()) if known.any() else 0.0
     cloud = _cloud_probability(lights, azimuth, elevation, mean, lowest)
     # The skyline behind a cloud's edge may be anywhere down to the lowest bin.
-    known &= spread + cloud * np.square(elevation - lowest) < UNKNOWN_SIGMA_RAD**2
-    variance = scatter / COLUMNS_PER_AZIMUTH + np.square(variation) / (variation + WALL_RAD**2) + shared
+    known &= scatter + variation + added + cloud * np.square(elevation - lowest) < UNKNOWN_SIGMA_RAD**2
+    added += np.square(cloud_sigma_rad(cloud, elevation - lowest))
+    variance = scatter / COLUMNS_PER_AZIMUTH + np.square(variation) / (variation + WALL_RAD**2) + added
     source = np.select([by_stars & by_light, by_light, by_stars], ["both", "sky light", "stars"], "")
     return MeasuredSkyline(
         azimuth_rad=azimuth,
@@ -151,7 +150,7 @@ def _cloud_probability(
     probability = np.ones(len(elevation))
     for stars, steps in lights:
         shows = _has_star([stars], azimuth, elevation) | _has_step([steps], mean)
-        one = cloud_probability(cloud_density(steps[-1], mean), stars, elevation, lowest_rad)
+        one = cloud_probability(steps[-1], stars, mean, elevation, lowest_rad)
         probability[shows] *= one[shows]
     return probability
 
@@ -162,7 +161,7 @@ def _gap_depth(steps: Sequence[list[Steps]], elevation_rad: Array) -> Array:
     for one in (one for by_width in steps for one in by_width[:2]):
         below = elevation_rad[one.column] - one.elevation_rad
         light = (one.contrast > WEAKEST_CONTRAST) & (one.significance > GAP_SIGNIFICANCE)
-        light &= (below > NEAR_LIGHT_RAD) & (below < DEEPEST_GAP_RAD)
+        light &= (below > NEAR_EDGE_RAD) & (below < DEEPEST_GAP_RAD)
         np.maximum.at(depth, one.column[light], below[light])
     return np.asarray(_columns_of_bins(depth, 2 * COLUMNS_PER_AZIMUTH).mean(axis=1))
 
@@ -201,7 +200,7 @@ def _has_step(steps: Sequence[list[Steps]], elevation_rad: Array) -> Bools:
     """Whether steps of light lie at the skyline of most columns of each bin."""
     found = np.zeros(AZIMUTH_COLUMNS, dtype=bool)
     for one in (one for by_width in steps for one in by_width):
-        near = np.abs(one.elevation_rad - elevation_rad[one.column]) < NEAR_LIGHT_RAD
+        near = np.abs(one.elevation_rad - elevation_rad[one.column]) < NEAR_EDGE_RAD
         found[one.column[near]] = True
     return np.asarray(_columns_of_bins(found, 0).mean(axis=1) >= 0.5)
 

@@ -22,7 +22,11 @@ BRIGHTER_PROBABILITY = 0.25  # that the ground at the skyline is brighter than t
 SURE_SIGNIFICANCE, RARELY_BRIGHTER_PROBABILITY = 8.0, 0.05  # weak bright steps are more often stars
 WEAKEST_CONTRAST = 0.25  # usual skylines have more
 NOISE_PER_RAD = np.degrees(0.5)  # density of steps of 3 sigma that are noise
-SKY_PER_RAD, SKY_CONTRAST = np.degrees(0.08), 0.12  # density of steps in the sky (clouds, reflections), and their scale
+SKY_PER_RAD = np.degrees(0.08)  # density of steps in the sky (clouds, reflections)
+# Below a step in the sky is sky, hardly darker. Sizes of the logarithm of the brightness below over that above, of 14
+# pictures of one camera: 9,671 dark steps in the sky have a mean of 0.23, 2,059 at the skyline 1.02, sigma 0.54. Of
+# three pictures of another camera: 0.27; 1.18, sigma 0.60.
+SKY_LOG_SCALE, GROUND_LOG_RATIO, GROUND_LOG_SIGMA = 0.23, 1.0, 0.55
 RARE_PER_RAD = np.degrees(3e-4)  # of sharp ones in the sky: wires, halos of bright stars
 GROUND_PER_RAD, GROUND_CONTRAST = np.degrees(0.3), 0.15  # density of steps below the skyline, and their scale
 SPURIOUS_PROBABILITY = 0.01  # of light at a hidden star: leaves with gaps, hot pixels
@@ -85,15 +89,27 @@ def limit_llr(llr: Array, missing: Array, spurious: float) -> Array:
     return np.asarray(np.log(((1 - missing) * seen + missing * unseen) / (spurious * seen + (1 - spurious) * unseen)))
 
 
+def sky_likelihood_ratio(log_ratio: Array) -> Array:
+    """Likelihood (...) of the brightness below a step over that above, for a step in the sky against the skyline's.
+
+    `log_ratio`: its logarithm.
+    """
+    size = np.abs(log_ratio)
+    in_sky = np.exp(-size / SKY_LOG_SCALE) / SKY_LOG_SCALE
+    z = (size - GROUND_LOG_RATIO) / GROUND_LOG_SIGMA
+    return np.asarray(in_sky * np.sqrt(2.0 * np.pi) * GROUND_LOG_SIGMA * np.exp(0.5 * np.square(z)))
+
+
 def add_step_log_likelihood(total: Array, steps: Steps, temper: float) -> None:
     """Add that of an image's steps of light, times `temper`, to the log-likelihood `total` (AZIMUTH_COLUMNS, n)."""
     noise = NOISE_PER_RAD * np.exp(-0.5 * (np.square(steps.significance) - MIN_SIGNIFICANCE**2))
     contrast = np.abs(steps.contrast)
-    in_sky = noise + SKY_PER_RAD * np.exp(-contrast / SKY_CONTRAST) + RARE_PER_RAD
+    usual = np.minimum(contrast / WEAKEST_CONTRAST, 1.0) ** 2
+    in_sky = noise + SKY_PER_RAD * usual * sky_likelihood_ratio(steps.log_ratio) + RARE_PER_RAD
     in_ground = noise + GROUND_PER_RAD * np.exp(-contrast / GROUND_CONTRAST) + 15 * RARE_PER_RAD
     brighter = np.where(steps.significance > SURE_SIGNIFICANCE, BRIGHTER_PROBABILITY, RARELY_BRIGHTER_PROBABILITY)
     weight = np.where(steps.contrast > 0, brighter, 1 - brighter)
-    weight = SHOWN_PROBABILITY * weight * np.minimum(contrast / WEAKEST_CONTRAST, 1.0) ** 2 / in_ground
+    weight = SHOWN_PROBABILITY * weight * usual / in_ground
     passed = 0.5 * np.log(in_sky / in_ground)
     order = np.argsort(steps.column, kind="stable")
     rows = (one[order] for one in (steps.column, steps.elevation_rad, steps.sigma_rad, weight, passed))

@@ -35,6 +35,7 @@ MIN_SIGNIFICANCE = 3.0
 PEAK_PX = 2.0  # a step is the most significant within this distance
 RELATIVE_ERROR = 0.02  # of the extrapolated sky, of its brightness above the darkest pixels
 DARKEST_PERCENT = 0.5
+MOST_RATIO = 10.0  # of the brightness on the two sides of a step: more says no more, and the darkest pixels have none
 WINDOW_PX = 10.0  # half width of the window in which an edge's place is measured
 REACH_PX, PLACE_STEP_PX = 2.5, 0.25
 PLACES_PX = np.arange(-REACH_PX, REACH_PX + PLACE_STEP_PX / 2, PLACE_STEP_PX)  # tried
@@ -56,6 +57,7 @@ class Steps:
     elevation_rad: Array
     sigma_rad: Array
     contrast: Array  # brightness below minus above, relative to the brightest sky above
+    log_ratio: Array  # logarithm of the brightness below over that of the sky right above
     significance: Array
 
 
@@ -90,8 +92,10 @@ def _steps_of(columns: Columns, width: int) -> Steps:
     level, size = mean_above(columns, 0.0, LEVEL_RAD / columns.px_rad), round(ABOVE_RAD / columns.step_rad)
     sky = maximum_filter1d(np.nan_to_num(level), size, axis=0, origin=-(size // 2), mode="constant")
     contrast = difference[row, column] / np.maximum(sky[row, column] - dark, 1e-9)
+    ratio = (below - dark)[row, column] / np.maximum((at_ground - dark)[row, column], 1e-9)
+    log_ratio = np.log(np.clip(ratio, 1.0 / MOST_RATIO, MOST_RATIO))
     sigma_rad, row, column = sigma_px * columns.px_rad, row[good], column[good]
-    return Steps(column, elevation[good], sigma_rad[good], contrast[good], significance[row, column])
+    return Steps(column, elevation[good], sigma_rad[good], contrast[good], log_ratio[good], significance[row, column])
 
 
 def _level_above(columns: Columns, gap_px: float, distance_px: float, dark_e: float) -> Array:

@@ -1,10 +1,12 @@
-"""Records against the schemas that `startrack schema` prints."""
+"""Records against the schemas that `startrack schema` prints; the keys of valid files with one changed."""
 
 from __future__ import annotations
 
+import copy
 import io
 import json
 from contextlib import redirect_stdout
+from typing import Any
 
 from jsonschema import Draft202012Validator
 
@@ -32,3 +34,17 @@ def unknown_keys(value, schema, path="$"):
         if isinstance(value, list) and isinstance(one.get("items"), dict):
             found += [key for item in value for key in unknown_keys(item, one["items"], f"{path}[]")]
     return found
+
+
+def change_key(keys: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
+    """The `keys` of a file with one set, or removed if the value is None."""
+    d = copy.deepcopy(keys)
+    *tables, key = path.split(".")
+    table = d
+    for name in tables:
+        table = table[name]
+    if value is None:
+        del table[key]
+    else:
+        table[key] = value
+    return d

@@ -1,8 +1,12 @@
-"""Painted pixels of a sky that stops at a skyline: known levels, slopes, noise and shifts."""
+"""Painted pixels of a sky that stops at a skyline: known levels, slopes, noise and shifts. Skyfield's sky."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
+from importlib.util import find_spec
+from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 from scipy.special import ndtr
@@ -48,3 +52,16 @@ def paint_pixels(
         azimuth_rad=azimuth, elevation_rad=ELEVATION_RAD + height / PX_PER_RAD, px_per_rad=np.full(n, PX_PER_RAD),
         height_px=height, light_e=ground + (sky - ground) * visible + noise, edge_px=EDGE_PX,
     )  # fmt: skip
+
+
+@cache
+def skyfield_moon():
+    """Skyfield's ephemeris and its own reading of the lunar orientation kernel that lunarsky has."""
+    from skyfield.api import PlanetaryConstants, load_file
+
+    folder = Path(find_spec("lunarsky").origin).parent / "data"
+    constants = PlanetaryConstants()
+    constants.read_text(BytesIO((folder / "fk/satellites/moon_080317.tf").read_bytes()))
+    constants.read_text(BytesIO(b"KPL/PCK\n\\begindata\nBODY301_RADII = ( 1737.4 1737.4 1737.4 )\n\\begintext\n"))
+    constants.read_binary(open(folder / "pck/moon_pa_de421_1900-2050.bpc", "rb"))  # noqa: SIM115
+    return load_file(str(Path(find_spec("skyfield_data").origin).parent / "data/de421.bsp")), constants

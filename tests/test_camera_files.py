@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tomli_w
+from schema_helpers import change_key
 from scipy.spatial.transform import Rotation
 
 from startrack.camera import Camera, KannalaBrandt, Pinhole, Sensor, camera_from_dict, load_camera, save_camera
@@ -34,20 +34,6 @@ GOOD: dict[str, Any] = {
     },
     "covariance": {"order": ["fx", "k1"], "matrix": [[0.04, -0.001], [-0.001, 0.0009]]},
 }  # fmt: skip
-
-
-def change_key(path: str, value: Any) -> dict[str, Any]:
-    """The valid file with one key set, or removed if the value is None."""
-    d = copy.deepcopy(GOOD)
-    *tables, key = path.split(".")
-    table = d
-    for name in tables:
-        table = table[name]
-    if value is None:
-        del table[key]
-    else:
-        table[key] = value
-    return d
 
 
 def assert_same(a: Camera, b: Camera) -> None:
@@ -103,7 +89,7 @@ def test_defaults_are_those_of_the_format() -> None:
 
 
 def test_integers_are_numbers() -> None:
-    d = change_key("focal_px", [300, 301]) | {"max_angle_deg": 92, "centre_px": [500, 400], "k": [0, 0]}
+    d = change_key(GOOD, "focal_px", [300, 301]) | {"max_angle_deg": 92, "centre_px": [500, 400], "k": [0, 0]}
     assert camera_from_dict(d).centre_px == (500.0, 400.0)
 
 
@@ -141,7 +127,7 @@ BAD = [
 @pytest.mark.parametrize(("path", "value"), BAD, ids=lambda v: str(v)[:30])
 def test_a_wrong_key_is_refused_and_named(path: str, value: Any, tmp_path: Path) -> None:
     file = tmp_path / "bad.toml"
-    file.write_text(tomli_w.dumps(change_key(path, value)))
+    file.write_text(tomli_w.dumps(change_key(GOOD, path, value)))
     with pytest.raises(BadInput) as caught:
         load_camera(file)
     assert caught.value.reason == "bad_calibration"
@@ -152,10 +138,10 @@ def test_a_wrong_key_is_refused_and_named(path: str, value: Any, tmp_path: Path)
 
 def test_a_circle_beyond_the_turning_point_is_refused() -> None:
     with pytest.raises(BadInput, match=r"max_angle_deg.*95\.4") as caught:
-        camera_from_dict(change_key("k", [-0.12]) | {"max_angle_deg": 96.0})
+        camera_from_dict(change_key(GOOD, "k", [-0.12]) | {"max_angle_deg": 96.0})
     assert caught.value.reason == "bad_calibration"
     with pytest.raises(BadInput, match="max_angle_deg"):
-        camera_from_dict(change_key("model", "pinhole") | {"k": [], "max_angle_deg": 90.0})
+        camera_from_dict(change_key(GOOD, "model", "pinhole") | {"k": [], "max_angle_deg": 90.0})
 
 
 def test_a_missing_file_is_no_calibration(tmp_path: Path) -> None:
@@ -191,7 +177,7 @@ def test_vignetting_is_the_stated_polynomial_and_never_negative() -> None:
 
 def test_a_lens_darker_than_any_is_refused() -> None:
     """Vignetting that a calibration with airmass in it once gave: 0.014 at 80 degrees, negative from 82.6."""
-    dark = change_key("sensor.vignetting", [-0.70, 0.10])
+    dark = change_key(GOOD, "sensor.vignetting", [-0.70, 0.10])
     for calibrated_deg in (80.0, 91.0):
         with pytest.raises(BadInput, match=rf"sensor.vignetting.*{calibrated_deg:.1f} degrees") as caught:
             camera_from_dict(dark | {"calibrated_angle_deg": calibrated_deg})

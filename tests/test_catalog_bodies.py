@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 from datetime import UTC, datetime, timedelta
-from functools import cache
-from importlib.util import find_spec
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from sky_helpers import skyfield_moon
 
 from startrack.catalog import bodies, daylight_warnings
 from startrack.core.types import BadInput
@@ -29,24 +27,11 @@ THEIR_NAMES = {
 }  # fmt: skip
 
 
-@cache
-def skyfield_world():
-    from skyfield.api import PlanetaryConstants, load, load_file
-
-    folder = Path(find_spec("lunarsky").origin).parent / "data"
-    constants = PlanetaryConstants()
-    constants.read_text(BytesIO((folder / "fk/satellites/moon_080317.tf").read_bytes()))
-    constants.read_text(BytesIO(b"KPL/PCK\n\\begindata\nBODY301_RADII = ( 1737.4 1737.4 1737.4 )\n\\begintext\n"))
-    constants.read_binary(open(folder / "pck/moon_pa_de421_1900-2050.bpc", "rb"))  # noqa: SIM115
-    ephemeris = load_file(str(Path(find_spec("skyfield_data").origin).parent / "data/de421.bsp"))
-    return ephemeris, constants, load.timescale(builtin=True)
-
-
 def skyfield_position(site: Site, time: datetime, name: str):
     """Skyfield's astrometric position of the body from the site."""
-    from skyfield.api import wgs84
+    from skyfield.api import load, wgs84
 
-    ephemeris, constants, timescale = skyfield_world()
+    (ephemeris, constants), timescale = skyfield_moon(), load.timescale(builtin=True)
     latitude, longitude = np.degrees([site.latitude_rad, site.longitude_rad])
     if site.body == "earth":
         place = ephemeris["earth"] + wgs84.latlon(latitude, longitude, site.height_m)
@@ -101,7 +86,7 @@ def test_magnitudes_agree_with_skyfield(site: Site, time: datetime) -> None:
             continue
         position = skyfield_position(site, time, body.name)
         # Skyfield takes the barycentre for the Sun, worth 0.1 mag of Mercury: give it the Sun for a barycentre.
-        position.center_barycentric = position.center_barycentric - skyfield_world()[0]["sun"].at(position.t)
+        position.center_barycentric = position.center_barycentric - skyfield_moon()[0]["sun"].at(position.t)
         assert body.v_mag == pytest.approx(planetary_magnitude(position), abs=0.005), body.name
 
 

@@ -7,13 +7,12 @@ import multiprocessing
 import os
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
-from functools import cache
 from importlib.util import find_spec
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from sky_helpers import skyfield_moon
 
 from startrack.core.types import BadInput
 from startrack.frames import (
@@ -48,20 +47,6 @@ def rotation_angle_rad(R: np.ndarray, S: np.ndarray) -> float:
     return float(np.arctan2(np.linalg.norm([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]]), np.trace(D) - 1))
 
 
-@cache
-def skyfield_moon():
-    """Skyfield's ephemeris and its own reading of the same lunar orientation kernel."""
-    from skyfield.api import PlanetaryConstants, load_file
-
-    folder = Path(find_spec("lunarsky").origin).parent / "data"
-    constants = PlanetaryConstants()
-    constants.read_text(BytesIO((folder / "fk/satellites/moon_080317.tf").read_bytes()))
-    constants.read_text(BytesIO(b"KPL/PCK\n\\begindata\nBODY301_RADII = ( 1737.4 1737.4 1737.4 )\n\\begintext\n"))
-    constants.read_binary(open(folder / "pck/moon_pa_de421_1900-2050.bpc", "rb"))  # noqa: SIM115
-    ephemeris = load_file(str(Path(find_spec("skyfield_data").origin).parent / "data/de421.bsp"))
-    return ephemeris, constants, constants.build_frame_named("MOON_ME_DE421")
-
-
 # --- the Moon -------------------------------------------------------------------------------------------------------
 
 
@@ -78,7 +63,7 @@ def test_moon_orientation_agrees_with_an_independent_renderer() -> None:
 def test_moon_orientation_agrees_with_skyfield(time: datetime) -> None:
     from skyfield.api import load
 
-    _, _, frame = skyfield_moon()
+    frame = skyfield_moon()[1].build_frame_named("MOON_ME_DE421")
     theirs = frame.rotation_at(load.timescale(builtin=True).from_datetime(time))
     assert rotation_angle_rad(R_mcmf_icrs(time), theirs) < 1e-3 * ARCSEC_RAD
 
@@ -95,7 +80,8 @@ def test_zenith_of_shackleton_is_near_the_south_ecliptic_pole() -> None:
 def test_moon_velocity_agrees_with_skyfield(time: datetime) -> None:
     from skyfield.api import load
 
-    ephemeris, constants, frame = skyfield_moon()
+    ephemeris, constants = skyfield_moon()
+    frame = constants.build_frame_named("MOON_ME_DE421")
     site = Site("moon", 0.3, 1.1)
     place = constants.build_latlon_degrees(frame, np.degrees(0.3), np.degrees(1.1))
     theirs = (ephemeris["moon"] + place).at(load.timescale(builtin=True).from_datetime(time))

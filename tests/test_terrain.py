@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import pytest
 import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from schema_helpers import change_key
 
 from startrack.core.files import data_dir
 from startrack.core.types import BadInput
@@ -187,19 +187,6 @@ GOOD: dict[str, Any] = {
 }  # fmt: skip
 
 
-def change_key(path: str, value: Any) -> dict[str, Any]:
-    d = copy.deepcopy(GOOD)
-    *tables, key = path.split(".")
-    table = d
-    for name in tables:
-        table = table[name]
-    if value is None:
-        del table[key]
-    else:
-        table[key] = value
-    return d
-
-
 def test_every_key_reaches_the_terrain() -> None:
     crater = terrain_from_dict(GOOD)
     assert crater == Cylinder(
@@ -208,7 +195,7 @@ def test_every_key_reaches_the_terrain() -> None:
         ellipse_sigma_1=None, rim_tilt_sigma_rad=None,
     )  # fmt: skip
     assert crater.reach_m == 1000.0
-    earth = terrain_from_dict(change_key("origin.height_m", 120.0) | {"body": "earth"})
+    earth = terrain_from_dict(change_key(GOOD, "origin.height_m", 120.0) | {"body": "earth"})
     assert (earth.site.body, earth.site.height_m) == ("earth", 120.0)
     least = {key: GOOD[key] for key in ("body", "origin", "cylinder")}
     assert terrain_from_dict(least, "plain").name == "plain"
@@ -266,7 +253,7 @@ def test_a_cylinder_takes_any_real_number_and_an_open_search_area() -> None:
 @pytest.mark.parametrize(("path", "value", "named"), BAD, ids=lambda v: str(v)[:30])
 def test_a_wrong_key_is_refused_and_named(path: str, value: Any, named: str, tmp_path: Path) -> None:
     file = tmp_path / "bad.toml"
-    file.write_text(tomli_w.dumps(change_key(path, value)))
+    file.write_text(tomli_w.dumps(change_key(GOOD, path, value)))
     with pytest.raises(BadInput, match=named) as caught:
         load_terrain(file)
     assert caught.value.reason == "bad_terrain"

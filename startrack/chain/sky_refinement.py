@@ -66,7 +66,8 @@ def refine_by_sky_light(located: Located, localizer: Localizer, stars: bool = Tr
                 near=located.near,
             )  # fmt: skip
             located = replace(fix_position(located, Located, localizer, evidence), sky=sky, by_stars=stars)
-            if _motion_px(before, located, sky.light) < MOVED_PX:
+            moved_rad = predicted_skyline(located)(MIDDLES_RAD) - predicted_skyline(before)(MIDDLES_RAD)
+            if np.quantile(np.abs(moved_rad) * sky.light.px_per_rad, 0.9) < MOVED_PX:
                 return located
         raise NoSkyLight("it points to no single position")
     except NoSkyLight as cause:
@@ -120,12 +121,6 @@ def _image_errors(measured: Measured, sky: SkyLight, used: Bools) -> ImageErrors
         raised_rad=offset_terms(MIDDLES_RAD) / sky.px_per_rad[:, None], mean=offsets.mean_px, covariance=covariance,
         variance_rad2=np.where(used, sky.variance_px2 / np.square(sky.px_per_rad), np.inf),
     )  # fmt: skip
-
-
-def _motion_px(before: Located, after: Located, sky: SkyLight) -> float:
-    """By how much the predicted skyline moves from one fix to the next, at most, where the sky's light is used."""
-    moved = predicted_skyline(after)(MIDDLES_RAD) - predicted_skyline(before)(MIDDLES_RAD)
-    return float(np.quantile(np.abs(moved) * sky.px_per_rad, 0.9))
 
 
 def _too_few_text(sky: SkyLight, used: Bools) -> str:

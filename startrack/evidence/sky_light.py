@@ -106,7 +106,8 @@ def measure_sky_light(pixels: SkyPixels, horizon: Horizon) -> SkyLight:
         informed, before = np.isfinite(sigma), width_px
         if informed.any():
             shifted = height_px[informed] - shift[informed, None], llr[informed], extended[informed]
-            width_px = pixels.edge_px * _softness(*shifted, pixels.edge_px)
+            nats = [_nats(*shifted, one) for one in _widened(pixels.edge_px * SOFTNESS)]
+            width_px = pixels.edge_px * float(SOFTNESS[int(np.argmax(nats))])
         if width_px == before:
             break
     seen = scale[:, 0] > 0
@@ -142,12 +143,6 @@ def _sum_pixels(
 def _widened(width_px: Any) -> Any:
     """Width of an edge in cells, whose pixels spread over their height."""
     return np.sqrt(np.square(width_px) + CELL_PX**2 / 12)
-
-
-def _softness(height_px: Array, llr: Array, extended: Array, edge_px: float) -> float:
-    """The width of the edge, in that of a star's `edge_px`, that explains cells (n, LEVELS) best."""
-    nats = [_nats(height_px, llr, extended, one) for one in _widened(edge_px * SOFTNESS)]
-    return float(SOFTNESS[int(np.argmax(nats))])
 
 
 def _nats(height_px: Array, llr: Array, extended: Array, edge_px: float) -> float:

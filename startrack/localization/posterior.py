@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +11,6 @@ from startrack.core.types import Evidence, Fix, NotLocated, PositionPrior
 from startrack.localization.clock import explore_times, is_wide
 from startrack.localization.conclusion import conclude
 from startrack.localization.horizon_bias import find_start
-from startrack.localization.hypothesis import Hypothesis
 from startrack.localization.joint_posterior import sample_posterior
 from startrack.localization.likelihood import SECTOR_RAD, PositionLikelihood
 from startrack.localization.position_prior import SearchedNear, name_prior, weigh_by_prior
@@ -57,8 +55,9 @@ class ExactPosterior:
         near = rows.near
         try:
             parts = self._explore_times(rows, terrain)
-            found, explored = _sample(parts, terrain), parts[0][1]
-            return conclude(found, terrain, explored, _dropped_probability(explored))
+            found = [one for turned, explored in parts for one in sample_posterior(explored, turned, terrain)]
+            found.sort(key=lambda one: -one.found.log_evidence)
+            return conclude(found, terrain, parts[0][1], _dropped_probability(parts[0][1]))
         except NotLocated as refusal:
             raise name_prior(refusal, near) from refusal
 
@@ -101,12 +100,6 @@ class ExactPosterior:
     def likelihood(evidence: Evidence, terrain: Terrain) -> PositionLikelihood:
         """The likelihood of `evidence` on a `terrain` that the search bounds."""
         return PositionLikelihood.from_evidence(evidence, terrain, SECTOR_RAD, SEARCH_EPSILON)
-
-
-def _sample(parts: Sequence[tuple[Evidence, Explored]], terrain: Terrain) -> list[Hypothesis]:
-    """The hypotheses at each likely time, the heaviest first."""
-    found = [one for turned, explored in parts for one in sample_posterior(explored, turned, terrain)]
-    return sorted(found, key=lambda one: -one.found.log_evidence)
 
 
 def _dropped_probability(explored: Explored) -> float:

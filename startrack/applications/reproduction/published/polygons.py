@@ -80,18 +80,13 @@ def chains_of(elevation_rad: Array, vertices: Bools) -> tuple[Ints, Array]:
 
 
 def keys_of(shape: Array) -> Ints:
-    """Keys (k,) of the bins in which the shapes (k, 6) lie."""
-    return np.asarray(np.ravel_multi_index(tuple(_wrap(np.floor(shape)).T), tuple(DIGITS)))
+    """Keys (k,) of the bins in which the shapes (k, 6) lie, within DIGITS; bearings begin anew after the last one."""
+    bins = np.floor(shape).astype(np.int64)
+    bins[:, 0] %= BEARING_BINS
+    return np.asarray(np.ravel_multi_index(tuple(np.clip(bins, 0, DIGITS - 1).T), tuple(DIGITS)))
 
 
 def near_keys(shape: Array) -> Ints:
     """Keys (64,) of the bins that are nearest to one shape (6,): two in each of its numbers."""
     low = np.floor(shape - 0.5)
     return keys_of(low + np.array(list(product((0, 1), repeat=len(shape)))))
-
-
-def _wrap(bins: Array) -> Ints:
-    """Bins (k, 6) within DIGITS; bearings begin anew after the last one."""
-    whole = bins.astype(np.int64)
-    whole[:, 0] %= BEARING_BINS
-    return np.clip(whole, 0, DIGITS - 1)

@@ -10,7 +10,7 @@ import tifffile
 from astropy.io import fits
 from PIL import Image, PngImagePlugin
 
-from startrack.core.types import BadInput
+from startrack.core.types import TIME_SIGMA_S, BadInput
 from startrack.exposure import read_exposure, with_facts
 
 FRAME = np.arange(12, dtype=np.uint16).reshape(3, 4)
@@ -59,6 +59,22 @@ def test_a_time_of_the_file_that_differs_from_the_given_one_is_named(image, side
     assert "0:01:00 (h:mm:ss) before that of the file" in warning
     sidecar({"time_utc": "yesterday"})
     assert read_exposure(image, time_utc=of_file).warnings == ()
+
+
+@pytest.mark.parametrize(("late_s", "kept"), [(0.5, True), (3600.0, False), (-3600.0, False)])
+def test_the_clock_error_of_a_file_is_not_that_of_another_time(image, sidecar, late_s, kept):
+    """A sidecar that states an exact clock says nothing about a time that a user types."""
+    of_file = datetime(2020, 1, 1, 0, 0, 10, tzinfo=UTC)
+    sidecar({"time_utc": of_file.isoformat(), "time_sigma_s": 0.0})
+    exposure = read_exposure(image)
+    assert (exposure.time_sigma_s, exposure.time_sigma_is_stated) == (0.0, True)
+    given = of_file + timedelta(seconds=late_s)
+    for one in (read_exposure(image, time_utc=given), with_facts(exposure, time_utc=given)):
+        assert one.time_utc == given
+        assert (one.time_sigma_s, one.time_sigma_is_stated) == ((0.0, True) if kept else (TIME_SIGMA_S, False))
+    for one in (read_exposure(image, time_utc=given, time_sigma_s=0.1),
+                with_facts(exposure, time_utc=given, time_sigma_s=0.1)):  # fmt: skip
+        assert (one.time_sigma_s, one.time_sigma_is_stated) == (0.1, True)
 
 
 @pytest.mark.parametrize("key", ["camera", "terrain"])

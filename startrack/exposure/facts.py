@@ -16,7 +16,7 @@ from typing import Any
 
 from startrack.core.declaration import SHOWN_CHARS, value_text
 from startrack.core.files import MAX_CAUSE_CHARS
-from startrack.core.types import BadInput, Exposure, Mask
+from startrack.core.types import TIME_SIGMA_S, BadInput, Exposure, Mask
 from startrack.exposure.sidecar import BAYER_PATTERNS, NAMED_FILES, NUMBERS, SIDECAR, Sidecar, resolve_path
 from startrack.frames import as_utc, format_utc, parse_utc
 
@@ -79,7 +79,7 @@ def with_facts(
 ) -> Exposure:
     """The exposure with the values given here in place of its own; `time_utc` is mid-exposure.
 
-    `time_sigma_s` is the standard deviation of the clock's error. `camera` and `terrain` are names or paths of files,
+    `time_sigma_s` is the standard deviation of the clock's error; that of another time does not count. `camera` and `terrain` are names or paths of files,
     `mask` is a path or the mask itself.
 
     A mid-exposure time computed from DATE-OBS and a header's EXPTIME does not change with a new `exposure_s`; give it
@@ -87,6 +87,8 @@ def with_facts(
     """
     given: dict[str, Any] = {"exposure_s": exposure_s, "camera": camera, "terrain": terrain, "mask": mask}
     given["time_utc"] = None if time_utc is None else as_utc(time_utc)
+    if time_sigma_s is None and time_utc is not None and _is_other_time(time_utc, exposure.time_utc):
+        given |= {"time_sigma_s": TIME_SIGMA_S, "time_sigma_is_stated": False}
     if time_sigma_s is not None:
         given |= {"time_sigma_s": check_time_sigma_s(time_sigma_s, "time_sigma_s"), "time_sigma_is_stated": True}
     return replace(exposure, **{key: value for key, value in given.items() if value is not None})
@@ -115,7 +117,10 @@ def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts
                 value = resolve_path(image, value)
         found[key] = as_utc(value) if key == "time_utc" and value is not None else value
     if given.time_utc is not None:
-        notes += _other_time_notes(found["time_utc"], sidecar, header, found["exposure_s"])
+        other = _other_time_notes(found["time_utc"], sidecar, header, found["exposure_s"])
+        notes += other
+        if other:  # what the file states of its clock is not about this time
+            found["time_sigma_s"] = given.time_sigma_s
     return Facts(**found, site_rad=_header_site_rad(header), warnings=tuple(notes))
 
 
@@ -125,11 +130,16 @@ def _other_time_notes(
     """What the time in the sidecar, else in the header, differs by from the `stated` one that is used."""
     with suppress(BadInput):  # a time that cannot be read is none
         other = sidecar.value("time_utc") or _header_time(header, exposure_s, [])
-        if other is not None and abs(late_s := (stated - as_utc(other)).total_seconds()) >= SAME_TIME_S:
+        if other is not None and _is_other_time(stated, other):
+            late_s = (stated - as_utc(other)).total_seconds()
             way = "after" if late_s > 0 else "before"
             return [f"the time used is {timedelta(seconds=round(abs(late_s)))} (h:mm:ss) {way} that of the file, "
                     f"{format_utc(as_utc(other))}"]  # fmt: skip
     return []
+
+
+def _is_other_time(stated: datetime, of_file: datetime | None) -> bool:
+    return of_file is not None and abs((as_utc(stated) - as_utc(of_file)).total_seconds()) >= SAME_TIME_S
 
 
 def facts_in_text(text: str) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from startrack.applications.horizon.posterior import limit_llr
 from startrack.applications.horizon.write import check_output, csv_text, nina_text, write_skyline
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
+from startrack.cli.horizon import UNTESTED
 from startrack.cli.main import main
 from startrack.core.errors import BadInput, NoSolution
 from startrack.core.types import MeasuredSkyline
@@ -286,7 +287,7 @@ def test_the_command_writes_the_file_and_the_record(tmp_path, capsys):
     assert record["format"] == "startrack.horizon/1"
     assert record["status"] == "ok"
     assert record["azimuths"]["known"] > 200
-    assert "interpolated" in record["message"]
+    assert "interpolated" in record["message"] and record["message"].endswith(UNTESTED)
     Draft202012Validator(SCHEMAS["horizon"]).validate(record)
     assert set(record) <= set(SCHEMAS["horizon"]["properties"])
     assert out.exists()
@@ -330,9 +331,12 @@ def test_the_library_has_it_and_checks_its_arguments():
         startrack.measure_horizon([], site=LOWELL, fov=180)
 
 
-@pytest.mark.parametrize("site", [(-34.7443, -111.4223), (34.7443, 111.4223)])
-def test_stars_below_the_horizon_show_a_wrong_site(site):
-    wrong = Site("earth", *np.radians(site), 2361.0)
+@pytest.mark.parametrize(
+    ("site", "late_h"), [((-34.7443, -111.4223), 0.0), ((34.7443, 111.4223), 0.0), ((34.7443, -111.4223), 3.0)]
+)
+def test_stars_below_the_horizon_show_a_wrong_site_or_time(site, late_h):
+    stated, photo = Site("earth", *np.radians(site), 2361.0), read_exposure(PHOTO)
+    photo = replace(photo, time_utc=photo.time_utc + timedelta(hours=late_h))
     with pytest.raises(BadInput, match="identified stars are below the horizon") as refusal:
-        orient_frames([read_exposure(PHOTO)], load_catalog(), wrong, camera=load_camera("lowell-ldt"), fov_rad=None)
+        orient_frames([photo], load_catalog(), stated, camera=load_camera("lowell-ldt"), fov_rad=None)
     assert refusal.value.reason == "inconsistent_evidence"

@@ -16,6 +16,7 @@ from startrack.cli.images import approximate_camera, check_fov, check_one_time, 
 from startrack.core.errors import BadInput, BadOutput, NoSolution, one_line
 
 FORMAT = "startrack.horizon/1"
+UNTESTED = "time and site are not tested by one image: an hour turns the skyline by 15 degrees"
 
 
 def run(args: argparse.Namespace) -> int:
@@ -52,6 +53,7 @@ def _measure(args: argparse.Namespace) -> Outcome:
     varying = int((found.skyline.source == "varies").sum())
     notes = [f"{unknown} of them interpolated"] if horizon.needs_all_azimuths(args.output) and unknown else []
     notes += [f"{varying} differ between the images: the highest edge is taken"] if varying else []
+    notes += [UNTESTED] if len(found.frames) == 1 else []
     note = "; ".join(notes)
     record, skyline = _record(args, found, note), found.skyline
     words = [f"{record['azimuths']['known']} of {len(skyline)} azimuths"]

@@ -79,6 +79,7 @@ class TrackRun:
 
     def take_all(self) -> None:
         """Locate all images, then estimate and write the track."""
+        self._odometry()  # a file that cannot be read is refused before any image is located
         first = Path(self.args.frames[0])
         paths: list[str] | None = list(self.args.frames)
         if len(self.args.frames) == 1 and is_bag(first):
@@ -94,7 +95,9 @@ class TrackRun:
                 bag = tracking.read_bag_exposures(first, self.args.image_topic, **self.session.facts)
                 sources = ((exposure.name, partial(self._add_exposure, exposure)) for exposure in bag)
             else:
-                sources = ((printable(Path(path).name), partial(self._add, path)) for path in paths)
+                base = first if first.is_dir() else None
+                names = [Path(path).name if base is None else os.path.relpath(path, base) for path in paths]
+                sources = ((printable(name), partial(self._add, path)) for name, path in zip(names, paths, strict=True))
             for name, add in sources:
                 try:
                     add()

@@ -79,8 +79,8 @@ def with_facts(
 ) -> Exposure:
     """The exposure with the values given here in place of its own; `time_utc` is mid-exposure.
 
-    `time_sigma_s` is the standard deviation of the clock's error; that of another time does not count. `camera` and `terrain` are names or paths of files,
-    `mask` is a path or the mask itself.
+    `time_sigma_s` is the standard deviation of the clock's error; that of another time does not count. `camera` and
+    `terrain` are names or paths of files, `mask` is a path or the mask itself.
 
     A mid-exposure time computed from DATE-OBS and a header's EXPTIME does not change with a new `exposure_s`; give it
     to `read_exposure` for that. Raises ValueError for a time without zone and an unusable `time_sigma_s`.

@@ -79,10 +79,10 @@ def orient_frames(
         if identified:
             first = identified[0]
             near = NearAttitude.of(first.attitude_fit.attitude.R_cam_icrs, first.exposure.time_utc)
-            return identify(exposure, first.camera, catalog, Settings(near_attitude=near), site)
+            return identify(exposure, first.camera, catalog, Settings(near_attitude=near))
         if camera is None:
             return identify_blind(exposure, fov_rad or 0.0, catalog)
-        return identify(exposure, camera, catalog, site=site)
+        return identify(exposure, camera, catalog)
 
     def take(exposure: Exposure, outcome: Oriented | Refused) -> None:
         progress(f"identified the stars of {exposure.name}")

@@ -210,6 +210,12 @@ def test_a_time_that_is_not_known_stays_unknown_and_is_explained(read, cards, no
     assert note in " ".join(exposure.warnings)
 
 
+def test_the_time_of_day_may_have_a_card_of_its_own(read):
+    for date, time in (("2018-08-16", "20:58:35"), ("2018-08-16T20:58:35", "11:00:00")):
+        exposure = read(image_with_cards(DATE_OBS=date, TIME_OBS=time, EXPTIME=60.0))
+        assert exposure.time_utc.isoformat() == "2018-08-16T20:59:05+00:00"
+
+
 def test_an_unusable_date_avg_leaves_date_obs(read):
     exposure = read(image_with_cards(DATE_AVG="yesterday", DATE_OBS="2018-08-06T05:17:00", EXPTIME=60, TIMESYS="UTC"))
     assert exposure.time_utc.isoformat() == "2018-08-06T05:17:30+00:00"

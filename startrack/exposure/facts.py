@@ -31,7 +31,7 @@ HEADER_OF = {  # the sidecar's key of a fact and its name in a header: FITS keyw
 # The names of the sidecar's keys are valid in a header too, except in FITS, where a card called CAMERA is common and
 # names the hardware.
 SITE_NAMES = (("OBSLAT", "OBSLONG"), ("SITELAT", "SITELONG"), ("LAT-OBS", "LONG-OBS"), ("OBSGEO-B", "OBSGEO-L"))
-_NAMES = ("DATE-OBS", "TIMESYS", *HEADER_OF.values(), *(name for pair in SITE_NAMES for name in pair))
+_NAMES = ("DATE-OBS", "TIME-OBS", "TIMESYS", *HEADER_OF.values(), *(name for pair in SITE_NAMES for name in pair))
 SAME_TIME_S = 1.0  # between a stated time and that of a file, below which they are the same
 HEADER_KEYS = {name: name for name in _NAMES} | HEADER_OF
 
@@ -194,9 +194,13 @@ def _header_time(header: Mapping[str, Any], exposure_s: float | None, notes: lis
     if given and scale != "UTC" and not scale.startswith("UTC("):  # FITS allows UTC(NIST) and the like
         notes.append(f"{given[0]} not used: it is in the time scale {scale[:20]}, not UTC")
         return None
+    of_day = str(header.get("TIME-OBS") or "").strip()  # an older form, in which DATE-OBS is a date alone
     for key in given:
+        text = str(header[key]).strip()
+        if key == "DATE-OBS" and of_day and "T" not in text:
+            text += f"T{of_day}"
         try:
-            time = parse_utc(str(header[key]))
+            time = parse_utc(text)
         except BadInput as error:
             notes.append(f"{key} not used: {str(error)[:MAX_CAUSE_CHARS]}")
             continue

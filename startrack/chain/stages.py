@@ -143,7 +143,8 @@ class Oriented(Identified):
     @property
     def warnings(self) -> list[str]:
         """Those of `Inputs`, and the difference of the lens from its file."""
-        text = f"the lens differs from the camera file by {self.lens_change_px:.2f} px (RMS): corrected by the stars"
+        px = f"{self.lens_change_px:.2f} px (RMS; without a site by refraction too)"
+        text = f"the lens differs from the camera file by {px}: corrected by the stars"
         return [*super().warnings, *([text] if self.lens_change_px > SHOWN_CHANGE_PX else [])]
 
     @property

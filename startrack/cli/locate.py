@@ -121,7 +121,8 @@ def _solve_image(args: argparse.Namespace, path: str, out: Path, solve: Solve) -
     if args.command == "identify" and camera is None and isinstance(result, chain.Oriented):
         fov = _found_fov_text(result.camera, args.fov)
         line += f"\n  {output.lens_text(result.camera)}; a camera file: startrack calibrate IMAGE "
-        line += f"--fov {fov} --site LAT,LON -o CAMERA.toml"
+        when = " --time UTC" if result.exposure.time_utc is None else ""
+        line += f"--fov {fov} --site LAT,LON{when} -o CAMERA.toml"
     if args.verbose and args.command != "detect":
         line += "\n" + output.verbose_text(result)
         line += f"\n  written to {out.parent}/{out.name.removesuffix('.fix.json')}.*" if is_located else ""

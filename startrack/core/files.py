@@ -86,7 +86,7 @@ def resolve_named(name_or_path: str | Path, kind: str, reason: str) -> Path:
         raise BadInput(
             reason,
             f"no shipped file is called {name_or_path!r}; shipped: {shipped}; a path ends in .toml or contains a "
-            "separator",
+            f"separator{f': ./{name_or_path}' if os.path.isfile(name_or_path) else ''}",
         )
     return path
 

@@ -74,4 +74,6 @@ def name_prior(refusal: NotLocated, near: PositionPrior | None) -> NotLocated:
     if near is None or "--near" in str(refusal):
         return refusal
     evidence: dict[str, Any] = refusal.evidence
-    return NotLocated(f"{refusal} (searched within 6 sigma of --near {near})", reason=refusal.reason, **evidence)
+    return NotLocated(
+        f"{refusal} (searched within 6 sigma of --near {near}: is it right?)", reason=refusal.reason, **evidence
+    )

@@ -76,10 +76,20 @@ def lens_text(camera: Camera) -> str:
     """The lens of a `camera` that an identification without a camera file found: model, focal length, centre."""
     x, y = camera.centre_px
     return (
-        f"lens found: {camera.lens.model}, focal length {camera.focal_px[0]:.1f} px, centre ({x:.1f}, {y:.1f}) px, "
+        f"lens found: {camera.lens.model}, focal length {camera.focal_px[0]:.1f} px, centre ({x:.1f}, {y:.1f}) px"
+        f"{_centre_error_text(camera)}, "
         f"{'mirrored' if camera.mirrored else 'not mirrored'}, known to {np.degrees(camera.calibrated_angle_rad):.0f} "
         "degrees off the axis"
     )
+
+
+def _centre_error_text(camera: Camera) -> str:
+    """The error of the centre, along which RA and Dec of the axis err too; empty where it is not fitted."""
+    if camera.covariance is None or not {"cx", "cy"} <= set(camera.covariance_order):
+        return ""
+    at = [camera.covariance_order.index(name) for name in ("cx", "cy")]
+    sigma_px = float(np.sqrt(np.diag(camera.covariance)[at].max()))
+    return f" ± {sigma_px:.2g} px (RA and Dec of the axis err with it)" if sigma_px > 0.0 else ""
 
 
 def verbose_text(result: Outcome) -> str:

@@ -161,7 +161,10 @@ def _content_of(file: Any, path: Path, near: tuple[float, float] | None, hint: s
     from rasterio.windows import Window
 
     if file.crs is None or file.transform.is_identity:
-        raise BadInput("bad_terrain", f"{path}: it has no position on a body{hint}")
+        raise BadInput(
+            "bad_terrain",
+            f"{path}: it has no position on a body{hint or ': add its projection (gdal_translate -a_srs)'}",
+        )
     t = file.transform
     if t.b or t.d:
         raise BadInput("bad_terrain", f"{path}: a rotated grid; bring it to north up (gdalwarp)")

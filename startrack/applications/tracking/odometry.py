@@ -96,7 +96,7 @@ class Odometry(Value):
             k = int(np.argmax(fast))
             _refuse(
                 f"pose {k + 1}: {length_m[k]:.4g} m in {step_s[k]:.4g} s are faster than {max_speed_m_s:g} m/s, the "
-                "highest speed of the rover (--max-speed)"
+                "highest speed of the rover (--max-speed): are positions in metres?"
             )
 
 

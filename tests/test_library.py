@@ -101,14 +101,6 @@ def test_rays_of_ones_own_are_located_in_one_call():
     assert np.linalg.norm(fix.position_enu_m[:2] - [3000.0, -1000.0]) < fix.radius999_m < 60.0
 
 
-def exported_names(module: types.ModuleType) -> list[str]:
-    """The names that a package exports: its `__all__`, or all that it imports from startrack and nothing else."""
-    names = [name for name in (*vars(module), *getattr(module, "_LAZY_MODULES", ())) if not name.startswith("_")]
-    homes = {name: getattr(getattr(module, name), "__module__", "") for name in names}
-    imported = [name for name, home in homes.items() if home.startswith("startrack.")]
-    return getattr(module, "__all__", [] if module.__name__ in homes.values() else imported)
-
-
 def public_functions() -> dict[str, tuple[object, str]]:
     """Functions and methods that `startrack` and its packages export, by full name, each with its documentation.
 
@@ -116,7 +108,7 @@ def public_functions() -> dict[str, tuple[object, str]]:
     """
     found: dict[str, tuple[object, str]] = {}
     for module in [startrack, *(one for one in submodules() if hasattr(one, "__path__"))]:
-        for name in exported_names(module):
+        for name in getattr(module, "__all__", ()):
             one = getattr(module, name)
             home = f"{getattr(one, '__module__', '')}.{name}"
             if inspect.isfunction(one):

@@ -26,3 +26,11 @@ from startrack.camera.load import camera_from_foreign_text, decentring_rms_px, f
 from startrack.camera.optics import MIN_THROUGHPUT_1, Decentring, Sensor
 from startrack.camera.platepar import Platepar, platepar_of
 from startrack.camera.virtualsky import VirtualSkyOverlay, virtualsky_of
+
+__all__ = [
+    "MIN_THROUGHPUT_1", "REFRACTION_CONTAINED", "REFRACTION_REMOVED", "SENSOR", "Camera", "Decentring", "KannalaBrandt",
+    "Lens", "Pinhole", "Platepar", "Sensor", "VirtualSkyOverlay", "camera_from_dict", "camera_from_foreign_text",
+    "camera_keys", "camera_text", "camera_to_dict", "cap_grid", "compensating_rotation", "decentring_rms_px",
+    "default_lens", "difference_px", "foreign_text", "lens_jacobian", "lens_kinds", "load_camera", "platepar_of",
+    "projection_covariance_px2", "save_camera", "virtualsky_of", "with_covariance", "with_update",
+]  # fmt: skip

@@ -34,3 +34,12 @@ from startrack.chain.stages import (
     StarRays,
     last_value,
 )
+
+__all__ = [
+    "CERTAIN_PROBABILITY", "COMPLETE_V_MAG", "EDGE_SIGMA_PX", "MISSING", "STAGES", "Detected", "Identified", "Image",
+    "Inputs", "Located", "Measured", "NearAttitude", "Oriented", "Outcome", "Refused", "Settings", "StarFix",
+    "StarRays", "Time", "add_timing", "angle_rad", "are_unchanged", "camera_input", "content_sha256", "detect",
+    "duration_s", "exposure_input", "field_of_view_rad", "identify", "identify_blind", "input_hashes",
+    "is_list_of_centroids", "job_sha256", "last_value", "load_camera_input", "load_named", "locate", "locate_exposure",
+    "locate_rays", "mask_unpredictable", "read_near_attitude", "settings_input", "terrain_input", "time_input",
+]  # fmt: skip

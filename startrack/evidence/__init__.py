@@ -52,3 +52,13 @@ from startrack.evidence.star_evidence import (
     with_noise_of_blocks,
 )
 from startrack.evidence.star_offsets import measure_star_offsets, offset_terms
+
+__all__ = [
+    "BAND_PX", "CLIP_SHIFT_PX", "DECIDABLE_SNR", "NEEDED_SECTORS", "SCALE_SNR", "SCALE_STARS", "SEEN_LLR",
+    "SKYLINE_POINTS", "SURE_SIGMAS", "DamagedResponse", "FluxScale", "Horizon", "Photometry", "SkyLight", "SkyStep",
+    "Skyline", "Sources", "StarEvidence", "StarPhotometry", "add_obstacles", "average_shifts", "check_single_skyline",
+    "expect_stars", "expected_flux_scale", "filtered_noise_e", "fit_flux_scale", "flux_scale", "half_width",
+    "height_above_px", "leave_out_obstacles", "measure", "measure_response", "measure_sky_light", "measure_sky_step",
+    "measure_star_offsets", "neighbour_profiles", "offset_terms", "order_by_cell", "pixels_near_skyline", "profiles_of",
+    "reliable_azimuths", "sectors_with_step", "subtract_sky_step", "with_noise_of_blocks",
+]  # fmt: skip

@@ -66,3 +66,12 @@ def require_localizer(given: Any) -> Localizer:
             f"localizer= is of type {type(given).__name__}: give a function of the evidence and the terrain"
         )
     return given  # type: ignore[no-any-return]
+
+
+__all__ = [
+    "AMBIGUOUS_MASS", "DEFAULT_LOCALIZER", "ENOUGH", "HIGH_RAD", "LOCALIZERS", "LOW_RAD", "MIN_ROW_NATS", "RISK",
+    "ErrorBasis", "ExactPosterior", "Gaussian", "Hull", "Localizer", "PseudoGradient", "Sectors", "SharedErrors",
+    "SkylineModel", "WeightedPoints", "camera_at", "clear_logs", "clock_at", "clock_matters", "descend", "duration",
+    "has_posterior", "hull_position", "localizer_name", "moments", "require_localizer", "sample", "settle_steepness",
+    "solve_linear",
+]  # fmt: skip

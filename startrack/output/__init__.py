@@ -73,3 +73,20 @@ from startrack.output.write import (
     write_star_table,
     write_wcs,
 )
+
+__all__ = [
+    "ABSENT", "ARCSEC_PER_RAD", "COMPANIONS", "MARGIN_PX", "PICTURES", "QUANTITIES", "SCHEMAS", "SIDE_PX",
+    "SKYLINE_FILES", "TEXT_PX", "TITLE_PX", "Axes", "Box", "Canvas", "Colour", "Column", "Found", "Ink", "Kind",
+    "Legend", "Map", "Quantity", "R_body_enu", "Rows", "Schema", "annotate", "boresight_rad", "box_around",
+    "cloud_texts", "comparison_picture", "detection_dict", "draw_overview", "ecsv_text", "ellipse_m", "encoded_bytes",
+    "explain",
+    "feature", "file_schema", "fill_frame", "geojson_text", "ground_map", "horizon_picture",
+    "identification_dict", "json_text", "lens_text", "list_schema", "markdown_table", "mix_colours", "nice_step",
+    "object_schema", "or_null", "page_text", "path_picture", "png_bytes", "prediction_picture", "prepare_folder",
+    "qgis_style_text", "quantity_columns", "radius_classes", "record_from", "record_of", "refusal_line",
+    "refused_dict", "relief_picture",
+    "remove_companions", "result_at", "result_dict", "results_under", "rows", "schema_of", "schema_of_kind",
+    "show_everywhere", "skyline_picture", "skyline_table_text", "skyline_texts_deg", "stage_values",
+    "star_table_text", "summary_line", "table_columns", "verbose_text", "write_annotated", "write_geo",
+    "write_json", "write_page", "write_results", "write_star_table", "write_wcs",
+]  # fmt: skip

@@ -6,3 +6,9 @@ from startrack.rendering.scene import HotPixels, Scene, Truth
 from startrack.rendering.series import FAINTEST_V_MAG, Pose, Series, load_sky_catalog
 from startrack.rendering.sky import sky_e_per_s, sky_gradient
 from startrack.rendering.sources import draw_field_stars, draw_v_errors, exposure_for_snr, flux_e, limiting_v_mag
+
+__all__ = [
+    "FAINTEST_V_MAG", "STEP_ROUNDING_1", "Drive", "HotPixels", "Pose", "Scene", "Series", "Truth", "draw_field_stars",
+    "draw_hot_pixels", "draw_odometry", "draw_v_errors", "exposure_for_snr", "flux_e", "light_e", "limiting_v_mag",
+    "load_sky_catalog", "read_drive", "render", "sky_e_per_s", "sky_gradient", "truth_of", "truth_paths", "write_truth",
+]  # fmt: skip

@@ -21,6 +21,14 @@ if TYPE_CHECKING:
     from startrack.terrain.map_reading import read_map
     from startrack.terrain.map_writing import write_bands, write_map
     from startrack.terrain.state_file import StateableError, state_errors, stateable_errors
+
+__all__ = [
+    "DIAMETER", "EQUIRECTANGULAR", "MAKERS", "NO_POST", "STEREOGRAPHIC", "TERRAIN_KEYS", "Cylinder", "EarthProjection",
+    "ExpectedCrests", "ForwardingTerrain", "HeightMap", "Projection", "Raster", "ShapeError", "StateableError",
+    "Terrain", "files_of_terrain", "import_maps", "is_geotiff", "load_terrain", "read_map", "require_bounds",
+    "require_horizons", "require_place", "require_site", "require_terrain", "site_of_terrain", "state_errors",
+    "stateable_errors", "terrain_from_dict", "write_bands", "write_map",
+]  # fmt: skip
 _LAZY_MODULES = {  # of names that few programs use: imported at the first use
     "EarthProjection": "earth_projection", "HeightMap": "height_map", "StateableError": "state_file",
     "import_maps": "import_map", "is_geotiff": "map_formats", "read_map": "map_reading",

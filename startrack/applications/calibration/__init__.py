@@ -27,3 +27,10 @@ from startrack.applications.calibration.verify import (
 )
 from startrack.estimation.lens_fit import fit_lens
 from startrack.estimation.normal_equations import observations
+
+__all__ = [
+    "CALIBRATION", "VERIFICATION", "VERIFICATION_FORMAT", "Board", "Calibration", "KnownSensor", "Verification",
+    "board_dict", "board_line", "calibrate", "calibrate_board", "calibration_dict", "camera_properties",
+    "camera_summary", "count_steps", "fit_lens", "initial_state", "observations", "refusal_dict", "summary", "verify",
+    "verify_dict", "verify_line", "write_report",
+]  # fmt: skip

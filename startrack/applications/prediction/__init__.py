@@ -11,3 +11,9 @@ from startrack.applications.prediction.run import (
     predict_positions,
     share_within,
 )
+
+__all__ = [
+    "CELL_QUANTITIES", "PATH_QUANTITIES", "PREDICTION", "Conditions", "Place", "Plan", "Prediction",
+    "Predictions", "Predictor", "Report", "Status", "area_cells", "cells_of_draws", "default_spacing_m", "draw_store",
+    "path_points", "predict_positions", "share_within", "summarize_cells", "times_between", "write_report",
+]  # fmt: skip

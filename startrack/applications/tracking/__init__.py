@@ -10,3 +10,10 @@ from startrack.applications.tracking.track import CrestHeights, Track, TrackFram
 from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.applications.tracking.write import track_page, track_record, write_track
 from startrack.exposure import read_bag_exposures
+
+__all__ = [
+    "FRAME_QUANTITIES", "TRACK", "CrestHeights", "FrameStore",
+    "ObservedFrame", "Odometry", "OdometryFile", "Track", "TrackErrors", "TrackFrame", "TrackSession", "Trajectory",
+    "draw_track", "estimate_frame", "estimate_track", "follow_images", "frame_records", "observe_frame",
+    "read_bag_exposures", "read_odometry", "rows_near_skyline", "track_page", "track_record", "write_track",
+]  # fmt: skip

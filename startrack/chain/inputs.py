@@ -40,8 +40,6 @@ def exposure_input(image: Image, time: Time, time_sigma: Any = None) -> Exposure
             raise TypeError("one object that is no sequence")
     except (TypeError, ValueError) as cause:
         raise BadInput("bad_image", f"{type(image).__name__} is neither a file nor an array of pixels") from cause
-    if pixels.ndim == 2 and 0 < min(pixels.shape) <= MAX_LIST_COLUMNS:
-        raise BadInput("bad_image", f"an array of shape {pixels.shape} is no image; centroids are an array (n, 2)")
     masked = getattr(pixels, "mask", None)  # of numpy's masked arrays and astropy's
     if masked is not None:
         masked = np.broadcast_to(masked, pixels.shape)

@@ -55,7 +55,7 @@ class Reason(StrEnum):
     )  # fmt: skip
     BAD_TERRAIN = (
         "bad_terrain", EXIT_BAD_INPUT, "No terrain file is known, or it cannot be used",
-        "Give a terrain file with -t or in NAME.json, and correct what the message names.",
+        "Correct what the message names; a terrain file is given with -t or in NAME.json.",
     )  # fmt: skip
     BAD_ODOMETRY = (
         "bad_odometry", EXIT_BAD_INPUT, "The odometry, or the path of a drive, cannot be used",

@@ -169,7 +169,10 @@ class Pinhole(Lens):
 
 
 DEFAULT = KannalaBrandt  # can follow any curve
-LENSES: tuple[type[Lens], ...] = (DEFAULT, Pinhole)
+LENSES: tuple[type[Lens], ...] = (
+    DEFAULT,
+    Pinhole,
+)
 
 
 def lens_kinds() -> dict[str, type[Lens]]:

@@ -200,6 +200,15 @@ def test_the_png_is_whole_and_the_same_each_time(located, picture, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == [first.name, second.name]
 
 
+def test_a_true_position_is_written_with_the_picture(located, tmp_path):
+    bare, marked = tmp_path / "bare.png", tmp_path / "marked.png"
+    write_annotated(bare, located.result)
+    write_annotated(marked, located.result, truth_enu_m=(100.0, 200.0))
+    expected = annotate(located.result, (100.0, 200.0))
+    np.testing.assert_array_equal(np.asarray(Image.open(marked)), expected)
+    assert (expected != np.asarray(Image.open(bare))).any()
+
+
 def test_matplotlib_stays_out():
     code = "import sys, startrack.output.picture.annotate, startrack.output.write; print('matplotlib' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -170,9 +170,10 @@ def write_wcs(path: FilePath, corr_path: FilePath, value: Oriented) -> None:
     write_atomically(corr_path, matches_bytes(value), overwrite=True)
 
 
-def write_annotated(path: FilePath, outcome: Outcome) -> None:
+def write_annotated(path: FilePath, outcome: Outcome, truth_enu_m: tuple[float, float] | None = None) -> None:
     """Write the annotated picture of an `outcome` to `path` (PNG). Raises BadInput where it cannot be written.
 
-    The file also holds the picture without marks and the marks as coordinates, for the HTML page.
+    `truth_enu_m` (east, north) [m] is drawn if it is given; no stage of the pipeline has it. The file also holds the
+    picture without marks and the marks as coordinates, for the HTML page.
     """
-    write_atomically(path, annotated_png(outcome), overwrite=True)
+    write_atomically(path, annotated_png(outcome, truth_enu_m), overwrite=True)

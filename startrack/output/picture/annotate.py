@@ -62,11 +62,11 @@ def annotate(outcome: Outcome, truth_enu_m: EastNorth = None) -> NDArray[np.uint
     return _draw_picture(outcome, truth_enu_m, bare_picture(value), overlay_of(value))
 
 
-def annotated_png(outcome: Outcome) -> bytes:
+def annotated_png(outcome: Outcome, truth_enu_m: EastNorth = None) -> bytes:
     """The picture of `annotate` as a PNG file with the layers of `layers_of`."""
     value = last_value(outcome)
     bare, overlay = bare_picture(value), overlay_of(value)
-    png = png_bytes(_draw_picture(outcome, None, bare, overlay))
+    png = png_bytes(_draw_picture(outcome, truth_enu_m, bare, overlay))
     jpeg = encoded_bytes(".jpg", bare[:, :, ::-1], cv2.IMWRITE_JPEG_QUALITY, QUALITY)
     text = json.dumps(overlay, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     return insert_png_chunks(png, [(BARE_CHUNK, jpeg), (MARKS_CHUNK, zlib.compress(text.encode("utf-8")))])

@@ -19,8 +19,7 @@ import numpy as np
 from _results import table, write_section
 
 from startrack.applications.horizon import orient_frames
-from startrack.applications.horizon.join import join_skylines
-from startrack.applications.horizon.measure import _measure_frame, _skyline_of
+from startrack.applications.horizon.measure import measure_frame, skyline_of_frames
 from startrack.catalog import load_catalog
 from startrack.core.types import Array, MeasuredSkyline
 from startrack.exposure import read_exposure
@@ -42,19 +41,13 @@ def main() -> None:
     site = Site("earth", *np.radians(args.site[:2]), args.site[2])
     exposures = [read_exposure(path) for path in args.photographs]
     frames, _ = orient_frames(exposures, load_catalog(), site, camera=None, fov_rad=np.radians(args.fov))
-    measured = [_measure_frame(frame, site) for frame in frames]
+    measured = [measure_frame(frame, site) for frame in frames]
     moved = np.zeros(360, dtype=bool)
     for first, last in zip(args.without[::2], args.without[1::2], strict=True):
         moved[first:last] = True
 
     def skyline(of: Sequence[int]) -> MeasuredSkyline:
-        alone = [measured[i][1] for i in of]
-        if len(of) == 1:
-            return alone[0]
-        by_stars, by_steps = (sum(measured[i][part] for i in of) for part in (2, 3))
-        lights = [measured[i][0] for i in of]
-        together = _skyline_of([frames[i] for i in of], lights, by_stars + by_steps / len(of), site)
-        return join_skylines(together, alone)
+        return skyline_of_frames([measured[i] for i in of], site)
 
     rng, count = np.random.default_rng(0), len(frames)
     clear = [i for i, frame in enumerate(frames) if frame.name in args.clear]

@@ -127,10 +127,8 @@ def calibrate_board(
 def _check_acceptance(fit: LensFit, points: Observations, pictures: int) -> tuple[acceptance.Check, ...]:
     """All checks, the most informative first."""
     ring = acceptance.rings_and_sectors(fit.camera, points.take(fit.used))[1]
-    rings, used = (
-        int(np.sum(np.bincount(ring, minlength=acceptance.IMAGE_RINGS) >= acceptance.STARS_PER_RING)),
-        int(fit.used.sum()),
-    )
+    rings = int(np.sum(np.bincount(ring, minlength=acceptance.IMAGE_RINGS) >= acceptance.STARS_PER_RING))
+    used = int(fit.used.sum())
     tilt = "more pictures: the board tilted by 30 degrees and more, near and far, and in every corner of the image"
     return (
         acceptance.minimum_check("pictures with a board", pictures, MIN_PICTURES, "insufficient_geometry", tilt),

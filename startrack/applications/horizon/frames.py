@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.applications.horizon.agreement import LeftOut, split_fixed
-from startrack.camera import Camera
+from startrack.camera import Camera, cap_grid
 from startrack.catalog import (
     LOWEST_STAR_RAD,
     Sky,
@@ -32,7 +32,6 @@ Progress = Callable[[str], None]
 # Of the names in a picture, anywhere in its field: none of 3,664 names in 17 pictures of one camera was wrong.
 WRONG_NAMES_1 = 1e-3
 MAX_FALSE_REFUSAL = 1e-5  # probability that wrong names alone are below the horizon of a right site
-FIELD_GRID = 64  # pixels across the field, for the part of it below the horizon
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -126,10 +125,8 @@ def _require_above_horizon(one: Oriented, site: Site) -> None:
     """Raises BadInput (inconsistent_evidence) where more identified stars than wrong names are below the horizon."""
     rays, time_utc = one.stars.rays_icrs[one.identification.star], require_time(one.exposure)
     below = int(np.count_nonzero(is_below_horizon(rays, site, time_utc)))
-    width, height = one.exposure.size_px
-    xy_px = np.stack(np.meshgrid(np.linspace(0, width, FIELD_GRID), np.linspace(0, height, FIELD_GRID)), axis=-1)
-    seen_px = xy_px[one.camera.angle_rad(xy_px) < one.camera.max_angle_rad]
-    seen = is_below_horizon(one.camera.unproject(seen_px) @ one.attitude_fit.attitude.R_cam_icrs, site, time_utc)
+    field = cap_grid(one.camera.max_angle_rad) @ one.attitude_fit.attitude.R_cam_icrs
+    seen = is_below_horizon(field, site, time_utc)
     wrong = WRONG_NAMES_1 * len(rays) * (np.count_nonzero(seen) + 1) / (len(seen) + 1)
     if below and log_p_value_poisson(below, wrong) < np.log(MAX_FALSE_REFUSAL):
         raise BadInput(

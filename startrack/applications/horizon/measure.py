@@ -48,6 +48,17 @@ class SkylineResult:
     left_out: tuple[LeftOut, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class MeasuredFrame:
+    """One frame: its light, its skyline, and the log-likelihoods (AZIMUTH_COLUMNS, n) by its stars and its steps."""
+
+    frame: SkyFrame
+    light: Light
+    skyline: MeasuredSkyline
+    by_stars: Array
+    by_steps: Array
+
+
 def measure_skyline(
     exposures: Sequence[Exposure], catalog: StarCatalog, site: Site, *, camera: Camera | None = None,
     fov_rad: float | None = None,
@@ -79,31 +90,36 @@ def measure_frames(
     if not frames:
         first = left_out[0]
         raise NoSolution(f"{first.name}: {first.message}", reason=first.reason)
-    lights, alone, by_stars, by_steps = list[Light](), list[MeasuredSkyline](), np.zeros(()), np.zeros(())
-    measured = map_in_threads(lambda frame: _measure_frame(frame, site), frames)
-    for frame, (light, single, of_stars, of_steps) in zip(frames, measured, strict=True):
+    measured = []
+    for frame, one in zip(frames, map_in_threads(lambda frame: measure_frame(frame, site), frames), strict=True):
         progress(f"measured the skyline of {frame.name}")
-        lights.append(light)
-        alone.append(single)
-        by_stars, by_steps = by_stars + of_stars, by_steps + of_steps
-    skyline = alone[0]
-    if len(frames) > 1:
-        # Other stars stand there in another picture. Steps are the same edges: which of them is the skyline, a second
-        # picture shows no better than the first.
-        together = _skyline_of(frames, lights, by_stars + by_steps / len(frames), site)
-        skyline = join_skylines(together, alone)
-    return SkylineResult(skyline, frames, left_out)
+        measured.append(one)
+    return SkylineResult(skyline_of_frames(measured, site), frames, left_out)
 
 
-def _measure_frame(frame: SkyFrame, site: Site) -> tuple[Light, MeasuredSkyline, Array, Array]:
-    """Light and skyline of a frame, and the log-likelihoods (AZIMUTH_COLUMNS, n) by its stars and its steps."""
+def skyline_of_frames(measured: Sequence[MeasuredFrame], site: Site) -> MeasuredSkyline:
+    """The skyline at a `site` by one or more frames that were `measured` there."""
+    alone = [one.skyline for one in measured]
+    if len(measured) == 1:
+        return alone[0]
+    # Other stars stand there in another picture. Steps are the same edges: which of them is the skyline, a second
+    # picture shows no better than the first.
+    by_stars = sum((one.by_stars for one in measured), np.zeros(()))
+    by_steps = sum((one.by_steps for one in measured), np.zeros(()))
+    frames, lights = [one.frame for one in measured], [one.light for one in measured]
+    together = _skyline_of(frames, lights, by_stars + by_steps / len(measured), site)
+    return join_skylines(together, alone)
+
+
+def measure_frame(frame: SkyFrame, site: Site) -> MeasuredFrame:
+    """What one `frame` shows of the skyline at a `site`."""
     stars = measure_stars(frame)
     steps, by_stars = find_steps(frame, stars), star_log_likelihood(stars.rays, stars.missing)
     by_steps = np.zeros_like(by_stars)
     for found, (_, weight) in zip(steps, WIDTHS, strict=True):
         add_step_log_likelihood(by_steps, found, weight)
     light = stars, steps
-    return light, _skyline_of([frame], [light], by_stars + by_steps, site), by_stars, by_steps
+    return MeasuredFrame(frame, light, _skyline_of([frame], [light], by_stars + by_steps, site), by_stars, by_steps)
 
 
 def _skyline_of(

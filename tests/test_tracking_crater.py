@@ -25,6 +25,7 @@ from startrack.applications.tracking.frame_estimate import estimate_frame, shown
 from startrack.applications.tracking.observed_frame import decode_frame, encode_frame
 from startrack.camera import load_camera, save_camera
 from startrack.cli.main import main
+from startrack.core import ODOMETRY_SIGMA
 from startrack.core.types import BadInput, Evidence, NotLocated
 from startrack.frames import Site
 from startrack.localization import ExactPosterior, SharedErrors, settle_steepness
@@ -36,7 +37,7 @@ TIME = datetime(2030, 6, 1, tzinfo=UTC)
 DEPTH_M, DIAMETER_M = 1000.0, 4000.0
 GROUND = Cylinder(site=SITE, diameter_m=DIAMETER_M, depth_m=DEPTH_M, camera_height_m=1.5)
 FRAMES, STEP_M = 12, 120.0
-ODOMETRY_SIGMA_M = float(np.hypot(0.02 * STEP_M, 0.05))
+ODOMETRY_SIGMA_M = float(np.hypot(ODOMETRY_SIGMA * STEP_M, 0.05))
 
 
 def stated(depth_1: float = 0.0, diameter_1: float = 0.0, **changes) -> Cylinder:
@@ -70,7 +71,8 @@ def drive(seed: int, terrain: Cylinder, frames: int = FRAMES):
         rows = rays_at(place, rng)
         one = estimate_frame(rows, ground, errors, scale * (place + 3.0 * rng.normal(size=2)), 25.0 * np.eye(2))
         observed.append(ObservedFrame(f"{k}", TIME + timedelta(hours=k), np.eye(3), (one,), rows))
-    moves = np.diff(position, axis=0) + ODOMETRY_SIGMA_M * rng.normal(size=(frames - 1, 2))
+    too_long_1 = ODOMETRY_SIGMA * rng.normal()  # of all moves; images do not show it
+    moves = (1.0 + too_long_1) * np.diff(position, axis=0) + ODOMETRY_SIGMA_M * rng.normal(size=(frames - 1, 2))
     poses = np.pad(np.vstack([np.zeros(2), np.cumsum(moves, axis=0)]), ((0, 0), (0, 1)))
     times = np.array([frame.time_utc.timestamp() for frame in observed])
     odometry = Odometry(time_s=times, position_m=poses, quat_xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (frames, 1)))
@@ -130,17 +132,36 @@ def test_a_drive_shows_depth_and_width():
     track, position = track_of(0, known)
     assert [frame.status for frame in track.frames] == ["used"] * FRAMES
     for size, true, before in ((track.depth, DEPTH_M, known.depth_m), (track.width, DIAMETER_M, known.diameter_m)):
-        assert abs(size.size_m - true) < 3.5 * size.sigma_m < 0.06 * true
+        assert abs(size.size_m - true) < 3.5 * size.sigma_m
+        assert 0.9 * ODOMETRY_SIGMA < size.sigma_m / true < 1.4 * ODOMETRY_SIGMA
         assert before * (1.0 + size.error_1) == pytest.approx(size.size_m)
     assert track.terrain.rim_radius_m == pytest.approx(track.width.size_m / 2)
     off = track.smoothed.position_enu_m[:, :2] - position
-    assert np.linalg.norm(off, axis=1).max() < 2.0 * track.smoothed.radius95_m.max() < 100.0
+    assert np.linalg.norm(off, axis=1).max() < 2.0 * track.smoothed.radius95_m.max() < 120.0
     np.testing.assert_allclose(track.filtered.position_enu_m[-1], track.smoothed.position_enu_m[-1], atol=0.05)
     assert track.filtered.radius95_m[0] > 1.5 * track.filtered.radius95_m[-1]
     record = track_record(track)
     assert record["depth"]["depth_m"] == track.depth.size_m and record["width"]["sigma_m"] == track.width.sigma_m
     page = track_page(track, png_bytes(draw_track(track)), title="drive")
     assert f"width of the crater: {track.width.size_m:.1f}" in page
+
+
+def test_a_file_may_be_surer_of_the_size_than_the_odometry():
+    known = stated(0.005, -0.005, depth_sigma_m=0.01 * DEPTH_M, diameter_sigma_m=0.01 * DIAMETER_M)
+    frames, odometry, _ = drive(5, known)
+    too_long = replace(odometry, position_m=1.04 * odometry.position_m)
+    track = estimate_track(frames, known, TrackErrors.of(known, None), odometry=too_long)
+    assert not track.odometry_fault and track.width.sigma_1 < 0.01
+    assert abs(track.width.size_m / DIAMETER_M - 1.0) < 0.015
+
+
+@pytest.mark.parametrize("sizes", [(-0.58, -0.3), (0.8, 0.5)])
+def test_sizes_far_from_those_stated_are_by_true_odometry(sizes):
+    """By other explanations the odometry is wrong, and the crater as the file states."""
+    track, position = track_of(6, stated(*sizes))
+    assert not track.odometry_fault and abs(track.width.size_m - DIAMETER_M) < 3.5 * track.width.sigma_m
+    off = track.smoothed.position_enu_m[:, :2] - position
+    assert np.einsum("ni,nij,nj->n", off, np.linalg.inv(track.smoothed.covariance_m2), off).mean() < 9.2
 
 
 @pytest.mark.slow
@@ -195,10 +216,10 @@ def test_a_drive_from_pixels_shows_depth_and_width(tmp_path, capsys):
     record = json.loads((tmp_path / "track" / "track.json").read_text())
     assert record["counts"]["used"] == record["counts"]["frames"] == 13
     for size, key, true in ((record["depth"], "depth_m", 2000.0), (record["width"], "diameter_m", 20_000.0)):
-        assert abs(size[key] - true) < 3.5 * size["sigma_m"] < 0.06 * true
+        assert abs(size[key] - true) < 3.5 * size["sigma_m"] < 0.08 * true
     last = record["frames"][-1]
     true_m = json.loads(sorted(out.glob("*.truth.json"))[-1].read_text())["position_enu_m"]
-    assert np.hypot(last["east_m"] - true_m[0], last["north_m"] - true_m[1]) < last["radius999_m"] < 150.0
+    assert np.hypot(last["east_m"] - true_m[0], last["north_m"] - true_m[1]) < last["radius999_m"] < 300.0
     before = capsys.readouterr().out
     assert (
         main(["track", "--follow", str(out), "--until-idle", "0.3", "--no-plots", *track[2:-1], str(tmp_path / "live")])

@@ -27,7 +27,7 @@ def odometry_moves(
     """Moves between frames by `odometry` as stated, and with each fault that it may have as a whole.
 
     The attitude that the stars show turns them. Without odometry no move is known. `shows_scale`: whether images show a
-    wrong scale; they do not in a crater of unknown size.
+    wrong scale; they do not in a crater of unknown size, and what it may be then is what is stated.
 
     Raises:
         BadInput: bad_odometry for odometry that does not cover the frames, or is impossible.
@@ -65,14 +65,15 @@ def odometry_moves(
     right = moves("", position, Q)
     east, north = np.eye(FREEDOMS).reshape(2, 3, FREEDOMS)
     similar, linear = np.zeros_like(unknown.freedom_m), np.zeros_like(unknown.freedom_m)
-    similar[..., :2] = moves_by_scale_and_heading(right.delta_m) * [shows_scale, 1.0]
+    similar[..., :2] = moves_by_scale_and_heading(right.delta_m)
     linear[:, 0], linear[:, 1] = right.delta_m @ east, right.delta_m @ north
-    sizes = ((1.0 - LARGER_PROBABILITY, errors.sigma_1), (LARGER_PROBABILITY, max(errors.sigma_1, LARGER_SIGMA_1)))
+    larger = LARGER_PROBABILITY if shows_scale else 0.0
+    sizes = ((1.0 - larger, errors.sigma_1), (larger, max(errors.sigma_1, LARGER_SIGMA_1)))
     named = [moves(fault, *poses) for fault, poses in faults.items()]
-    wrong = [
-        replace(unknown, fault="other axes, quaternions or lengths", freedom_m=linear, sigma_m=right.sigma_m),
-        replace(unknown, fault="an unknown fault", sigma_m=apart),
-    ]
+    wrong = [replace(unknown, fault="an unknown fault", sigma_m=apart)]
+    if shows_scale:
+        of_axes = "other axes, quaternions or lengths"
+        wrong.append(replace(unknown, fault=of_axes, freedom_m=linear, sigma_m=right.sigma_m))
     prior = np.log(ODOMETRY_WRONG_PROBABILITY / (len(wrong) + 1))
     return [
         *(
@@ -80,6 +81,7 @@ def odometry_moves(
                 right, freedom_m=size_1 * similar, log_prior=float(np.log(part * (1.0 - ODOMETRY_WRONG_PROBABILITY)))
             )
             for part, size_1 in sizes
+            if part > 0.0
         ),
         *(replace(one, log_prior=float(prior - np.log(len(named)))) for one in named),
         *(replace(one, log_prior=float(prior)) for one in wrong),

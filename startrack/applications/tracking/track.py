@@ -177,21 +177,25 @@ def smooth_placed(
 ) -> tuple[list[list[FrameEstimate]], RobustTrack]:
     """The modes with their positions in the crater of the errors `shared` that all show, and the track by them.
 
-    Where the size of a crater is not known, positions are products of it: they are expanded about the estimate anew.
-    `moves` and `names` are those of `smooth_robustly`, which says what this raises.
+    Where the size of a crater is not known, positions are products of it: they are expanded about the estimate anew,
+    by odometry as it is stated first. What may be wrong with it is compared where the expansion is right. `moves` and
+    `names` are those of `smooth_robustly`, which says what this raises.
     """
     placed = [[shared.place(one) for one in of] for of in modes]
-    robust = smooth_robustly(placed, moves, height_sigma_m, names=names)
-    rounds, moved_m = 0, np.inf
-    while shared.bends and moved_m > STILL_MOVES_M and rounds < SIZE_ROUNDS:
-        before = robust.smoothed
-        placed = [
-            [shared.place(one, position_m, before.shared) for one in of]
-            for of, position_m in zip(modes, before.position_m, strict=True)
-        ]
-        robust = smooth_robustly(placed, moves, height_sigma_m, names=names)
-        rounds, moved_m = rounds + 1, float(np.abs(robust.smoothed.position_m - before.position_m).max())
-    if shared.bends and (moved_m > STILL_MOVES_M or not _is_possible(robust.smoothed, shared)):
+    if not shared.bends:
+        return placed, smooth_robustly(placed, moves, height_sigma_m, names=names)
+    for kinds in (moves[:1], moves):
+        robust = smooth_robustly(placed, kinds, height_sigma_m, names=names)
+        rounds, moved_m = 0, np.inf
+        while moved_m > STILL_MOVES_M and rounds < SIZE_ROUNDS:
+            before = robust.smoothed
+            placed = [
+                [shared.place(one, position_m, before.shared) for one in of]
+                for of, position_m in zip(modes, before.position_m, strict=True)
+            ]
+            robust = smooth_robustly(placed, kinds, height_sigma_m, names=names)
+            rounds, moved_m = rounds + 1, float(np.abs(robust.smoothed.position_m - before.position_m).max())
+    if moved_m > STILL_MOVES_M or not _is_possible(robust.smoothed, shared):
         raise BadInput(
             "inconsistent_evidence",
             "the odometry contradicts what the terrain file states of the crater's size: are its lengths in metres?",
@@ -200,10 +204,11 @@ def smooth_placed(
 
 
 def _is_possible(found: Smoothed, shared: TrackErrors) -> bool:
-    """Whether the crater's size is one that its file may mean."""
+    """Whether the crater's size is one that its file may mean: it is positive, so that factors are compared."""
     is_size = np.array([name in SIZES for name in shared.names])
-    sizes = (1.0 + shared.mean + shared.sigma * found.shared)[is_size] / (1.0 + shared.mean)[is_size]
-    return bool(np.abs(found.shared[is_size]).max() < MOST_SIZE_SIGMAS and sizes.min() > LEAST_SIZE_1)
+    sigma_1 = (shared.sigma / (1.0 + shared.mean))[is_size]
+    factor = np.maximum(1.0 + sigma_1 * found.shared[is_size], LEAST_SIZE_1)
+    return bool((np.abs(np.log(factor)) <= MOST_SIZE_SIGMAS * sigma_1).all())
 
 
 def track_of_newest(frame: ObservedFrame, online: OnlineTrack, terrain: Terrain) -> Track:

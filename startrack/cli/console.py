@@ -84,6 +84,7 @@ class Progress:
     def __init__(self, total: int | None = None, bar: RichProgress | None = None, row: Any = None) -> None:
         self.completed, self.total, self.text = 0, total, ""
         self._bar, self._row = bar, row
+        self._done = [(time.monotonic(), 0)]  # times and steps done: of the start, the first step and the last one
 
     def advance(self, steps: int = 1, text: str | None = None) -> None:
         """Further steps are done; `text` names the current step."""
@@ -92,16 +93,23 @@ class Progress:
 
     def update(self, completed: int, total: int | None) -> None:
         """Numbers of steps done and of all steps."""
+        if completed > self.completed:
+            self._done = [*self._done[:2], (time.monotonic(), completed)]
         self.completed, self.total = completed, total
         if self._bar is not None:
             self._bar.update(self._row, completed=completed, total=total, text=self.text)
 
-    def line(self, seconds: float) -> str:
-        """What is done after so many seconds, and the time left at the mean speed of the steps so far."""
+    def line(self) -> str:
+        """What is done after how many seconds, and the time left at the mean speed; the first step may compile."""
+        now, (first_s, first), (last_s, last) = time.monotonic(), self._done[len(self._done) // 3], self._done[-1]
+        to_do, left_s = (self.total or 0) - self.completed, 0.0
+        if last > first:
+            left_s = (last_s - first_s) / (last - first) * to_do - (now - last_s)
         count = f"{self.completed} of {self.total}" if self.total else ""
-        to_do = (self.total or 0) - self.completed
-        left = f"about {duration_text(seconds * to_do / self.completed)} left" if self.completed and to_do > 0 else ""
-        return errors.one_line(", ".join(part for part in (count, self.text, f"{seconds:.0f} s", left) if part))
+        left = f"about {duration_text(left_s)} left" if left_s > 0.0 else ""
+        return errors.one_line(
+            ", ".join(one for one in (count, self.text, f"{now - self._done[0][0]:.0f} s", left) if one)
+        )
 
 
 @contextmanager
@@ -132,11 +140,11 @@ def progress(what: str, total: int | None = None, *, shown: bool = True, jobs: i
 @contextmanager
 def _lines_about(what: str, steps: Progress) -> Iterator[Progress]:
     """In the block, print the state of the `steps` on stderr every LINE_S seconds."""
-    start, end = time.monotonic(), Event()
+    end = Event()
 
     def print_lines() -> None:
         while not end.wait(LINE_S):
-            print(f"{what}: {steps.line(time.monotonic() - start)}", file=sys.stderr, flush=True)
+            print(f"{what}: {steps.line()}", file=sys.stderr, flush=True)
 
     thread = Thread(target=print_lines, daemon=True)
     thread.start()

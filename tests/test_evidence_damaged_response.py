@@ -56,4 +56,4 @@ def test_a_frame_without_noise_is_refused_as_damaged(located: Any) -> None:
     cut = np.median(pixels) + 25 * np.median(np.abs(pixels - np.median(pixels)))
     result = locate_damaged(located, np.where(pixels > cut, pixels, 0.0))
     assert (result.status, result.reason) == ("refused", "damaged_image")
-    assert "the noise is removed" in result.message and "\n" not in result.message
+    assert "the noise is lost" in result.message and "\n" not in result.message

@@ -21,7 +21,8 @@ from startrack.core.types import Array, Bools, Exposure, Ints, TooFewStars
 from startrack.detection.background import BLOCK_PX, CLIPPED_SIGMA, MIN_NOISE_STEPS, smallest_step
 
 PROBE_PX, STRIDE_PX = BLOCK_PX // 2, 4 * BLOCK_PX  # of the tiles looked at first: dead parts of 72 px hold one
-MOST_EQUAL = 0.8  # of the tiles: with more of one value the noise is removed
+LOST_NOISE = "the noise is lost (rounding, compression or a filter)"
+MOST_EQUAL = 0.8  # of the tiles: with more of one value the noise is lost
 MIN_SIDE_PX = PROBE_PX + 1  # of a rectangle of noise no 81 pixels are equal
 MIN_PART = 0.004  # of the image; smaller constant blocks occur behind JPEG compression
 MIN_FILLED = 0.95  # of the rectangle about a part: saturated stars and dark ground are no rectangles
@@ -66,7 +67,7 @@ def find_damage(exposure: Exposure, camera: Camera | None = None) -> Damage | No
     tiles = _tiles_at(exposure.recorded_adu, corners)
     equal = np.ptp(tiles, axis=(1, 2)) == 0
     if len(tiles) >= TILES and MOST_EQUAL < equal.mean() < 1.0 and (tiles[equal] == tiles.min()).all():
-        return Damage(f"the noise is removed: {100 * equal.mean():.0f} % of the image has one value", False)
+        return Damage(f"{LOST_NOISE}: {100 * equal.mean():.0f} % of the image has one value", False)
     tiles, corners = tiles[~equal], corners[~equal]
     if len(tiles) < TILES:
         return None
@@ -79,7 +80,7 @@ def find_damage(exposure: Exposure, camera: Camera | None = None) -> Damage | No
         return Damage(cause, False)
     noisy = sigma > 0
     if np.count_nonzero(noisy) < len(tiles) / 2:
-        cause = f"the noise is removed: most pixels of {100 * np.mean(~noisy):.0f} % of the image are equal"
+        cause = f"{LOST_NOISE}: most pixels of {100 * np.mean(~noisy):.0f} % of the image are equal"
         return Damage(cause, False)
     correlation = _neighbour_correlation(_tiles_at(exposure.pixels_adu, corners[noisy]))
     if correlation > CORRELATION:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 from drive_helpers import render_small_drive
+from earth_helpers import jacksboro
 from jsonschema import Draft202012Validator
 
 import startrack
@@ -22,6 +23,7 @@ from startrack.applications.tracking.observed_frame import decode_frame, encode_
 from startrack.cli.main import main
 from startrack.estimation.trajectory import radius_holding
 from startrack.frames import R_from_quat_xyzw
+from startrack.terrain import write_map
 
 FRAMES = 5
 KILLS, KILL_AFTER_S, KILL_SEED = 3, (1.5, 6.0), 8
@@ -216,6 +218,13 @@ def test_wrong_odometry_is_left_out_or_refused(drive, tracked, tmp_path, capsys)
         assert np.hypot(one["east_m"] - true[0], one["north_m"] - true[1]) < 2.0 * one["radius999_m"]
     assert run(drive / "frames", "--odometry", reversed_signs, "--max-speed", "0.04", "-D", out, "-q") == 4
     assert "faster than 0.04 m/s" in capsys.readouterr().err
+
+
+def test_a_height_map_in_the_folder_is_left_out(tmp_path, capsys):
+    write_map(tmp_path / "valley.tif", jacksboro())
+    assert run(tmp_path, "-D", tmp_path / "out") == 4
+    shown = capsys.readouterr().err
+    assert "valley.tif: left out, a height map (GeoTIFF)\n" in shown and "no images in this folder" in shown
 
 
 def test_a_folder_without_images_is_refused(tmp_path, capsys):

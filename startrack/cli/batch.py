@@ -19,7 +19,7 @@ from startrack.applications import batch
 from startrack.applications.batch import Image, ImageDone, Task
 from startrack.cli.console import discard_stdout, progress
 from startrack.cli.flags import check_cluster, check_localizer
-from startrack.cli.images import absolute_facts, compile_kernels, prepare_reference, settings_of
+from startrack.cli.images import absolute_facts, compile_kernels, maps_left_out, prepare_reference, settings_of
 from startrack.cli.report import write_page_of
 from startrack.core import errors
 from startrack.core.compilation import is_compiled
@@ -62,10 +62,8 @@ def _find_images(args: argparse.Namespace) -> tuple[Sequence[Image], Sequence[Im
         listed = sys.stdin.buffer.read()
         paths = os.fsdecode(listed).split("\0" if b"\0" in listed else "\n")  # ended by NUL, or else one a line
         found = batch.listed_images(args.folder, paths, args.dir)
-    maps = set(batch.maps_among({*whole, *found}))
+    maps = maps_left_out({*whole, *found})
     found, whole = ([image for image in images if image not in maps] for images in (found, whole))
-    for image in sorted(maps):
-        print(f"{errors.one_line(image.name)}: left out, a height map (GeoTIFF)", file=sys.stderr, flush=True)
     if not found:
         raise BadInput("bad_image", f"{args.folder}: no PNG, TIFF, FITS, JPEG or camera raw images there")
     if args.time is not None and len(found) > 1:

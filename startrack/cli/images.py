@@ -8,10 +8,10 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,6 +31,9 @@ from startrack.estimation.observations import OdometryErrors
 from startrack.frames import Site, angle_between_rad, parse_utc, rays_from_azel
 from startrack.identification import Identifier
 from startrack.terrain import TERRAIN_KEYS, Terrain, load_terrain
+
+if TYPE_CHECKING:
+    from startrack.applications.batch import Image
 
 SITE_TOLERANCE_DEG = 0.1  # as far as an azimuth of a skyline may be wrong
 FACT_FLAGS = {  # keyword of `read_exposure`: argument of the command
@@ -56,6 +59,16 @@ def read(path: str, args: argparse.Namespace) -> Exposure:
     if bag is None:
         return images.read_exposure(path, **flag_facts(args))
     return images.read_bag_image(images.choose_bag_image(*bag, args.image_topic), **flag_facts(args))
+
+
+def maps_left_out(found: Iterable[Image]) -> set[Image]:
+    """The height maps among the images `found` in a folder, each named on stderr."""
+    from startrack.applications.batch import maps_among
+
+    maps = sorted(maps_among(found))
+    for one in maps:
+        print(f"{one_line(one.name)}: left out, a height map (GeoTIFF)", file=sys.stderr, flush=True)
+    return set(maps)
 
 
 def odometry_errors(args: argparse.Namespace) -> OdometryErrors:

@@ -19,7 +19,14 @@ from startrack.applications.tracking import FrameStore, ObservedFrame, Odometry,
 from startrack.catalog import load_catalog
 from startrack.chain import Settings
 from startrack.cli.console import progress, worst_code
-from startrack.cli.images import compile_kernels, flag_facts, near_attitude_of, odometry_errors, prepare_reference
+from startrack.cli.images import (
+    compile_kernels,
+    flag_facts,
+    maps_left_out,
+    near_attitude_of,
+    odometry_errors,
+    prepare_reference,
+)
 from startrack.core.errors import EXIT_BAD_INPUT, EXIT_REFUSED, EXIT_STOPPED, BadInput, BadOutput, exit_code_of
 from startrack.core.files import make_folder, printable
 from startrack.core.types import Exposure
@@ -85,7 +92,9 @@ class TrackRun:
         if len(self.args.frames) == 1 and is_bag(first):
             paths = None
         elif first.is_dir():
-            paths = [one.path for one in images_under(first, self.args.dir)]
+            images = images_under(first, self.args.dir)
+            maps = maps_left_out(images)
+            paths = [one.path for one in images if one not in maps]
             if not paths:
                 raise BadInput("bad_image", f"{first}: no images in this folder")
         with progress(

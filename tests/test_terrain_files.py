@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -135,6 +136,9 @@ def test_maps_without_position_of_other_bodies_or_with_holes_are_refused(tmp_pat
         projection_of({"proj": "stere", "lat_0": -90, "R": 3_396_190.0})
     with pytest.raises(BadInput, match="Earth"):
         projection_of({"proj": "longlat", "datum": "WGS84"})
+    for key, value in (("k_0", 1e-200), ("k_0", 1e200), ("x_0", 1e200), ("y_0", np.nan), ("lat_0", np.inf)):
+        with pytest.raises(BadInput, match="impossible numbers"):
+            projection_of({"proj": "stere", "lat_0": -90, "R": 1_737_400.0, key: value})
 
 
 @pytest.mark.parametrize(
@@ -235,6 +239,14 @@ OBJECT = IMAGE_MAP_PROJECTION
 END_OBJECT = IMAGE_MAP_PROJECTION
 END
 """
+
+
+VRT = """<VRTDataset rasterXSize="9" rasterYSize="9"><SRS>EPSG:32610</SRS>
+<GeoTransform>500000, 200, 0, 5000000, 0, -200</GeoTransform><VRTRasterBand dataType="Float32" band="1"><SimpleSource>
+<SourceFilename>{source}</SourceFilename><SourceBand>1</SourceBand></SimpleSource></VRTRasterBand></VRTDataset>"""
+WMS = """<GDAL_WMS><Service name="TMS"><ServerUrl>{address}/${{z}}.png</ServerUrl></Service><DataWindow>
+<UpperLeftX>0</UpperLeftX><UpperLeftY>9</UpperLeftY><LowerRightX>9</LowerRightX><LowerRightY>0</LowerRightY>
+<SizeX>9</SizeX><SizeY>9</SizeY></DataWindow><Projection>EPSG:3857</Projection><BandsCount>1</BandsCount></GDAL_WMS>"""
 
 
 @pytest.mark.parametrize(("body", "radius"), [("MOON", "1737.4"), ("MARS", "3396.19")])
@@ -358,6 +370,27 @@ def test_the_error_of_posts_is_estimated_from_the_map(tmp_path, capsys):
         true = float(np.sqrt(np.mean((ground[::every, half_way::every][:, : n - 1] - middle) ** 2)))
         taken[every] = facts["height_sigma_m"] / MEASURED_PER_ESTIMATE / true
     assert all(0.66 < ratio < 1.5 for ratio in taken.values()), taken
+
+
+def test_no_map_opens_a_network_connection(tmp_path, capfd, monkeypatch):
+    """A mosaic, a map service under the name of an elevation file, and a label whose pixels are elsewhere."""
+    pytest.importorskip("rasterio")
+    monkeypatch.setenv("GDAL_HTTP_TIMEOUT", "1")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(0.1)
+        address = f"http://127.0.0.1:{server.getsockname()[1]}"
+        files = {
+            "mosaic.vrt": VRT.format(source=f"/vsicurl/{address}/a.tif"),
+            "service.dem": WMS.format(address=address),
+            "label.lbl": PDS3.format(body="MOON", radius="1737.4").replace("HILL.IMG", f"/vsicurl/{address}/a.img"),
+        }
+        for name, text in files.items():
+            (tmp_path / name).write_text(text)
+            with pytest.raises(BadInput, match=f"{name}: not a map that can be read"):
+                read_map(tmp_path / name)
+            with pytest.raises(TimeoutError):
+                server.accept()
+    assert capfd.readouterr().err == ""
 
 
 def test_pixels_without_their_label_are_refused_with_advice(tmp_path, capfd):

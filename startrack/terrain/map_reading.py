@@ -18,7 +18,7 @@ from startrack.core.types import MAX_PIXELS, BadInput
 from startrack.frames import MOON_RADIUS_M
 from startrack.terrain.earth_projection import FOOT_M, EarthProjection, is_earth, project_earth
 from startrack.terrain.map_formats import UNITS_M, Stored, one_line_refusal, read_geotiff, read_hgt
-from startrack.terrain.raster import Projection, Raster, projection_of
+from startrack.terrain.raster import MAX_NUMBER, Projection, Raster, projection_of
 from startrack.terrain.shape import MAX_LENGTH_M
 
 # Half the side of what is read about the origin. On the Moon 10 km mountains are below the horizontal farther away. On
@@ -26,6 +26,17 @@ from startrack.terrain.shape import MAX_LENGTH_M
 WINDOW_HALF_M = {"moon": 300_000.0, "earth": 150_000.0}
 LOWEST_M, HIGHEST_ABOVE_SEA_M = -11_050.0, 9_000.0  # of the Earth: the deepest sea and the highest mountain, and 100 m
 MAX_BLOCK_POSTS = 50_000_000  # 200 MB of floating point, for any window
+# GDAL's readers of heights in one file, or in a file that it names; mosaics and map services name any address.
+DRIVERS = (
+    "GTiff", "PDS", "PDS4", "ISIS2", "ISIS3", "VICAR", "USGSDEM", "SRTMHGT", "DTED", "SDTS", "HFA", "NITF", "JPEG",
+    "PNG", "JP2OpenJPEG", "netCDF", "HDF5", "HDF5Image", "GRIB", "BAG", "GPKG", "AAIGrid", "GRASSASCIIGrid", "AIG",
+    "GSAG", "GSBG", "GS7BG", "XYZ", "ENVI", "EHdr", "ERS", "GenBin", "RRASTER", "SAGA", "RST", "ILWIS", "PCIDSK",
+    "PCRaster", "BT", "GXF", "HF2", "NWT_GRD", "SIGDEM", "Terragen", "ZMap", "ACE2", "ROI_PAC", "ISCE",
+)  # fmt: skip
+WITHOUT_NETWORK = {
+    "CPL_VSIL_CURL_ALLOWED_FILENAME": "none",
+    "GDAL_HTTP_PROXY": "0.0.0.0:0",
+}  # for a label that names one
 HEIGHT_NAMES = "altitude", "dem", "elevation", "height", "topo", "z"  # of the grid of heights among others of a file
 
 
@@ -89,7 +100,7 @@ def _heights_of(stored: Stored, path: Path, scale: float | None, offset_m: float
         )
     scale = 1.0 if scale is None else scale
     numbers = (raster.x0_m, raster.y0_m, raster.dx_m, raster.dy_m, scale, offset)
-    if not np.isfinite(numbers).all() or 0.0 in numbers[2:4] or max(map(abs, numbers)) > 1e12:
+    if not np.isfinite(numbers).all() or 0.0 in numbers[2:4] or max(map(abs, numbers)) > MAX_NUMBER:
         raise BadInput(
             "bad_terrain", f"{path}: its position, its scale or its offset is not a usable number: {numbers}"
         )
@@ -126,7 +137,11 @@ def _check_range(path: Path, lowest_m: float, highest_m: float) -> None:
 
 def _read_with_rasterio(path: Path, near: tuple[float, float] | None) -> Stored:
     """The content, cut to a window about `near`. Raises BadInput bad_terrain."""
-    hint = f" (of a PDS map give the label, {path.stem}.LBL)" if path.suffix.lower() == ".img" else ""
+    hints = {
+        ".img": f" (of a PDS map give the label, {path.stem}.LBL)",
+        ".vrt": ": a mosaic names other files; make one file of it (gdal_translate)",
+    }
+    hint = hints.get(path.suffix.lower(), "")
     if find_spec("rasterio") is None or find_spec("pyproj") is None:
         raise BadInput(
             "bad_terrain",
@@ -134,15 +149,17 @@ def _read_with_rasterio(path: Path, near: tuple[float, float] | None) -> Stored:
             f"known compression; other maps need rasterio and pyproj: {how_to_install('dem')}",
         )
     import rasterio
+    from rasterio.io import DatasetReader  # in place of rasterio.open, which takes one driver
 
-    with one_line_refusal(f"{path}: not a map that can be read{hint}"), warnings.catch_warnings():
+    refusal = one_line_refusal(f"{path}: not a map that can be read{hint}")
+    with refusal, rasterio.Env(**WITHOUT_NETWORK), warnings.catch_warnings():
         # About files without a position, which have their own message, and about terms that PROJ lacks beside WKT.
         warnings.simplefilter("ignore")
-        with rasterio.open(path) as file:
+        with DatasetReader(os.fspath(path), driver=DRIVERS) as file:
             parts = file.subdatasets if file.crs is None else []
             if not parts:
                 return _content_of(file, path, near, hint)
-        with rasterio.open(_heights_among(parts, path)) as file:
+        with DatasetReader(_heights_among(parts, path), driver=DRIVERS) as file:
             return _content_of(file, path, near, hint)
 
 

@@ -15,6 +15,7 @@ from startrack.terrain.earth_projection import EarthProjection, is_earth
 
 STEREOGRAPHIC, ORTHOGRAPHIC, EQUIRECTANGULAR = 0, 1, 2
 PROJECTION_NAMES = ("stereographic", "orthographic", "equirectangular")
+MAX_NUMBER = 1e12  # of a map's place, spacing and projection: squares of larger ones, and of their inverse, overflow
 RADIUS_TOLERANCE_M = 50.0  # maps name 1737.4 km or, rarely, 1737.4 with other digits; Mars and the Earth are far away
 
 
@@ -41,7 +42,8 @@ class Projection:
 
     def __post_init__(self) -> None:
         numbers = (self.latitude_rad, self.longitude_rad, self.scale, self.scale_y, self.false_x_m, self.false_y_m)
-        if not np.isfinite(numbers).all() or not self.scale * self.scale_y > 0 or abs(self.latitude_rad) > 1.6:
+        small, large = min(self.scale, self.scale_y) < 1 / MAX_NUMBER, max(map(abs, numbers)) > MAX_NUMBER
+        if small or large or not np.isfinite(numbers).all() or abs(self.latitude_rad) > 1.6:
             raise BadInput("bad_terrain", f"the map's projection has impossible numbers: {numbers}")
         if not abs(self.radius_m - MOON_RADIUS_M) <= RADIUS_TOLERANCE_M:
             raise BadInput(

@@ -147,10 +147,14 @@ def test_a_key_of_many_parts_is_refused(tmp_path, key, read):
         read(path)
 
 
-def test_a_height_map_whose_strip_inflates_to_much_more_is_refused(tmp_path):
-    (tmp_path / "hill.tif").write_bytes(with_strip(hill_map(), zlib.compress(ZEROS)))
+@pytest.mark.parametrize(
+    ("cut", "cause"), [(None, "inflates to more than its part"), (-1, "beyond the end of the file")]
+)
+def test_a_height_map_whose_strip_is_much_larger_is_refused(tmp_path, cut, cause):
+    """Deflated, and as its length states: tifffile makes room for as much."""
+    (tmp_path / "hill.tif").write_bytes(with_strip(hill_map(), zlib.compress(ZEROS))[:cut])
     (tmp_path / "hill.toml").write_text(HEIGHT_MAP)
-    with pytest.raises(BadInput, match="inflates to more than its part"):
+    with pytest.raises(BadInput, match=cause):
         load_terrain(tmp_path / "hill.toml")
 
 

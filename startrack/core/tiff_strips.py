@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from os import SEEK_END
 from typing import Any
 
 DEFLATE = (8, 32946)
@@ -13,7 +14,7 @@ MAX_SPARE_BYTES = 2**26  # of a tile beyond the picture that it is cropped to
 
 
 def check_packed_strips(page: Any, file: Any) -> None:
-    """Raise ValueError where strips or tiles would decode to more than the picture.
+    """Raise ValueError where strips or tiles would decode to more than the picture, or end beyond the file.
 
     `page` is a tifffile.TiffPage of any compression; `file` (open, binary) holds its bytes.
     """
@@ -25,6 +26,8 @@ def check_packed_strips(page: Any, file: Any) -> None:
         raise ValueError(f"{len(strips)} strips, more than the {MAX_STRIPS} allowed")
     if part_bytes > page.nbytes + MAX_SPARE_BYTES:
         raise ValueError(f"tiles of {part_bytes} bytes for a picture of {page.nbytes}")
+    if any(start + count > file.seek(0, SEEK_END) for start, count in strips):  # tifffile makes room for all of it
+        raise ValueError("a strip ends beyond the end of the file")
     for start, count in strips if page.compression in DEFLATE else ():
         file.seek(start)
         if len(isal_zlib.decompressobj().decompress(file.read(count), part_bytes + 1)) > part_bytes:

@@ -130,6 +130,7 @@ def test_a_result_is_a_rough_attitude(
     [(None, "no such file"), ("{", "is no JSON file"), ("[1]", "holds no attitude"),
      ('{"status": "refused", "provenance": {"time_utc": null}}', "holds no attitude"),
      ('{"attitude": {"quat_xyzw_cam_icrs": [0, 0, 0, 0]}}', "holds no attitude"),
+     (f'{{"attitude": {{"quat_xyzw_cam_icrs": [{10**400}, 0, 0, 0]}}}}', "holds no attitude"),
      ('{"attitude": {"quat_xyzw_cam_icrs": [0, 0, 0, 1]}, "provenance": {"time_utc": "noon"}}', "holds no attitude")],
 )  # fmt: skip
 @pytest.mark.parametrize("command", ["identify", "locate", "batch", "track"])

@@ -52,7 +52,7 @@ def read_near_attitude(path: FilePath) -> NearAttitude:
         raise BadInput(REASON, f"{printable(path)}: is no JSON file ({cause})") from cause
     try:
         return _attitude_in(found)
-    except (AttributeError, BadInput, KeyError, TypeError, ValueError) as cause:
+    except (AttributeError, BadInput, KeyError, OverflowError, TypeError, ValueError) as cause:
         raise BadInput(
             REASON,
             f"{printable(path)}: holds no attitude (attitude.quat_xyzw_cam_icrs): give the NAME.fix.json or "

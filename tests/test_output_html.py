@@ -6,6 +6,7 @@ import base64
 import json
 import re
 import shutil
+import zlib
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -20,6 +21,7 @@ from html_helpers import NASTY, results_in
 from startrack.cli.main import main
 from startrack.cli.report import write_page_of_images
 from startrack.core.errors import Reason
+from startrack.exposure import insert_png_chunks
 from startrack.localization.rim_plane import point_fix
 from startrack.output import page_text, result_at, result_dict, results_under, write_json, write_results
 from startrack.output.html.details import SOURCES, ground_map, skyline_of
@@ -282,6 +284,56 @@ def test_files_that_are_no_results_are_named(tmp_path, capsys, damage):
     (tmp_path / "y.fix.json").unlink()
     assert main(["report", str(tmp_path)]) == 4
     assert "no result there can be read: x.fix.json" in capsys.readouterr().err
+
+
+TABLE_DAMAGE = {
+    "no text": lambda data: data[:900] + b"\xff\xfe" + data[900:],
+    "a column lost": lambda data: data.replace(b"azimuth_deg", b"azimuth"),
+    "words": lambda data: data.replace(b".", b"x"),
+    "no numbers": lambda data: data.replace(b",1", b",inf").replace(b",2", b",nan").replace(b",3", b",1e300"),
+    "long field": lambda data: data + 200_000 * b"7",
+}
+
+
+@pytest.mark.parametrize("damage", TABLE_DAMAGE)
+@pytest.mark.parametrize("end", [".stars.ecsv", ".skyline.ecsv"])
+def test_a_page_shows_what_can_be_read_of_damaged_tables(results, tmp_path, damage, end):
+    out = Path(shutil.copytree(results, tmp_path / "out"))
+    table = out / f"small{end}"
+    table.write_bytes(TABLE_DAMAGE[damage](table.read_bytes()))
+    assert main(["report", str(out / "small.fix.json"), "-q"]) == 0
+    assert data_of((out / "small.report.html").read_text(encoding="utf-8"), "detail-0")["picture"] is not None
+
+
+def test_damaged_layers_of_a_picture_are_left_out(results, tmp_path, capfd):
+    """Marks that are no JSON, hold no number, or inflate to much; a picture much larger than ours, or cut."""
+    out = Path(shutil.copytree(results, tmp_path / "out"))
+    picture = out / "small.annotated.png"
+    whole = picture.read_bytes()
+    plain = cv2.imencode(".png", np.zeros((40, 60, 3), np.uint8))[1].tobytes()
+    jpeg, marks = plain_jpeg(60), zlib.compress(b'{"size": [60, 40]}')
+    cases = {
+        "marks": (insert_png_chunks(plain, [(b"stPX", jpeg), (b"stOV", marks)]), True),
+        "damaged": (insert_png_chunks(plain, [(b"stPX", jpeg), (b"stOV", marks[:-6] + b"123456")]), False),
+        "no marks": (
+            insert_png_chunks(plain, [(b"stPX", jpeg), (b"stOV", zlib.compress(b'{"size": [NaN, 1]}'))]),
+            False,
+        ),
+        "bomb": (insert_png_chunks(plain, [(b"stPX", jpeg), (b"stOV", zlib.compress(bytes(2**25)))]), False),
+        "large": (insert_png_chunks(plain, [(b"stPX", plain_jpeg(5000)), (b"stOV", marks)]), False),
+        "cut": (whole[: len(whole) // 2], None),
+    }
+    for data, has_marks in cases.values():
+        picture.write_bytes(data)
+        assert main(["report", str(out / "small.fix.json"), "-q"]) == 0
+        shown = data_of((out / "small.report.html").read_text(encoding="utf-8"), "detail-0")["picture"]
+        assert has_marks is (None if shown is None else "marks" in shown)
+    assert capfd.readouterr().err == ""
+
+
+def plain_jpeg(width: int) -> bytes:
+    """A black picture."""
+    return bytes(cv2.imencode(".jpg", np.zeros((40, width, 3), np.uint8))[1])
 
 
 def test_the_command_reads_the_folder_of_true_positions(results, tmp_path, capsys):

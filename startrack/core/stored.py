@@ -1,4 +1,4 @@
-"""Files that a later run reads again: data with their hash, and JSON objects. Damaged ones count as missing."""
+"""Files that a later run reads again: data with their hash, and JSON. Damaged ones count as missing."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from startrack.core.declaration import LARGEST
 from startrack.core.files import FilePath, write_atomically
 
 SEAL_BYTES = hashlib.sha256().digest_size
@@ -38,3 +39,16 @@ def read_json_object(path: FilePath) -> dict[str, Any] | None:
     except (OSError, ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) else None
+
+
+def finite_json(text: str | bytes) -> Any:
+    """What a JSON `text` holds; None for NaN and infinity, which JSON has not, and for numbers larger than any of ours.
+
+    Raises ValueError or RecursionError for what is no JSON.
+    """
+
+    def usual(digits: str) -> float | int | None:
+        value = float(digits)
+        return None if abs(value) > LARGEST else value if {*digits} & {*".eE"} else int(digits)
+
+    return json.loads(text, parse_constant=lambda _: None, parse_float=usual, parse_int=usual)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import csv
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.catalog import proper_name_designations
+from startrack.core.declaration import LARGEST
 from startrack.core.types import Array, Bools, Evidence
 from startrack.localization import Sectors
-from startrack.output.picture.annotate import layers_of
+from startrack.output.picture.annotate import layers_of, picture_in
 from startrack.output.picture.canvas import QUALITY, encoded_bytes
 from startrack.output.picture.relief import edge_cover, ground_cells, hill_shading
 from startrack.output.tables import half_range_rad
@@ -65,33 +66,48 @@ def star_table_of(path: Path, most: int) -> tuple[dict[str, Any] | None, Measure
     names = proper_name_designations()
     shown = {
         "total": len(rows),
-        "counts": dict(Counter(row.get("status", "") for row in rows)),
+        "counts": dict(Counter(row.get("status") or "" for row in rows)),
         "unit": "ADU" if any("'expected_e'" in line and "unit: adu" in line for line in head) else "e",
         "columns": {key: values for key, values in columns.items() if any(one not in (None, "") for one in values)},
         "designations": {name: known for name in columns["name"] if (known := names.get(name))},
     }
-    measured = [row for row in rows if row.get("evidence")]
-    azimuth, elevation, llr = (np.array([float(row[name]) for row in measured]) for name in DIRECTION_COLUMNS)
-    status = np.array([row.get("status", "") for row in measured], dtype=np.str_)
+    measured, (azimuth, elevation, llr) = _known_rows(rows, DIRECTION_COLUMNS)
+    status = np.array([row.get("status") or "" for row in measured], dtype=np.str_)
     stars = MeasuredStars(np.radians(azimuth), np.radians(elevation), llr, status)
     return (shown if head else None), stars
 
 
 def read_ecsv(path: Path) -> tuple[list[str], list[dict[str, str]]]:
-    """The comment lines and the rows of an ECSV file; both empty where there is none."""
-    lines = path.read_text(encoding="utf-8").split("\n") if path.is_file() else []
+    """The comment lines and the rows of an ECSV file; both empty where there is none, or none that can be read."""
+    lines = path.read_text(encoding="utf-8", errors="replace").split("\n") if path.is_file() else []
     head = [line for line in lines if line.startswith("#")]
-    return head, list(csv.DictReader(lines[len(head) :]))
+    try:
+        return head, list(csv.DictReader(lines[len(head) :]))
+    except csv.Error:
+        return [], []
+
+
+def _number(text: str | None) -> float:
+    """The number of a field; nan where it is empty, no number, or larger than any of ours."""
+    try:
+        value = float(text or "nan")
+    except ValueError:
+        return np.nan
+    return value if abs(value) <= LARGEST else np.nan
+
+
+def _known_rows(rows: list[dict[str, str]], names: Sequence[str]) -> tuple[list[dict[str, str]], Array]:
+    """The rows with a number in each of the columns `names`, and these numbers (columns, rows)."""
+    numbers = np.array([[_number(row.get(name)) for name in names] for row in rows]).reshape(len(rows), len(names))
+    known = np.isfinite(numbers).all(axis=1)
+    return [row for row, is_known in zip(rows, known.tolist(), strict=True) if is_known], numbers[known].T
 
 
 def _text_or_number(text: str, decimals: int | None) -> Any:
     if decimals is None:
         return text
-    try:
-        number = round(float(text), decimals)
-    except ValueError:  # an empty field: nothing was measured
-        return None
-    return int(number) if decimals == 0 or number == int(number) else number
+    number = round(_number(text), decimals)
+    return None if number != number else int(number) if number == int(number) else number
 
 
 def sectors_of(stars: MeasuredStars, horizon: Horizon) -> dict[str, Any] | None:
@@ -160,12 +176,11 @@ def skyline_of(path: Path, horizon: Horizon | None, stars: dict[str, Any] | None
     Of a known `horizon` also `above`, the heights above it, `half`, the range of them to
     be shown, and `near`: the indices of the `stars` within that range, and their heights above the horizon.
     """
-    rows = [row for row in read_ecsv(path)[1] if row.get("source") in SOURCES[1:]]
+    found_there = (row for row in read_ecsv(path)[1] if row.get("source") in SOURCES[1:])
+    rows, columns_deg = _known_rows(list(found_there), ("azimuth_deg", "elevation_deg", "sigma_deg"))
     if not rows:
         return None
-    azimuth, elevation, sigma = (
-        np.radians([float(row[f"{name}_deg"]) for row in rows]) for name in ("azimuth", "elevation", "sigma")
-    )
+    azimuth, elevation, sigma = np.radians(columns_deg)
     found: dict[str, Any] = {
         "az": round_values(np.degrees(azimuth), 2),
         "el": round_values(np.degrees(elevation), 3),
@@ -178,7 +193,8 @@ def skyline_of(path: Path, horizon: Horizon | None, stars: dict[str, Any] | None
     half, near = half_range_rad(above, sigma), list[list[float]]()
     columns = stars["columns"] if stars is not None else {}
     if "az" in columns and "el" in columns:
-        heights = np.radians(columns["el"]) - horizon(np.radians(columns["az"]))
+        az, el = (np.radians(np.array(columns[name], dtype=np.float64)) for name in ("az", "el"))  # None: nan
+        heights = el - horizon(az)
         which = np.flatnonzero(np.abs(heights) < half)
         near = [
             [k, height] for k, height in zip(which.tolist(), round_values(np.degrees(heights[which]), 3), strict=True)
@@ -217,11 +233,7 @@ def picture_of(picture: Path, longest_px: int) -> dict[str, Any] | None:
     """
     data = picture.read_bytes() if picture.is_file() else b""
     layers = layers_of(data)
-    sky: Any = None
-    if layers is not None:
-        sky = layers.bare[:, :, ::-1]
-    elif data:
-        sky = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    sky: Any = picture_in(data) if layers is None else layers.bare[:, :, ::-1]
     if sky is None:
         return None
     shrink = longest_px / max(sky.shape[:2])

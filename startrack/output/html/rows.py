@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from startrack.core.files import existing_folder
+from startrack.core.stored import finite_json
 from startrack.core.types import BadInput
 from startrack.output.quantities import QUANTITIES
 from startrack.output.record import record_values
@@ -103,11 +102,7 @@ def _record(path: Path) -> dict[str, Any]:
     if path.exists() and not path.is_file():  # a pipe would block
         raise ValueError("is no regular file")
     try:
-        # JSON has no NaN and no infinity, but files written or edited elsewhere may: such values are unknown.
-        record = json.loads(
-            path.read_text(encoding="utf-8"), parse_constant=lambda _: None,
-            parse_float=lambda text: float(text) if math.isfinite(float(text)) else None,
-        )  # fmt: skip
+        record = finite_json(path.read_text(encoding="utf-8"))
     except OSError as cause:
         raise ValueError(f"cannot be opened ({cause.strerror})") from cause
     except (ValueError, RecursionError) as cause:

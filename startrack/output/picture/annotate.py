@@ -6,16 +6,21 @@ Its file also holds the picture without marks and the marks as coordinates, for 
 from __future__ import annotations
 
 import json
+import warnings
 import zlib
+from collections import deque
 from dataclasses import dataclass
+from io import BytesIO
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from startrack.chain import Detected, Identified, Inputs, Located, Measured, Oriented, Outcome, last_value
 from startrack.core.errors import BadInput
+from startrack.core.stored import finite_json
 from startrack.estimation.attitude import AttitudeFit
 from startrack.exposure import insert_png_chunks, png_chunks
 from startrack.output.picture.axes import GAP_PX, multiples, nice_step
@@ -49,6 +54,7 @@ OVERVIEW_PART = 0.58  # of the height left for maps
 WIDEST_RMS = 4.5  # residuals beyond this many rms are outliers and would squeeze the rest
 MAX_MODES = 4  # of positions that fit
 MAX_LINES = 2 * MAX_MODES  # of a message
+MAX_SIDE_PX, MAX_MARKS_BYTES = 4096, 2**24  # of a picture and its marks; ours are half as long, and 1 MB
 BARE_CHUNK, MARKS_CHUNK = b"stPX", b"stOV"  # a JPEG; compressed JSON
 EastNorth = tuple[float, float] | None  # east and north [m] of the true position, where a caller knows it
 
@@ -82,15 +88,35 @@ class Layers:
 
 def layers_of(png: bytes) -> Layers | None:
     """The layers of a PNG file; None where it has none, or is damaged."""
+    marks = zlib.decompressobj()
     try:
         found = {kind: body for kind, body in png_chunks(png) if kind in (BARE_CHUNK, MARKS_CHUNK)}
-    except BadInput:  # the page shows what there is
+        overlay = finite_json(marks.decompress(found[MARKS_CHUNK], MAX_MARKS_BYTES)) if len(found) == 2 else None
+    except (BadInput, zlib.error, ValueError, RecursionError):  # the page shows what there is
         return None
-    if len(found) < 2:
+    if not isinstance(overlay, dict) or not _is_size(overlay.get("size")):
         return None
-    bare = cv2.imdecode(np.frombuffer(found[BARE_CHUNK], np.uint8), cv2.IMREAD_COLOR)
-    overlay = json.loads(zlib.decompress(found[MARKS_CHUNK]))
-    return None if bare is None else Layers(np.asarray(bare[:, :, ::-1], dtype=np.uint8), overlay)
+    bare = picture_in(bytes(found[BARE_CHUNK]))
+    return None if bare is None else Layers(bare[:, :, ::-1], overlay)
+
+
+def _is_size(value: Any) -> bool:
+    """Whether a value of JSON is a width and a height."""
+    return isinstance(value, list) and len(value) == 2 and all(isinstance(n, int | float) and n > 0 for n in value)
+
+
+def picture_in(data: bytes) -> NDArray[np.uint8] | None:
+    """The picture (H, W, 3), blue first, in a PNG or JPEG file; None where there is none, or a larger one than ours."""
+    try:
+        with warnings.catch_warnings(action="error"), Image.open(BytesIO(data), formats=("PNG", "JPEG")) as header:
+            longest_px = max(header.size)
+            deque(png_chunks(data) if header.format == "PNG" else (), maxlen=0)  # OpenCV makes room for any length
+    except (BadInput, Image.DecompressionBombError, OSError, SyntaxError, ValueError, Warning):
+        return None
+    if longest_px > MAX_SIDE_PX:
+        return None
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    return None if pixels is None else np.asarray(pixels, dtype=np.uint8)
 
 
 def _draw_picture(

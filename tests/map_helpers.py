@@ -1,10 +1,41 @@
-"""Projections of maps for tests."""
+"""Projections and labels of maps for tests."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from startrack.terrain.raster import STEREOGRAPHIC, Projection
+
+PDS3 = """PDS_VERSION_ID = PDS3
+RECORD_TYPE = FIXED_LENGTH
+RECORD_BYTES = 122
+FILE_RECORDS = 61
+^IMAGE = "HILL.IMG"
+TARGET_NAME = {body}
+OBJECT = IMAGE
+  LINES = 61
+  LINE_SAMPLES = 61
+  SAMPLE_TYPE = LSB_INTEGER
+  SAMPLE_BITS = 16
+  UNIT = METER
+  SCALING_FACTOR = 0.5
+  OFFSET = 1737400.
+END_OBJECT = IMAGE
+OBJECT = IMAGE_MAP_PROJECTION
+  MAP_PROJECTION_TYPE = "POLAR STEREOGRAPHIC"
+  MAP_RESOLUTION = 303.23 <pix/deg>
+  A_AXIS_RADIUS = {radius} <km>
+  B_AXIS_RADIUS = {radius} <km>
+  C_AXIS_RADIUS = {radius} <km>
+  POSITIVE_LONGITUDE_DIRECTION = "EAST"
+  CENTER_LATITUDE = -90. <deg>
+  CENTER_LONGITUDE = 0. <deg>
+  LINE_PROJECTION_OFFSET = 30. <pix>
+  SAMPLE_PROJECTION_OFFSET = 30. <pix>
+  MAP_SCALE = 100. <m/pix>
+END_OBJECT = IMAGE_MAP_PROJECTION
+END
+"""  # a detached label of 61 x 61 posts, for format(body=, radius=)
 
 
 def polar_stereographic(

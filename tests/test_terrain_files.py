@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tomli_w
-from map_helpers import polar_stereographic
+from map_helpers import PDS3, polar_stereographic
 
 from startrack.camera import load_camera
 from startrack.cli.main import main
@@ -207,38 +207,6 @@ def test_a_cloud_optimised_geotiff_is_read(tmp_path):
     assert np.nanmax(np.abs(read.heights_m - m.heights_m)) < 0.26
     assert (read.x0_m, read.y0_m, read.dx_m, read.dy_m) == pytest.approx((m.x0_m, m.y0_m, 100.0, -100.0))
     assert read.projection == m.projection
-
-
-PDS3 = """PDS_VERSION_ID = PDS3
-RECORD_TYPE = FIXED_LENGTH
-RECORD_BYTES = 122
-FILE_RECORDS = 61
-^IMAGE = "HILL.IMG"
-TARGET_NAME = {body}
-OBJECT = IMAGE
-  LINES = 61
-  LINE_SAMPLES = 61
-  SAMPLE_TYPE = LSB_INTEGER
-  SAMPLE_BITS = 16
-  UNIT = METER
-  SCALING_FACTOR = 0.5
-  OFFSET = 1737400.
-END_OBJECT = IMAGE
-OBJECT = IMAGE_MAP_PROJECTION
-  MAP_PROJECTION_TYPE = "POLAR STEREOGRAPHIC"
-  MAP_RESOLUTION = 303.23 <pix/deg>
-  A_AXIS_RADIUS = {radius} <km>
-  B_AXIS_RADIUS = {radius} <km>
-  C_AXIS_RADIUS = {radius} <km>
-  POSITIVE_LONGITUDE_DIRECTION = "EAST"
-  CENTER_LATITUDE = -90. <deg>
-  CENTER_LONGITUDE = 0. <deg>
-  LINE_PROJECTION_OFFSET = 30. <pix>
-  SAMPLE_PROJECTION_OFFSET = 30. <pix>
-  MAP_SCALE = 100. <m/pix>
-END_OBJECT = IMAGE_MAP_PROJECTION
-END
-"""
 
 
 VRT = """<VRTDataset rasterXSize="9" rasterYSize="9"><SRS>EPSG:32610</SRS>

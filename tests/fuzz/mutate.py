@@ -9,7 +9,10 @@ import struct
 import zlib
 from random import Random
 
-TEXT_KINDS = {"sidecar", "camera", "converted", "terrain"}
+TEXT_KINDS = {
+    "sidecar", "camera", "converted", "terrain", "odometry", "table", "attitude", "label", "record",
+}  # fmt: skip
+PNG_KINDS = {"png", "layers", "correction"}
 CHANGES = 1, 1, 1, 2, 3, 5  # of one file
 CARD_BYTES = 80
 HEADER_BYTES = 700  # of a binary file: half of the changes fall there
@@ -44,7 +47,7 @@ def mutate(kind: str, data: bytes, random: Random) -> bytes:
         change = _change_cards
     for _ in range(random.choice(CHANGES)):
         data = change(data, random) or b"\0"
-    return repair_checksums(data) if kind == "png" and random.random() < 0.8 else data
+    return repair_checksums(data) if kind in PNG_KINDS and random.random() < 0.8 else data
 
 
 def _gzip(data: bytes) -> bytes:

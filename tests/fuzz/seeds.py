@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from .seeds_beside import seeds_beside
+
 FRAME = np.random.default_rng(3).normal(1000, 50, (40, 60)).astype(np.uint16)
 HEADER = {"DATE-OBS": "2031-03-26T20:58:11", "EXPTIME": 2.5, "STCAMERA": "fisheye-2048", "BAYERPAT": "RGGB"}
 SIDECAR = {
@@ -52,6 +54,35 @@ radius_m = 800.0
 max_slope_deg = 25.0
 glare_deg = [[10.0, 30.0]]
 """
+EARTH = """format = 1
+body = "earth"
+obstacles = "obstacles.csv"
+[origin]
+latitude_deg = 34.0
+longitude_deg = -111.5
+height_m = 2300.0
+[air]
+pressure_hpa = 760.0
+temperature_c = 5.0
+terrestrial_refraction_sigma = 0.05
+[cylinder]
+diameter_m = 900.0
+depth_m = 80.0
+depth_sigma_m = 2.0
+[rover]
+camera_height_sigma_m = 0.1
+"""
+XML = b"""<?xml version="1.0"?>
+<opencv_storage>
+<image_width>2048</image_width>
+<image_height>2048</image_height>
+<fisheye_model>1</fisheye_model>
+<camera_matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt>
+<data>652. 0. 1023.5 0. 652. 1023.5 0. 0. 1.</data></camera_matrix>
+<distortion_coefficients type_id="opencv-matrix"><rows>4</rows><cols>1</cols><dt>d</dt>
+<data>0.01 -0.002 1e-4 0.</data></distortion_coefficients>
+</opencv_storage>
+"""
 CAMERA_EXTRAS = """
 [mount]
 quat_xyzw_body_cam = [0.0, 0.0, 1.0, 0.0]
@@ -74,16 +105,18 @@ def seeds() -> dict[str, tuple[bytes, ...]]:
         "sidecar": (json.dumps(SIDECAR, indent=1).encode(),),
         "camera": tuple(text.encode() for text in cameras),
         "converted": tuple(_converted()),
-        "terrain": (CYLINDER.encode(), HEIGHT_MAP.encode()),
+        "terrain": tuple(text.encode() for text in (CYLINDER, HEIGHT_MAP, EARTH)),
         "elevation": tuple(_maps()),
+        **seeds_beside(),
     }
 
 
-def _pillow(pixels: Any, form: str, **options: Any) -> bytes:
+def pillow(pixels: Any, form: str, *, eight: bool = False, **options: Any) -> bytes:
+    """The `pixels` (H, W) or (H, W, 3) as a file of Pillow's format `form`, of 8 bits if `eight`."""
     from PIL import Image
 
     file = io.BytesIO()
-    eight = form == "JPEG" or pixels.ndim == 3
+    eight = eight or form == "JPEG" or pixels.ndim == 3
     Image.fromarray(pixels.astype(np.uint8) if eight else pixels).save(file, form, **options)
     return file.getvalue()
 
@@ -92,7 +125,7 @@ def _jpegs() -> list[bytes]:
     grey, colour = FRAME // 8, np.dstack(3 * [FRAME // 8])
     comment = json.dumps(HEADER).encode()
     return [
-        _pillow(grey, "JPEG"), _pillow(grey, "JPEG", progressive=True), _pillow(colour, "JPEG", comment=comment),
+        pillow(grey, "JPEG"), pillow(grey, "JPEG", progressive=True), pillow(colour, "JPEG", comment=comment),
     ]  # fmt: skip
 
 
@@ -101,7 +134,7 @@ def _pngs() -> list[bytes]:
 
     texts = {key: str(value) for key, value in HEADER.items()}
     colour = np.dstack([FRAME // 8, FRAME // 9, FRAME // 10])
-    return [_pillow(FRAME, "PNG"), add_text(_pillow(FRAME, "PNG"), texts), _pillow(colour, "PNG")]
+    return [pillow(FRAME, "PNG"), add_text(pillow(FRAME, "PNG"), texts), pillow(colour, "PNG")]
 
 
 def _tiffs() -> list[bytes]:
@@ -115,7 +148,7 @@ def _tiffs() -> list[bytes]:
     return [
         one(description=json.dumps(HEADER), metadata=None), one(compression="zlib", rowsperstrip=8),
         one(tile=(16, 16)), one(pixels=FRAME.astype(np.float32)), one(bigtiff=True),
-        _pillow(FRAME, "TIFF", compression="tiff_lzw"),
+        pillow(FRAME, "TIFF", compression="tiff_lzw"),
     ]  # fmt: skip
 
 
@@ -152,10 +185,13 @@ def _dng() -> bytes:
 
 def _cameras() -> list[str]:
     from startrack.camera import Decentring, camera_text, load_camera
+    from startrack.camera.lenses import LENSES
 
     fisheye = load_camera("fisheye-2048")
     bent = replace(fisheye, decentring=Decentring(2e-4, -6e-4), mirrored=True)
-    return [camera_text(fisheye) + CAMERA_EXTRAS, camera_text(bent), camera_text(load_camera("lowell-ldt"))]
+    shapes = (shape for kind in LENSES for shape in kind.typical_shapes())
+    every = [replace(fisheye, lens=shape, max_angle_rad=1.0, calibrated_angle_rad=1.0) for shape in shapes]
+    return [camera_text(fisheye) + CAMERA_EXTRAS, *map(camera_text, (bent, load_camera("lowell-ldt"), *every))]
 
 
 def _converted() -> list[bytes]:
@@ -164,7 +200,7 @@ def _converted() -> list[bytes]:
     from startrack.camera import load_camera
     from startrack.camera.formats import FOREIGN_FORMATS
 
-    return [to_text(load_camera("fisheye-2048"), program).encode() for program in FOREIGN_FORMATS]
+    return [*(to_text(load_camera("fisheye-2048"), program).encode() for program in FOREIGN_FORMATS), XML]
 
 
 def hill_map() -> bytes:

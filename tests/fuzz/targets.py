@@ -13,11 +13,13 @@ import numpy as np
 from startrack.core.errors import BAD_INPUT_REASONS, BadInput
 
 from .access import Broken, no_access_beside
+from .beside import READERS_BESIDE
 from .mutate import mutate
 from .seeds import CYLINDER, HEIGHT_MAP, hill_map, seeds
+from .seeds_beside import OBSTACLES
 
 SUFFIXES = {"png": ".png", "jpeg": ".jpg", "tiff": ".tif", "fits": ".fits", "raw": ".dng"}
-PROGRAMS = ("ros", "kalibr", "colmap", "opencv")
+PROGRAMS = ("ros", "kalibr", "colmap", "opencv", "opencv")  # of the seeds in order
 MAX_MESSAGE_CHARS = 1200  # with two paths of a temporary folder in it
 OUT_OF_MEMORY = ("MemoryError", "Unable to allocate", "Insufficient memory", "bad_alloc", "cannot allocate")
 
@@ -25,8 +27,10 @@ OUT_OF_MEMORY = ("MemoryError", "Unable to allocate", "Insufficient memory", "ba
 def prepare(folder: Path) -> None:
     """The sound files that stand beside the mutated one, and one use of every reader, so that all is imported."""
     (folder / "hill.tif").write_bytes(hill_map())
-    (folder / "sound.png").write_bytes(seeds()["png"][0])
+    for name in ("sound.png", "frame.png"):  # with a sidecar, which other files mutate, and without
+        (folder / name).write_bytes(seeds()["png"][0])
     (folder / "terrain.toml").write_text(CYLINDER)
+    (folder / "obstacles.csv").write_text(OBSTACLES)
     (folder / "camera.toml").write_bytes(seeds()["camera"][0])
     for kind, files in seeds().items():
         for number in range(len(files)):
@@ -97,15 +101,16 @@ def _read_camera(data: bytes, number: int, folder: Path) -> None:
 
 
 def _read_converted(data: bytes, number: int, folder: Path) -> None:
-    """As the command `calibrate convert --from` does."""
+    """As the command `calibrate convert --from` does, and of the program that is found."""
     from startrack.camera import camera_from_foreign_text as from_text
     from startrack.camera import camera_text, load_camera
+    from startrack.camera.formats import find_program
 
     try:
         text = data.decode()
     except UnicodeDecodeError:
         return
-    written = camera_text(from_text(text, PROGRAMS[number], "converted"))
+    written = camera_text(from_text(text, find_program(text) or PROGRAMS[number], "converted"))
     path = folder / "mutated.toml"
     path.write_text(written, encoding="utf-8")
     _use_camera(load_camera(path))
@@ -126,11 +131,14 @@ def _use_camera(camera: Any) -> None:
 
 
 def _read_terrain(data: bytes, number: int, folder: Path) -> None:
-    from startrack.terrain import load_terrain
+    """As a terrain, and as the command `terrain state` does."""
+    from startrack.terrain import load_terrain, state_errors, stateable_errors
 
     path = folder / "mutated.toml"
     path.write_bytes(data)
     load_terrain(path)
+    text = data.decode()
+    state_errors(text, {(error.table, error.key): 0.5 for error in stateable_errors(text) if error.is_missing})
 
 
 def _read_elevation(data: bytes, number: int, folder: Path) -> None:
@@ -145,5 +153,5 @@ def _read_elevation(data: bytes, number: int, folder: Path) -> None:
 READERS: dict[str, Callable[[bytes, int, Path], None]] = {
     **{kind: _read_image(suffix) for kind, suffix in SUFFIXES.items()},
     "sidecar": _read_sidecar, "camera": _read_camera, "converted": _read_converted, "terrain": _read_terrain,
-    "elevation": _read_elevation,
+    "elevation": _read_elevation, **READERS_BESIDE,
 }  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
@@ -160,3 +161,14 @@ def test_without_rosbags_the_extra_is_named(drive, tmp_path, monkeypatch, capsys
     monkeypatch.setattr("startrack.exposure.bag.find_spec", lambda name: None)
     assert main(["batch", str(drive), "-D", str(tmp_path)]) == 4
     assert "pip install '.[ros]'" in capsys.readouterr().err
+
+
+def test_no_room_is_made_for_more_than_a_bag_holds(tmp_path):
+    """The first record of an MCAP file's summary states a length of 1 TB."""
+    bag = write_bag(tmp_path, "ros2.mcap", noise_topics)
+    data = bytearray(bag.read_bytes())
+    (summary,) = struct.unpack_from("<Q", data, len(data) - 37 + 9)  # of the footer
+    struct.pack_into("<Q", data, summary + 1, 2**40)
+    bag.write_bytes(data)
+    with pytest.raises(BadInput, match=rf"Truncated record .* expected {2**40} bytes"):
+        list_bag_images(bag)

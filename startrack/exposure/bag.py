@@ -18,6 +18,7 @@ import numpy as np
 from startrack.core.errors import BadInput, how_to_install
 from startrack.core.files import MAX_CAUSE_CHARS, FilePath, printable
 from startrack.core.types import Exposure
+from startrack.exposure.bounded_path import BoundedPath
 from startrack.exposure.decoding import Decoded, bad_image, check_size, decode_bytes, grey_float32, largest_value
 from startrack.exposure.facts import Facts
 from startrack.exposure.read import exposure_of_decoded
@@ -247,7 +248,7 @@ def _open(path: Path, kinds: tuple[str, ...], topic: str | None, flag: str) -> I
     if path.is_dir() and not (path / "metadata.yaml").is_file():
         raise _Fault("is a folder without metadata.yaml, not a ROS 2 bag")
     # Files of older ROS 2 releases lack the definitions; those of the messages read here have never changed.
-    with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
+    with AnyReader([BoundedPath(path)], default_typestore=get_typestore(Stores.LATEST)) as reader:
         used = _choose_topic([(one.topic, one.msgtype) for one in reader.connections], kinds, topic, flag)
         connections = [one for one in reader.connections if one.topic == used and one.msgtype in kinds]
         yield reader, connections

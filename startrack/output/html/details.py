@@ -233,9 +233,10 @@ def picture_of(picture: Path, longest_px: int) -> dict[str, Any] | None:
     """
     data = picture.read_bytes() if picture.is_file() else b""
     layers = layers_of(data)
-    sky: Any = picture_in(data) if layers is None else layers.bare[:, :, ::-1]
-    if sky is None:
+    found = picture_in(data) if layers is None else layers.bare
+    if found is None:
         return None
+    sky: Any = found[:, :, ::-1]
     shrink = longest_px / max(sky.shape[:2])
     if shrink < 1:
         size = tuple(max(1, round(n * shrink)) for n in sky.shape[1::-1])

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import warnings
 import zlib
-from collections import deque
 from dataclasses import dataclass
 from io import BytesIO
 from typing import Any
@@ -16,7 +15,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from startrack.chain import Detected, Identified, Inputs, Located, Measured, Oriented, Outcome, last_value
 from startrack.core.errors import BadInput
@@ -97,7 +95,7 @@ def layers_of(png: bytes) -> Layers | None:
     if not isinstance(overlay, dict) or not _is_size(overlay.get("size")):
         return None
     bare = picture_in(bytes(found[BARE_CHUNK]))
-    return None if bare is None else Layers(bare[:, :, ::-1], overlay)
+    return None if bare is None else Layers(bare, overlay)
 
 
 def _is_size(value: Any) -> bool:
@@ -106,17 +104,17 @@ def _is_size(value: Any) -> bool:
 
 
 def picture_in(data: bytes) -> NDArray[np.uint8] | None:
-    """The picture (H, W, 3), blue first, in a PNG or JPEG file; None where there is none, or a larger one than ours."""
+    """The picture (H, W, 3), red, green, blue, in the PNG or JPEG file `data`; None for any other, or a larger one.
+
+    By Pillow: OpenCV prints what is damaged, and makes room for any length that a file states.
+    """
+    from PIL import Image
+
     try:
-        with warnings.catch_warnings(action="error"), Image.open(BytesIO(data), formats=("PNG", "JPEG")) as header:
-            longest_px = max(header.size)
-            deque(png_chunks(data) if header.format == "PNG" else (), maxlen=0)  # OpenCV makes room for any length
-    except (BadInput, Image.DecompressionBombError, OSError, SyntaxError, ValueError, Warning):
+        with warnings.catch_warnings(action="error"), Image.open(BytesIO(data), formats=("PNG", "JPEG")) as image:
+            return np.asarray(image.convert("RGB")) if max(image.size) <= MAX_SIDE_PX else None
+    except (Image.DecompressionBombError, OSError, SyntaxError, ValueError, Warning):
         return None
-    if longest_px > MAX_SIDE_PX:
-        return None
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    return None if pixels is None else np.asarray(pixels, dtype=np.uint8)
 
 
 def _draw_picture(

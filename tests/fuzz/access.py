@@ -15,23 +15,26 @@ class Broken(Exception):
 
 
 _allowed: Path | None = None
+_written: tuple[str, ...] = ()
 _violations: list[str] = []
 WRITING = {"os.remove", "os.rename", "os.mkdir", "os.rmdir", "os.symlink", "os.link", "os.truncate", "shutil.rmtree"}
 NEVER = {"socket.connect", "subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.fork"}
 
 
 @contextmanager
-def no_access_beside(folder: Path) -> Iterator[None]:
-    """In the block only files below `folder`, of Python and of the repository are opened, and only the former written.
+def no_access_beside(folder: Path, written: tuple[Path, ...] | None = None) -> Iterator[None]:
+    """In the block only files below `folder`, of Python and of the repository are opened.
 
-    Python's audit events show it; a library's own reading in C is not seen. Raises Broken at the end of the block.
+    Only those below the folders `written` are written (None: below `folder`). Python's audit events show it; a
+    library's own reading in C is not seen. Raises Broken at the end of the block.
     """
-    global _allowed
+    global _allowed, _written
     if not _hooked:
         sys.addaudithook(_audit)
         _hooked.append(True)
     _violations.clear()
     _allowed = folder.resolve()
+    _written = tuple(str(one.resolve()) for one in written or (folder,))
     try:
         yield
     finally:
@@ -53,8 +56,8 @@ def _audit(event: str, args: tuple[Any, ...]) -> None:
     elif event in WRITING or (event == "open" and isinstance(args[0], str | bytes)):
         path = str(Path(args[0] if isinstance(args[0], str) else args[0].decode("utf-8", "replace")).absolute())
         writes = event in WRITING or bool(args[1] and set(str(args[1])) & set("wax+"))
-        inside = _below(path, str(_allowed)) or "__pycache__" in path  # where numba stores compiled code
-        if not inside and (writes or not _below(path, *_READABLE)):
+        is_code = "__pycache__" in path  # where numba stores compiled code
+        if not is_code and not (_below(path, *_written) if writes else _below(path, str(_allowed), *_READABLE)):
             _violations.append(f"{event} {path}")
 
 

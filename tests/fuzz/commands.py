@@ -20,31 +20,45 @@ from startrack.core.runner import Runner
 
 from .access import Broken, no_access_beside
 from .mutate import TEXTS, mutate
-from .seeds import CYLINDER, FRAME
+from .seeds import CYLINDER, FRAME, HEIGHT_MAP, hill_map, pillow, seeds
+from .seeds_beside import ODOMETRY
 from .targets import OUT_OF_MEMORY
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_images" / "near-centre"
 NIGHT = "2030-06-01T00:00:00Z"
 PREDICTED = ("--time", NIGHT, "--draws", "1", "--path", "way.csv", "--spacing", "200", "-j", "1")
+CAMERA = ("-c", "camera.toml")
 COMMANDS = (
     ("locate", "image.png", "--json", "--no-plots"), ("identify", "image.png", "--json", "--no-plots"),
     ("detect", "image.png", "--json", "--no-plots"), ("locate", "image.png", "--no-plots"),
     ("terrain", "show", "terrain.toml", "--json", "--no-plots"), ("calibrate", "show", "camera.toml"),
     ("calibrate", "convert", "camera.toml", "--to", "opencv", "-q"), ("track", "image.png", "--no-plots"),
-    ("calibrate", "image.png", "-c", "camera.toml", "-q", "-o"),
-    ("horizon", "image.png", "-c", "camera.toml", "--site=34,-111", "-q", "-o"),
-    ("report", "image.fix.json", "-q"), ("batch", ".", "--no-plots", "--report", "-j", "1"),
+    ("calibrate", "convert", "camera.toml", "--to", "platepar", "--attitude", "image.fix.json", "--site=34,-111", "-q"),
+    ("calibrate", "convert", "camera.toml", "--to", "indi-allsky", "--attitude", "image.fix.json", "--site=34,-111"),
+    ("calibrate", "convert", "camera.yaml", "--from", "ros", "-q"), ("calibrate", "verify", "image.png", *CAMERA),
+    ("calibrate", "image.png", *CAMERA, "-q", "-o"), ("horizon", "image.png", *CAMERA, "--site=34,-111", "-q", "-o"),
+    ("identify", "image.png", "--fov=180", "--no-plots"), ("identify", "image.png", "--near-sky=94,-68,20", "-q"),
+    ("locate", "image.png", "--near-attitude", "image.fix.json", "--near=400,-300,100", "-q", "--format=kml"),
+    ("track", "image.png", "--odometry", "drive.tum", "--max-speed=2", "--no-plots"),
+    ("terrain", "show", "map.toml", "--at", "0", "10"), ("terrain", "state", "terrain.toml", "--depth-sigma=30"),
+    ("terrain", "import", "hill.tif", "--latitude=-90", "--longitude=0", "--radius=800", "--half=2000", "-q", "-o"),
+    ("report", "image.fix.json", "-q"), ("report", ".", "-q"), ("batch", ".", "--no-plots", "--report", "-j", "1"),
     ("reproduce", "fig3.4", "--no-plots", "-j", "1"),
-    ("predict", "-t", "terrain.toml", "-c", "camera.toml", *PREDICTED, "--no-plots"),
-    ("render", "-t", "terrain.toml", "-c", "camera.toml", "--time", NIGHT, "-q"),
+    ("predict", "-t", "terrain.toml", *CAMERA, *PREDICTED, "--no-plots"),
+    ("render", "-t", "terrain.toml", *CAMERA, "--time", NIGHT, "-q"),
 )  # fmt: skip
 FILES = (  # that are mutated, with the kind of their changes
     ("png", "image.png"), ("sidecar", "image.json"), ("camera", "camera.toml"), ("terrain", "terrain.toml"),
-    ("sidecar", "image.fix.json"), ("terrain", "way.csv"),
+    ("sidecar", "image.fix.json"), ("terrain", "way.csv"), ("camera", "camera.yaml"), ("odometry", "drive.tum"),
+    ("table", "obstacles.csv"), ("correction", "mask.png"), ("correction", "dark.png"), ("elevation", "hill.tif"),
+    ("terrain", "map.toml"),
 )  # fmt: skip
 RESUMED = ("batch", "predict", "reproduce", "track")  # begin with the results of a run on sound files
 ENTRIES = 0.1  # of the mutations: the file becomes something else
-INPUTS = (".png", ".toml", ".json", ".csv")
+WITHOUT_OUTPUT = (("calibrate", "show"), ("calibrate", "verify"), ("terrain", "state"))
+SUFFIXES = {"horizon": ".csv"}  # of what -o names
+INPUTS = (".png", ".toml", ".json", ".csv", ".yaml", ".tum", ".tif")
+WORDS = 0.3  # of the mutations: a value among the words of the command
 REFUSE_SAMPLES = ("horizon", "batch")  # a sky of the Moon above a site on the Earth; a picture without a sidecar
 
 
@@ -58,13 +72,23 @@ def run_command(seed: int, index: int, folder: Path) -> str | None:
     results = _results_of(words, folder)
     stored = [("sidecar" if name.endswith(".json") else "raw", name) for name in results if is_read_again(name)]
     kind, name = random.choice(stored if stored and random.random() < 0.5 else FILES)
-    here = _begin(words, folder, small=kind == "png" and not results)
-    if random.random() < ENTRIES:
+    here = _begin(words, folder, small=kind in ("png", "correction") and not results)
+    values = [k for k, word in enumerate(words) if "=" in word]
+    if values and random.random() < WORDS:
+        words = _change_value(words, random.choice(values), random)
+    elif random.random() < ENTRIES:
         _change_entry(here / name, random)
     else:
         (here / name).write_bytes(mutate(kind, (here / name).read_bytes(), random))
-    with no_access_beside(folder):
+    with no_access_beside(folder, written=(here / "out", folder / "cache", *([here] if "state" in words else []))):
         return _run(words, here)
+
+
+def _change_value(words: tuple[str, ...], which: int, random: Random) -> tuple[str, ...]:
+    """The words with the value of one of them, of --flag=value the part after the sign, changed."""
+    flag, sign, value = words[which].rpartition("=")
+    changed = mutate("sidecar", value.encode(), random).replace(b"\0", b"").decode("utf-8", "replace")
+    return *words[:which], flag + sign + changed, *words[which + 1 :]
 
 
 def is_read_again(name: str) -> bool:
@@ -129,8 +153,10 @@ def _run(command: tuple[str, ...], folder: Path) -> str | None:
     words = [str(folder / word) if word == "." or Path(word).suffix in INPUTS else word for word in command]
     if command[0] == "report":
         words += ["-o", str(folder / "out" / "report.html")]
-    elif command[:2] != ("calibrate", "show"):
-        words += ["-D", str(folder / "out")] if "-o" not in words else [str(folder / f"out.{words[0]}.csv"), "-O"]
+    elif words[-1] == "-o":
+        words += [str(folder / "out" / f"new{SUFFIXES.get(words[0], '.toml')}"), "-O"]
+    elif command[:2] not in WITHOUT_OUTPUT:
+        words += ["-D", str(folder / "out")]
     out, err = io.StringIO(), io.StringIO()
     in_process = patch("startrack.cli.batch.Runner", partial(Runner, in_process=True))  # under our limits
     with in_process, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
@@ -160,9 +186,18 @@ def _write_sound(above: Path, *, small: bool) -> Path:
         camera = (data_dir("calib") / "fisheye-2048.toml").read_text()
     (folder / "camera.toml").write_text(camera)
     (folder / "terrain.toml").write_text(CYLINDER)
-    (folder / "image.json").write_text(json.dumps(facts | {"camera": "camera.toml", "terrain": "terrain.toml"}))
+    named = {"camera": "camera.toml", "terrain": "terrain.toml", "obstacles": "obstacles.csv"}
+    named |= {"mask": "mask.png", "dark": "dark.png"} if small else {}
+    for name, pixels in (("mask.png", np.full(FRAME.shape, 255)), ("dark.png", FRAME // 300)):
+        (folder / name).write_bytes(pillow(pixels, "PNG", eight=name == "mask.png"))
+    (folder / "image.json").write_text(json.dumps(facts | named))
     (folder / "image.fix.json").write_text(_result_of_sample())
     (folder / "way.csv").write_text("east_m,north_m\n0,0\n150,0\n")
+    (folder / "camera.yaml").write_bytes(seeds()["converted"][0])
+    (folder / "drive.tum").write_text(ODOMETRY)
+    (folder / "obstacles.csv").write_text("azimuth_deg,elevation_deg\n10,3\n12,3\n")
+    (folder / "hill.tif").write_bytes(hill_map())
+    (folder / "map.toml").write_text(HEIGHT_MAP)
     return folder
 
 
@@ -203,7 +238,9 @@ def _night() -> bytes:
 def _judge_command(words: list[str], code: int, out: str, err: str, folder: Path) -> str | None:
     """The reason of a refusal, None for an answer. Raises Broken."""
     where = f"{words[:2]} code {code}, printed {out[-300:]!r}, {err[-600:]!r}"
-    codes = (0, 2, 3, 4, 5) if words[0] in RESUMED else (0, 3, 4)
+    codes = (
+        {0, 3, 4} | ({2, 5} if words[0] in RESUMED else set()) | ({2} if any("=" in word for word in words) else set())
+    )
     if code not in codes or any(mark in out + err for mark in ("Traceback", "internal error", "Warning")):
         raise Broken(where)
     if any(mark in out + err for mark in OUT_OF_MEMORY):

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-START_S = 1_900_000_000.0
+START_S = 1_932_324_600.0  # eight minutes before the picture of SIDECAR
 ODOMETRY = "# time tx ty tz qx qy qz qw\n" + "".join(
     f"{START_S + 60 * k:.6f} {0.5 * k:g} {0.1 * k:g} 0 0 0 {np.sin(0.1 * k):.6f} {np.cos(0.1 * k):.6f}\n"
     for k in range(12)

@@ -13,9 +13,29 @@ from startrack.localization import ExactPosterior
 from startrack.localization.obstacle_chain import LEVELS_RAD, STATES, WRONG_SECTOR, transitions
 from startrack.localization.sector_likelihood import Sectors
 from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS, sector_of
-from startrack.terrain import ForwardingTerrain, Terrain
+from startrack.terrain import Cylinder, ForwardingTerrain, Terrain, load_terrain
 
+TERRAIN = load_terrain("shackleton-thesis")
+assert isinstance(TERRAIN, Cylinder)
+THESIS_STARS = 2142  # Kua 2008, eq. 3.8 at magnitude 6
 PART = 300  # positions at a time: their matrices fit the processor's cache
+
+
+def sky(rng: np.random.Generator, n: int) -> tuple[Array, Array]:
+    return 2 * np.pi * rng.random(n), np.arcsin(rng.random(n))
+
+
+def random_position(rng: np.random.Generator, terrain: Cylinder = TERRAIN) -> Array:
+    r, b = 0.98 * terrain.radius_m * np.sqrt(rng.random()), 2 * np.pi * rng.random()
+    return r * np.array([np.sin(b), np.cos(b)])
+
+
+def perfect_list(rng: np.random.Generator, at_m: Array, n: int = THESIS_STARS) -> Evidence:
+    azimuth, elevation = sky(rng, n)
+    seen = elevation > TERRAIN.horizon_rad(at_m[None], azimuth)
+    return Evidence(
+        azimuth_rad=azimuth, elevation_rad=elevation, llr=np.where(seen, 12.0, -12.0), edge_sigma_rad=np.zeros(n)
+    )
 
 
 def slow_contributions(evidence: Evidence, margin_rad: Array, sigma_rad: Array) -> Array:

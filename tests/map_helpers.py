@@ -1,10 +1,14 @@
-"""Projections and labels of maps for tests."""
+"""Projections, labels and a small map for tests."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from startrack.terrain.raster import STEREOGRAPHIC, Projection
+from startrack.frames import Site
+from startrack.terrain import STEREOGRAPHIC, HeightMap, Projection, Raster
+
+SITE = Site("moon", -1.5, 0.3, 0.0)
+POSTS, POST_M, SIGMA_M = 61, 60.0, 4.0  # of `basin`
 
 PDS3 = """PDS_VERSION_ID = PDS3
 RECORD_TYPE = FIXED_LENGTH
@@ -47,3 +51,20 @@ def polar_stereographic(
     return Projection(
         kind=STEREOGRAPHIC, latitude_rad=pole, longitude_rad=longitude_rad, scale=float((1 + np.sin(abs(at))) / 2)
     )
+
+
+def basin(height_sigma_m: float = SIGMA_M) -> HeightMap:
+    """Two ridges around a floor: the inner one just below the outer one in the west, far below it in the east."""
+    line = (np.arange(POSTS) - POSTS // 2) * POST_M
+    east, north = np.meshgrid(line, -line)
+    away = np.hypot(east, north)
+    inner, outer = (np.exp(-0.5 * ((away - at) / 120.0) ** 2) for at in (700.0, 1400.0))
+    heights = (
+        (204.0 - 50.0 * (east > 0)) * inner + 420.0 * outer + 4.0 * np.sin(away / 90.0 + 3 * np.arctan2(east, north))
+    )
+    projection = Projection(kind=STEREOGRAPHIC, latitude_rad=SITE.latitude_rad, longitude_rad=SITE.longitude_rad)
+    raster = Raster(
+        heights_m=heights.astype(np.float32), source="basin", dx_m=POST_M, dy_m=-POST_M, projection=projection,
+        x0_m=float(line[0]), y0_m=-float(line[0]),
+    )  # fmt: skip
+    return HeightMap(name="basin", site=SITE, maps=(raster,), search_radius_m=300.0, height_sigma_m=height_sigma_m)

@@ -6,34 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from map_helpers import POST_M, POSTS, SIGMA_M, basin
 
-from startrack.frames import Site
-from startrack.terrain import NO_POST, STEREOGRAPHIC, ExpectedCrests, HeightMap, Projection, Raster
+from startrack.terrain import NO_POST, ExpectedCrests, HeightMap
 from startrack.terrain.crest_kernel import take_larger
 
-SITE = Site("moon", -1.5, 0.3, 0.0)
-POSTS, POST_M, SIGMA_M = 61, 60.0, 4.0
 AZIMUTHS = np.linspace(0.02, 2 * np.pi, 90, endpoint=False)
 CAMERA_M = np.array([11.0, -17.0])
 GROUNDS = 400
 pytestmark = pytest.mark.usefixtures("own_cache")
-
-
-def basin(height_sigma_m: float = SIGMA_M) -> HeightMap:
-    """Two ridges around a floor: the inner one just below the outer one in the west, far below it in the east."""
-    line = (np.arange(POSTS) - POSTS // 2) * POST_M
-    east, north = np.meshgrid(line, -line)
-    away = np.hypot(east, north)
-    inner, outer = (np.exp(-0.5 * ((away - at) / 120.0) ** 2) for at in (700.0, 1400.0))
-    heights = (
-        (204.0 - 50.0 * (east > 0)) * inner + 420.0 * outer + 4.0 * np.sin(away / 90.0 + 3 * np.arctan2(east, north))
-    )
-    projection = Projection(kind=STEREOGRAPHIC, latitude_rad=SITE.latitude_rad, longitude_rad=SITE.longitude_rad)
-    raster = Raster(
-        heights_m=heights.astype(np.float32), source="basin", dx_m=POST_M, dy_m=-POST_M, projection=projection,
-        x0_m=float(line[0]), y0_m=-float(line[0]),
-    )  # fmt: skip
-    return HeightMap(name="basin", site=SITE, maps=(raster,), search_radius_m=300.0, height_sigma_m=height_sigma_m)
 
 
 @pytest.fixture(scope="module")

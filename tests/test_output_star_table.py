@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -105,18 +107,21 @@ def test_a_full_table_has_a_line_for_each_star(located):
 
 
 def test_texts_with_commas_quotes_and_letters_from_afar(tmp_path):
-    texts = ["plain", "a, b", 'say "so"', "Škoda", ""]
+    texts = ["plain", "a, b", 'say "so"', "Škoda", "drive.mcap#12", ""]
     columns = [
         Column("text", texts, "string", description="it's a text"),
-        Column("number", ["1", "", "3", "", "5"], "int64"),
-        Column("yes", [True, False, True, True, False], "bool"),
+        Column("number", ["1", "", "3", "", "5", "6"], "int64"),
+        Column("yes", [True, False, True, True, False, True], "bool"),
     ]
     path = tmp_path / "t.ecsv"
     path.write_text(ecsv_text(columns), encoding="utf-8")
     table = Table.read(path, format="ascii.ecsv")
     assert table["text"].filled("").tolist() == texts
-    assert table["number"].filled(-1).tolist() == [1, -1, 3, -1, 5]
-    assert table["yes"].tolist() == [True, False, True, True, False]
+    assert table["number"].filled(-1).tolist() == [1, -1, 3, -1, 5, 6]
+    assert table["yes"].tolist() == [True, False, True, True, False, True]
     assert table["text"].description == "it's a text"
+    rows = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+    assert "#" not in re.sub('"[^"]*"', "", "".join(rows))  # pandas ends a line at a # outside quotes
+    assert [row["text"] for row in csv.DictReader(rows)] == texts
     with pytest.raises(ValueError, match="different lengths"):
         ecsv_text([*columns, Column("short", [1.0])])

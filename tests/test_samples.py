@@ -10,6 +10,7 @@ import pytest
 from startrack.exposure import read_exposure
 from startrack.exposure.png import decode as decode_png
 from startrack.frames import R_enu_icrs, R_from_quat_xyzw, parse_utc
+from startrack.output.html.details import read_ecsv
 from startrack.terrain import load_terrain
 
 SAMPLES = Path(__file__).parent.parent / "sample_images"
@@ -76,3 +77,11 @@ def test_the_tilted_sample_lost_part_of_the_rim():
 def test_the_folder_stays_small():
     size = sum(path.stat().st_size for path in SAMPLES.iterdir() if path.is_file())
     assert size < 30e6
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_table_of_the_truth_has_the_stars(name):
+    _, rows = read_ecsv(SAMPLES / f"{name}.truth.ecsv")
+    assert sum(row["hidden"] == "False" for row in rows) > 500
+    assert {row["catalog_id"].split()[0] for row in rows} >= {"HIP"}
+    assert max(float(row["v_mag"]) for row in rows) <= 6.0

@@ -1,5 +1,6 @@
 """Results for people and programs: JSON, tables, pictures, pages, one-line summaries, and the table of quantities."""
 
+from startrack.core.ecsv import Column, ecsv_text
 from startrack.output.geo import feature, geojson_text
 from startrack.output.html import fill_frame, page_text, write_page
 from startrack.output.html.details import ground_map
@@ -26,7 +27,6 @@ from startrack.output.qgis import qgis_style_text
 from startrack.output.quantities import QUANTITIES, table_columns
 from startrack.output.quantity import (
     ABSENT,
-    Column,
     Kind,
     Quantity,
     Schema,
@@ -51,7 +51,6 @@ from startrack.output.record import (
 from startrack.output.schema import SCHEMAS
 from startrack.output.tables import (
     cloud_texts,
-    ecsv_text,
     quantity_columns,
     skyline_table_text,
     skyline_texts_deg,

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from startrack import __version__
 from startrack.chain import Detected, Identified, Inputs, Located, Measured, Oriented
+from startrack.core.ecsv import Column
 from startrack.frames import format_utc
 from startrack.output.quantities_pose import ATTITUDE_QUANTITIES, POSITION_QUANTITIES
-from startrack.output.quantity import Column, Listed, Quantity, Show, list_schema, show_everywhere
+from startrack.output.quantity import Listed, Quantity, Show, list_schema, show_everywhere
 from startrack.output.values import blocked_deg, chance_text, file_or_name, predicted_visible, ranges_text
 
 Q = Quantity

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
+from startrack.core.ecsv import Column
+
 Schema = dict[str, Any]
 Kind = str | Schema  # a schema, or its word in KINDS
 KINDS: dict[str, Schema] = {
@@ -134,27 +136,6 @@ class Quantity:
             Column(name, (), kind, unit, self.form, self.description, (*self.path.split("."), *at))
             for name, at in columns.items()
         ]
-
-
-@dataclass(frozen=True)
-class Column:
-    """A column of a table: its heading and its values, None, nan or an empty text where there is none."""
-
-    name: str
-    values: Iterable[Any] = ()
-    datatype: str = "float64"  # or int64, string, bool, as ECSV names them
-    unit: str | None = None  # as astropy spells it
-    form: str = "%s"  # printf format of a value
-    description: str = ""
-    path: tuple[Any, ...] = ()  # keys and indices that lead to the value in a record
-
-    def value(self, record: Any) -> Any:
-        """The value in a `record`; None if that lacks it."""
-        for key in self.path:
-            if record is None or (isinstance(key, str) and key not in record):
-                return None
-            record = record[key]
-        return record
 
 
 def show_everywhere(label: str, form: str, line: str) -> tuple[Show, ...]:

@@ -1,12 +1,8 @@
-"""Tables as ECSV: of stars, of a measured skyline, and of quantities.
-
-ECSV 1.0 (Astropy Proposal for Enhancement 6) is a table that astropy, TOPCAT and spreadsheets read. It is written here
-in a tenth of the time that astropy takes. Comma-separated; an empty field is a masked value.
-"""
+"""Tables of stars, of a measured skyline, and of quantities."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -15,10 +11,11 @@ from numpy.typing import NDArray
 
 from startrack.catalog import star_names
 from startrack.chain import Inputs, Measured, Oriented
-from startrack.core.table_text import column_lines, join_columns
+from startrack.core.ecsv import Column, ecsv_text
+from startrack.core.table_text import column_lines
 from startrack.core.types import Array, Ints, MeasuredSkyline
 from startrack.evidence import SEEN_LLR
-from startrack.output.quantity import Column, Quantity
+from startrack.output.quantity import Quantity
 
 if TYPE_CHECKING:
     from startrack.evidence import StarPhotometry
@@ -27,28 +24,6 @@ IDENTIFIED = "identified", "predicted"  # without a terrain
 STAR_STATUSES = ("seen", "hidden", "uncertain", "unusable")
 FAINTER_THAN_FAINTEST_MATCH_MAG = 0.5
 LEAST_HALF_RAD, MOST_HALF_RAD = np.radians(0.02), np.radians(5.0)
-
-
-def ecsv_text(columns: Sequence[Column]) -> str:
-    """The table as ECSV. Texts must be free of line breaks. Raises ValueError for columns of different lengths."""
-    head, bodies, lengths = ["# %ECSV 1.0", "# ---", "# delimiter: ','", "# datatype:"], [], set()
-    for one in columns:
-        unit, description = f"unit: {one.unit}, " if one.unit else "", one.description.replace("'", "''")
-        head.append(f"# - {{name: '{one.name}', {unit}datatype: {one.datatype}, description: '{description}'}}")
-        lines = column_lines(one.form, one.values)
-        if one.datatype == "string" and (b"," in lines or b'"' in lines):
-            lines = b"\n".join([_quoted(line) for line in lines.split(b"\n")])
-        bodies.append(lines)
-        lengths.add(lines.count(b"\n"))
-    if len(lengths) > 1:
-        raise ValueError(f"columns of different lengths: {sorted(lengths)}")
-    head += ["# schema: astropy-2.0", ",".join(column.name for column in columns)]
-    return "\n".join([*head, join_columns(bodies).decode()])
-
-
-def _quoted(text: bytes) -> bytes:
-    """A text in quotes if it holds a comma or a quote."""
-    return b'"%b"' % text.replace(b'"', b'""') if b"," in text or b'"' in text else text
 
 
 def quantity_columns(quantities: Iterable[Quantity], values: Mapping[str, Iterable[Any]]) -> list[Column]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Sensor
+from startrack.core.ecsv import Column, ecsv_text
 from startrack.core.files import write_atomically
 from startrack.core.types import Array, Exposure, Stars
 from startrack.frames import off_axis_rad, quat_xyzw_from_R
@@ -21,14 +22,6 @@ from startrack.rendering.sky import diffuse_e
 from startrack.rendering.sources import add_sources, flux_e, is_above_terrain, splat
 
 # ECSV 1.0 (astropy enhancement proposal 6), written as text: astropy.table would take longer than the rendering.
-_COLUMNS = (
-    ("catalog_id", "string", None, "HIP, FIELD (not in the catalogue) or the name of a body"),
-    ("x_px", "float64", "pix", "at mid-exposure; (0, 0) is the centre of the top-left pixel"),
-    ("y_px", "float64", "pix", "at mid-exposure"),
-    ("v_mag", "float64", "mag", "as the catalogue states it"),
-    ("flux_e", "float64", "electron", "whole PSF, from v_mag"),
-    ("hidden", "bool", None, "the terrain hides it at mid-exposure"),
-)
 ADC_MAX_ADU = 65535.0  # 16 bits
 POISSON_UP_TO_E = 64.0  # above it the normal distribution is used (skewness under 1/8), five times as fast
 HOT_E_PER_S = (50.0, 50_000.0)  # dark current of hot pixels: even in its logarithm, from barely visible to glaring
@@ -128,22 +121,17 @@ def write_truth(
 
 def truth_ecsv(truth: Truth, to_v_mag: float) -> str:
     """The table of sources down to `to_v_mag` as the text of an ECSV file, in the order of the truth."""
-    head = ["# %ECSV 1.0", "# ---", "# datatype:"]
-    for name, kind, unit, description in _COLUMNS:
-        unit_text = f"unit: {unit}, " if unit else ""
-        head.append(f"# - {{name: {name}, {unit_text}datatype: {kind}, description: '{description}'}}")
-    head += ["# schema: astropy-2.0", " ".join(name for name, *_ in _COLUMNS)]
     kept = truth.sources.v_mag <= to_v_mag
-    rows = zip(
-        truth.sources.catalog_id[kept].tolist(),
-        truth.xy_px[kept].tolist(),
-        truth.sources.v_mag[kept].tolist(),
-        truth.flux_e[kept].tolist(),
-        truth.hidden[kept].tolist(),
-        strict=True,
-    )
-    body = [f'"{name}" {x:.4f} {y:.4f} {v:.4f} {flux:.6g} {hidden}' for name, (x, y), v, flux, hidden in rows]
-    return "\n".join(head + body) + "\n"
+    name, (x_px, y_px) = truth.sources.catalog_id[kept], truth.xy_px[kept].T
+    origin = "at mid-exposure; (0, 0) is the centre of the top-left pixel"
+    return ecsv_text([
+        Column("catalog_id", name, "string", description="HIP, FIELD (not in the catalogue) or the name of a body"),
+        Column("x_px", x_px, "float64", "pix", "%.4f", origin),
+        Column("y_px", y_px, "float64", "pix", "%.4f", "at mid-exposure"),
+        Column("v_mag", truth.sources.v_mag[kept], "float64", "mag", "%.4f", "as the catalogue states it"),
+        Column("flux_e", truth.flux_e[kept], "float64", "electron", "%.6g", "whole PSF, from v_mag"),
+        Column("hidden", truth.hidden[kept], "bool", description="the terrain hides it at mid-exposure"),
+    ])  # fmt: skip
 
 
 def draw_hot_pixels(size_px: tuple[int, int], count: int, *, rng: np.random.Generator) -> HotPixels:

@@ -414,7 +414,7 @@ def test_a_build_prints_one_line_and_an_interrupted_one_is_discarded(tmp_path, c
     assert json.loads(heard.out)["known_before"] is False
     assert len(heard.err.splitlines()) == 1
     assert "hill: computed now, once" in heard.err
-    assert [one.suffix for one in table.parent.iterdir()] == [".npz"]
+    assert [one.suffix for one in table.parent.iterdir()] == [".table"]
     assert main(["terrain", "build", str(path), "-q", "--force"]) == 0
     assert capsys.readouterr().err == ""
 

@@ -240,12 +240,19 @@ def test_the_table_is_kept_and_found_again_by_content(shackleton, caplog):
     first = terrain.maps[0]
     other = replace(first, heights_m=first.heights_m + np.float32(0.5))
     assert replace(terrain, maps=(other, *terrain.maps[1:])).table_key != key
-    path.write_bytes(path.read_bytes()[:1000])
-    cache.TABLES_IN_MEMORY.pop(key)
-    assert cache.load_table(key, terrain.square) is None  # a damaged table is made again
-    assert f"{path} cannot be read (cut short?): made anew" in caplog.text
-    cache.keep_table(key, table)
-    assert cache.load_table(key, terrain.square) is table
+
+
+@pytest.mark.parametrize("fault", ["cut short", "empty", "one bit"])
+def test_a_damaged_table_is_made_anew_with_one_line(shackleton, caplog, fault):
+    terrain = replace(shackleton, camera_height_m=1.8, search_radius_m=100.0)
+    path, values = terrain.table_path, terrain.table.values
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= fault == "one bit"
+    path.write_bytes(data[: {"cut short": 1000, "empty": 0}.get(fault)])
+    cache.TABLES_IN_MEMORY.pop(terrain.table_key)
+    assert np.array_equal(replace(terrain).table.values, values)
+    assert caplog.messages.count(f"the table of horizons {path} is damaged: made anew") == 1
+    assert cache.read_sealed(path) is not None
 
 
 def test_of_two_that_need_a_table_one_makes_it(shackleton, monkeypatch):
@@ -266,7 +273,7 @@ def test_of_two_that_need_a_table_one_makes_it(shackleton, monkeypatch):
         tables = list(pool.map(lambda terrain: terrain.table, terrains))
     assert len(made) == 1
     assert all(np.array_equal(table.values, tables[0].values) for table in tables)
-    assert [p.suffix for p in path.parent.iterdir() if p.stem == path.stem] == [".npz"]
+    assert [p.suffix for p in path.parent.iterdir() if p.stem == path.stem] == [".table"]
 
 
 @pytest.mark.slow

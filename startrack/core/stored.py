@@ -22,13 +22,18 @@ def write_sealed(path: FilePath, data: bytes) -> None:
     write_atomically(path, data + hashlib.sha256(data).digest(), overwrite=True)
 
 
-def read_sealed(path: FilePath) -> bytes | None:
+def read_sealed(path: FilePath) -> bytearray | None:
     """The data that `write_sealed` wrote to `path`; None where there is no such file, or any byte of it has changed."""
     try:
-        whole = Path(path).read_bytes() if os.path.isfile(path) else b""  # reading a pipe would block
+        if not os.path.isfile(path):  # reading a pipe would block
+            return None
+        with open(path, "rb") as file:
+            data = bytearray(os.fstat(file.fileno()).st_size)  # read in place: tables of horizons have 130 MB
+            file.readinto(data)
     except OSError:
         return None
-    data, seal = whole[:-SEAL_BYTES], whole[-SEAL_BYTES:]
+    seal = bytes(data[-SEAL_BYTES:])
+    del data[-SEAL_BYTES:]
     return data if hashlib.sha256(data).digest() == seal else None
 
 

@@ -12,12 +12,13 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 from weakref import WeakValueDictionary
-from zipfile import BadZipFile
 
 import numpy as np
 
-from startrack.core.files import atomic_file, hold_lock
+from startrack.core.errors import BadInput
+from startrack.core.files import hold_lock
 from startrack.core.runner import count_cores
+from startrack.core.stored import read_sealed, write_sealed
 from startrack.core.types import Array, Ints
 from startrack.terrain.horizon_table import (
     AZIMUTH_BINS,
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from startrack.terrain.traced_map import TracedMap
 
 LOG = logging.getLogger(__name__)
-VERSION = 5  # of the tracing and of the table's format
+VERSION = 6  # of the tracing and of the table's format
 UNKNOWN_FROM = 12  # points across the square at which the ends of the maps are looked up
 
 # Terrains that need the same table share one in memory, for as long as one of them lives.
@@ -65,25 +66,16 @@ def key_of_table(ground: TracedMap) -> str:
 
 def path_of_table(key: str) -> Path:
     """File of the table with this key."""
-    return cache_dir() / f"{key[:40]}.npz"
+    return cache_dir() / f"{key[:40]}.table"
 
 
 def load_table(key: str, square: Square) -> HorizonTable | None:
-    """The table of a `square` from memory or disk; None if there is none that can be read."""
+    """The table of a `square` from memory or disk; None if there is none, or any byte of it has changed."""
     table = TABLES_IN_MEMORY.get(key)
-    if table is None:
-        path = path_of_table(key)
-        if not path.is_file():
-            return None
-        try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-                values, unknown = arrays["values"], arrays["unknown_rad"]
-        except (OSError, ValueError, KeyError, EOFError, BadZipFile):
-            LOG.warning("the table of horizons %s cannot be read (cut short?): made anew", path)
-            return None
-        if values.shape != (square.across**2, AZIMUTH_BINS, FIELDS) or unknown.shape != (AZIMUTH_BINS,):
-            return None
-        TABLES_IN_MEMORY[key] = table = HorizonTable(square, values, unknown)
+    if table is None and (data := read_sealed(path_of_table(key))) is not None:
+        unknown_rad = np.frombuffer(data, np.float64, AZIMUTH_BINS)
+        values = np.frombuffer(data, np.uint16, offset=unknown_rad.nbytes).reshape(-1, AZIMUTH_BINS, FIELDS)
+        TABLES_IN_MEMORY[key] = table = HorizonTable(square, values, unknown_rad)
     return table
 
 
@@ -91,9 +83,8 @@ def keep_table(key: str, table: HorizonTable) -> bool:
     """Keep the table in memory and, if the folder can be written, on disk; whether it can."""
     TABLES_IN_MEMORY[key] = table
     try:
-        with atomic_file(path_of_table(key)) as temporary, temporary.open("xb") as file:
-            np.savez(file, values=table.values, unknown_rad=table.unknown_rad)
-    except OSError:
+        write_sealed(path_of_table(key), table.unknown_rad.tobytes() + table.values.tobytes())
+    except BadInput:
         return False
     return True
 
@@ -114,6 +105,8 @@ def load_or_build_table(ground: TracedMap, progress: Progress | None = None) -> 
     with _single_builder(path_of_table(key).with_suffix(".lock"), ground.name):
         table = load_table(key, ground.square)
         if table is None:
+            if os.path.lexists(path_of_table(key)):
+                LOG.warning("the table of horizons %s is damaged: made anew", path_of_table(key))
             LOG.info("horizons of %s: computed now, once; this may take minutes", ground.name)
             start = clock.perf_counter()
             table = build_table(ground, progress)

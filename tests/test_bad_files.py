@@ -19,14 +19,17 @@ from typing import Any
 import numpy as np
 import pytest
 from batch_helpers import frames
+from earth_helpers import in_projection
 
 from startrack.cli.main import main
 from startrack.core.errors import BadInput, BadOutput, NotLocated
 from startrack.core.files import write_atomically
 from startrack.exposure import read_exposure
 from startrack.output import remove_companions, write_results
+from startrack.terrain import read_map, write_bands, write_map
 
 ROOT = Path(__file__).parent.parent
+MAP = ROOT / "terrain" / "site01-10m.tif"
 BAD_INPUT, NOT_ALL = 4, 5
 DEEP = "[" * 100_000
 OUTPUTS = (  # commands that write one file, up to its name
@@ -106,7 +109,9 @@ def test_only_regular_files_are_replaced(tmp_path, capsys, kind, name):
     before = path.lstat()
     with time_limit(60):
         assert main(["detect", str(image), "-D", str(tmp_path / "out"), "-O"]) == BAD_INPUT
-    (line,) = capsys.readouterr().out.splitlines()
+    printed = capsys.readouterr()
+    (line,) = printed.out.splitlines()
+    assert "next:" not in printed.err  # the advice of bad_image is about pictures
     assert f"{name}: cannot be replaced: it is no regular file; remove it, or write elsewhere" in line
     assert "-O" not in line
     assert path.lstat() == before
@@ -250,24 +255,61 @@ def test_a_folder_in_place_of_a_table_is_named(tmp_path, capsys):
     assert "full" not in err and "space" not in err
 
 
+@contextmanager
+def file_limit(largest_kb: int) -> Iterator[None]:
+    """In the block no file may be larger: stands for a full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1024 * largest_kb, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
 @pytest.mark.parametrize("largest_kb", [4, 100, 900])
 def test_a_full_disk_leaves_no_part_of_a_fix(located, tmp_path, largest_kb):
-    """A limit on file sizes stands for the full disk: of the record, of the star table, or of the picture alone."""
+    """For the record, for the star table, or for the picture alone."""
     path = tmp_path / "small.fix.json"
     write_results(located.result, path)
     sizes = {one.name: one.stat().st_size for one in tmp_path.iterdir()}
     assert min(sizes.values()) < 1024 * largest_kb < max(sizes.values())
     remove_companions(path)
     path.unlink()
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1024 * largest_kb, limits[1]))
-    try:
-        with pytest.raises(BadInput, match=r"cannot be written \(File too large\)") as refusal:
-            write_results(located.result, path)
-        assert (refusal.value.reason, refusal.value.reason.exit_code) == ("disk_full", BAD_INPUT)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with file_limit(largest_kb), pytest.raises(BadInput, match=r"cannot be written \(File too large\)") as refusal:
+        write_results(located.result, path)
+    assert (refusal.value.reason, refusal.value.reason.exit_code) == ("disk_full", BAD_INPUT)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("projection", ["moon", "EPSG:32616"])
+def test_a_map_on_a_full_disk_is_named_and_leaves_nothing(tmp_path, projection):
+    """Maps of the Earth are made by rasterio, which says that a write failed and not why."""
+    raster = read_map(MAP) if projection == "moon" else in_projection(projection, 75.0)
+    with file_limit(4):
+        for write in (write_map, lambda path, one: write_bands(path, one, dict.fromkeys("ab", one.heights_m))):
+            with pytest.raises(BadInput, match=r"a\.tif: cannot be written \(File too large\)") as refusal:
+                write(tmp_path / "a.tif", raster)
+            assert refusal.value.reason == "disk_full"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_import_on_a_full_disk_leaves_nothing(tmp_path, capsys):
+    words = ["--latitude", "-89.66", "--longitude", "129.78", "-o", str(tmp_path / "z.toml")]
+    with file_limit(4):
+        assert main(["terrain", "import", str(MAP), *words]) == BAD_INPUT
+    assert f"disk_full: {tmp_path}/z-1.tif: cannot be written (File too large)" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["pipe", "loop"])
+@pytest.mark.parametrize("name", ["predict.tif", "predict.ecsv"])
+def test_predict_refuses_names_that_take_no_file_before_it_draws(tmp_path, capsys, kind, name):
+    put(tmp_path / name, kind)
+    words = ["-t", "shackleton-thesis", "-c", "fisheye-2048", "--time", "2030-01-01T00:00:00Z", "--draws", "1000"]
+    with time_limit(60):
+        assert main(["predict", *words, "-D", str(tmp_path)]) == 2
+    assert f"{name}: cannot be replaced: it is no regular file" in capsys.readouterr().err
+    assert [one.name for one in tmp_path.iterdir()] == [name]
 
 
 def test_a_colour_jpeg_takes_a_bounded_memory(tmp_path):

@@ -45,7 +45,8 @@ def print_outcome(args: argparse.Namespace, record: dict[str, Any], line: str) -
         print(line, file=sys.stderr if args.quiet else sys.stdout, flush=True)
     for need in () if args.quiet else record.get("explain", ()):
         print(f"  needs {need}", file=sys.stderr, flush=True)
-    print_advice(record["reason"], record.get("message", ""), args)
+    if "advice" in record:
+        print_advice(record["reason"], record["message"], args)
     return errors.exit_code_of(record["reason"])
 
 

@@ -39,17 +39,14 @@ def show(args: argparse.Namespace) -> int:
 
 def _draw(args: argparse.Namespace, terrain: Terrain, position: tuple[float, float] | None) -> list[str]:
     """Write the relief and, seen from a position, the horizon; the paths of the pictures."""
-    from PIL import Image
-
-    from startrack.output import horizon_picture, relief_picture
+    from startrack.output import horizon_picture, png_bytes, relief_picture
 
     out, stem = files.make_folder(args.dir, "bad_terrain"), files.file_stem(terrain.name)
     pictures = {out / f"{stem}.relief.png": relief_picture(terrain, position)}
     if position is not None:
         pictures[out / f"{stem}.horizon.png"] = horizon_picture(terrain, position)
     for path, picture in pictures.items():
-        files.check_output(path, overwrite=True, reason="bad_terrain")
-        Image.fromarray(picture).save(path)
+        files.write_atomically(path, png_bytes(picture), overwrite=True, reason="bad_terrain")
     return [str(path) for path in pictures]
 
 

@@ -182,24 +182,6 @@ def file_stem(name: str) -> str:
     return stem.encode("utf-8", "replace")[:MAX_STEM_BYTES].decode("utf-8", "ignore") or "unnamed"
 
 
-@contextmanager
-def atomic_file(path: FilePath) -> Iterator[Path]:
-    """A temporary path in the folder of `path`, renamed to it at the end of the block, removed after an exception.
-
-    Missing folders are made. Raises OSError, and ValueError for a name that the system cannot take.
-    """
-    target = Path(path)
-    # In the same folder, because a rename does not cross file systems; tempfile would make the file private.
-    temporary = target.with_name(f".{uuid4().hex}.part")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        yield temporary
-        os.replace(temporary, target)
-    finally:
-        with suppress(OSError):  # renamed already; and a failed clean-up must not hide the cause
-            temporary.unlink()
-
-
 def write_atomically(path: FilePath, data: bytes, *, overwrite: bool, reason: str = "bad_image") -> None:
     """Write a file that appears under its name only when it is complete; missing folders are made.
 
@@ -207,11 +189,18 @@ def write_atomically(path: FilePath, data: bytes, *, overwrite: bool, reason: st
     disk is full.
     """
     check_free(path, overwrite=overwrite, reason=reason)
+    # In the same folder, because a rename does not cross file systems; tempfile would make the file private.
+    target, temporary = Path(path), Path(path).parent / f".{uuid4().hex}.part"
     try:
-        with atomic_file(path) as temporary, temporary.open("xb") as file:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with temporary.open("xb") as file:
             file.write(data)
-    except (OSError, ValueError) as cause:
+        os.replace(temporary, target)
+    except (OSError, ValueError) as cause:  # ValueError: a name with a null character
         raise _write_error(cause, reason, path, "cannot be written") from cause
+    finally:
+        with suppress(OSError, ValueError):  # renamed already; and a failed clean-up must not hide the cause
+            temporary.unlink()
 
 
 def _write_error(cause: Exception, reason: str, path: FilePath, text: str, advice: str = "") -> BadInput:

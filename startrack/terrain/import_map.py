@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 
 from startrack.core.errors import BadOutput, length_text
-from startrack.core.files import check_output, data_dir
+from startrack.core.files import check_output, data_dir, write_atomically
 from startrack.core.types import BadInput
 from startrack.frames import EARTH_RADIUS_M, Site
 from startrack.terrain.earth_projection import geoid_at
@@ -169,7 +169,8 @@ def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, c
         if errors.common_crest_sigma_m is not None:
             angle_rad = errors.common_crest_sigma_m * crest_angle_rad_per_m(cast(HeightMap, terrain))
             values["dem"]["horizon_sigma_deg"] = float(f"{np.degrees(angle_rad):.2g}")
-        output.write_text(errors.comment_lines(values["body"]) + tomli_w.dumps(values), encoding="utf-8")
+        text = errors.comment_lines(values["body"]) + tomli_w.dumps(values)
+        write_atomically(output, text.encode("utf-8"), overwrite=True, reason="bad_terrain")
     except BaseException:
         for path in written:
             path.unlink(missing_ok=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.files import atomic_file
+from startrack.core.files import write_atomically
 from startrack.terrain.earth_projection import WGS84_CODE, EarthProjection
 from startrack.terrain.raster import EQUIRECTANGULAR, ORTHOGRAPHIC, STEREOGRAPHIC, Projection, Raster
 
@@ -23,7 +24,7 @@ def write_map(path: str | Path, raster: Raster, *, step_m: float | None = None, 
     """Write the map `raster` to `path` as deflated 16-bit steps with scale and offset, as GDAL reads them.
 
     Heights are rounded to `offset_m`, by default the lowest, plus multiples of `step_m`, by default a 65,000th of
-    their range. The file appears when complete. Raises OSError.
+    their range. The file appears when complete. Raises BadInput bad_terrain or disk_full where it cannot be written.
     """
     import tifffile
 
@@ -38,21 +39,21 @@ def write_map(path: str | Path, raster: Raster, *, step_m: float | None = None, 
     )
     no_data = NO_HEIGHT if np.isnan(h).any() else None
     if raster.projection.wkt:
-        with atomic_file(path) as temporary:
-            _write_with_rasterio(temporary, raster, values[None], no_data, scales=(step,), offsets=(offset,))
-        return
-    tags = _tags(raster, items, None if no_data is None else str(no_data))
-    with atomic_file(path) as temporary:
+        data = _rasterio_bytes(raster, values[None], no_data, scales=(step,), offsets=(offset,))
+    else:
         tifffile.imwrite(
-            temporary, values, compression="deflate", compressionargs={"level": 9}, predictor=True, extratags=tags,
-            metadata=None, rowsperstrip=256, software="startrack",
+            file := io.BytesIO(), values, compression="deflate", compressionargs={"level": 9}, predictor=True,
+            extratags=_tags(raster, items, None if no_data is None else str(no_data)), metadata=None, rowsperstrip=256,
+            software="startrack",
         )  # fmt: skip
+        data = file.getvalue()
+    write_atomically(path, data, overwrite=True, reason="bad_terrain")
 
 
 def write_bands(path: str | Path, frame: Raster, bands: Mapping[str, NDArray[np.float32]]) -> None:
     """Write named `bands` (rows, columns) to `path`, at the posts of a `frame`; NaN where there is no value.
 
-    The file appears when complete. Raises OSError.
+    The file appears when complete. Raises BadInput bad_image or disk_full where it cannot be written.
     """
     import tifffile
 
@@ -61,33 +62,38 @@ def write_bands(path: str | Path, frame: Raster, bands: Mapping[str, NDArray[np.
     )
     values = np.stack([np.asarray(band, dtype=np.float32) for band in bands.values()])
     if frame.projection.wkt:
-        with atomic_file(path) as temporary:
-            _write_with_rasterio(temporary, frame, values, np.nan, descriptions=tuple(bands))
-        return
-    with atomic_file(path) as temporary:
+        data = _rasterio_bytes(frame, values, np.nan, descriptions=tuple(bands))
+    else:
         tifffile.imwrite(
-            temporary, values, photometric="minisblack", planarconfig="separate", compression="deflate",
+            file := io.BytesIO(), values, photometric="minisblack", planarconfig="separate", compression="deflate",
             compressionargs={"level": 9}, extratags=_tags(frame, items, "nan"), metadata=None, software="startrack",
         )  # fmt: skip
+        data = file.getvalue()
+    write_atomically(path, data, overwrite=True)
 
 
-def _write_with_rasterio(
-    path: Path, frame: Raster, values: NDArray[Any], no_data: float | None, **facts: tuple[Any, ...]
-) -> None:
-    """Write bands (bands, rows, columns) at the posts of a map of the Earth; `facts` of each by rasterio's names."""
+def _rasterio_bytes(
+    frame: Raster, values: NDArray[Any], no_data: float | None, **facts: tuple[Any, ...]
+) -> bytes:  # fmt: skip
+    """GeoTIFF of bands (bands, rows, columns) at the posts of a map of the Earth; `facts` of each by rasterio's names.
+
+    Made in memory: GDAL does not tell why a disk takes no file.
+    """
     import rasterio
 
     place = rasterio.Affine(
         frame.dx_m, 0.0, frame.x0_m - 0.5 * frame.dx_m, 0.0, frame.dy_m, frame.y0_m - 0.5 * frame.dy_m
     )
-    with rasterio.open(
-        path, "w", driver="GTiff", height=values.shape[1], width=values.shape[2], count=len(values),
-        dtype=values.dtype, crs=frame.projection.wkt, transform=place, nodata=no_data, compress="deflate", zlevel=9,
-        predictor=2 if values.dtype == np.uint16 else 1,
-    ) as file:  # fmt: skip
-        file.write(values)
-        for name, value in facts.items():
-            setattr(file, name, value)
+    with rasterio.MemoryFile() as memory:
+        with memory.open(
+            driver="GTiff", height=values.shape[1], width=values.shape[2], count=len(values), dtype=values.dtype,
+            crs=frame.projection.wkt, transform=place, nodata=no_data, compress="deflate", zlevel=9,
+            predictor=2 if values.dtype == np.uint16 else 1,
+        ) as file:  # fmt: skip
+            file.write(values)
+            for name, value in facts.items():
+                setattr(file, name, value)
+        return bytes(memory.read())
 
 
 def _tags(m: Raster, items: str, no_data: str | None) -> list[tuple[int, str, int, Any, bool]]:

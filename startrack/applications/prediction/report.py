@@ -28,7 +28,7 @@ from startrack.applications.prediction.quantities import (
 )
 from startrack.applications.prediction.run import add_odometry
 from startrack.core.errors import BadOutput, length_text
-from startrack.core.files import remove_file, write_atomically
+from startrack.core.files import check_regular, remove_file, write_atomically
 from startrack.core.stored import read_json_object
 from startrack.estimation.observations import OdometryErrors
 from startrack.frames import format_utc, latlon_from_enu
@@ -81,7 +81,12 @@ class Plan:
         }
 
     def check_folder(self, out: Path, *, overwrite: bool) -> None:
-        """Raise BadOutput if `out` holds a prediction of other places, cameras or times and not `overwrite`."""
+        """Raise BadOutput if `out` holds a prediction of other places, cameras or times and not `overwrite`.
+
+        Also where one of the files' names is taken by what is no regular file.
+        """
+        for name in sorted(PREDICTION_FILES):
+            check_regular(out / name)
         before, now = read_json_object(out / RECORD_FILE), self.settings
         differs = [] if before is None else [key for key in SETTINGS if before.get(key) != now[key]]
         if differs and not overwrite:

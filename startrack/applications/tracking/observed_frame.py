@@ -187,7 +187,7 @@ def encode_frame(frame: ObservedFrame) -> bytes:
     return file.getvalue()
 
 
-def decode_frame(data: bytes) -> ObservedFrame:
+def decode_frame(data: bytes | bytearray) -> ObservedFrame:
     """The frame in the archive `data`. Raises ValueError, KeyError or BadZipFile for another file."""
     with np.load(io.BytesIO(data), allow_pickle=False) as archive:
         arrays: dict[str, Any] = dict(archive)

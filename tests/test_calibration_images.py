@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 import pytest
 from astropy.io import fits
+from horizon_helpers import CAMERA, TIME, painted_frame
+from horizon_helpers import SITE as HIGH_SITE
 from jsonschema import ValidationError
 from schema_helpers import check_printed_schema
 from scipy.spatial import cKDTree
@@ -474,3 +476,15 @@ def test_why_no_mask_is_proposed_is_said(cold_calibration, tmp_path):
         assert found is None and "a clear, dark night is needed" in why
     silent = replace(cold_calibration, obstructed=None, no_mask_because=why)
     assert write_camera(tmp_path / "new.toml", silent, []) == f"no mask is proposed: {why}"
+
+
+def test_pictures_of_a_fixed_camera_with_a_wrong_time_are_left_out_or_refused():
+    stars = load_catalog().brighter_than(8.0)
+    frames = [painted_frame(k + 1, TIME + timedelta(hours=hours)) for k, hours in enumerate((0.0, 3.0, 5.0))]
+    frames[1] = replace(frames[1], time_utc=frames[1].time_utc + timedelta(hours=1))
+    found = calibrate(frames, stars, camera=CAMERA, site=HIGH_SITE)
+    [out] = found.refused
+    assert (out.name, out.reason) == ("frame-2", "inconsistent_evidence") and len(found.joint.frames) == 2
+    assert "turned by 15.0 degrees about the celestial pole against most pictures" in out.message
+    with pytest.raises(BadInput, match=r"no majority of the 2 pictures.*turned by 15.0 degrees about the celestial"):
+        calibrate(frames[:2], stars, camera=CAMERA, site=HIGH_SITE)

@@ -25,6 +25,7 @@ from startrack.catalog import StarCatalog
 from startrack.core.runner import map_in_threads
 from startrack.core.types import Array, BadInput, Bools, Exposure, Identification, NoSolution, NotIdentified
 from startrack.detection import Detector
+from startrack.estimation.fixed_camera import disagreeing
 from startrack.estimation.frame_matching import Frame, frame_of, require_body, require_time
 from startrack.estimation.joint_fit import FINAL_ROUNDS, JointFit, fit_frames, grow_from_matches
 from startrack.exposure import combine_masks, with_facts
@@ -98,7 +99,8 @@ def calibrate(
         camera: approximate camera; None: `fov_rad` is needed.
         fov_rad: field of view to about 10 %. Below 100 degrees the angle across the frame's width, from there up that
             of the image circle.
-        site: on the Earth, for refraction and extinction; without it the lens contains the refraction.
+        site: on the Earth, for refraction and extinction; without it the lens contains the refraction. Pictures that
+            a wrong time turns about the celestial pole against most others are left out.
         known_sensor: properties of the sensor that are known already.
         name: of the camera.
         progress: is called with a text at each step.
@@ -106,7 +108,7 @@ def calibrate(
     A calibration that fails a check (`accepted` is False) must not be used.
 
     Raises:
-        BadInput: no_time, size_mismatch, no_calibration.
+        BadInput: no_time, size_mismatch, no_calibration, inconsistent_evidence of the times of two pictures.
         NotIdentified: the stars of no image are identified.
     """
     run = _Run(catalog, camera, field_of_view_rad(camera, fov_rad), site, progress)
@@ -262,16 +264,27 @@ def _fit_jointly(run: _Run) -> tuple[JointFit, tuple[Frame, ...]]:
     R = np.stack([one.R_cam_icrs for one in same])
     frames = tuple(one.frame for one in same)
     joint = fit_frames(remove_static_sources(frames, R), camera, R, run.progress)
-    explained = [matched.fraction >= SMALLEST_FRACTION for matched in joint.matches]
-    if all(explained) or not any(explained):  # the checks refuse these
+    wrong = _why_wrong(run.site, joint)
+    for k, text in wrong.items():
+        run.refuse(same[k].frame.exposure.name, NotIdentified(text, "inconsistent_evidence"))
+    if not wrong:
         return joint, frames
-    for one, matched, is_explained in zip(same, joint.matches, explained, strict=True):
-        if not is_explained:
-            text = (
-                f"{100 * matched.fraction:.0f} % of its bright sources are stars, or of its bright stars sources, the "
-                f"larger, and {100 * SMALLEST_FRACTION:.0f} % is the least: it shows cloud or lamps, or its lens or "
-                "time is another"
-            )
-            run.refuse(one.frame.exposure.name, NotIdentified(text, "inconsistent_evidence"))
-    run.identified = [one for one, is_explained in zip(same, explained, strict=True) if is_explained]
+    run.identified = [one for k, one in enumerate(same) if k not in wrong]
     return _fit_jointly(run)
+
+
+def _why_wrong(site: Site | None, joint: JointFit) -> dict[int, str]:
+    """The frames of the joint fit that must be left out, if others can stay, and why."""
+    wrong = {
+        k: (
+            f"{100 * matched.fraction:.0f} % of its bright sources are stars, or of its bright stars sources, the "
+            f"larger, and {100 * SMALLEST_FRACTION:.0f} % is the least: it shows cloud or lamps, or its lens or "
+            "time is another"
+        )
+        for k, matched in enumerate(joint.matches) if matched.fraction < SMALLEST_FRACTION
+    }  # fmt: skip
+    if len(wrong) == len(joint.matches):  # the checks refuse these
+        return {}
+    if wrong or site is None:
+        return wrong
+    return disagreeing([one.exposure for one in joint.frames], joint.fit.R_cam_icrs, site, may_move=True)

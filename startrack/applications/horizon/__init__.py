@@ -1,7 +1,6 @@
 """The skyline of a fixed camera on the Earth, from photographs of the night sky."""
 
-from startrack.applications.horizon.agreement import LeftOut
-from startrack.applications.horizon.frames import SkyFrame, orient_frames
+from startrack.applications.horizon.frames import LeftOut, SkyFrame, orient_frames
 from startrack.applications.horizon.measure import SkylineResult, measure_frames, measure_skyline, predicted_visible
 from startrack.applications.horizon.write import check_output, needs_all_azimuths, write_skyline
 

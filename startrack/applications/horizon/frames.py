@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.applications.horizon.agreement import LeftOut, split_fixed
 from startrack.camera import Camera, cap_grid
 from startrack.catalog import (
     LOWEST_STAR_RAD,
@@ -22,6 +21,7 @@ from startrack.core.errors import BadInput, Reason
 from startrack.core.runner import map_in_threads
 from startrack.core.types import Array, Body, Detections, Exposure, Ints
 from startrack.estimation.false_alarm import log_p_value_poisson
+from startrack.estimation.fixed_camera import disagreeing
 from startrack.estimation.frame_matching import frame_of, require_body, require_time
 from startrack.estimation.joint_fit import JointFit, fit_frames
 from startrack.frames import R_enu_icrs, Site
@@ -32,6 +32,15 @@ Progress = Callable[[str], None]
 # Of the names in a picture, anywhere in its field: none of 3,664 names in 17 pictures of one camera was wrong.
 WRONG_NAMES_1 = 1e-3
 MAX_FALSE_REFUSAL = 1e-5  # probability that wrong names alone are below the horizon of a right site
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeftOut:
+    """A photograph without identified stars, or with an attitude unlike that of the others, and why."""
+
+    name: str
+    reason: Reason
+    message: str
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,12 +115,15 @@ def orient_frames(
         take(exposure, outcome)
     if not identified:
         return (), tuple(left_out)
-    identified, contradicting = split_fixed(identified, site)
-    left_out += contradicting
+    wrong = disagreeing([one.exposure for one in identified], _attitudes(identified), site)
+    for k, message in wrong.items():
+        name = identified[k].exposure.name
+        left_out.append(LeftOut(name=name, reason=Reason.INCONSISTENT_EVIDENCE, message=message))
+    identified = [one for k, one in enumerate(identified) if k not in wrong]
     frames = tuple(frame_of(one.exposure, one.detections, catalog, site) for one in identified)
     progress("fitting the lens")
     lead = max(identified, key=lambda one: len(one.identification))
-    joint = fit_frames(frames, lead.camera, np.stack([one.attitude_fit.attitude.R_cam_icrs for one in identified]))
+    joint = fit_frames(frames, lead.camera, _attitudes(identified))
     fitted = joint.fit.camera
     edge = fitted.max_angle_rad if camera is None else camera.max_angle_rad
     if camera is None and fov_rad is not None and fov_rad >= WIDE_FIELD_RAD:
@@ -119,6 +131,10 @@ def orient_frames(
     camera = replace(fitted, max_angle_rad=float(min(edge, fitted.lens.max_invertible_rad)))
     found = (_sky_frame(k, one, joint, camera, catalog, site) for k, one in enumerate(identified))
     return tuple(found), tuple(left_out)
+
+
+def _attitudes(identified: Sequence[Oriented]) -> Array:
+    return np.stack([one.attitude_fit.attitude.R_cam_icrs for one in identified])
 
 
 def _require_above_horizon(one: Oriented, site: Site) -> None:

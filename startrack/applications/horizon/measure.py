@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.applications.horizon.agreement import LeftOut
 from startrack.applications.horizon.clouds import NEAR_EDGE_RAD, cloud_probability, cloud_sigma_rad
 from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, COLUMNS_PER_AZIMUTH, SKYLINE_AZIMUTHS, WIDTHS
-from startrack.applications.horizon.frames import Progress, SkyFrame, orient_frames
+from startrack.applications.horizon.frames import LeftOut, Progress, SkyFrame, orient_frames
 from startrack.applications.horizon.join import join_skylines
 from startrack.applications.horizon.posterior import (
     WEAKEST_CONTRAST,

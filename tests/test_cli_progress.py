@@ -20,11 +20,11 @@ from scipy.spatial.transform import Rotation
 
 from startrack.camera import camera_text
 from startrack.catalog import apparent_stars, load_catalog
-from startrack.chain import detect
-from startrack.chain.sky_state import VISIBLE_SNR, count_expected_stars
+from startrack.chain import detect, identify
+from startrack.chain.sky_state import BRIGHT_SKY, DARK_SKY, FEW_STARS, VISIBLE_SNR, count_expected_stars
 from startrack.cli import console
 from startrack.cli.main import main
-from startrack.exposure import exposure_of
+from startrack.exposure import exposure_of, read_exposure
 
 
 def test_long_work_without_a_terminal_prints_lines(monkeypatch):
@@ -84,7 +84,7 @@ def test_expected_stars_are_those_in_the_frame_of_a_clear_sky():
         xy_px, inside = FISHEYE.project(stars.rays_icrs[bright] @ R.T)
         counts.append(np.count_nonzero(inside & (np.abs(xy_px - 255.5) < 256).all(axis=1)))
     assert min(counts) > 100
-    expected = count_expected_stars(detected, FISHEYE, stars)
+    expected = count_expected_stars(detected.exposure, found, FISHEYE, stars.v_mag)
     assert expected == pytest.approx(np.mean(counts), rel=0.05)
 
 
@@ -101,7 +101,7 @@ def test_a_picture_whose_rounding_hides_stars_is_told_from_a_noisy_one(tmp_path,
     assert main(["identify", str(tmp_path / "dim.jpg"), *words]) == 3
     (line,) = capsys.readouterr().out.splitlines()
     assert ("below half a step of the pixel values" in line and "raw or 16-bit" in line) == (noise_steps < 0.5)
-    assert line.endswith("moonlight or twilight?") == (noise_steps > 0.5)
+    assert ("clouds or poor focus" in line) == (noise_steps > 0.5)
 
 
 @pytest.mark.parametrize("noise_steps", [0.2, 1.0])
@@ -120,16 +120,52 @@ def test_a_picture_without_sources_states_that_rounding_hides_them(tmp_path, cap
 )
 @pytest.mark.parametrize(("level", "text"), [(100.0, "background from 1"), (40_000.0, "(90 % of the range)")])
 def test_a_picture_that_is_not_identified_states_its_sky(tmp_path, capsys, flags, level, text):
-    """Sources, background, and with a camera's zero point the stars of a clear sky; clouds come before the files."""
+    """Sources, background, and the stars of a clear sky; a bright sky and few stars come before the files."""
     picture(tmp_path, level, 60)
     words = [word.format(camera=tmp_path / "camera.toml") for word in flags]
     assert main(["identify", str(tmp_path / "a.png"), "-D", str(tmp_path), "--no-plots", *words]) == 3
     (line,) = capsys.readouterr().out.splitlines()
     assert re.search(r"Measured: \d+ point sources", line) and text in line
-    assert line.endswith("clouds, moonlight or twilight?")
-    assert ("where a clear sky would show about" in line) == (flags[0] == "-c")
+    assert line.endswith(BRIGHT_SKY if level > 1000.0 else FEW_STARS)
+    assert "where a clear sky would show about" in line
     if ".." in flags[-1]:
         assert "no lens of 120 to 170 degrees" in line
+
+
+@pytest.mark.parametrize("flags", [["-c", "{camera}"], pytest.param(["--fov", "40"], marks=pytest.mark.slow)])
+def test_many_sources_on_a_dark_sky_are_no_clouds(tmp_path, capsys, flags):
+    """Then the camera file or the field of view comes first, also in the advice."""
+    picture(tmp_path, 100.0, 700)
+    facts = tmp_path / "a.json"
+    facts.write_text(facts.read_text().replace('"exposure_s": 0.5', '"exposure_s": 0.05'))
+    words = [word.format(camera=tmp_path / "camera.toml") for word in flags]
+    assert main(["identify", str(tmp_path / "a.png"), "-D", str(tmp_path), "--no-plots", *words]) == 3
+    heard = capsys.readouterr()
+    assert "clouds" not in heard.out + heard.err and "Moon" not in heard.out + heard.err
+    assert ("check the field of view" in heard.out) == (flags[0] == "--fov")
+    assert ("check that the camera file is that of this lens" in heard.out) == (flags[0] == "-c")
+
+
+def test_without_a_camera_file_none_is_to_be_checked(tmp_path):
+    """The lens of the first picture is taken for further ones."""
+    picture(tmp_path, 100.0, 700)
+    exposure = replace(read_exposure(tmp_path / "a.png"), exposure_s=0.05)
+    for name, lens in (("unknown", "its lens is that of the others"), ("mine", "the camera file is that of this lens")):
+        assert f"check that {lens}" in identify(exposure, replace(FISHEYE, name=name), load_catalog()).message
+
+
+@pytest.mark.parametrize("command", ["identify", "calibrate", "horizon"])
+@pytest.mark.parametrize(("level", "advice"), [(40_000.0, BRIGHT_SKY), (100.0, DARK_SKY)])
+def test_a_picture_without_a_source_is_bright_or_dark(tmp_path, capsys, command, level, advice):
+    picture(tmp_path, level, 0)
+    words = {
+        "identify": ["-D", str(tmp_path), "--no-plots"],
+        "calibrate": ["-o", str(tmp_path / "new.toml"), "--no-plots"],
+        "horizon": ["-o", str(tmp_path / "a.hrz"), "--site", "46,7"],
+    }
+    assert main([command, str(tmp_path / "a.png"), "--fov", "150", *words[command]]) == 3
+    heard = capsys.readouterr()
+    assert advice in heard.out + heard.err and "next:" not in heard.err
 
 
 def picture(folder, level, sources):

@@ -19,6 +19,7 @@ from startrack.chain.measurement import CERTAIN_PROBABILITY, COMPLETE_V_MAG, loc
 from startrack.chain.near_attitude import NearAttitude, read_near_attitude
 from startrack.chain.pipeline import add_timing, detect, identify, identify_blind, load_named, locate, locate_exposure
 from startrack.chain.sky_refinement import EDGE_SIGMA_PX
+from startrack.chain.sky_state import stating_sky
 from startrack.chain.stages import (
     STAGES,
     Detected,
@@ -41,5 +42,6 @@ __all__ = [
     "StarRays", "Time", "add_timing", "angle_rad", "are_unchanged", "camera_input", "content_sha256", "detect",
     "duration_s", "exposure_input", "field_of_view_rad", "identify", "identify_blind", "input_hashes",
     "is_list_of_centroids", "job_sha256", "last_value", "load_camera_input", "load_named", "locate", "locate_exposure",
-    "locate_rays", "mask_unpredictable", "read_near_attitude", "settings_input", "terrain_input", "time_input",
+    "locate_rays", "mask_unpredictable", "read_near_attitude", "settings_input", "stating_sky", "terrain_input",
+    "time_input",
 ]  # fmt: skip

@@ -81,7 +81,13 @@ def detect_sources(inputs: Inputs, camera: Camera | None, detector: Detector) ->
             "the pixels are fractions from 0 to 1, and the camera file's gain and levels are for the sensor's counts: "
             "give those (8- or 16-bit integers, or floating point in ADU)",
         )
-    return extend(inputs, Detected, detections=detector(inputs.exposure, camera))
+    with stating_sky(inputs.exposure, on_moon=_on_moon(inputs)):
+        return extend(inputs, Detected, detections=detector(inputs.exposure, camera))
+
+
+def _on_moon(inputs: Inputs) -> bool:
+    """Whether the ground is known, and has no air."""
+    return inputs.terrain is not None and inputs.terrain.air is None
 
 
 def identify_stars(
@@ -95,7 +101,7 @@ def identify_stars(
     when, near = detected.exposure.time_utc, settings.near_attitude
     stars = apparent_stars(catalog, when, site)
     near_R_cam_icrs = None if near is None else near.R_cam_icrs_at(when, site)
-    with stating_sky(detected, camera, stars):
+    with stating_sky(detected.exposure, detected.detections, camera, stars.v_mag, on_moon=_on_moon(detected)):
         found = settings.identifier(detected.detections, camera, stars, near_R_cam_icrs)
     return extend(
         detected,
@@ -117,7 +123,8 @@ def identify_unknown_lens(
     known) is where the optical axis points. Raises NotIdentified, TooFewStars.
     """
     stars = apparent_stars(catalog, detected.exposure.time_utc, None)
-    with stating_sky(detected, None, stars):
+    fov_rad = float(np.min(fovs_rad))
+    with stating_sky(detected.exposure, detected.detections, v_mag=stars.v_mag, fov_rad=fov_rad):
         return _identify_at_fovs(detected, fovs_rad, stars, near_sky)
 
 
@@ -138,8 +145,8 @@ def _identify_at_fovs(detected: Detected, fovs_rad: Array, stars: Stars, near_sk
     step = (fovs_rad[-1] / fovs_rad[0]) ** (1 / (len(fovs_rad) - 1))  # each is the middle of a part of the range
     low, high = np.degrees([fovs_rad[0], fovs_rad[-1] * step]) * 2 / (1 + step)
     raise NotIdentified(
-        f"no lens of {low:.3g} to {high:.3g} degrees explains the point sources ({len(fovs_rad)} tried): "
-        "check the focus"
+        f"no lens of {low:.3g} to {high:.3g} degrees explains the point sources ({len(fovs_rad)} tried)",
+        advice="check the focus",
     )
 
 

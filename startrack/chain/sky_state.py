@@ -1,4 +1,4 @@
-"""What an image that is not identified shows of its sky: sources, background, and the stars of a clear sky."""
+"""What an image that is not identified shows of its sky, and what comes first: the sky, or the camera file."""
 
 from __future__ import annotations
 
@@ -8,50 +8,103 @@ from contextlib import contextmanager
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.chain.stages import Detected
-from startrack.core.types import NotIdentified, Stars, TooFewStars
+from startrack.core.types import Array, Centroids, Detections, Exposure, NotIdentified, TooFewStars
 from startrack.detection import ROUNDED, is_rounded, smallest_step
 
 STEP_PX = 16  # of the pixels at which the background is looked up
 VISIBLE_SNR = 5.0
-CAUSES = "clouds, moonlight or twilight?"
+# Of the range, that 95 % of the background stay below: 0.05 on a clear night of an all-sky camera, 0.08 under clouds,
+# 0.53 beside a bright Moon.
+BRIGHT_PART = 0.25
+FEW_PART = 0.25  # of the stars of a clear sky: 14 clear images, half hidden by ground, have 0.45 to 0.76
+# Where no zero point tells: an all-sky camera then has 3.7 times the stars of a clear sky on a clear night, 0.98 beside
+# a bright Moon, and 0.16 under clouds.
+ASSUMED_LIMIT_MAG = 5.0
+BRIGHT_SKY = "the sky is bright, by clouds, the Moon or twilight: use a picture of a clear, dark sky"
+BRIGHT_VIEW = "the sky is bright, by the Sun, the Earth or lit ground: use a picture without stray light"
+FEW_STARS = "clouds or poor focus hide the stars: use a picture of a clear sky in focus, or expose longer"
+DARK_SKY = "do clouds or the lens cap cover the sky, or was the exposure too short?"
+DARK_VIEW = "was the lens cap on, or the exposure too short?"
 
 
 @contextmanager
-def stating_sky(detected: Detected, camera: Camera | None, stars: Stars) -> Iterator[None]:
-    """In the block a refusal that no attitude fits also states what the image shows of its sky.
+def stating_sky(
+    exposure: Exposure, found: Centroids | None = None, camera: Camera | None = None, v_mag: Array | None = None, *,
+    fov_rad: float = 0.0, on_moon: bool = False, more: str = "",
+) -> Iterator[None]:  # fmt: skip
+    """In the block a refusal that no attitude fits also states what the `exposure` shows of its sky.
 
-    `camera` (None: not known) gives with the `stars` of the catalogue how many a clear sky would show.
+    Its advice is that of the likely cause. `found` are the point sources (None: there are none). `camera` (None: not
+    known, then `fov_rad` is the field of view, if known) gives with `v_mag` (n,), magnitudes of the whole sky in
+    ascending order, how many stars a clear sky would show. `on_moon`: above ground without air. `more` follows the
+    advice about the lens.
     """
     try:
         yield
     except (NotIdentified, TooFewStars) as cause:
         if cause.reason in (NotIdentified.reason, TooFewStars.reason):
-            cause.args = (f"{str(cause).rstrip('.?')}. {sky_text(detected, camera, stars)}",)
+            clear = None if v_mag is None else count_clear(exposure, found, camera, v_mag, fov_rad)
+            lens = (cause.advice or (DARK_VIEW if on_moon else DARK_SKY)) + more
+            text = sky_text(exposure, found, clear, on_moon, _rounding(exposure, found, camera), lens)
+            cause.args = (f"{cause.fact.rstrip('.?')}. {text}",)
         raise
 
 
-def sky_text(detected: Detected, camera: Camera | None, stars: Stars) -> str:
-    """The measured state of the sky of an image as text; `camera` and `stars` as for `stating_sky`."""
-    exposure, found = detected.exposure, detected.detections
-    low, high = np.percentile(exposure.recorded_adu[::STEP_PX, ::STEP_PX], [5, 95])
-    of_range = f" ({100 * high / exposure.saturation_adu:.0f} % of the range)" if exposure.saturation_adu else ""
-    expected = None if camera is None else count_expected_stars(detected, camera, stars)
-    clear = "" if expected is None else f" where a clear sky would show about {float(f'{expected:.2g}'):.0f}"
-    on_moon = detected.terrain is not None and detected.terrain.air is None
-    text = f"Measured: {len(found)} point sources{clear}, background from {low:.0f} to {high:.0f} ADU{of_range}"
-    gain = 1.0 if camera is None or camera.sensor is None else camera.sensor.gain_e_per_adu
-    if is_rounded(found.noise_e[::STEP_PX, ::STEP_PX] / gain, smallest_step(exposure.recorded_adu)):
-        return f"{text}; {ROUNDED}"
-    return text if on_moon else f"{text}: {CAUSES}"
+def sky_text(
+    exposure: Exposure, found: Centroids | None, clear: float | None, on_moon: bool, rounding: str, lens: str
+) -> str:  # fmt: skip
+    """The measured state of the sky as text, with the advice of what comes first: sky, rounding of the counts or lens.
 
-
-def count_expected_stars(detected: Detected, camera: Camera, stars: Stars) -> float | None:
-    """How many of the `stars` (of the whole sky) a clear sky would show above the measured noise, on average.
-
-    None where the `camera` states no zero point or the exposure time is not known.
+    `found` are the point sources of the `exposure`, `clear` is how many a clear sky would show (None: not known).
+    `rounding` is the advice where rounding hides stars, `lens` that where nothing else is the likely cause.
     """
-    sensor, exposure_s, found = camera.sensor, detected.exposure.exposure_s, detected.detections
+    count = 0 if found is None else len(found)
+    low, high = np.percentile(exposure.recorded_adu[::STEP_PX, ::STEP_PX], [5, 95])
+    part = high / exposure.saturation_adu if exposure.saturation_adu else 0.0
+    of_range = f" ({100 * part:.0f} % of the range)" if part else ""
+    of_clear = "" if clear is None else f" where a clear sky would show about {float(f'{clear:.2g}'):.0f}"
+    advice = rounding or lens
+    if part >= BRIGHT_PART:
+        advice = BRIGHT_VIEW if on_moon else BRIGHT_SKY
+    elif not rounding and not on_moon and count and clear is not None and count < FEW_PART * clear:
+        advice = FEW_STARS
+    return f"Measured: {count} point sources{of_clear}, background from {low:.0f} to {high:.0f} ADU{of_range}: {advice}"
+
+
+def _rounding(exposure: Exposure, found: Centroids | None, camera: Camera | None) -> str:
+    """The advice where the rounding of the counts hides faint stars, else an empty text."""
+    if not isinstance(found, Detections):
+        return ""
+    gain = 1.0 if camera is None or camera.sensor is None else camera.sensor.gain_e_per_adu
+    coarse = is_rounded(found.noise_e[::STEP_PX, ::STEP_PX] / gain, smallest_step(exposure.recorded_adu))
+    return ROUNDED if coarse else ""
+
+
+def count_clear(
+    exposure: Exposure, found: Centroids | None, camera: Camera | None, v_mag: Array, fov_rad: float
+) -> float | None:
+    """How many stars a clear sky would show, on average; None where no field is known.
+
+    Of stars of the magnitudes `v_mag` (n,), ascending, of the whole sky. By the zero point of the `camera`, the
+    exposure time and the noise of the `found` sources; where one is not known, down to ASSUMED_LIMIT_MAG. Without a
+    camera `fov_rad` is the field of view.
+    """
+    expected = None
+    if isinstance(found, Detections) and camera is not None:
+        expected = count_expected_stars(exposure, found, camera, v_mag)
+    field_rad = camera.max_angle_rad if camera is not None else 0.5 * fov_rad
+    if expected is None and field_rad:
+        expected = np.searchsorted(v_mag, ASSUMED_LIMIT_MAG) * 0.5 * (1.0 - np.cos(field_rad))
+    return expected
+
+
+def count_expected_stars(exposure: Exposure, found: Detections, camera: Camera, v_mag: Array) -> float | None:
+    """How many stars a clear sky would show above the measured noise, on average.
+
+    Of stars of the magnitudes `v_mag` (n,), ascending, of the whole sky. None where the `camera` states no zero point
+    or the time of the `exposure` is not known; `found` has the noise.
+    """
+    sensor, exposure_s = camera.sensor, exposure.exposure_s
     if sensor is None or exposure_s is None:
         return None
     rows, columns = (np.arange(STEP_PX // 2, size, STEP_PX) for size in found.image_e.shape)
@@ -62,7 +115,7 @@ def count_expected_stars(detected: Detected, camera: Camera, stars: Stars) -> fl
     clear_e = sensor.zero_point_e_per_s * exposure_s * sensor.throughput(angle_rad)
     with np.errstate(divide="ignore"):
         limit_mag = -2.5 * np.log10(limit_e / clear_e)
-    brighter = np.searchsorted(np.sort(stars.v_mag), limit_mag)
+    brighter = np.searchsorted(v_mag, limit_mag)
     solid_angle_sr = STEP_PX**2 * camera.pixel_solid_angle_sr(angle_rad)
     inside = angle_rad < camera.max_angle_rad
     return float(np.sum((brighter * solid_angle_sr)[inside]) / (4 * np.pi))

@@ -181,12 +181,13 @@ class BadOutput(BadInput):
 
 
 class NoSolution(Exception):
-    """A stage found no reliable answer (exit code 3). The message contains advice."""
+    """A stage found no reliable answer (exit code 3). The message is a `fact`, followed by an `advice` where one is."""
 
     reason: Reason = Reason.INCONSISTENT_EVIDENCE
 
-    def __init__(self, message: str, reason: str | None = None, **evidence: Any) -> None:
-        super().__init__(one_line(message))
+    def __init__(self, fact: str, reason: str | None = None, *, advice: str = "", **evidence: Any) -> None:
+        super().__init__(one_line(f"{fact}: {advice}" if advice else fact))
+        self.fact, self.advice = one_line(fact), one_line(advice)
         if reason is not None:
             self.reason = Reason(reason)
         self.evidence = evidence

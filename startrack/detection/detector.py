@@ -42,7 +42,7 @@ UNKNOWN_WIDTH_PX = 1.2  # first guess where the camera file does not state the w
 FIRST_PASS_LOWER = 1.1  # sigma of the filtered noise: threshold of the stars minus that of the candidates
 WINGS_SIGMAS = 4.0  # radius of the area that a star covers
 CROWDED_PART = 0.06  # of the frame, covered by stars: above it they are subtracted to measure the background again
-NOTHING_SEEN = "no point source stands above the noise: was the lens cap on, or the exposure too short?"
+NOTHING_SEEN = "no point source stands above the noise"
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Detector:
         if mask is not None:
             image, dead = fill_masked(image, mask.masked), dead & ~mask.masked
         if float(image[0, 0]) == float(image[-1, -1]) == float(image[::64, ::64].max()) and not np.ptp(image):
-            raise TooFewStars("the frame is flat: every pixel has the same value (lens cap, or a saturated day sky?)")
+            raise TooFewStars("the frame is flat: every pixel has the same value")
         known = camera.sensor.psf_sigma_px if camera is not None and camera.sensor is not None else None
         # Dark frame and flat field do not undo the rounding of the counts.
         gain = 1.0 if camera is None or camera.sensor is None else camera.sensor.gain_e_per_adu
@@ -198,4 +198,4 @@ class _FrameSource:
 def _nothing_seen(frame: Frame) -> TooFewStars:
     """The refusal of a frame without point sources."""
     is_coarse = is_rounded(frame.noise.whole(), smallest_step(frame.image))
-    return TooFewStars(f"{NOTHING_SEEN} {ROUNDED.capitalize()}" if is_coarse else NOTHING_SEEN)
+    return TooFewStars(NOTHING_SEEN, advice=ROUNDED if is_coarse else "")

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from startrack.camera import Camera, Lens
 from startrack.core.types import Array
 
+UNKNOWN_LENS = "unknown"  # name of a camera that no file states
 PINHOLE = 1.0  # shape
 LINEAR_SHAPE = 1e-4  # below this the law is the equidistant one
 STEEPEST_RAD = 1.55  # of the argument of sine or tangent
@@ -53,7 +54,7 @@ def unknown_camera(
     """A camera of a frame (W, H), as wide as its lens."""
     widest = lens.max_invertible_rad
     return Camera(
-        name="unknown", size_px=size_px, focal_px=(focal_px, focal_px), centre_px=centre_px, max_angle_rad=widest,
+        name=UNKNOWN_LENS, size_px=size_px, focal_px=(focal_px, focal_px), centre_px=centre_px, max_angle_rad=widest,
         calibrated_angle_rad=widest, lens=lens, mirrored=mirrored,
     )  # fmt: skip
 

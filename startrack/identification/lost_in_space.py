@@ -32,6 +32,7 @@ from startrack.identification.attitude_search import (
     Sources,
 )
 from startrack.identification.index import patterns_of, pixel_scale_of
+from startrack.identification.lens_guesses import UNKNOWN_LENS
 from startrack.identification.near_sky import NearSky
 
 MAX_FALSE_ALARM = 1e-9  # probability that chance gives an accepted identification
@@ -72,8 +73,8 @@ class Identifier:
         some, rays_inside = (centroids, rays_cam) if is_whole else (centroids.take(inside), rays_cam[inside])
         sources = Sources(some, rays_inside, camera, scale, patterns_of(stars, scale.field_sr), self.near_sky)
         if len(inside) < sources.min_matches:
-            few = _describe_few(len(inside), len(centroids), camera, sources.min_matches)
-            raise NotIdentified(few, detected=len(inside))
+            fact, advice = _describe_few(len(inside), len(centroids), camera, sources.min_matches)
+            raise NotIdentified(fact, advice=advice, detected=len(inside))
         search = AttitudeSearch(sources)
         tolerance_px, rough_px = self.tolerances_px
         tolerance_px = min(max(tolerance_px, TOLERANCE_SIGMAS * upper_median(sources.variance_px2) ** 0.5), rough_px)
@@ -96,10 +97,12 @@ class Identifier:
                 reason="mirrored",
             )
         where, advice = ("", "") if self.near_sky is None else (f" within {self.near_sky}", " and where it points")
+        is_known = camera.name != UNKNOWN_LENS
+        lens = "the camera file is that of this lens" if is_known else "its lens is that of the others"
         raise NotIdentified(
             f"no attitude{where} explains the {len(inside)} point "
-            f"sources better than chance ({search.tried} tried; {refusal}): check that the camera file is that of this "
-            f"lens{advice}",
+            f"sources better than chance ({search.tried} tried; {refusal})",
+            advice=f"check that {lens}{advice}",
             detected=len(inside),
             tried=search.tried,
         )
@@ -170,14 +173,18 @@ class Identifier:
         return float(log_p_value(hits, predicted, each))
 
 
-def _describe_few(inside: int, given: int, camera: Camera, needed: int) -> str:
-    """Why the `inside` of the `given` point sources, those within the camera's image circle, are not the `needed`."""
+def _describe_few(inside: int, given: int, camera: Camera, needed: int) -> tuple[str, str]:
+    """Why the `inside` of the `given` point sources, those within the camera's image circle, are not the `needed`.
+
+    With the advice.
+    """
     if given < needed:
-        return f"{given} point sources are too few to identify: expose longer"
+        return f"{given} point sources are too few to identify", "expose longer"
     return (
         f"only {inside} of {given} point sources lie in the image circle of camera {camera.name!r} "
         f"({np.degrees(camera.max_angle_rad):.4g} degrees from its axis, in {camera.size_px[0]} x "
-        f"{camera.size_px[1]} px), too few to identify: is it the camera file of these pixels?"
+        f"{camera.size_px[1]} px), too few to identify",
+        "is it the camera file of these pixels?",
     )
 
 

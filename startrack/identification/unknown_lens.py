@@ -98,7 +98,8 @@ def identify_unknown_lens(
     where = "" if near_sky is None else f" within {near_sky}"
     raise NotIdentified(
         f"no lens of {np.degrees(fov_rad):.3g} degrees ({100 * tolerance:.0f} % more or less){where} explains the "
-        f"{len(centroids)} point sources better than chance ({tried} patterns tried): {ADVICE}",
+        f"{len(centroids)} point sources better than chance ({tried} patterns tried)",
+        advice=ADVICE,
         detected=len(centroids),
         tried=tried,
     )
@@ -148,7 +149,8 @@ class _Search:
         if len(chosen) < self.min_matches:
             raise NotIdentified(
                 f"{len(chosen)} point sources are too few to identify without a camera file, which takes "
-                f"{self.min_matches}: expose longer, or {ADVICE}",
+                f"{self.min_matches}",
+                advice=f"expose longer, or {ADVICE}",
                 detected=len(centroids),
             )
         self.hypotheses = HypothesisSearch(self.xy_px[chosen], size_px, near_sky, 0.5 * fov_rad * tolerance)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -22,6 +22,7 @@ from startrack.applications.calibration.shared_errors import widen_covariance
 from startrack.applications.calibration.static_parts import find_obstructions, remove_static_sources
 from startrack.camera import REFRACTION_CONTAINED, REFRACTION_REMOVED, Camera
 from startrack.catalog import StarCatalog
+from startrack.chain import stating_sky
 from startrack.core.runner import map_in_threads
 from startrack.core.types import Array, BadInput, Bools, Exposure, Identification, NoSolution, NotIdentified
 from startrack.detection import Detector
@@ -155,7 +156,8 @@ def load_frame(exposure: Exposure, catalog: StarCatalog, site: Site | None, came
     require_body(exposure, site)
     if camera is not None:
         exposure = with_facts(exposure, mask=combine_masks(exposure.mask, camera.mask, exposure.size_px))
-    return frame_of(exposure, Detector()(exposure, None), catalog, site)
+    with stating_sky(exposure):
+        return frame_of(exposure, Detector()(exposure, None), catalog, site)
 
 
 def _frames(run: _Run, exposures: Sequence[Exposure]) -> list[Frame]:
@@ -199,14 +201,14 @@ def _identify_all(run: _Run, frames: list[Frame]) -> None:
             run.refuse(frame.exposure.name, refusal)
         raise NotIdentified(
             f"the stars of no image could be identified ({run.refused[0].message}). Take pictures of the clear, dark "
-            "night sky, in focus, with the camera still and at least a hundred stars in view"
-            + ("" if run.site is None else "; check the site (signs) and the time"),
+            "night sky, in focus, with the camera still and at least a hundred stars in view",
             reason=run.refused[0].reason,
         )
 
     def identify(frame: Frame) -> _IdentifiedFrame | NoSolution:
         try:
-            camera, found = identify_with_camera(run.identified[0].camera, frame)
+            with _stating_sky_of(frame, run, run.identified[0].camera):
+                camera, found = identify_with_camera(run.identified[0].camera, frame)
         except NoSolution as cause:
             return cause
         return _IdentifiedFrame(frame, camera, found.R_cam_icrs, found)
@@ -228,10 +230,17 @@ def _identify_first(run: _Run, frame: Frame) -> _IdentifiedFrame:
         with suppress(NotIdentified):
             camera, found = identify_with_camera(camera, frame)
     if camera is None or found is None:  # an approximate camera with another kind of lens still gives the field of view
-        solution = identify_unknown_lens(frame.sources, frame.exposure.size_px, run.fov_rad, frame.sky.stars)
+        with _stating_sky_of(frame, run):
+            solution = identify_unknown_lens(frame.sources, frame.exposure.size_px, run.fov_rad, frame.sky.stars)
         camera, found = solution.camera, solution.identification
     camera, R = grow_from_matches(frame, camera, found.R_cam_icrs, found.star, found.detection)
     return _IdentifiedFrame(frame, camera, R, found)
+
+
+def _stating_sky_of(frame: Frame, run: _Run, camera: Camera | None = None) -> AbstractContextManager[None]:
+    """`stating_sky` of a frame that is identified with a `camera`, or with the field of view alone."""
+    more = "" if run.site is None else "; check the site (signs) and the time"
+    return stating_sky(frame.exposure, frame.sources, camera, run.catalog.v_mag, fov_rad=run.fov_rad, more=more)
 
 
 def identify_with_camera(camera: Camera, frame: Frame) -> tuple[Camera, Identification]:

@@ -59,7 +59,8 @@ def _frame(k: int, status: str) -> TrackFrame:
         "refused": ("no_stars", "no star found"), "left_out": ("inconsistent_evidence", "it contradicts the others"),
         "used": ("", ""),
     }[status]  # fmt: skip
-    return TrackFrame(NASTY if k == 2 else f"frame-{k + 1}.png", time, status, reason, message, None)
+    search = "" if status == "refused" else "beam" if k == 6 else "proven"
+    return TrackFrame(NASTY if k == 2 else f"frame-{k + 1}.png", time, status, reason, message, None, search)
 
 
 def _trajectory(position_m: Array, covariance_m2: Array, known: Array) -> Trajectory:

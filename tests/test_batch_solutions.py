@@ -159,6 +159,7 @@ WRONG_VALUES = [
     ("timing_ms", [1]), ("position.east_m", "0"), ("position.covariance_m2", [1]), ("provenance.time_utc", "noon"),
     ("provenance.camera", 1), ("attitude.quat_xyzw_body_enu", None), ("attitude.sigma_arcsec", {}), ("reason", "text"),
     ("reason", []), ("message", None), ("message", 1), ("warnings", 1), ("warnings", [1]),
+    ("search", 3), ("search.outcome", 1),
 ]  # fmt: skip
 
 
@@ -191,3 +192,13 @@ def test_warnings_are_counted_and_shown_with_verbose(folder, capsys):
     assert "exposuer_s" not in streams.err
     assert batch(folder, "-v") == 5
     assert "01.png: sidecar 01.json: key 'exposuer_s'" in capsys.readouterr().err
+
+
+def test_results_whose_search_proved_nothing_are_counted(folder, capsys):
+    result = folder / "out" / "00.fix.json"
+    assert batch(folder) == 5
+    assert "beam" not in capsys.readouterr().out
+    record = json.loads(result.read_text())
+    result.write_text(json.dumps(record | {"search": record["search"] | {"outcome": "beam"}}))
+    assert batch(folder) == 5
+    assert "; 1 with search: beam, not proven; tables in" in capsys.readouterr().out.splitlines()[-1]

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -23,6 +24,8 @@ from startrack.applications.tracking.observed_frame import decode_frame, encode_
 from startrack.cli.main import main
 from startrack.estimation.trajectory import radius_holding
 from startrack.frames import R_from_quat_xyzw
+from startrack.localization import posterior
+from startrack.localization.search import Search
 from startrack.terrain import write_map
 
 FRAMES = 5
@@ -89,6 +92,19 @@ def test_a_track_of_one_image_states_what_locate_states(drive, tmp_path):
         R_body_enu = alone.camera.R_body_cam @ alone.R_cam_enu
         quat = [found[f"q{axis}_body_enu"] for axis in "xyzw"]
         np.testing.assert_allclose(R_from_quat_xyzw(quat), R_body_enu, rtol=0, atol=1e-9)
+
+
+def test_a_search_that_proved_nothing_is_stated(drive, tracked, tmp_path, capsys, monkeypatch):
+    assert {one["search"] for one in json.loads((tracked / "track.json").read_text())["frames"]} == {"proven"}
+    monkeypatch.setattr(posterior, "Search", lambda *of: Search(*of[:-1], budget_horizons=0.0))
+    for _ in ("located", "kept"):
+        assert run(min((drive / "frames").glob("*.png")), "-D", tmp_path / "out", "--no-plots") == 0
+        line, _ = capsys.readouterr().out.splitlines()
+        assert re.search(r"used  E .* \(95 %\)  search: beam$", line)
+        record = json.loads((tmp_path / "out" / "track.json").read_text())
+        Draft202012Validator(TRACK).validate(record)
+        assert [one["search"] for one in record["frames"]] == ["beam"]
+        assert Table.read(tmp_path / "out" / "track.ecsv")["search"].tolist() == ["beam"]
 
 
 def test_tum_text_is_that_of_the_poses(drive, tracked):
@@ -237,7 +253,7 @@ def test_a_stored_frame_is_the_frame(drive, tracked):
     for file in (tracked / ".frames").glob("*.npz"):
         frame = decode_frame(file.read_bytes())
         again = decode_frame(encode_frame(frame))
-        assert (frame.name, frame.time_utc) == (again.name, again.time_utc)
+        assert (frame.name, frame.time_utc, frame.search) == (again.name, again.time_utc, again.search)
         np.testing.assert_array_equal(frame.modes[0].mean, again.modes[0].mean)
         np.testing.assert_array_equal(frame.evidence.llr, again.evidence.llr)
         assert frame.time_utc.tzinfo is not None and frame.time_utc > datetime(2020, 1, 1, tzinfo=UTC)

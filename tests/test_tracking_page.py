@@ -86,8 +86,10 @@ def test_the_slider_chooses_the_frame_by_keys_buttons_and_rows(window):
     assert "3 of 8" in slider.get_attribute("aria-valuetext")
     w.page.get_by_role("button", name="Next frame").click()
     assert "left out" in frame.inner_text()
+    assert "ended before the proof" not in frame.inner_text()
     w.page.get_by_role("button", name="frame-7.png").click()
     assert "slip before this frame" in frame.inner_text()
+    assert "ended before the proof" in frame.inner_text()
     assert slider.input_value() == "7"
     assert w.page.locator("tr[aria-current=true]").inner_text().startswith("frame-7.png")
 

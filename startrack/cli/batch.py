@@ -31,7 +31,7 @@ from startrack.exposure import is_bag
 SHOWN = ("ok", "ambiguous", "refused", "error")
 FINISHING = b"\nstartrack: finishing the images in progress; a second Ctrl-C drops them\n"
 SAME_SIGNAL_S = 1.0  # a second signal within it is the same request: timeout signals process and group
-Counts = Counter[str]  # images by outcome: ok, ambiguous, refused, error; and kept, warned
+Counts = Counter[str]  # images by outcome: ok, ambiguous, refused, error; and kept, warned, beam
 
 
 def run(args: argparse.Namespace) -> int:
@@ -187,6 +187,7 @@ class _Shown:
                     self.counts["error" if record["reason"] == INTERNAL_ERROR else str(record["status"])] += 1
                     self.counts["kept"] += kept
                     self.counts["warned"] += bool(record.get("warnings"))
+                    self.counts["beam"] += record.get("search", {}).get("outcome") == "beam"
                     self._print(record)
                     bar.advance(text="  ".join(self._numbers()))
         except RunStopped as cause:
@@ -219,7 +220,8 @@ class _Shown:
         """Number of images of each outcome, in words."""
         kept = f" ({self.counts['kept']} were there already)" if self.counts["kept"] else ""
         warned = f"; {self.counts['warned']} with warnings (-v shows them)" if self.counts["warned"] else ""
-        return f"{self.total} images: {', '.join(self._numbers())}{kept}{warned}"
+        beam = f"; {self.counts['beam']} with search: beam, not proven" if self.counts["beam"] else ""
+        return f"{self.total} images: {', '.join(self._numbers())}{kept}{warned}{beam}"
 
 
 def _write_tables(args: argparse.Namespace, out: Path, tasks: Sequence[Task], records: list[dict[str, Any]]) -> None:

@@ -208,7 +208,9 @@ class TrackRun:
             place = f"E {east_m:.1f} m  N {north_m:.1f} m  ±{radius_m:.1f} m (95 %)" if is_known else "no position"
             why = f"  {record['reason']}: {record['message']}" if record["reason"] else ""
             slip = "  after a slip" if record["slipped"] else ""
-            print(f"{printable(record['image'])}  {record['status'].replace('_', ' ')}  {place}{slip}{why}", flush=True)
+            search = "  search: beam" if record["search"] == "beam" else ""
+            status = record["status"].replace("_", " ")
+            print(f"{printable(record['image'])}  {status}  {place}{search}{slip}{why}", flush=True)
 
     def _add(self, path: str) -> None:
         self._add_exposure(read_exposure(path, **self.session.facts), path)

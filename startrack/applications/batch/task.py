@@ -238,7 +238,7 @@ def _has_types(found: dict[str, Any]) -> bool:
     """Whether what is printed, and what the tables and the trajectory take, has the types of a record."""
     try:
         numbers = [(TYPES["float64"], one) for one in found.get("timing_ms", {}).values()]
-        texts = [found["message"], *found.get("warnings", ())]
+        texts = [found["message"], *found.get("warnings", ()), found.get("search", {}).get("outcome", "")]
         columns = [(TYPES[one.datatype], one.value(found)) for one in output.table_columns()]
         time_utc = found.get("provenance", {}).get("time_utc")
         if time_utc is not None:

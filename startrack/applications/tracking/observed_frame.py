@@ -24,7 +24,7 @@ from startrack.estimation.trajectory import SIGMAS_95
 from startrack.localization import HIGH_RAD, LOW_RAD, MIN_ROW_NATS, camera_at
 from startrack.terrain import Terrain
 
-FRAME_FORMAT = "startrack.observed-frame/4"
+FRAME_FORMAT = "startrack.observed-frame/5"
 ROWS = ("azimuth_rad", "elevation_rad", "llr", "edge_sigma_rad", "extended_nats")
 MODE_SIGMA_M = 10.0  # of a mode whose circle is not known
 T = TypeVar("T")
@@ -56,6 +56,7 @@ class ObservedFrame:
     reason: str = ""  # of a refusal
     message: str = ""
     steepness_1: float = 1.0  # of the terrain, as the image shows it where it is not known
+    search: str = ""  # as `Fix.search`; empty: refused
 
     @property
     def facts(self) -> frozenset[str]:
@@ -89,7 +90,9 @@ def observe_frame(outcome: Outcome, errors: TrackErrors | None = None, terrain: 
         raise ValueError(f"{name}: it shows a gross error of {', '.join(missing)}: it must be shared")
     fixes = _image_fixes(value.fix, terrain)
     rows = _informative_rows(value, terrain, fixes[0].at_time_m)
-    frame = ObservedFrame(name, when, R, (), rows, fixes, value.fix.shown, steepness_1=value.terrain.steepness_1)
+    frame = ObservedFrame(
+        name, when, R, (), rows, fixes, value.fix.shown, steepness_1=value.terrain.steepness_1, search=value.fix.search
+    )
     return observe_again(frame, errors, terrain)
 
 
@@ -180,7 +183,7 @@ def encode_frame(frame: ObservedFrame) -> bytes:
     head = {
         "format": FRAME_FORMAT, "name": frame.name, "time_utc": frame.time_utc.isoformat(), "modes": len(frame.modes),
         "fixes": len(frame.fixes), "shown": [asdict(one) for one in frame.shown], "reason": frame.reason,
-        "message": frame.message, "steepness_1": frame.steepness_1,
+        "message": frame.message, "steepness_1": frame.steepness_1, "search": frame.search,
     }  # fmt: skip
     file = io.BytesIO()
     np.savez(file, head=np.array(json.dumps(head)), **arrays)  # type: ignore[arg-type]
@@ -204,7 +207,7 @@ def decode_frame(data: bytes | bytearray) -> ObservedFrame:
         tuple(_value(FrameEstimate, f"mode{number}", arrays) for number in range(head["modes"])), rows,
         tuple(_value(ImageFix, f"fix{number}", arrays) for number in range(head["fixes"])),
         tuple(ShownError(**one) for one in head["shown"]), head["reason"], head["message"],
-        head["steepness_1"],
+        head["steepness_1"], head["search"],
     )  # fmt: skip
 
 

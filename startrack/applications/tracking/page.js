@@ -22,6 +22,7 @@ const radiusText = (k, prefix) => say(frames[`${prefix}radius95_m`][k], 2, "m");
 function frameRows(k) {
   return [
     ["Time", sayTime(frames.time_utc[k])], ["Why", frames.message[k]], ["Odometry", frames.slipped[k] ? "slip before this frame" : null],
+    ["Search", frames.search[k] === "beam" ? "beam: ended before the proof that no other position fits" : null],
     ["Smoothed", placeText(k, "")], ["95 % within", radiusText(k, "")],
     ["Filtered", placeText(k, "filtered_")], ["95 % within", radiusText(k, "filtered_")],
     ["Latitude", known(frames.latitude_deg[k]) ? sayDegrees(frames.latitude_deg[k], 6) : null],

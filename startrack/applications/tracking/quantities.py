@@ -16,6 +16,7 @@ from startrack.frames import format_utc, latlon_from_enu
 
 FORMAT = "startrack.track/1"
 STATUSES = ("used", "left_out", "refused")
+SEARCHES = ("proven", "beam")
 Value = Callable[["FrameValues"], Any]
 
 
@@ -84,6 +85,10 @@ FRAME_QUANTITIES = (
     _frame(
         "slipped", "", "%d", "1: the odometry's move to this frame is judged wheel slip",
         lambda v: int(v.k > 0 and bool(v.track.slipped[v.k - 1])), {"enum": [0, 1]}, known=True,
+    ),
+    _frame(
+        "search", "", "%s", "proven: the image alone excludes every other position; beam: its search ended before that",
+        lambda v: v.frame.search or None, {"enum": [None, *SEARCHES]}, known=True,
     ),
     *_trajectory("smoothed", "", "by all frames"),
     *_trajectory("filtered", "filtered_", "by the frames up to this one"),

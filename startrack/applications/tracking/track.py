@@ -55,6 +55,7 @@ class TrackFrame:
     reason: str  # code; empty where used
     message: str
     quat_xyzw_body_enu: Array | None  # (4,) None: no attitude, or one that contradicts the track
+    search: str = ""  # as `Fix.search` of the image alone; empty: refused
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +233,7 @@ def _track_frame(frame: ObservedFrame, mode: int, attitude_fits: bool) -> TrackF
         found = "left_out", "inconsistent_evidence", "its position contradicts the other frames"
     R = frame.R_body_enu if attitude_fits and found[0] != "left_out" else None
     quat = None if R is None else quat_xyzw_from_R(R)
-    return TrackFrame(frame.name, frame.time_utc, *found, quat)
+    return TrackFrame(frame.name, frame.time_utc, *found, quat, frame.search)
 
 
 def _trajectory(

@@ -326,7 +326,7 @@ def test_import_states_the_geoid_of_a_grid(tmp_path, capsys):
 BAD = [
     ({"body": "moon"}, "a map of the Earth"), ({"dem": {"scale": 30.0}}, "not of the Earth's ground"),
     ({"origin": {"height_m": 551.0 * 0.3048}}, "one of them is in feet"),
-    ({"origin": {"latitude_deg": 40.0}}, "not near the origin: .* 36.59, longitude -84.25, .* 30.1 km x 31.8 km"),
+    ({"origin": {"latitude_deg": 40.0}}, "origin is not on this map: .* 36.59, longitude -84.25, .* 30.1 km x 31.8 km"),
     ({"search": {"radius_m": 20_000.0}}, "cover"),
     ({"air": {"terrestrial_refraction": 2.0}}, "terrestrial_refraction"),
 ]  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import socket
 from dataclasses import replace
 from pathlib import Path
@@ -105,7 +106,7 @@ REFUSED = [
     ({"search": {"radius_m": 5000.0}}, "cover"), ({"search": {"max_slope_deg": 0.0}}, "max_slope_deg"),
     ({"search": {"glare_deg": [10.0]}}, "glare_deg"), ({"body": "earth"}, "a map of the Moon"),
     ({"cylinder": {"diameter_m": 100.0, "depth_m": 10.0}}, "two grounds"),
-    ({"origin": {"latitude_deg": 0.0}}, "origin: its middle is at latitude -90.00, longitude"),
+    ({"origin": {"latitude_deg": 0.0}}, "origin is not on this map: its middle is at latitude -90.00, longitude"),
 ]  # fmt: skip
 
 
@@ -539,3 +540,21 @@ def test_what_is_neither_a_name_nor_a_path_is_refused(given: Any) -> None:
         with pytest.raises(BadInput, match=f"{type(given).__name__} is neither a name nor a path") as caught:
             load(given)
         assert caught.value.reason == reason
+
+
+@pytest.mark.parametrize(
+    ("name", "place_deg", "middle"),
+    [
+        ("site01-10m", ("89.5", "222"), "latitude -89.46, longitude -137.49, .* 9 km x 9 km"),
+        ("site01-10m", ("-89.45", "42"), "latitude -89.46, longitude -137.49, .* 9 km x 9 km"),
+        ("ldem75s-240m", ("89.5", "222"), "latitude -90.00, .* 230 km x 230 km"),
+        ("kepler-48m", ("8.12", "38.01"), "latitude 8.1., longitude -38.0., .* 38.3 km"),
+    ],
+)
+def test_an_origin_with_a_wrong_sign_is_told_where_the_map_lies(name, place_deg, middle, tmp_path, capsys):
+    latitude, longitude = place_deg
+    words = ["--latitude", latitude, "--longitude", longitude, "-o", str(tmp_path / "mine.toml")]
+    assert main(["terrain", "import", str(ROOT / "terrain" / f"{name}.tif"), *words]) == 4
+    err = capsys.readouterr().err
+    assert re.search(f"{name}.tif: the origin is not on this map: its middle is at {middle}", err)
+    assert "next:" not in err

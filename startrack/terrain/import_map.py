@@ -19,7 +19,7 @@ from startrack.terrain.height_map import HeightMap
 from startrack.terrain.io import terrain_from_dict
 from startrack.terrain.map_comparison import compare_with_finest, crest_angle_rad_per_m
 from startrack.terrain.map_error import carried_spacing, error_between_posts_m, find_product
-from startrack.terrain.map_reading import read_map
+from startrack.terrain.map_reading import read_map, require_origin
 from startrack.terrain.map_writing import write_map
 from startrack.terrain.raster import Raster
 from startrack.terrain.shape import CAMERA_ERROR, EARTH_HIGHEST_M, REFRACTION, REFRACTION_1, STRETCH, vertical_fact
@@ -100,11 +100,15 @@ def import_maps(
     files = [output.with_name(f"{output.stem}-{k + 1}.tif") for k in range(len(maps))]
     for path in (output, *files):
         check_output(path, overwrite=overwrite, reason="bad_terrain")
-    crops: list[Raster] = []
-    for k, (source, half) in enumerate(zip(maps, half_m, strict=True)):
+    wholes: list[Raster] = []
+    for k, source in enumerate(maps):
         own = {"scale": scale[k] if k < len(scale) else None, "offset_m": offset_m[k] if k < len(offset_m) else None}
-        body = crops[0].projection.body if crops else None
-        crop = read_map(source, near=origin, body=body, **own).crop_around(*origin, half)
+        body = wholes[0].projection.body if wholes else None
+        wholes.append(read_map(source, near=origin, body=body, **own))
+    require_origin(wholes, *origin)
+    crops: list[Raster] = []
+    for source, whole, half in zip(maps, wholes, half_m, strict=True):
+        crop = whole.crop_around(*origin, half)
         if min(crop.heights_m.shape) < 2:
             raise BadInput("bad_terrain", f"{source}: it does not reach {latitude_deg:g}, {longitude_deg:g}")
         crops.append(replace(crop, source=Path(source).name))

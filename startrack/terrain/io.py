@@ -216,13 +216,14 @@ def _radians(degrees: float | None) -> float | None:
 
 def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) -> Terrain:
     from startrack.terrain.height_map import HeightMap
-    from startrack.terrain.map_reading import read_map
+    from startrack.terrain.map_reading import read_map, require_origin
 
     dem, rover, search = keys["dem"], keys["rover"], keys["search"]
     near, files = (site.latitude_rad, site.longitude_rad), _map_files(keys, folder)
     obstacles, more_files = _obstacles(keys, folder)
     scaling = {key: dem[key] for key in ("scale", "offset_m") if key in dem}
     maps = tuple(read_map(file, near=near, body=site.body, **scaling) for file in files)
+    require_origin(maps, *near)
     on_earth = {}
     if site.body == "earth":
         from startrack.terrain.ellipsoid_fit import above_ellipsoid, check_height

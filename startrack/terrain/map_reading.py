@@ -62,21 +62,30 @@ def read_map(
         )
     raster = _heights_of(stored, path, scale, offset_m)
     cut = raster if near is None else raster.crop_around(*near, WINDOW_HALF_M[found])
-    _check_near(path, raster, cut.heights_m.shape)
+    if min(cut.heights_m.shape) < 2:
+        raise _not_on(str(path), raster)
     return cut
 
 
-def _check_near(path: Path, whole: Raster, cut: tuple[int, ...]) -> None:
-    """Raise BadInput bad_terrain, with the place of the `whole` map, where a shape `cut` from it has no two rows."""
-    if min(cut) >= 2:
-        return
+def require_origin(maps: Sequence[Raster], latitude_rad: float, longitude_rad: float) -> None:
+    """Raise BadInput bad_terrain, with the place of the first map, where none of the `maps` holds a place."""
+    for one in maps:
+        at = one.row_column(np.array(latitude_rad), np.array(longitude_rad))
+        if np.all((at >= 0) & (at <= np.array(one.heights_m.shape) - 1)):
+            return
+    raise _not_on(maps[0].source, maps[0])
+
+
+def _not_on(name: str, whole: Raster) -> BadInput:
+    """The refusal of an origin that is not on the `whole` map called `name`: where it lies, and how large it is."""
     posts = np.array(whole.heights_m.shape)
-    latitude, longitude = np.degrees(whole.projection.latlon_from_xy(*whole.xy(0.5 * posts)))
+    latitude, longitude = np.degrees(whole.projection.latlon_from_xy(*whole.xy(0.5 * (posts - 1))))
     height_km, width_km = posts * whole.spacings_m / 1000
-    raise BadInput(
+    return BadInput(
         "bad_terrain",
-        f"{path}: it is not near the origin: its middle is at latitude {latitude:.2f}, longitude {longitude:.2f}, and "
-        f"it is about {width_km:.3g} km x {height_km:.3g} km large; give the latitude and longitude of a place on it",
+        f"{name}: the origin is not on this map: its middle is at latitude {latitude:.2f}, longitude {longitude:.2f}, "
+        f"and it is about {width_km:.3g} km x {height_km:.3g} km large; give the latitude and longitude of a place on "
+        "it (north and east positive)",
     )
 
 
@@ -199,8 +208,8 @@ def _content_of(file: Any, path: Path, near: tuple[float, float] | None, hint: s
     if near is not None:
         rows, columns = raster.window(*near, WINDOW_HALF_M[projection.body])
     shape = rows.stop - rows.start, columns.stop - columns.start
-    if min(file.height, file.width) >= 2:
-        _check_near(path, raster, shape)
+    if min(file.height, file.width) >= 2 > min(shape):
+        raise _not_on(str(path), raster)
     if shape[0] * shape[1] > MAX_PIXELS:
         raise BadInput("bad_terrain", f"{path}: too large; cut it to the area (startrack terrain import --half)")
     if math.prod(file.block_shapes[0]) > MAX_BLOCK_POSTS:  # of which a window is a part

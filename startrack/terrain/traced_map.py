@@ -71,8 +71,11 @@ class TracedMap(Terrain):
                 "bad_terrain", f"{other[0]} is not a map of the {self.site.body.title()}, where the origin is"
             )
         if not self._covers(self.search_radius_m):
-            area = f"the search area of {self.search_radius_m:.0f} m about the origin"
-            raise BadInput("bad_terrain", f"the maps do not cover {area}, or have holes in it")
+            raise BadInput(
+                "bad_terrain",
+                f"the maps do not cover the search area of {self.search_radius_m:.0f} m about the origin, or have "
+                "holes in it: give a wider map, or a smaller radius",
+            )
 
     @property
     def projection(self) -> Projection | EarthProjection:  # type: ignore[override]

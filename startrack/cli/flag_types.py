@@ -34,9 +34,9 @@ def count(text: str) -> int:
     try:
         value = int(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+        raise argparse.ArgumentTypeError(f"{text[:SHOWN_CHARS]!r} is not a whole number") from None
     if value < 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is negative")
+        raise argparse.ArgumentTypeError(f"{text[:SHOWN_CHARS]!r} is negative")
     return value
 
 
@@ -147,5 +147,7 @@ def cluster_address(text: str) -> str:
     scheme, _, address = text.rpartition("://")
     host, _, port = address.rpartition(":")
     if scheme not in SCHEMES or not host or not port.isdecimal() or not 0 < int(port) < 2**16:
-        raise argparse.ArgumentTypeError(f"{text!r} is not the address of a Dask scheduler such as tcp://host:8786")
+        raise argparse.ArgumentTypeError(
+            f"{text[:SHOWN_CHARS]!r} is not the address of a Dask scheduler such as tcp://host:8786"
+        )
     return text

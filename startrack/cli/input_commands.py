@@ -152,7 +152,7 @@ COMMANDS = (
                 {
                     "input": (
                         flag("terrain TERRAIN", "terrain file, or the name of a shipped one"),
-                        flag("--at EAST NORTH", "a position [m]", float, nargs=2),
+                        flag("--at EAST NORTH", "a position [m]", number, nargs=2),
                     ),
                     "output": (flags.DIR, flags.JSON, flags.NO_PLOTS),
                     "more": flags.MORE,
@@ -176,25 +176,25 @@ COMMANDS = (
                 {
                     "input": (
                         flag("maps MAP", "GeoTIFF, COG, PDS label, .hgt, USGS .dem ..., the finest first", nargs="+"),
-                        flag("--latitude DEG", "of the origin, north positive", float, required=True),
-                        flag("--longitude DEG", "east positive", float, required=True),
-                        flag("--radius M", "of the search area", float, default=10_000.0),
+                        flag("--latitude DEG", "of the origin, north positive", number, required=True),
+                        flag("--longitude DEG", "east positive", number, required=True),
+                        flag("--radius M", "of the search area", positive_number, default=10_000.0),
                         flag("--half M", "half side of each map's crop (30000 for the first, then 300000; on the Earth "
-                             "150000 at most)", float,
+                             "150000 at most)", positive_number,
                              nargs="+"),
                         flag("--scale M", "metres per unit of each map; needed for integers if the files lack it",
-                             float, nargs="+"),
-                        flag("--offset M", "height of value 0 of each map, if the files lack it", float, nargs="+"),
-                        flag("--sigma M", "error of single posts (default: measured or estimated)", float),
+                             number, nargs="+"),
+                        flag("--offset M", "height of value 0 of each map, if the files lack it", number, nargs="+"),
+                        flag("--sigma M", "error of single posts (default: measured or estimated)", amount),
                         flag(
                             "--compare MAP",
                             "finer maps of a part of the ground, to measure the errors (the shipped maps are tried "
                             "anyway)", nargs="+", default=(),
                         ),
-                        flag("--camera-height M", "above the ground", float, default=1.5),
+                        flag("--camera-height M", "above the ground", amount, default=1.5),
                         flag(
                             "--highest-beyond M", "ground off the maps is no higher (default: 8850 on the Earth; on "
-                            "the Moon the highest of the maps)", float,
+                            "the Moon the highest of the maps)", number,
                         ),
                         flag("--geoid GRID", "of PROJ, above which the maps count heights: a name that it finds, as "
                              "us_nga_egm96_15.tif, or a file"),

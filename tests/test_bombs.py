@@ -158,6 +158,17 @@ def test_a_height_map_whose_strip_is_much_larger_is_refused(tmp_path, cut, cause
         load_terrain(tmp_path / "hill.toml")
 
 
+def test_a_height_map_with_much_metadata_is_refused(tmp_path):
+    text = f"<GDALMetadata>{2**20 * 'a'}</GDALMetadata>"
+    with tifffile.TiffFile(io.BytesIO(hill_map())) as file:
+        tags = [(t.code, t.dtype, t.count, t.value, True) for t in file.pages[0].tags if 33550 <= t.code <= 34737]
+    more = [(42112, "s", 0, text, True)]
+    tifffile.imwrite(tmp_path / "hill.tif", FRAME.astype(np.float32), extratags=tags + more, metadata=None)
+    (tmp_path / "hill.toml").write_text(HEIGHT_MAP)
+    with pytest.raises(BadInput, match="GDAL_METADATA of 1048605 characters"):
+        load_terrain(tmp_path / "hill.toml")
+
+
 def test_aliases_of_yaml_are_refused(tmp_path):
     """Each line is nine times as long as the line before, once written out."""
     lines = ["a0: &a0 [1]", *(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 12))]

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from startrack.core.files import MAX_CAUSE_CHARS
+from startrack.core.files import MAX_CAUSE_CHARS, MAX_TEXT_BYTES
 from startrack.core.tiff_strips import TIFF_COMPRESSIONS, check_packed_strips
 from startrack.core.types import MAX_PIXELS, BadInput
 from startrack.terrain.earth_projection import FOOT_M, WGS84_CODE, EarthProjection, is_earth
@@ -100,9 +100,11 @@ def read_geotiff(path: Path) -> Stored | None:
 
 
 def _gdal_scale(items: Any) -> tuple[float | None, float]:
-    """SCALE and OFFSET of GDAL's metadata: None where the step is not known, and 0."""
+    """SCALE and OFFSET of GDAL's metadata: None where the step is not known, and 0. Raises ValueError."""
     found = {}
     if isinstance(items, str):
+        if len(items) > MAX_TEXT_BYTES:  # entities make much more of it
+            raise ValueError(f"GDAL_METADATA of {len(items)} characters")
         found = {str(e.get("name")).upper(): e.text or "" for e in ElementTree.fromstring(items).iter("Item")}
     metres = UNITS_M.get(str(found.get("UNITTYPE", "")).lower())
     return (float(found["SCALE"]) if "SCALE" in found else metres), float(found.get("OFFSET", 0.0))

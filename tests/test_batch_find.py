@@ -134,3 +134,14 @@ def test_a_height_map_in_the_folder_is_left_out_and_named(tmp_path, capsys):
         (images / name).unlink()
     assert main(command) == 4
     assert "no PNG, TIFF" in capsys.readouterr().err
+
+
+def test_an_image_whose_result_has_too_long_a_name_is_refused_alone(tmp_path, capsys):
+    """File systems take names of 255 bytes."""
+    (image,) = frames(tmp_path / "images", 1)
+    image.rename(image.with_name(f"{250 * 'y'}.png"))
+    words = ["batch", str(tmp_path / "images"), "-D", str(tmp_path / "out"), "-j", "1", "--no-plots"]
+    assert main(words) == 5
+    assert "File name too long" in capsys.readouterr().err
+    (row,) = Table.read(tmp_path / "out" / "results.ecsv", format="ascii.ecsv")
+    assert row["status"] == "refused"

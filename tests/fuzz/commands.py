@@ -25,6 +25,7 @@ from .seeds_beside import ODOMETRY
 from .targets import OUT_OF_MEMORY
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_images" / "near-centre"
+SKY = SAMPLE.with_name("lowell-2018-08-06.fits.bz2")
 NIGHT = "2030-06-01T00:00:00Z"
 PREDICTED = ("--time", NIGHT, "--draws", "1", "--path", "way.csv", "--spacing", "200", "-j", "1")
 CAMERA = ("-c", "camera.toml")
@@ -36,7 +37,8 @@ COMMANDS = (
     ("calibrate", "convert", "camera.toml", "--to", "platepar", "--attitude", "image.fix.json", "--site=34,-111", "-q"),
     ("calibrate", "convert", "camera.toml", "--to", "indi-allsky", "--attitude", "image.fix.json", "--site=34,-111"),
     ("calibrate", "convert", "camera.yaml", "--from", "ros", "-q"), ("calibrate", "verify", "image.png", *CAMERA),
-    ("calibrate", "image.png", *CAMERA, "-q", "-o"), ("horizon", "image.png", *CAMERA, "--site=34,-111", "-q", "-o"),
+    ("calibrate", "image.png", *CAMERA, "-q", "-o"),
+    ("horizon", "sky.fits.bz2", "-c", "sky.toml", "--site=34.74,-111.42,2360", "-q", "-o"),
     ("identify", "image.png", "--fov=180", "--no-plots"), ("identify", "image.png", "--near-sky=94,-68,20", "-q"),
     ("locate", "image.png", "--near-attitude", "image.fix.json", "--near=400,-300,100", "-q", "--format=kml"),
     ("track", "image.png", "--odometry", "drive.tum", "--max-speed=2", "--no-plots"),
@@ -53,13 +55,19 @@ FILES = (  # that are mutated, with the kind of their changes
     ("table", "obstacles.csv"), ("correction", "mask.png"), ("correction", "dark.png"), ("elevation", "hill.tif"),
     ("terrain", "map.toml"),
 )  # fmt: skip
+SKY_FILES = (("fits", "sky.fits.bz2"), ("sidecar", "sky.json"), ("camera", "sky.toml"))  # of horizon
 RESUMED = ("batch", "predict", "reproduce", "track")  # begin with the results of a run on sound files
 ENTRIES = 0.1  # of the mutations: the file becomes something else
 WITHOUT_OUTPUT = (("calibrate", "show"), ("calibrate", "verify"), ("terrain", "state"))
 SUFFIXES = {"horizon": ".csv"}  # of what -o names
-INPUTS = (".png", ".toml", ".json", ".csv", ".yaml", ".tum", ".tif")
+INPUTS = (".png", ".toml", ".json", ".csv", ".yaml", ".tum", ".tif", ".bz2")
 WORDS = 0.3  # of the mutations: a value among the words of the command
-REFUSE_SAMPLES = ("horizon", "batch")  # a sky of the Moon above a site on the Earth; a picture without a sidecar
+REFUSE_SAMPLES = ("batch",)  # a picture without a sidecar
+
+
+def words_of(seed: int, index: int) -> tuple[str, ...]:
+    """The sound words of the command number `index` of a campaign with this `seed`."""
+    return Random(f"{seed}/command/{index}").choice(COMMANDS)
 
 
 def run_command(seed: int, index: int, folder: Path) -> str | None:
@@ -71,7 +79,8 @@ def run_command(seed: int, index: int, folder: Path) -> str | None:
     words = random.choice(COMMANDS)
     results = _results_of(words, folder)
     stored = [("sidecar" if name.endswith(".json") else "raw", name) for name in results if is_read_again(name)]
-    kind, name = random.choice(stored if stored and random.random() < 0.5 else FILES)
+    inputs = SKY_FILES if words[0] == "horizon" else FILES
+    kind, name = random.choice(stored if stored and random.random() < 0.5 else inputs)
     here = _begin(words, folder, small=kind in ("png", "correction") and not results)
     values = [k for k, word in enumerate(words) if "=" in word]
     if values and random.random() < WORDS:
@@ -99,6 +108,10 @@ def is_read_again(name: str) -> bool:
 def _begin(words: tuple[str, ...], folder: Path, *, small: bool) -> Path:
     """Sound files, and the results that the command goes on from."""
     here = _write_sound(folder, small=small)
+    if words[0] == "horizon":
+        for name, sample in (("sky.fits.bz2", SKY), ("sky.json", SKY.with_name("lowell-2018-08-06.json"))):
+            shutil.copyfile(sample, here / name)
+        (here / "sky.toml").write_text((data_dir("calib") / "lowell-ldt.toml").read_text())
     for name, data in _results_of(words, folder).items():
         (here / name).parent.mkdir(parents=True, exist_ok=True)
         (here / name).write_bytes(data)

@@ -1,4 +1,4 @@
-"""Frames of a fixed camera below a known jagged skyline, painted without the package's renderer."""
+"""Frames of a fixed camera below a known jagged skyline, painted without the package's renderer; a small skyline."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from star_painter import paint
 
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
-from startrack.core.types import Exposure
+from startrack.core.types import Exposure, MeasuredSkyline
 from startrack.frames import R_enu_icrs, Site, azel_from_rays, observer_velocity_m_s, parse_utc, rays_from_azel
 
+LOWELL = Site("earth", np.radians(34.7443), np.radians(-111.4223), 2361.0)
 SITE = Site("earth", np.radians(46.0), np.radians(7.0), 1000.0)
 TIME = parse_utc("2024-10-05T21:00:00Z")
 CAMERA = Camera(
@@ -89,3 +90,15 @@ def _paint_stars(light: np.ndarray, time_utc: datetime, with_clouds: bool) -> No
     air = 1.0 / (np.sin(elevation[up]) + 0.025 * np.exp(-11 * np.sin(elevation[up])))
     flux = 10 ** (-0.4 * (stars.v_mag[up] + EXTINCTION_MAG * air - ZERO_MAG))
     paint(light, xy[inside], flux[inside], PSF_PX)
+
+
+def small_skyline() -> MeasuredSkyline:
+    """Rising from north to north, unknown at three azimuths."""
+    elevation = np.radians(np.linspace(1.0, 10.0, 360))
+    elevation[[0, 5, 6]] = np.nan
+    return MeasuredSkyline(
+        azimuth_rad=np.radians(np.arange(360.0)),
+        elevation_rad=elevation,
+        sigma_rad=np.where(np.isnan(elevation), np.inf, np.radians(0.1)),
+        source=np.where(np.isnan(elevation), "", "both"),
+    )

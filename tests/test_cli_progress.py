@@ -9,6 +9,7 @@ import sys
 import time
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -18,6 +19,7 @@ from PIL import Image
 from render_helpers import FISHEYE
 from scipy.spatial.transform import Rotation
 
+from startrack import chain
 from startrack.camera import camera_text
 from startrack.catalog import apparent_stars, load_catalog
 from startrack.chain import detect, identify
@@ -44,6 +46,20 @@ def test_long_work_without_a_terminal_prints_lines(monkeypatch):
     with console.progress("table", 3, shown=False):
         time.sleep(0.2)
     assert sys.stderr.getvalue().splitlines() == lines
+
+
+@pytest.mark.parametrize(("flags", "shown"), [([], True), (["-q"], False), (["--json"], False)])
+@pytest.mark.parametrize("command", ["locate", "identify"])
+def test_a_long_search_of_one_image_prints_lines(tmp_path, capsys, monkeypatch, command, flags, shown):
+    monkeypatch.setattr(console, "LINE_S", 0.05)
+    solve = {"locate": "locate_exposure", "identify": "identify"}[command]
+    found = getattr(chain, solve)
+    monkeypatch.setattr(chain, solve, lambda *args: time.sleep(0.2) or found(*args))
+    words = [command, str(Path(__file__).parent.parent / "sample_images/near-centre.png"), "-D", str(tmp_path), "--no-plots", *flags]
+    assert main(words) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith(f"{command} near-centre: ")]
+    assert bool(lines) == shown
+    assert all(re.fullmatch(r".*: \d+ s", line) for line in lines)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 
@@ -154,6 +154,11 @@ def _lines_about(what: str, steps: Progress) -> Iterator[Progress]:
     finally:
         end.set()
         thread.join()
+
+
+def wait_lines(args: argparse.Namespace, what: str) -> AbstractContextManager[object]:
+    """In the block, a line on stderr every LINE_S seconds shows that `what` goes on, unless the flags forbid it."""
+    return nullcontext() if args.quiet or args.json else _lines_about(what, Progress())
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from startrack import chain, output
 from startrack.applications.batch import result_stems
 from startrack.camera import Camera, load_camera
 from startrack.catalog import load_catalog
-from startrack.cli.console import Outcome, print_outcome, worst_code
+from startrack.cli.console import Outcome, print_outcome, wait_lines, worst_code
 from startrack.cli.flags import check_localizer
 from startrack.cli.images import check_fov, compile_beside, near_attitude_of, prepare, read, settings_of
 from startrack.cli.report import write_page_of_images
@@ -112,7 +112,8 @@ def _solve_image(args: argparse.Namespace, path: str, out: Path, solve: Solve) -
         prepare(terrain, args)
         compile_beside(exposure.terrain)
     start = time.perf_counter()
-    result = chain.add_timing(solve(exposure, camera), read=1e3 * read_s)
+    with wait_lines(args, f"{args.command} {printable(exposure.name)}"):
+        result = chain.add_timing(solve(exposure, camera), read=1e3 * read_s)
     more = {"explain": output.explain(result)} if is_located and args.explain else {}
     record = output.write_results(
         result, out, plots=not args.no_plots, catalog_table=getattr(args, "catalog_table", False), more=more

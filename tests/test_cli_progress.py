@@ -55,8 +55,8 @@ def test_a_long_search_of_one_image_prints_lines(tmp_path, capsys, monkeypatch, 
     solve = {"locate": "locate_exposure", "identify": "identify"}[command]
     found = getattr(chain, solve)
     monkeypatch.setattr(chain, solve, lambda *args: time.sleep(0.2) or found(*args))
-    words = [command, str(Path(__file__).parent.parent / "sample_images/near-centre.png"), "-D", str(tmp_path), "--no-plots", *flags]
-    assert main(words) == 0
+    image = Path(__file__).parent.parent / "sample_images/near-centre.png"
+    assert main([command, str(image), "-D", str(tmp_path), "--no-plots", *flags]) == 0
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith(f"{command} near-centre: ")]
     assert bool(lines) == shown
     assert all(re.fullmatch(r".*: \d+ s", line) for line in lines)

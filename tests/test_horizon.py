@@ -230,11 +230,20 @@ def test_the_command_writes_the_file_and_the_record(tmp_path, capsys):
     assert record["format"] == "startrack.horizon/1"
     assert record["status"] == "ok"
     assert record["azimuths"]["known"] > 200
-    assert "interpolated" in record["message"] and record["message"].endswith(UNTESTED)
+    assert "of the 360 interpolated" in record["message"] and record["message"].endswith(UNTESTED)
     Draft202012Validator(SCHEMAS["horizon"]).validate(record)
     assert set(record) <= set(SCHEMAS["horizon"]["properties"])
     assert out.exists()
     assert main(["horizon", str(PHOTO), "-o", str(out), LOWELL_FLAG, "-c", "lowell-ldt"]) == 2
+
+
+def test_the_advice_of_a_wrong_site_is_about_the_site(tmp_path, capsys):
+    words = ["-o", str(tmp_path / "a.hrz"), "--site=-34.7443,-111.4223", "-c", "lowell-ldt"]
+    assert main(["horizon", str(PHOTO), *words, "--json"]) == 3
+    advice = json.loads(capsys.readouterr().out)["advice"]
+    assert "site" in advice and "terrain" not in advice and "boulder" not in advice
+    assert main(["horizon", str(PHOTO), *words]) == 3
+    assert "terrain" not in capsys.readouterr().err
 
 
 def test_without_site_or_time_it_is_bad_input(tmp_path, capsys):

@@ -13,10 +13,12 @@ from startrack.applications import horizon
 from startrack.catalog import load_catalog
 from startrack.cli.console import Outcome, named_steps, print_left_out, print_outcome, refusal
 from startrack.cli.images import approximate_camera, check_fov, check_one_time, read, site_of
-from startrack.core.errors import BadInput, BadOutput, NoSolution, one_line
+from startrack.core.errors import BadInput, BadOutput, NoSolution, Reason, one_line
 
 FORMAT = "startrack.horizon/1"
 UNTESTED = "time and site are not tested by one image: an hour turns the skyline by 15 degrees"
+
+ADVICE = "Check the site (signs) and the times (UTC); measure each picture alone if the camera was turned between them."
 
 
 def run(args: argparse.Namespace) -> int:
@@ -28,7 +30,10 @@ def run(args: argparse.Namespace) -> int:
     except BadOutput:
         raise
     except (BadInput, NoSolution) as cause:
-        return print_outcome(args, *refusal(cause, Path(args.output).name, format=FORMAT))
+        record, line = refusal(cause, Path(args.output).name, format=FORMAT)
+        if cause.reason == Reason.INCONSISTENT_EVIDENCE:
+            record["advice"] = ADVICE
+        return print_outcome(args, record, line)
 
 
 def _measure(args: argparse.Namespace) -> Outcome:
@@ -42,7 +47,7 @@ def _measure(args: argparse.Namespace) -> Outcome:
         raise BadInput("bad_terrain", f"the site is on the {site.body}: this command is for cameras on the Earth")
     camera = approximate_camera(args, exposures)
     steps = 2 * len(exposures) + 1
-    with named_steps(args, f"horizon from {len(exposures)} images", steps) as show_step:
+    with named_steps(args, f"horizon from {_count_text(len(exposures))}", steps) as show_step:
         frames, left_out = horizon.orient_frames(
             exposures, load_catalog(), site, camera=camera, fov_rad=args.fov, progress=show_step
         )
@@ -51,7 +56,8 @@ def _measure(args: argparse.Namespace) -> Outcome:
     horizon.write_skyline(args.output, found.skyline, site, found.frames, overwrite=args.overwrite)
     unknown = int((~found.skyline.known).sum())
     varying = int((found.skyline.source == "varies").sum())
-    notes = [f"{unknown} of them interpolated"] if horizon.needs_all_azimuths(args.output) and unknown else []
+    interpolates = unknown and horizon.needs_all_azimuths(args.output)
+    notes = [f"{unknown} of the {len(found.skyline)} interpolated"] if interpolates else []
     notes += [f"{varying} differ between the images: the highest edge is taken"] if varying else []
     notes += [UNTESTED] if len(found.frames) == 1 else []
     note = "; ".join(notes)
@@ -59,11 +65,15 @@ def _measure(args: argparse.Namespace) -> Outcome:
     words = [f"{record['azimuths']['known']} of {len(skyline)} azimuths"]
     if record["median_sigma_deg"] is not None:
         words.append(f"median sigma {record['median_sigma_deg']:.2f}°")
-    words.append(f"{len(found.frames)} image{'s' if len(found.frames) > 1 else ''}")
+    words.append(_count_text(len(found.frames)))
     line = "  ".join([Path(args.output).name, "ok", *words, *([note] if note else [])])
     if args.verbose:
         line += "".join(f"\n  {one_line(one.name)}: {len(one.matched_star)} stars fit the lens" for one in found.frames)
     return record, line
+
+
+def _count_text(images: int) -> str:
+    return f"{images} image{'s' if images > 1 else ''}"
 
 
 def _record(args: argparse.Namespace, found: horizon.SkylineResult, note: str) -> dict[str, Any]:

@@ -12,12 +12,14 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import chdir, contextmanager
+from contextlib import chdir, contextmanager, suppress
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from astropy.table import Table
 from batch_helpers import frames
 from earth_helpers import in_projection
 
@@ -37,6 +39,16 @@ OUTPUTS = (  # commands that write one file, up to its name
     "calibrate board {image} --pattern 9x6 -o", "calibrate convert fisheye-2048 --to ros -o",
     "render -t shackleton-thesis -o", "report {folder} -o",
     "terrain import {image} --latitude -89 --longitude 0 -o",
+)  # fmt: skip
+
+WITH_PATHS = (  # commands that print the path of a folder or a file
+    "detect {folder} -D {folder}/out", "identify {image} --fov 180 -D {image}", "locate {image} -D {folder}/out -v",
+    "batch {folder} -D {folder}/out -j 1 -v", "batch {folder} -D {image}", "track {folder} -D {folder}/out",
+    "render -c {calib} -t {terrain} -o {folder}/a.png", "terrain show {terrain} -D {folder}/out",
+    "terrain state {terrain}", "terrain build {terrain}", "calibrate show {calib}", "report {folder}",
+    "calibrate convert {calib} --to ros -o {folder}/a.yaml", "reproduce methods -D {image}",
+    "terrain import {map} --latitude -89.66 --longitude 129.78 -o {folder}/a\x1b.toml --sigma 1 --radius 500",
+    "predict -c {calib} -t {terrain} --time 2030-01-01T00:00:00Z --draws 1 --spacing 9000 -j 1 -D {folder}/out",
 )  # fmt: skip
 
 
@@ -166,6 +178,57 @@ def test_control_characters_in_names_are_escaped(tmp_path, capsys, command, cont
     text = printed.out + printed.err
     assert "a\\nb\\x1b[31m\\x07c" in text or "c.toml  refused no_stars" in text
     assert all(line.isprintable() for line in text.splitlines()) and "\nb" not in text
+
+
+def check_printed(capsys: pytest.CaptureFixture[str]) -> str:
+    """What was printed, none of which moves the cursor or breaks a name into lines."""
+    text = "".join(capsys.readouterr())
+    assert all(line.isprintable() for line in text.splitlines()) and "\nb" not in text
+    return text
+
+
+def test_a_located_picture_has_any_name(tmp_path, capsys):
+    """In tables, pages and maps too; folders have such names as well."""
+    folder, out = tmp_path / CONTROL, tmp_path / "out" / CONTROL
+    folder.mkdir()
+    for name, sample in ((CONTROL, "near-centre"), ("c", "near-wall")):
+        for suffix in (".png", ".json"):
+            (folder / f"{name}{suffix}").write_bytes((ROOT / "sample_images" / f"{sample}{suffix}").read_bytes())
+    escaped = "a\\nb\\x1b[31m\\x07c"
+    assert main(["track", str(folder), "-D", str(out)]) == 0
+    assert f"{escaped}  used" in check_printed(capsys)
+    assert sorted(Table.read(out / "track.ecsv")["image"]) == [escaped, "c"]
+    assert main(["batch", str(folder), "-D", str(out), "-j", "1", "--no-plots", "-v"]) == 0
+    assert sorted(Table.read(out / "results.ecsv")["image"]) == [f"{escaped}.png", "c.png"]
+    assert main(["report", str(out)]) == 0
+    assert "left out" not in check_printed(capsys)
+    words = ["-D", str(out / "one"), "--no-plots", "--format", "kml", "-v"]
+    assert main(["locate", str(folder / f"{CONTROL}.png"), *words]) == 0
+    check_printed(capsys)
+    assert escaped in "".join(ElementTree.parse(out / "one" / f"{CONTROL}.kml").getroot().itertext())
+
+
+@pytest.mark.parametrize("words", WITH_PATHS)
+def test_control_characters_in_paths_are_escaped(tmp_path, capsys, words):
+    folder = tmp_path / CONTROL
+    (image,) = frames(folder, 1)
+    places = {"image": image, "folder": folder, "map": MAP}
+    for kind, name in (("calib", "fisheye-2048"), ("terrain", "shackleton-thesis")):
+        places[kind] = folder / f"{CONTROL}{kind}.toml"  # its stem is the name where it states none
+        places[kind].write_bytes((ROOT / kind / f"{name}.toml").read_bytes().replace(b"name =", b"#"))
+    with suppress(SystemExit):
+        main([word.format(**places) for word in words.split()])
+    assert check_printed(capsys)
+
+
+def test_a_rendered_picture_names_files_of_any_name(tmp_path):
+    """Its sidecar is read again."""
+    folder = tmp_path / CONTROL
+    folder.mkdir()
+    (folder / "camera.toml").write_bytes((ROOT / "calib" / "fisheye-2048.toml").read_bytes())
+    words = ["-c", str(folder / "camera.toml"), "-t", "shackleton-thesis", "--time", "2030-01-01T00:00:00Z"]
+    assert main(["render", *words, "-o", str(tmp_path / "a.png"), "--no-faint-stars"]) == 0
+    assert read_exposure(tmp_path / "a.png").camera == str(folder / "camera.toml")
 
 
 def test_writers_at_once_leave_a_whole_file(tmp_path):

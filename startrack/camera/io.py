@@ -73,9 +73,11 @@ def camera_keys(lens: type[Lens] | None = None) -> Table:
             "calibrated_angle_deg": Number(low=0, high=360, above=True,
                                            description="beyond this the lens is not known; default: max_angle_deg"),
             "mirrored": Flag(default=False),
-            "mask": Text(description="8-bit image of this size, relative to this file: pixels below 128 do not count"),
-            "obstacles": Text(description="CSV file, relative to this one: azimuth_deg from body x to the right, and "
-                                           "elevation_deg above the body's x y plane, below which the view is hidden"),
+            "mask": Text(is_path=True,
+                         description="8-bit image of this size, relative to this file: pixels below 128 do not count"),
+            "obstacles": Text(is_path=True,
+                              description="CSV file, relative to this one: azimuth_deg from body x to the right, and "
+                              "elevation_deg above the body's x y plane, below which the view is hidden"),
             "refraction": Choice(values=(REFRACTION_REMOVED, REFRACTION_CONTAINED),
                                  description="of the Earth's air: contained in a lens calibrated without a site"),
             "decentring": List(each=Number(low=-1, high=1), count=2, description="p1, p2 of a decentred lens"),

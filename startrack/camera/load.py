@@ -43,12 +43,13 @@ def load_camera(name_or_path: str | Path) -> Camera:
     try:
         program = None if path.suffix == ".toml" else find_program(text)
         if program is not None:
-            camera = camera_from_foreign_text(text, program, path.stem)
+            camera = camera_from_foreign_text(text, program, printable(path.stem))
             _log_angle(printable(path), program, float(np.degrees(camera.calibrated_angle_rad)))
             return camera
         if path.suffix in FOREIGN_CAMERA_SUFFIXES:
             raise BadInput("bad_calibration", "not a camera file of startrack (.toml), ROS, Kalibr, COLMAP or OpenCV")
-        return camera_from_dict(parse_toml(text, "bad_calibration"), default_name=path.stem, folder=path.parent)
+        keys = parse_toml(text, "bad_calibration")
+        return camera_from_dict(keys, default_name=printable(path.stem), folder=path.parent)
     except BadInput as cause:
         raise BadInput(cause.reason, f"{printable(path)}: {cause}") from cause
 

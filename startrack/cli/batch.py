@@ -24,7 +24,7 @@ from startrack.cli.report import write_page_of
 from startrack.core import errors
 from startrack.core.compilation import is_compiled
 from startrack.core.errors import INTERNAL_ERROR, BadInput
-from startrack.core.files import make_folder
+from startrack.core.files import make_folder, printable
 from startrack.core.runner import Runner, RunStopped, count_cores
 from startrack.exposure import is_bag
 
@@ -95,7 +95,7 @@ def _locate_images(
         try:
             _write_tables(args, out, _tasks(sorted({*whole, *found}), out, facts, args), records)
             lack = "" if batch.has_parquet() else " (no results.parquet: the extra parquet is missing)"
-            tables = f"tables in {out}{lack}"
+            tables = f"tables in {printable(out)}{lack}"
         except BadInput as cause:
             stopped, tables = stopped or "the tables cannot be written", f"no tables: {cause}"
     if stopped:

@@ -63,21 +63,22 @@ def convert(args: argparse.Namespace) -> int:
         lost = cameras.decentring_rms_px(camera) if camera.decentring and args.to != "colmap" else 0.0
         note = f"; {args.to} has no decentring: {lost:.2f} px RMS are lost" if lost else ""
     else:
-        foreign, stem = read_text(args.file, "no_calibration"), Path(args.file).stem
+        foreign, stem = read_text(args.file, "no_calibration"), printable(Path(args.file).stem)
         angle_rad = None if args.calibrated_angle is None else math.radians(args.calibrated_angle)
         camera = cameras.camera_from_foreign_text(foreign, args.source, stem, angle_rad)
         text = cameras.camera_text(replace(camera, name=args.name or camera.name))
         default, note = f"{stem}.toml", ""
         if angle_rad is None:
             print(
-                f"{args.file}: calibrated_angle_deg is set to {math.degrees(camera.calibrated_angle_rad):.1f}, the "
-                "nearest edge of the frame: the file states none; give --calibrated-angle",
+                f"{printable(args.file)}: calibrated_angle_deg is set to "
+                f"{math.degrees(camera.calibrated_angle_rad):.1f}, the nearest edge of the frame: the file states "
+                "none; give --calibrated-angle",
                 file=sys.stderr,
             )
     out = _output_path(args, default)
     write_atomically(out, text.encode("utf-8"), overwrite=args.overwrite)
     if not args.quiet:
-        print(f"{out}{note}")
+        print(f"{printable(out)}{note}")
     return 0
 
 

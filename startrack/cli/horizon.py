@@ -66,7 +66,7 @@ def _measure(args: argparse.Namespace) -> Outcome:
     if record["median_sigma_deg"] is not None:
         words.append(f"median sigma {record['median_sigma_deg']:.2f}°")
     words.append(_count_text(len(found.frames)))
-    line = "  ".join([Path(args.output).name, "ok", *words, *([note] if note else [])])
+    line = "  ".join([one_line(Path(args.output).name), "ok", *words, *([note] if note else [])])
     if args.verbose:
         line += "".join(f"\n  {one_line(one.name)}: {len(one.matched_star)} stars fit the lens" for one in found.frames)
     return record, line

@@ -128,7 +128,8 @@ def _solve_image(args: argparse.Namespace, path: str, out: Path, solve: Solve) -
         line += f"--fov {fov} --site LAT,LON{when} -o CAMERA.toml"
     if args.verbose and args.command != "detect":
         line += "\n" + output.verbose_text(result)
-        line += f"\n  written to {out.parent}/{out.name.removesuffix('.fix.json')}.*" if is_located else ""
+        files = printable(out).removesuffix(".fix.json")
+        line += f"\n  written to {files}.*" if is_located else ""
     return record, line
 
 

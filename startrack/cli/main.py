@@ -128,7 +128,7 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the `message` and the command that shows the usage, and exit."""
-        self.exit(USAGE, f"{self.prog}: error: {message}\ntry '{self.prog} --help'\n")
+        self.exit(USAGE, f"{self.prog}: error: {errors.one_line(message)}\ntry '{self.prog} --help'\n")
 
 
 @contextmanager
@@ -165,7 +165,7 @@ def _parser() -> tuple[argparse.ArgumentParser, dict[str, Command]]:
 
 
 def _report_failure(message: str, code: int) -> int:
-    print(f"startrack: {message}", file=sys.stderr)
+    print(f"startrack: {errors.one_line(message)}", file=sys.stderr)
     return code
 
 

@@ -16,7 +16,7 @@ from startrack.camera import load_camera
 from startrack.cli.console import progress
 from startrack.cli.images import odometry_errors
 from startrack.core.compilation import announce_compilation
-from startrack.core.files import check_output, write_atomically
+from startrack.core.files import check_output, printable, write_atomically
 from startrack.core.types import TIME_SIGMA_S
 from startrack.exposure import with_facts, write_exposure, write_sidecar
 from startrack.frames import format_utc, heading_pitch_roll_from_R_body_enu, parse_utc, tum_line
@@ -147,7 +147,7 @@ def _render_one(args: argparse.Namespace, series: Series, number: int, image: Pa
 
 def _line(summary: dict[str, Any]) -> str:
     return (
-        f"{summary['image']}: east {summary['east_m']:.1f} m, north {summary['north_m']:.1f} m, "
+        f"{printable(summary['image'])}: east {summary['east_m']:.1f} m, north {summary['north_m']:.1f} m, "
         f"heading {summary['heading_deg']:.2f}, pitch {summary['pitch_deg']:.2f}, "
         f"roll {summary['roll_body_deg']:.2f} deg, "
         f"{summary['time_utc']}, {summary['exposure_s']:.3g} s"

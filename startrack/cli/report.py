@@ -8,10 +8,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from startrack.applications.batch import JOB, result_stems, tabled_results
+from startrack.applications.batch import JOB, result_stems, tabled_results, text_of_name
 from startrack.core import REPORTED_IMAGES
-from startrack.core.errors import BadInput
-from startrack.core.files import check_output, existing_folder
+from startrack.core.errors import BadInput, one_line
+from startrack.core.files import check_output, existing_folder, printable
 from startrack.core.stored import read_json_object
 from startrack.output import Found, result_at, results_under, write_page
 
@@ -24,7 +24,7 @@ def run(args: argparse.Namespace) -> int:
     """Write the page; 0."""
     path = write_page_of(args.out, truth=args.truth, images=args.images, output=args.output)
     if not args.quiet:
-        print(f"page in {path}")
+        print(f"page in {printable(path)}")
     return 0
 
 
@@ -41,7 +41,7 @@ def write_page_of(
         return path
     found, unread = results_under(out)
     for line in unread:
-        print(f"startrack: left out {line}", file=sys.stderr)
+        print(f"startrack: left out {one_line(line)}", file=sys.stderr)
     found = _select_tabled(out, found)
     path = Path(output) if output else Path(out) / PAGE
     write_page(path, found, unread=unread, real=_true_positions(found, truth), images=images)
@@ -53,12 +53,13 @@ def _select_tabled(out: str, found: list[Found]) -> list[Found]:
     known = tabled_results(Path(out))
     if known is None:
         return found
-    left = {one.stem for one in found if JOB in one.record and one.path.relative_to(out).as_posix() not in known}
+    paths = {one.stem: text_of_name(one.path.relative_to(out).as_posix()) for one in found if JOB in one.record}
+    left = {stem for stem, path in paths.items() if path not in known}
     if left:
-        some = ", ".join(sorted(left)[:NAMED_FILES]) + (", ..." if len(left) > NAMED_FILES else "")
+        some = ", ".join(sorted(map(text_of_name, left))[:NAMED_FILES]) + (", ..." if len(left) > NAMED_FILES else "")
         print(
-            f"startrack: left out {len(left)} results that {out}'s tables do not have ({some}): their images are no "
-            "longer in the batch's folder, or startrack batch is to be run again",
+            f"startrack: left out {len(left)} results that {printable(out)}'s tables do not have ({some}): their "
+            "images are no longer in the batch's folder, or startrack batch is to be run again",
             file=sys.stderr,
         )
     return [one for one in found if one.stem not in left]
@@ -109,7 +110,7 @@ def run_demo(args: argparse.Namespace) -> int:
     code = main(["locate", str(image), "-D", args.dir, "-O", *(["-q"] if args.quiet else [])])
     page = write_page_of(str(image.with_suffix(".fix.json")), truth=args.dir)
     if not args.quiet:
-        print(f"the camera stood at E {east_north[0]} m, N {east_north[1]} m; report: {page}")
+        print(f"the camera stood at E {east_north[0]} m, N {east_north[1]} m; report: {printable(page)}")
     if not args.no_open:
         import webbrowser
 

@@ -21,8 +21,8 @@ from startrack.cli.console import progress
 from startrack.cli.flags import check_cluster, check_extra, check_localizer
 from startrack.cli.images import absolute_reference, compile_kernels, odometry_errors, prepare
 from startrack.core.compilation import announce_compilation, is_compiled
-from startrack.core.errors import EXIT_STOPPED
-from startrack.core.files import make_folder
+from startrack.core.errors import EXIT_STOPPED, one_line
+from startrack.core.files import make_folder, printable
 from startrack.core.runner import RunStopped, count_cores
 from startrack.frames import parse_utc
 from startrack.rendering import read_drive
@@ -67,9 +67,9 @@ def predict(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(report.record))
     elif not args.quiet:
-        print("\n".join(report.lines()))
+        print("\n".join(map(one_line, report.lines())))
         elapsed_s = time.perf_counter() - start
-        print(f"{', '.join(path.name for path in files)} in {args.dir} ({elapsed_s:.0f} s)")
+        print(f"{', '.join(path.name for path in files)} in {printable(args.dir)} ({elapsed_s:.0f} s)")
     return 0
 
 

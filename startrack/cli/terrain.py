@@ -18,7 +18,7 @@ from startrack.cli.images import prepare
 from startrack.cli.input_commands import STATED_ERRORS, state_flag
 from startrack.core import files
 from startrack.core.compilation import announce_compilation
-from startrack.core.errors import BadInput
+from startrack.core.errors import BadInput, one_line
 from startrack.frames import Site, latlon_from_enu
 from startrack.terrain import StateableError, Terrain, load_terrain, require_place
 
@@ -86,11 +86,11 @@ def import_map(args: argparse.Namespace) -> int:
 
 def _print_facts(args: argparse.Namespace, facts: dict[str, Any]) -> None:
     for warning in () if args.quiet else facts.get("warnings", ()):
-        print(f"{facts['name']}: {warning}", file=sys.stderr, flush=True)
+        print(one_line(f"{facts['name']}: {warning}"), file=sys.stderr, flush=True)
     if args.json:
         print(json.dumps({"format": "startrack.terrain/1", **facts}), flush=True)
     elif not args.quiet:
-        print("\n".join(_lines_of(facts)), flush=True)
+        print("\n".join(map(one_line, _lines_of(facts))), flush=True)
 
 
 def _facts_of(terrain: Terrain) -> dict[str, Any]:
@@ -244,7 +244,7 @@ def _show(args: argparse.Namespace, path: str, missing: list[StateableError], wr
     elif not args.quiet:
         lines = [f"  written   {key} = {str(value).lower()}" for key, value in written.items()]
         lines += [f"  left out  {error.key}, {error.meaning}: {error.default}" for error in left]
-        print("\n".join([path, *(lines or ["  states every error"])]))
+        print("\n".join([one_line(path), *(lines or ["  states every error"])]))
     if left and not written and not sys.stdin.isatty():
         flags = " ".join(f"{state_flag(error.key)} {STATED_ERRORS[error.key]}" for error in left)
-        print(f"startrack terrain state {path}: give {flags}, or --exact", file=sys.stderr)
+        print(f"startrack terrain state {one_line(path)}: give {flags}, or --exact", file=sys.stderr)

@@ -167,7 +167,7 @@ class TrackRun:
             counts = tracking.track_record(track)["counts"]
             print(
                 f"{counts['frames']} frames: {counts['used']} used, {counts['left_out']} left out, {counts['refused']} "
-                f"refused; {counts['slips']} slips of the odometry; files in {self.args.dir}/track.*"
+                f"refused; {counts['slips']} slips of the odometry; files in {printable(self.args.dir)}/track.*"
             )
 
     def _update(self, has_come: bool) -> None:

@@ -86,14 +86,15 @@ class Number(Key):
 
 @dataclass(frozen=True, kw_only=True)
 class Text(Key):
-    """One line of printable text."""
+    """One line of printable text; a path may hold any characters."""
 
     max_chars: int = 1000
+    is_path: bool = False
 
     def check(self, value: Any, name: str) -> str:
         if not isinstance(value, str) or not value.strip():
             raise ValueError(f"{name} must be a text, not {value_text(value)}")
-        if len(value) > self.max_chars or not value.isprintable():
+        if len(value) > self.max_chars or not (self.is_path or value.isprintable()):
             raise ValueError(f"{name} must be one line of at most {self.max_chars} characters, not {value_text(value)}")
         return value
 

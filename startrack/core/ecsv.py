@@ -37,7 +37,7 @@ class Column:
 
 
 def ecsv_text(columns: Sequence[Column]) -> str:
-    """The table as ECSV. Texts must be free of line breaks. Raises ValueError for columns of different lengths."""
+    """The table as ECSV. Raises ValueError for columns of different lengths."""
     head, bodies, lengths = ["# %ECSV 1.0", "# ---", "# delimiter: ','", "# datatype:"], [], set()
     for one in columns:
         unit, description = f"unit: {one.unit}, " if one.unit else "", one.description.replace("'", "''")

@@ -149,6 +149,8 @@ def length_text(metres: float, digits: int = 2) -> str:
 
 def one_line(text: str) -> str:
     """A `text` for one line of a terminal: control characters, which names of files may hold, are escaped."""
+    if text.isprintable():
+        return text
     return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
 
 

@@ -173,7 +173,7 @@ def check_output(file: FilePath, *, overwrite: bool, reason: str = "bad_image") 
 
 def printable(name: FilePath) -> str:
     """A file's name as one line of text for messages: undecodable bytes and control characters are escaped."""
-    return one_line(os.fspath(name).encode("utf-8", "backslashreplace").decode())
+    return one_line(os.fspath(name))
 
 
 def file_stem(name: str) -> str:

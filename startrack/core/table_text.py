@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from startrack.core.errors import one_line
 from startrack.core.kernels import njit
 
 LINE_CHARACTERS = 32  # characters of a number and its line break
@@ -15,7 +16,10 @@ LARGEST_NUMBER, SMALLEST_NUMBER = 1e15, 1e-12  # that the kernel writes: below 2
 
 
 def column_lines(form: str, values: Any) -> bytes:
-    """The `values` (n,) in the %-format `form`, one a line, UTF-8; an empty line for None and nan."""
+    """The `values` (n,) in the %-format `form`, one a line, UTF-8; an empty line for None and nan.
+
+    Control characters of texts are escaped.
+    """
     digits, is_general = form[2:-1], form.endswith("g")
     if isinstance(values, np.ndarray) and form in (f"%.{digits}f", f"%.{digits}g") and digits in "123456789":
         size = np.abs(values[values == values])
@@ -23,8 +27,8 @@ def column_lines(form: str, values: Any) -> bytes:
         if size.max(initial=0.0) < largest and not (is_general and ((size > 0) & (size < SMALLEST_NUMBER)).any()):
             return bytes(_number_lines(np.ascontiguousarray(values, dtype=np.float64), int(digits), is_general))
     listed = values.tolist() if isinstance(values, np.ndarray) else values
-    if form == "%s" and isinstance(values, np.ndarray) and values.dtype.kind == "U":
-        return "".join([f"{one}\n" for one in listed]).encode()
+    if form == "%s":
+        return "".join(["\n" if one is None or one != one else f"{one_line(str(one))}\n" for one in listed]).encode()
     return "".join(["\n" if one is None or one != one else f"{form % one}\n" for one in listed]).encode()
 
 

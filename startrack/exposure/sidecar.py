@@ -27,15 +27,16 @@ SIDECAR = Table(
     keys={
         "time_utc": Text(max_chars=100, description="middle of the exposure, ISO 8601, UTC"),
         **NUMBERS,
-        "camera": Text(description="a camera file, or the name of a shipped one"),
-        "terrain": Text(description="a terrain file, or the name of a shipped one"),
+        "camera": Text(is_path=True, description="a camera file, or the name of a shipped one"),
+        "terrain": Text(is_path=True, description="a terrain file, or the name of a shipped one"),
         "air": AIR_TABLE,
-        "mask": Text(description="8-bit image of the frame's size: pixels below 128 do not count"),
+        "mask": Text(is_path=True, description="8-bit image of the frame's size: pixels below 128 do not count"),
         "obstacles": Text(
-            description="CSV file of azimuth_deg and elevation_deg, below which something hides the ground's skyline"
+            is_path=True,
+            description="CSV file of azimuth_deg and elevation_deg, below which something hides the ground's skyline",
         ),
-        "dark": Text(description="dark frame of the frame's size, subtracted"),
-        "flat": Text(description="flat field of the frame's size, divided by"),
+        "dark": Text(is_path=True, description="dark frame of the frame's size, subtracted"),
+        "flat": Text(is_path=True, description="flat field of the frame's size, divided by"),
         "bayer_pattern": Choice(values=BAYER_PATTERNS, description="colours of the first 2 x 2 pixels of a mosaic"),
     },
 )

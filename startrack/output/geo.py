@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import html
 import json
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from startrack.core.errors import one_line
 from startrack.frames import Site, latlon_from_enu
 from startrack.output.record import result_dict
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from startrack.chain import Located
     from startrack.core.types import Array
 
-escape = partial(html.escape, quote=False)
 
 GEO_FORMATS = ("geojson", "kml")
 CIRCLE_POINTS = 72
@@ -86,6 +85,11 @@ def geojson_text(features: list[dict[str, Any]], body: str) -> str:
     if body == "moon":
         whole |= {"crs": MOON_CRS, "body": "moon"}
     return json.dumps({**whole, "features": features}, ensure_ascii=False, allow_nan=False, indent=1) + "\n"
+
+
+def escape(text: str) -> str:
+    """A `text` for XML, which has no control characters."""
+    return html.escape(one_line(text), quote=False)
 
 
 def _kml(value: Located, found: list[dict[str, Any]]) -> str:

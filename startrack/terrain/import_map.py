@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 
 from startrack.core.errors import BadOutput, length_text
-from startrack.core.files import check_output, data_dir, write_atomically
+from startrack.core.files import check_output, data_dir, printable, write_atomically
 from startrack.core.types import BadInput
 from startrack.frames import EARTH_RADIUS_M, Site
 from startrack.terrain.earth_projection import geoid_at
@@ -120,7 +120,7 @@ def import_maps(
         errors = StatedErrors(height_sigma_m=float(height_sigma_m), origin="flag", comment="height_sigma_m: as given")
     body = crops[0].projection.body
     values: dict[str, Any] = {
-        "format": 1, "name": output.stem, "body": body,
+        "format": 1, "name": printable(output.stem), "body": body,
         "origin": {"latitude_deg": latitude_deg, "longitude_deg": longitude_deg},
         "dem": {
             "file": [path.name for path in files], "height_sigma_m": errors.height_sigma_m,

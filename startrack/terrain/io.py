@@ -20,7 +20,7 @@ from startrack.terrain import shape
 from startrack.terrain.cylinder import CYLINDER_KEYS, Cylinder
 from startrack.terrain.protocol import Terrain
 
-FILE = Text(max_chars=4000)
+FILE = Text(max_chars=4000, is_path=True)
 HEIGHT = Number(low=-shape.MAX_LENGTH_M, high=shape.MAX_LENGTH_M)
 KEYS = Table(
     keys={
@@ -143,7 +143,7 @@ def read_keys(text: str) -> dict[str, Any]:
 @lru_cache(maxsize=2)
 def _load_cached(path: Path, text: str, stamps: tuple[Any, ...]) -> Terrain:
     """Read once for many images: maps, packed ground and tables take some 0.3 GB and half a second."""
-    return terrain_from_dict(parse_toml(text, "bad_terrain"), default_name=path.stem, folder=path.parent)
+    return terrain_from_dict(parse_toml(text, "bad_terrain"), default_name=printable(path.stem), folder=path.parent)
 
 
 def _map_files(keys: dict[str, Any], folder: Path) -> list[Path]:

@@ -172,3 +172,11 @@ def test_no_room_is_made_for_more_than_a_bag_holds(tmp_path):
     bag.write_bytes(data)
     with pytest.raises(BadInput, match=rf"Truncated record .* expected {2**40} bytes"):
         list_bag_images(bag)
+
+
+def test_a_large_description_of_a_bag_is_refused(tmp_path):
+    bag = write_bag(tmp_path, "ros2-folder", noise_topics)
+    with (bag / "metadata.yaml").open("a") as file:
+        file.write(2**20 * "[")
+    with pytest.raises(BadInput, match=r"its metadata\.yaml has more than 1 MiB"):
+        list_bag_images(bag)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from startrack.core.errors import BadInput, how_to_install
-from startrack.core.files import MAX_CAUSE_CHARS, FilePath, printable
+from startrack.core.files import MAX_CAUSE_CHARS, MAX_TEXT_BYTES, FilePath, printable
 from startrack.core.types import Exposure
 from startrack.exposure.bounded_path import BoundedPath
 from startrack.exposure.decoding import Decoded, bad_image, check_size, decode_bytes, grey_float32, largest_value
@@ -245,8 +245,11 @@ def _open(path: Path, kinds: tuple[str, ...], topic: str | None, flag: str) -> I
 
     if not path.exists():
         raise _Fault("no such file")
-    if path.is_dir() and not (path / "metadata.yaml").is_file():
+    metadata = path / "metadata.yaml"
+    if path.is_dir() and not metadata.is_file():
         raise _Fault("is a folder without metadata.yaml, not a ROS 2 bag")
+    if path.is_dir() and metadata.stat().st_size > MAX_TEXT_BYTES:  # which rosbags would read for minutes
+        raise _Fault(f"its metadata.yaml has more than {MAX_TEXT_BYTES // 2**20} MiB")
     # Files of older ROS 2 releases lack the definitions; those of the messages read here have never changed.
     with AnyReader([BoundedPath(path)], default_typestore=get_typestore(Stores.LATEST)) as reader:
         used = _choose_topic([(one.topic, one.msgtype) for one in reader.connections], kinds, topic, flag)

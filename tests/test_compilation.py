@@ -113,7 +113,8 @@ def test_the_line_about_compiling_counts_the_kernels_of_its_package(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["nbi", "nbc"])
-def test_compiled_code_that_was_cut_short_is_made_anew(tmp_path, kind):
+@pytest.mark.parametrize("fault", ["cut short", "one bit"])
+def test_damaged_compiled_code_is_made_anew(tmp_path, kind, fault):
     """With one line for all files and the same bytes; the run after it loads what it kept."""
     script, cache = tmp_path / "peaks.py", tmp_path / "cache"
     script.write_text(PEAKS)
@@ -121,10 +122,12 @@ def test_compiled_code_that_was_cut_short_is_made_anew(tmp_path, kind):
     files = list(cache.rglob(f"*.{kind}"))
     assert files
     for file in files:
-        file.write_bytes(file.read_bytes()[:30])
+        data = bytearray(file.read_bytes())
+        data[len(data) // 2] ^= fault == "one bit"
+        file.write_bytes(data[:30] if fault == "cut short" else data)
     out, log = run_script(script, cache)
     assert out == before
-    assert log.splitlines() == [f"a file of compiled code was cut short: compiled anew ({cache})"]
+    assert log.splitlines() == [f"a file of compiled code is damaged: compiled anew ({cache})"]
     assert run_script(script, cache) == (before, "")
 
 

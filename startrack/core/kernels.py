@@ -2,33 +2,34 @@
 
 from __future__ import annotations
 
+import io
 import logging
-from collections.abc import Callable
-from contextlib import suppress
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 from math import erfc, sqrt
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.compilation import choose_cache_folder, discard_stale_kernels
+from startrack.core.stored import read_sealed, sealed
 
 choose_cache_folder()
 discard_stale_kernels()
 
 import numba  # noqa: E402 - it reads where its cache lies when it loads
 from llvmlite.binding import Linkage, add_symbol, parse_bitcode  # noqa: E402
-from numba.core.caching import FunctionCache  # noqa: E402
+from numba.core.caching import FunctionCache, IndexDataCacheFile  # noqa: E402
 from numba.core.codegen import JITCodeLibrary  # noqa: E402
 from numba.core.registry import CPUDispatcher  # noqa: E402
 from numba.core.runtime._nrt_python import c_helpers  # noqa: E402
 from numba.extending import overload  # noqa: E402, F401 - for kernels that choose code by types
 
 LOG = logging.getLogger(__name__)
-CUT_SHORT = EOFError, UnpicklingError, ValueError, LookupError, AttributeError  # of pickle, about a part of a file
 WARNED: set[str] = set()  # texts logged by this process
 REORDERED_SUMS = {"reassoc", "contract", "nsz"}  # as `fastmath`: lets the compiler sum several pixels at a time
 PYTHON_WRAPPER = "_ZN7cpython"  # begin of the name by which Python calls
@@ -95,8 +96,38 @@ def warn_of_cache(text: str, folder: str) -> None:
         LOG.warning("%s (%s)", text, Path(folder).parent)
 
 
+class Damaged(Exception):
+    """A file of compiled code has changed since it was written."""
+
+
+class SealedFiles(IndexDataCacheFile):  # type: ignore[misc]
+    """numba's index and data files of a kernel, sealed: damaged machine code would end the process, or err."""
+
+    @contextmanager
+    def _open_for_write(self, path: str) -> Iterator[io.BytesIO]:
+        with super()._open_for_write(path) as file:
+            yield (data := io.BytesIO())
+            file.write(sealed(data.getvalue()))
+
+    def _load_index(self) -> Any:
+        self._check(self._index_path)
+        return super()._load_index()
+
+    def _load_data(self, name: str) -> Any:
+        self._check(self._data_path(name))
+        return super()._load_data(name)
+
+    def _check(self, path: str) -> None:
+        if os.path.exists(path) and read_sealed(path) is None:
+            raise Damaged
+
+
 class KernelCache(FunctionCache):  # type: ignore[misc]
     """numba's cache of a kernel, which loads it without all that compilation needs: that takes 0.2 s."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        self._cache_file.__class__ = SealedFiles
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The compiled kernel for arguments of types `sig` in a `target_context`; None where there is none yet."""
@@ -104,8 +135,8 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
         try:
             with self._guard_against_spurious_io_errors():
                 return self._load_overload(sig, target_context)
-        except CUT_SHORT:
-            warn_of_cache("a file of compiled code was cut short: compiled anew", self.cache_path)
+        except Damaged:
+            warn_of_cache("a file of compiled code is damaged: compiled anew", self.cache_path)
             with suppress(OSError):
                 self.flush()
             return None

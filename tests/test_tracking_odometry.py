@@ -1,12 +1,13 @@
 """Odometry: TUM text, interpolated increments in the body frame, and refusals."""
 
+import tracemalloc
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from startrack.applications.tracking import Odometry, read_odometry
+from startrack.applications.tracking import Odometry, odometry, read_odometry
 from startrack.core.errors import BadInput
 from startrack.frames import R_from_quat_xyzw, tum_line
 
@@ -124,6 +125,20 @@ def test_a_bad_file_is_refused_in_one_line_that_names_it(tmp_path, lines, cause)
     assert (refusal.value.reason, refusal.value.reason.exit_code) == ("bad_odometry", 4)
     assert "o.tum: " in message
     assert "\n" not in message
+
+
+def test_reading_takes_a_few_hundred_bytes_a_pose(tmp_path, monkeypatch):
+    """A day at 100 Hz has 8.6 million; lists of numbers took 620 bytes of each."""
+    path, poses = tmp_path / "a.tum", 20_000
+    monkeypatch.setattr(odometry, "MAX_ODOMETRY_BYTES", 2**20)  # Python reserves as many
+    path.write_text("".join(f"{k} 0 0 0 0 0 0 1\n" for k in range(poses)))
+    tracemalloc.start()
+    try:
+        assert len(read_odometry(path)) == poses
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 400 * poses, peak / poses
 
 
 def test_files_that_are_no_text_are_refused(tmp_path):

@@ -4,8 +4,9 @@
 
 The thesis's crater, of which the terrain file states another depth and width, drawn with sigmas of 30 and 25 %. A drive
 of 2 km in 40 steps of 50 m in a random direction ends within 5 km of the axis. Odometry errs by 2 % of each step, each
-step by itself; in the last case all steps are 1 % too long besides, which nothing states. The evidence is simulated,
-without images: stars of the catalogue, 5 sigma at V 6. With `--pixels` so many drives are rendered and located too.
+step by itself; in the last case all steps are 1 % too long besides, as the stated 2 % include. The evidence is
+simulated, without images: stars of the catalogue, 5 sigma at V 6. With `--pixels` so many drives are rendered and
+located too.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from _results import table, write_section
 
 from startrack.applications.tracking import ObservedFrame, Odometry, Track, estimate_track
 from startrack.applications.tracking.frame_estimate import estimate_frame
+from startrack.applications.tracking.observed_frame import observe_again
 from startrack.catalog import load_catalog
 from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.localization import settle_steepness
@@ -95,7 +97,9 @@ def draw_drive(rng: np.random.Generator) -> Course:
 def observe(course: Course, number: int, rng: np.random.Generator, *, by_pixels: bool) -> list[ObservedFrame]:
     """The frames; errors are counted from the steepness that the first one shows."""
     if by_pixels:
-        return [replace(frame, R_body_enu=np.eye(3)) for frame in frames_by_pixels(course, 0.0, number)]
+        found = [replace(frame, R_body_enu=np.eye(3)) for frame in frames_by_pixels(course, 0.0, number)]
+        ground = course.stated.with_steepness(found[0].steepness_1)
+        return [observe_again(frame, course.shared, ground) for frame in found]
     catalog, frames, terrain = load_catalog(), [], course.stated
     error_mag = rng.normal(size=len(catalog)) * np.hypot(catalog.v_sigma_mag, FLUX_SCATTER)
     assert isinstance(course.ground, Cylinder) and isinstance(course.stated, Cylinder)

@@ -42,15 +42,16 @@ def odometry_moves(
     Q = attitude.as_matrix()
     back, first = Q.swapaxes(1, 2), Rotation.from_quat(np.roll(attitude.as_quat(), -1, axis=1)).as_matrix()
     down = np.diag([1.0, -1.0, -1.0])
+    units, axes = (UNITS, AXES) if shows_scale else ((), AXES[:1])  # horizontal moves of other lengths are not seen
     faults = {
         "the opposite sign": (-position, Q),
-        **{f"lengths {1.0 / to:.4g} times the true ones": (to * position, Q) for to in (UNITS if shows_scale else ())},
+        **{f"lengths {1.0 / to:.4g} times the true ones": (to * position, Q) for to in units},
         "quaternions with w first": (position, first),
         "quaternions of the inverse rotations": (position, back),
         "inverse poses": (-np.einsum("nij,nj->ni", back, position), back),
         "z down and y to the right": (position @ down, down @ Q @ down),
         "the opposite order in time": (position[::-1], Q[::-1]),
-        **{f"axes in the order {' '.join('xyz'[k] for k in order)}": (position[:, order], Q) for order in AXES},
+        **{f"axes in the order {' '.join('xyz'[k] for k in order)}": (position[:, order], Q) for order in axes},
     }
     apart = np.full(len(frames) - 1, APART_SIGMA_M)
     R = np.array([np.full((3, 3), np.nan) if frame.R_body_enu is None else frame.R_body_enu for frame in frames])

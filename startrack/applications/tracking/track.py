@@ -24,7 +24,7 @@ from startrack.localization import camera_at
 from startrack.terrain import Terrain
 
 SIZES = {DEPTH: "depth_m", WIDTH: "diameter_m"}  # errors of a crater, and the fact of each
-MOST_SIZE_SIGMAS, LEAST_SIZE_1 = 4.0, 0.1  # of a crater's depth or width: what its file states is wrong beyond
+MOST_SIZE_SIGMAS = 4.0  # of the logarithms of a crater's depth and width: what its file states is wrong beyond
 SIZE_ROUNDS, STILL_MOVES_M = 10, 0.01  # of the expansion about a crater's size, until no position moves by more
 UNKNOWN_SIGMA_M = 1e-3 * UNKNOWN_M  # a position with a larger error is not known
 
@@ -205,11 +205,9 @@ def smooth_placed(
 
 
 def _is_possible(found: Smoothed, shared: TrackErrors) -> bool:
-    """Whether the crater's size is one that its file may mean: it is positive, so that factors are compared."""
+    """Whether the crater's size is one that its file may mean."""
     is_size = np.array([name in SIZES for name in shared.names])
-    sigma_1 = (shared.sigma / (1.0 + shared.mean))[is_size]
-    factor = np.maximum(1.0 + sigma_1 * found.shared[is_size], LEAST_SIZE_1)
-    return bool((np.abs(np.log(factor)) <= MOST_SIZE_SIGMAS * sigma_1).all())
+    return bool(np.linalg.norm(found.shared[is_size]) < MOST_SIZE_SIGMAS)
 
 
 def track_of_newest(frame: ObservedFrame, online: OnlineTrack, terrain: Terrain) -> Track:
@@ -253,7 +251,7 @@ def _trajectory(
 
 def _shape_values(found: Smoothed, shared: TrackErrors, terrain: Terrain) -> Array:
     """(n,) of all errors of the terrain's shape, as estimated."""
-    known = dict(zip(shared.names, (shared.mean + shared.sigma * found.shared).tolist(), strict=True))
+    known = dict(zip(shared.names, shared.values(found.shared).tolist(), strict=True))
     return np.array([known.get(one.name, one.mean) for one in terrain.shape_errors])
 
 
@@ -271,5 +269,5 @@ def _shared_error(found: Smoothed, shared: TrackErrors, name: str) -> tuple[floa
     if name not in shared.names:
         return None
     at = shared.names.index(name)
-    sigma = float(shared.sigma[at])
-    return sigma * float(found.shared[at]), sigma * float(np.sqrt(found.shared_covariance[at, at]))
+    error, slope = (shared.values(found.shared) - shared.mean)[at], shared.slopes(found.shared)[at]
+    return float(error), float(slope * np.sqrt(found.shared_covariance[at, at]))

@@ -25,7 +25,8 @@ class TrackErrors:
     """The errors (k,) that all frames of a track have in common, with their standard deviations.
 
     Those of the terrain and the clock come first, as `SharedErrors` lists them. Parameters of a track are a position
-    (2,) [m] and the errors in units of their standard deviations.
+    (2,) [m] and the errors in units of their standard deviations. Depth and width of a round crater are positive:
+    their logarithms are normal, and the parameters are those of the logarithms.
     """
 
     listed: SharedErrors  # of the terrain and the clock
@@ -79,6 +80,22 @@ class TrackErrors:
     def __len__(self) -> int:
         return len(self.names)
 
+    @cached_property
+    def _log_sigma(self) -> Array:
+        """(k,) standard deviation of the logarithm of depth and width; 0 for other errors."""
+        is_size = np.isin(self.names, (DEPTH, WIDTH)) & self.listed.axisymmetric
+        return np.where(is_size, self.sigma / (1.0 + self.mean), 0.0)
+
+    def values(self, shared: Array) -> Array:
+        """(k,) of the errors in the units of the names, at parameters `shared` (k,)."""
+        s = np.where(self._log_sigma > 0.0, self._log_sigma, 1.0)
+        linear = np.where(self._log_sigma > 0.0, np.expm1(s * shared) / s, shared)
+        return np.asarray(self.mean + self.sigma * linear)
+
+    def slopes(self, shared: Array) -> Array:
+        """(k,) of the `values` by the parameters, at `shared` (k,)."""
+        return np.asarray(self.sigma * np.exp(self._log_sigma * shared))
+
     def to_model(self, parameters: Array, evidence: Evidence) -> Array:
         """Parameters (n, 2 + m) of a `SkylineModel` of `evidence`, from `parameters` (n, 2 + k) of the track."""
         m = len(self.listed)
@@ -126,11 +143,15 @@ class TrackErrors:
         m, small = len(self.listed), 1e-3
         if not (m and self.listed.axisymmetric):
             return estimate
-        at = np.zeros(len(self)) if shared is None else shared
+        shared = np.zeros(len(self)) if shared is None else shared
+        at, slope = (self.values(shared) - self.mean) / self.sigma, self.slopes(shared) / self.sigma
         values, one = at[:m] * self.sigma[:m], small * np.diag(self.sigma[:m])
         by_position = self.listed.true_positions(np.eye(2), np.tile(values, (2, 1))).T
         before = estimate.mean[:2] if position_m is None else np.linalg.solve(by_position, position_m)
         moved = [self.listed.true_positions(np.tile(before, (m, 1)), values + sign * one) for sign in (1.0, -1.0)]
         to = np.eye(len(estimate.mean))
         to[:2, :2], to[:2, 2 : 2 + m] = by_position, (moved[0] - moved[1]).T / (2 * small)
-        return estimate.transform(to, np.r_[-to[:2, 2:] @ at, np.zeros(len(at))])
+        linear = estimate.transform(to, np.r_[-to[:2, 2:] @ at, np.zeros(len(at))])
+        by_shared = linear.response[:, 2:]  # at + slope (shared' - shared) by parameters shared'
+        response = np.hstack([linear.response[:, :2], by_shared * slope])
+        return replace(linear, mean=linear.mean - by_shared @ (at - slope * shared), response=response)

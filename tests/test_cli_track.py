@@ -233,7 +233,25 @@ def test_wrong_odometry_is_left_out_or_refused(drive, tracked, tmp_path, capsys)
     for one, true in zip(record["frames"], truth_m(drive), strict=True):
         assert np.hypot(one["east_m"] - true[0], one["north_m"] - true[1]) < 2.0 * one["radius999_m"]
     assert run(drive / "frames", "--odometry", reversed_signs, "--max-speed", "0.04", "-D", out, "-q") == 4
-    assert "faster than 0.04 m/s" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert "faster than 0.04 m/s" in err and f"the files {out}/track.* are of an earlier run" in err
+
+
+def test_an_image_outside_the_odometry_is_left_out_by_name(drive, tracked, tmp_path, capsys):
+    images, out = tmp_path / "frames", tmp_path / "out"
+    shutil.copytree(drive / "frames", images)
+    shutil.copytree(tracked, out)
+    shutil.copy(drive / "small.toml", tmp_path)
+    image = min(images.glob("*.png"))
+    shutil.copy(image, images / "foreign.png")
+    facts = json.loads(image.with_suffix(".json").read_text())
+    (images / "foreign.json").write_text(json.dumps(facts | {"time_utc": "2001-01-01T00:00:00Z"}))
+    assert run(images, "--odometry", images / "odometry.tum", "-D", out, "-q", "--no-plots") == 4
+    err = capsys.readouterr().err
+    assert "foreign.png  refused  bad_odometry: the frame's time 2001-01-01T00:00:00" in err
+    assert "earlier run" not in err
+    counts = json.loads((out / "track.json").read_text())["counts"]
+    assert counts["frames"] == counts["used"] == FRAMES
 
 
 def test_a_height_map_in_the_folder_is_left_out(tmp_path, capsys):

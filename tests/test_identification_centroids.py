@@ -29,6 +29,15 @@ def test_a_list_in_any_order_is_identified(camera) -> None:
     assert np.linalg.norm(off) < 60 * ARCSEC
 
 
+def test_without_a_time_the_error_of_aberration_is_stated() -> None:
+    truth = frame(FISHEYE, 2, limit=5.0, hidden=0.3)
+    found = identify_centroids(truth.detections.xy_px, sigma_px=0.2, camera=FISHEYE)
+    at_time = identify_centroids(truth.detections.xy_px, sigma_px=0.2, camera=FISHEYE, stars=sky())
+    more = found.attitude.covariance_rad2 - found.attitude_fit.attitude.covariance_rad2
+    np.testing.assert_allclose(more, (60 * ARCSEC) ** 2 * np.eye(3))
+    assert at_time.attitude is at_time.attitude_fit.attitude
+
+
 def test_without_fluxes_the_order_of_the_list_is_enough() -> None:
     truth = frame(FISHEYE, 2, limit=5.0, hidden=0.3)
     found = identify_centroids(truth.detections.xy_px, sigma_px=0.2, camera=FISHEYE)

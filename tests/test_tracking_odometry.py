@@ -153,8 +153,8 @@ def test_files_that_are_no_text_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("times", "cause"),
     [
-        ([0.0, 25.0], "1 of 2 frames are outside the odometry, which covers 1970-01-01T00:00:00.000000Z to .*:20.0000"),
-        ([-3.0, -2.0, 5.0], "2 of 3 frames are outside .* the first of them is at 1969-12-31T23:59:57"),
+        ([0.0, 25.0], "1 of 2 frames, the first at .*:25.0000.*, are outside the odometry, which covers 1970-.* to .*:20.0"),
+        ([-3.0, -2.0, 5.0], "2 of 3 frames, the first at 1969-12-31T23:59:57.*, are outside"),
         ([1e18], "1 of 1 frames are outside .* at 1e\\+18 s"),
         ([5.0, 4.0], "not in the order of time"),
         ([5.0, np.nan], "not a list of finite numbers"),

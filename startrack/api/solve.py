@@ -125,7 +125,8 @@ def identify(
         image: an image, as for `locate`; or centroids, an array (n, 2) or a list of pairs, x and y in px from the
             centre of the top-left pixel.
         camera: the camera, as for `locate`. Of an image it may come from sidecar or header.
-        time: middle of the exposure, as for `locate`. None: the catalogue is taken at J2000.0 without aberration.
+        time: middle of the exposure, as for `locate`. None: the catalogue is taken at J2000.0 without aberration,
+            and 60 arcsec are added to the stated sigma.
         fov: instead of a camera, the field of view to 10 %: an angle or degrees; across the frame's width below 100
             degrees, else across the image circle. The lens is then found with the stars.
         size_px: of centroids: width and height of the frame; needed with `fov`, and given with nothing else.
@@ -163,10 +164,11 @@ def identify(
         if camera is None and (fov is None or size_px is None):
             raise ValueError("centroids: give a camera, or fov= with size_px=")
         xy_px: Any = image
+        when = chain.time_input(time)
         return identify_centroids(
             xy_px, camera=None if camera is None else chain.load_camera_input(camera),
             fov_rad=None if fov is None else chain.field_of_view_rad(fov), size_px=size_px, flux=flux,
-            sigma_px=sigma_px, stars=apparent_stars(load_catalog(), chain.time_input(time), None),
+            sigma_px=sigma_px, stars=None if when is None else apparent_stars(load_catalog(), when, None),
             identifier=identifier, near_R_cam_icrs=None if near is None else near.R_cam_icrs_at(None, None),
         )  # fmt: skip
     exposure = chain.exposure_input(image, time)

@@ -50,12 +50,12 @@ def exposure_input(image: Image, time: Time, time_sigma: Any = None) -> Exposure
 def is_list_of_centroids(image: Any) -> bool:
     """Whether an argument `image` is meant as a list of centroids, which need not be a valid one.
 
-    That is any list or iterator of pairs, and an array that is empty, or narrower than any image.
+    That is any list or iterator of pairs, and an array that is empty, or narrower or lower than any image.
     """
     if isinstance(image, list | tuple | zip | map | Generator):
         return True
     shape = image.shape if isinstance(image, np.ndarray) else None
-    return shape is not None and (shape == (0,) or (len(shape) == 2 and 2 <= shape[1] <= MAX_LIST_COLUMNS))
+    return shape is not None and (shape == (0,) or (len(shape) == 2 and 2 <= min(shape) <= MAX_LIST_COLUMNS))
 
 
 def time_input(time: Time) -> datetime | None:

@@ -44,7 +44,6 @@ from startrack.localization import DEFAULT_LOCALIZER, Localizer, has_posterior, 
 from startrack.terrain import Terrain
 
 EVIDENCE_SOURCES = ("both", "stars", "sky")  # of a position; "sky" begins with a fix by the stars
-UNKNOWN_TIME_SIGMA_RAD = np.radians(60 / 3600)  # aberration and proper motion left out
 SHOWN_CHANGE_PX = 0.1  # of the lens, from which a warning states it
 STAGES = ("read", "detect", "identify", "attitude", "evidence", "locate")  # keys of `timing_ms`
 T = TypeVar("T")
@@ -150,10 +149,8 @@ class Oriented(Identified):
     @property
     def attitude(self) -> Attitude:
         """Attitude with the error of an unknown time included."""
-        attitude = self.attitude_fit.attitude
-        if self.exposure.time_utc is not None:
-            return attitude
-        return replace(attitude, covariance_rad2=attitude.covariance_rad2 + UNKNOWN_TIME_SIGMA_RAD**2 * np.eye(3))
+        has_time = self.exposure.time_utc is not None
+        return self.attitude_fit.attitude if has_time else self.attitude_fit.attitude_without_time
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -13,6 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from startrack.applications import tracking
 from startrack.applications.batch import images_under
 from startrack.applications.tracking import FrameStore, ObservedFrame, Odometry, OdometryFile, Track, TrackSession
@@ -50,7 +52,11 @@ def run(args: argparse.Namespace) -> int:
         settings=Settings(evidence_sources=args.evidence, near_attitude=near_attitude_of(args)),
     )  # fmt: skip
     track = TrackRun(args, session)
-    (track.follow if args.follow else track.take_all)()
+    try:
+        (track.follow if args.follow else track.take_all)()
+    finally:
+        if (out / "track.json").exists() and not track.has_written:
+            print(f"startrack: the files {out}/track.* are of an earlier run", file=sys.stderr, flush=True)
     return worst_code(track.codes)
 
 
@@ -80,6 +86,7 @@ class TrackRun:
         self._is_old, self._write_s = False, 0.0  # the files; what writing them took
         self._printed = 0  # lines at rest
         self._shown: set[str] = set()  # facts whose gross error an image showed
+        self.has_written = False
         self._moves: OdometryFile | None = None
         if args.odometry is not None:
             self._moves = OdometryFile(args.odometry, args.odometry_topic, bool(args.follow))
@@ -217,6 +224,9 @@ class TrackRun:
 
     def _add_exposure(self, exposure: Exposure, path: str | None = None) -> None:
         """Locate the image; print the facts that it shows to be grossly wrong, once each."""
+        odometry = None if self.args.follow else self._odometry()
+        if odometry is not None and exposure.time_utc is not None:
+            odometry.require_covers(np.array([exposure.time_utc.timestamp()]))
         if self.session.terrain is None:
             prepare_reference(exposure.terrain, self.args)
         frame: ObservedFrame = self.session.add_exposure(exposure, path)
@@ -251,3 +261,4 @@ class TrackRun:
             page = tracking.track_page(track, picture, title=title, odometry_m=moves_m)
             made = {"track.png": picture, "track.html": page.encode()}
         tracking.write_track(track, Path(args.dir), odometry=odometry, pictures=made)
+        self.has_written = True

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from startrack.estimation.adjust import HUBER_WITH_CUT, MIN_ATTITUDE_STARS, STAR
 from startrack.estimation.normal_equations import Terms, observations_of_image
 
 MIN_FOR_SCATTER = 30  # stars from which the scatter of the residuals is a better covariance than the stated one
+UNKNOWN_TIME_SIGMA_RAD = np.radians(60 / 3600)  # aberration and proper motion left out
 SCHEME = Scheme(loss=HUBER_WITH_CUT, steps=12, estimates_extra=True)
 
 
@@ -26,6 +27,12 @@ class AttitudeFit:
     rms_px: float  # of the used stars, per axis
     extra_sigma_px: float  # error per axis beyond the stated centroid errors (lens, blends, catalogue)
     weight: Array  # (m, 2, 2) inverse covariances of the used stars, times the factor of the robust loss
+
+    @property
+    def attitude_without_time(self) -> Attitude:
+        """The attitude with the error of stars that are taken at J2000.0 and without aberration."""
+        covariance = self.attitude.covariance_rad2 + UNKNOWN_TIME_SIGMA_RAD**2 * np.eye(3)
+        return replace(self.attitude, covariance_rad2=covariance)
 
 
 def solve_attitude(

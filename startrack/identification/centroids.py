@@ -26,6 +26,7 @@ class IdentifiedCentroids:
     stars: Stars  # the catalogue to which its `star` refers
     camera: Camera  # as given, or found (name "unknown", with covariance)
     attitude_fit: AttitudeFit
+    has_time: bool  # whether `stars` are those at the time of the exposure
 
     def __repr__(self) -> str:
         """Number of stars, residual and camera: the arrays fill pages."""
@@ -34,8 +35,8 @@ class IdentifiedCentroids:
 
     @property
     def attitude(self) -> Attitude:
-        """R_cam_icrs with its covariance."""
-        return self.attitude_fit.attitude
+        """R_cam_icrs with its covariance, without a time with what that leaves unknown."""
+        return self.attitude_fit.attitude if self.has_time else self.attitude_fit.attitude_without_time
 
     @property
     def detection(self) -> Ints:
@@ -93,6 +94,7 @@ def identify_centroids(
             type.
         NotIdentified: the stars are not identified; its `reason` is "mirrored" for the mirror image of a known camera.
     """
+    has_time = stars is not None
     if stars is None:
         from startrack.catalog import load_catalog
 
@@ -118,7 +120,7 @@ def identify_centroids(
         detection=order[found.detection], star=found.star, R_cam_icrs=fit.attitude.R_cam_icrs,
         false_alarm_probability=found.false_alarm_probability, unexplained=found.unexplained,
     )  # fmt: skip
-    return IdentifiedCentroids(identification=found, stars=stars, camera=camera, attitude_fit=fit)
+    return IdentifiedCentroids(identification=found, stars=stars, camera=camera, attitude_fit=fit, has_time=has_time)
 
 
 def sorted_centroids(
@@ -134,6 +136,7 @@ def sorted_centroids(
     xy = xy.reshape(0, 2) if xy.shape == (0,) else xy
     if xy.ndim != 2 or xy.shape[1] != 2:
         more = ", and further columns by their names, such as flux=table[:, 2]" if xy.shape[1:] in ((3,), (4,)) else ""
+        more = " (the transposed array)" if len(xy) == 2 else more
         raise ValueError(f"the centroids have the shape {xy.shape}: give (n, 2), x and y [px] of each{more}")
     n = len(xy)
     if flux is None:

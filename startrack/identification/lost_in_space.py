@@ -80,7 +80,7 @@ class Identifier:
         tolerance_px = min(max(tolerance_px, TOLERANCE_SIGMAS * upper_median(sources.variance_px2) ** 0.5), rough_px)
         found = None
         if near_R_cam_icrs is not None and (self.near_sky is None or self.near_sky.contains(near_R_cam_icrs)):
-            with suppress(_WrongCamera):  # or a wrong attitude
+            with suppress(WrongCamera):  # or a wrong attitude
                 found, _ = self._find_accepted(search, search.hypotheses_near(near_R_cam_icrs, tolerance_px))
         if found is None:
             found, refusal = self._find_accepted(search, search.hypotheses(tolerance_px, rough_px))
@@ -120,7 +120,7 @@ class Identifier:
                 continue
             try:
                 return self._accept_match(match, search.sources, search.tried), ""
-            except _WrongCamera:
+            except WrongCamera:
                 raise
             except NotIdentified as cause:
                 refusal = str(cause)
@@ -144,7 +144,7 @@ class Identifier:
             bright = match.inlier[pairs.detection[match.matched] < BRIGHT_DETECTIONS]
             inliers, near = int(np.count_nonzero(bright)), len(bright)
             if inliers < INLIER_FRACTION * near - 3.0 * sqrt(INLIER_FRACTION * (1 - INLIER_FRACTION) * near):
-                raise _WrongCamera(
+                raise WrongCamera(
                     f"only {inliers} of {near} bright stars lie within {INLIER_PX:g} px of where the camera file puts "
                     f"them, the others up to {GATE_PX:g} px off: it is not the calibration of this lens",
                     matched=inliers,
@@ -188,5 +188,5 @@ def _describe_few(inside: int, given: int, camera: Camera, needed: int) -> tuple
     )
 
 
-class _WrongCamera(NotIdentified):
+class WrongCamera(NotIdentified):
     """The attitude is found, but the camera file is not the calibration of this lens."""

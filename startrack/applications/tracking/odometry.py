@@ -79,16 +79,20 @@ class Odometry(Value):
             _refuse("the frames' times are not a list of finite numbers")
         if (np.diff(at_s) < 0).any():
             _refuse("the frames are not in the order of time")
-        first, last = self.time_s[[0, -1]]
-        outside = (at_s < first - SPAN_TOLERANCE_S) | (at_s > last + SPAN_TOLERANCE_S)
-        if outside.any():
-            _refuse(
-                f"{np.count_nonzero(outside)} of {len(at_s)} frames are outside the odometry, which covers "
-                f"{_utc_text(first)} to {_utc_text(last)}; the first of them is at {_utc_text(at_s[outside][0])}"
-            )
-        at_s = np.clip(at_s, first, last)
+        self.require_covers(at_s)
+        at_s = np.clip(at_s, *self.time_s[[0, -1]])
         position_m = np.stack([np.interp(at_s, self.time_s, axis) for axis in self.position_m.T], axis=-1)
         return position_m, Slerp(self.time_s, Rotation.from_quat(self.quat_xyzw))(at_s)
+
+    def require_covers(self, time_s: Array) -> None:
+        """Raises BadInput (bad_odometry) for times (m,) [Unix s] before the first pose or after the last one."""
+        first, last = self.time_s[[0, -1]]
+        outside = time_s[(time_s < first - SPAN_TOLERANCE_S) | (time_s > last + SPAN_TOLERANCE_S)]
+        if len(outside):
+            at = _utc_text(outside[0])
+            many = f"{len(outside)} of {len(time_s)} frames, the first at {at}, are"
+            which = many if len(time_s) > 1 else f"the frame's time {at} is"
+            _refuse(f"{which} outside the odometry, which covers {_utc_text(first)} to {_utc_text(last)}")
 
     def require_possible(self, max_speed_m_s: float) -> None:
         """Raises BadInput (bad_odometry) for moves faster than `max_speed_m_s`."""

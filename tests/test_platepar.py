@@ -160,6 +160,12 @@ def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert main([*words, "--attitude", str(record(tmp_path, None))]) == 4
     assert "states no time" in capsys.readouterr().err
     assert main([*words, "--attitude", str(tmp_path / "none.json")]) == 4
+    capsys.readouterr()
+    away = record(tmp_path, "2024-08-12T22:13:05Z")
+    assert main([*words[:-2], "--site=-46.1,194.5,300", "-O", "--attitude", str(away)]) == 4
+    assert "degrees below the horizon of this site" in capsys.readouterr().err
+    away.write_text(json.dumps(json.loads(away.read_text()) | {"provenance": {"camera": "other.toml"}}))
+    assert main([*words, "-O", "--attitude", str(away)]) == 4
 
 
 @pytest.mark.parametrize(

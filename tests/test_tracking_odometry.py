@@ -153,9 +153,9 @@ def test_files_that_are_no_text_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("times", "cause"),
     [
-        ([0.0, 25.0], "1 of 2 frames, the first at .*:25.0000.*, are outside the odometry, which covers 1970-.* to .*:20.0"),
+        ([0.0, 25.0], "1 of 2 frames, the first at .*:25.0000.*, are outside the odometry, which covers .* to .*:20.0"),
         ([-3.0, -2.0, 5.0], "2 of 3 frames, the first at 1969-12-31T23:59:57.*, are outside"),
-        ([1e18], "1 of 1 frames are outside .* at 1e\\+18 s"),
+        ([1e18], "the frame's time 1e\\+18 s is outside"),
         ([5.0, 4.0], "not in the order of time"),
         ([5.0, np.nan], "not a list of finite numbers"),
         ([[5.0]], "not a list of finite numbers"),

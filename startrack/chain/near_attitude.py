@@ -27,6 +27,7 @@ class NearAttitude:
 
     quat_xyzw_cam_icrs: tuple[float, ...]
     time_utc: datetime | None = None
+    camera: str | None = None  # file by which it was measured, as the result names it
 
     @classmethod
     def of(cls, R_cam_icrs: ArrayLike, time_utc: datetime | None = None) -> Self:
@@ -64,6 +65,7 @@ def _attitude_in(record: Any) -> NearAttitude:
     """The attitude of a result. Raises one of the exceptions above for anything else."""
     time_text = record.get("provenance", {}).get("time_utc")
     quat = tuple(float(one) for one in record["attitude"]["quat_xyzw_cam_icrs"])
-    near = NearAttitude(quat, None if time_text is None else parse_utc(time_text))
+    camera = record.get("provenance", {}).get("camera")
+    near = NearAttitude(quat, None if time_text is None else parse_utc(time_text), camera and str(camera))
     near.R_cam_icrs_at(None, None)
     return near

@@ -20,6 +20,7 @@ from startrack.core.errors import BadInput
 from startrack.core.files import check_output, file_stem, printable, read_text, write_atomically
 from startrack.core.types import Exposure
 from startrack.exposure import write_exposure
+from startrack.frames import R_enu_icrs, azel_from_rays
 
 if TYPE_CHECKING:
     from startrack.applications.calibration import Calibration
@@ -96,7 +97,20 @@ def _pointed(args: argparse.Namespace) -> tuple[str, str]:
     camera, attitude = cameras.load_camera(args.file), read_near_attitude(args.attitude)
     if attitude.time_utc is None:
         raise BadInput("no_time", f"{printable(args.attitude)}: states no time: identify the image again with --time")
+    if attitude.camera is not None and Path(attitude.camera).stem != Path(args.file).stem:
+        raise BadInput(
+            "bad_calibration",
+            f"{printable(args.attitude)}: is of the camera {printable(attitude.camera)}, not of "
+            f"{printable(args.file)}: identify the image again with -c",
+        )
     R_cam_icrs = attitude.R_cam_icrs_at(None, None)
+    elevation_rad = azel_from_rays(R_enu_icrs(site, attitude.time_utc) @ R_cam_icrs[2])[1]
+    if elevation_rad < 0.0:
+        raise BadInput(
+            "bad_terrain",
+            f"{printable(args.attitude)}: the camera points {-math.degrees(elevation_rad):.0f} degrees below the "
+            "horizon of this site: check --site (signs) and the time of the image",
+        )
     if args.to == INDI_ALLSKY:
         overlay = cameras.virtualsky_of(camera, R_cam_icrs, attitude.time_utc, site)
         return overlay.text, (

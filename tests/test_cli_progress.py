@@ -24,7 +24,7 @@ from startrack.camera import camera_text
 from startrack.catalog import apparent_stars, load_catalog
 from startrack.chain import detect, identify
 from startrack.chain.sky_state import BRIGHT_SKY, DARK_SKY, FEW_STARS, VISIBLE_SNR, count_expected_stars
-from startrack.cli import console
+from startrack.cli import console, images
 from startrack.cli.main import main
 from startrack.exposure import exposure_of, read_exposure
 
@@ -216,3 +216,14 @@ def test_a_line_of_work_states_the_time_left(monkeypatch):
     steps.advance(6)
     assert steps.line() == "10 of 10, b.png, 2095 s"
     assert console.Progress().line() == "0 s"
+
+
+def test_a_picture_counts_once_and_one_without_a_time_is_left_out(monkeypatch, capsys):
+    a, b = (exposure_of(np.full((9, 9), level, np.uint16), time_utc="2030-01-01T00:00:00Z") for level in (1, 2))
+    named = {k: replace(one, name=k, sha256=sha) for k, one, sha in (("a", a, "1"), ("b", b, "2"), ("c", a, "1"))}
+    named["d"] = replace(a, name="d", sha256="3", time_utc=None)
+    monkeypatch.setattr(images, "read", lambda path, args: named[path])
+    assert [one.name for one in images.read_each_once(SimpleNamespace(images=list(named)))] == ["a", "b"]
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == "c: left out, bad_image: the same picture as a" and second.startswith("d: left out, no_time: ")
+    assert [one.name for one in images.read_each_once(SimpleNamespace(images=["d"]))] == ["d"]

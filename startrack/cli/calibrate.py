@@ -18,7 +18,7 @@ from startrack.cli.camera_files import (
 )
 from startrack.cli.console import named_steps, print_left_out, print_outcome, refusal
 from startrack.cli.flags import checked_flag
-from startrack.cli.images import approximate_camera, check_one_time, flag_site, read, site_of
+from startrack.cli.images import approximate_camera, check_one_time, flag_site, read, read_each_once, site_of
 from startrack.core.compilation import announce_compilation
 from startrack.core.errors import BadInput, NoSolution
 from startrack.core.files import printable, resolve_named
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     })  # fmt: skip
     flag_site(args)  # wrong usage is reported before the images are read
     out = check_camera_output(args)
-    exposures = [read(path, args) for path in args.images]
+    exposures = read_each_once(args)
     announce_compilation()
     start = approximate_camera(args, exposures)
     with named_steps(

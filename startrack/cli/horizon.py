@@ -12,7 +12,7 @@ import numpy as np
 from startrack.applications import horizon
 from startrack.catalog import load_catalog
 from startrack.cli.console import Outcome, named_steps, print_left_out, print_outcome, refusal
-from startrack.cli.images import approximate_camera, check_fov, check_one_time, read, site_of
+from startrack.cli.images import approximate_camera, check_fov, check_one_time, read_each_once, site_of
 from startrack.core.errors import BadInput, BadOutput, NoSolution, Reason, one_line
 
 FORMAT = "startrack.horizon/1"
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
 def _measure(args: argparse.Namespace) -> Outcome:
     """The record and the line of a skyline that was measured and written."""
     horizon.check_output(args.output, overwrite=args.overwrite)
-    exposures = [read(path, args) for path in args.images]
+    exposures = read_each_once(args)
     site = site_of(args, exposures)
     if site is None:
         raise BadInput("bad_terrain", "the site is not known: give --site LAT,LON[,M]; without it there is no azimuth")

@@ -61,6 +61,22 @@ def read(path: str, args: argparse.Namespace) -> Exposure:
     return images.read_bag_image(images.choose_bag_image(*bag, args.image_topic), **flag_facts(args))
 
 
+def read_each_once(args: argparse.Namespace) -> list[Exposure]:
+    """The images of one camera; a picture that came before, or has no time where others do, is named and left out."""
+    found = [read(path, args) for path in args.images]
+    has_time, first, kept = any(one.time_utc is not None for one in found), dict[str, Exposure](), list[Exposure]()
+    for one in found:
+        same = first.setdefault(one.sha256, one)
+        why = "" if same is one else f"bad_image: the same picture as {one_line(same.name)}"
+        if not why and has_time and one.time_utc is None:
+            why = f"no_time: {images.NO_TIME}"
+        if why:
+            print(f"{one_line(one.name)}: left out, {why}", file=sys.stderr, flush=True)
+        else:
+            kept.append(one)
+    return kept
+
+
 def maps_left_out(found: Iterable[Image]) -> set[Image]:
     """The height maps among the images `found` in a folder, each named on stderr."""
     from startrack.applications.batch import maps_among

@@ -117,7 +117,8 @@ ADVICE_IN_MESSAGE = re.compile(  # the imperatives of our messages, a flag, or a
     r"\?|(^|\s)--[a-z]"
     r"|\b(give|choose|correct|enlarge|expose|find|flip|install|make|replace|run|set|state|try|use|widen) "
 )
-MISSING, MISSING_ADVICE = "No such file", "Check the name and the folder of the file."
+MISSING = "No such file"
+MISSING_ADVICE = "Check the name and the folder of the file."
 OTHER_FOV_ADVICE = (  # in the place of NOT_IDENTIFIED's, where a field of view is given and no camera file
     "Try another field of view: startrack identify --fov 60..200 IMAGE finds it; check the focus; expose longer for "
     "more stars."
@@ -132,7 +133,7 @@ def next_step(reason: str, message: str, *, by_fov: bool = False) -> str:
     """
     if ADVICE_IN_MESSAGE.search(message):
         return ""
-    if message.endswith(MISSING):
+    if message.endswith((MISSING, "no such folder", "is a file, not a folder")):
         return MISSING_ADVICE
     return OTHER_FOV_ADVICE if by_fov and reason == Reason.NOT_IDENTIFIED else Reason(reason).advice
 

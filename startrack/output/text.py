@@ -121,7 +121,7 @@ def _needs_of(outcome: Outcome) -> Iterator[str]:
     elif reason is Reason.INCONSISTENT_EVIDENCE and isinstance(value, Measured):
         yield from _doubtful_facts(value)
     elif isinstance(value, Measured) and isinstance(outcome, Refused):
-        yield _longer_exposure(value)
+        yield from _longer_exposure(value)
         yield from _more_skyline(value)
         clock = ["time_sigma_s"] if value.clock.gross_probability > 0.0 else []
         shape = [error.fact for error in value.terrain.shape_errors if not error.is_stated]
@@ -158,7 +158,7 @@ def _needs_of_located(located: Located) -> Iterator[str]:
                 f"a fact: with {one.fact} stated and exact the 99.9 % circle would be "
                 f"{one.radius999_m_if_exact:.1f} m, not {radius_m:.1f} m ({_statement_of(one.fact)})"
             )
-    yield _longer_exposure(located)
+    yield from _longer_exposure(located)
     yield from _more_skyline(located)
 
 
@@ -168,18 +168,20 @@ def _statement_of(fact: str) -> str:
     return "startrack terrain state FILE writes it"
 
 
-def _longer_exposure(measured: Measured) -> str:
-    """How much a longer exposure would gain, by the stars near the skyline."""
+def _longer_exposure(measured: Measured) -> Iterator[str]:
+    """How much a longer exposure would gain, by the stars near the skyline, if any are there."""
     now, then = _deciding_stars(measured, 1.0), _deciding_stars(measured, LONGER)
+    if not then:
+        return
     seconds = measured.exposure.exposure_s
     longer = f"{LONGER:g} times the exposure" + ("" if seconds is None else f" ({LONGER * seconds:.3g} s)")
     seen_from = "" if isinstance(measured, Located) else " of the search area's middle"
     text = f"{longer}: {then} stars near the skyline{seen_from}, in place of {now}, would show whether they are visible"
-    if not isinstance(measured, Located) or measured.fix.ambiguous or not np.isfinite(measured.fix.radius95_m):
-        return text
-    gain = LONGER**0.5 if measured.sky is not None else max(then, 1) / max(now, 1)
-    stated = " if all facts were stated" if measured.fix.unstated else ""
-    return f"{text}, a 95 % circle of about {measured.fix.radius95_m / gain:.1f} m{stated}"
+    if isinstance(measured, Located) and not measured.fix.ambiguous and np.isfinite(measured.fix.radius95_m):
+        gain = LONGER**0.5 if measured.sky is not None else max(then, 1) / max(now, 1)
+        stated = " if all facts were stated" if measured.fix.unstated else ""
+        text += f", a 95 % circle of about {measured.fix.radius95_m / gain:.1f} m{stated}"
+    yield text
 
 
 def _deciding_stars(measured: Measured, longer: float) -> int:

@@ -78,7 +78,7 @@ def test_the_clock_error_of_a_file_is_not_that_of_another_time(image, sidecar, l
 
 
 @pytest.mark.parametrize("key", ["camera", "terrain"])
-@pytest.mark.parametrize("value", ["", 5, ["a"], "x" * 2000, "two\nlines", {"a": "b"}])
+@pytest.mark.parametrize("value", ["", 5, ["a"], "x" * 2000, {"a": "b"}])
 def test_a_sidecar_reference_that_is_no_name_is_refused_in_one_line(image, sidecar, key, value):
     sidecar({key: value})
     with pytest.raises(BadInput, match=key) as caught:

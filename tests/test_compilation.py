@@ -89,6 +89,33 @@ def test_the_first_use_of_a_command_without_images_is_announced(tmp_path, words)
 
 
 @pytest.mark.slow
+def test_after_doctor_no_command_compiles(tmp_path):
+    """Of those that are used first: a narrow field without a camera file, a skyline, a track, and a height map."""
+    place = {"NUMBA_CACHE_DIR": str(tmp_path / "numba"), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    (tmp_path / "numba").mkdir()
+    images = ROOT / "sample_images"
+    drive = tmp_path / "drive"
+    drive.mkdir()
+    for name in ("near-centre.png", "near-centre.json", "near-wall.png", "near-wall.json"):
+        (drive / name).write_bytes((images / name).read_bytes())
+    lowell = images / "lowell-2018-08-06.fits.bz2"
+
+    def lines_of(*words: object) -> list[str]:
+        command = [sys.executable, "-m", "startrack", *map(str, words)]
+        run = subprocess.run(command, env={**os.environ, **place}, capture_output=True, text=True, cwd=tmp_path)
+        return [line for line in run.stderr.splitlines() if line.startswith("compiling ")]
+
+    assert lines_of("doctor")
+    for words in (
+        ("identify", images / "near-centre.png", "--fov", "8..20", "-D", tmp_path / "out", "--no-plots"),
+        ("horizon", lowell, "-c", "lowell-ldt", "--site=34.7443,-111.4223,2361", "-o", tmp_path / "a.hrz"),
+        ("track", drive, "-D", tmp_path / "track"),
+        ("terrain", "show", "shackleton", "--no-plots"),
+    ):
+        assert lines_of(*words) == [], words
+
+
+@pytest.mark.slow
 def test_a_kernel_gives_the_same_bytes_compiled_and_loaded(tmp_path):
     """Its sums of reordered terms are those of its own library's code, in the process that compiles its parts too."""
     script = tmp_path / "peaks.py"

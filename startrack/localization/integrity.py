@@ -16,6 +16,7 @@ from startrack.core.kernels import njit
 from startrack.core.types import SECTORS, Array, Bools, Integrity
 from startrack.localization.obstacle_chain import fill_clear_emissions
 from startrack.localization.skyline_model import SkylineModel
+from startrack.localization.skyline_profiles import Profiles
 
 GROUPS = 8  # of azimuth, 45 degrees wide
 DIVISIONS = 3  # into such groups, each turned by 15 degrees: an obstacle of up to 30 degrees is wholly in one group
@@ -83,10 +84,19 @@ def _sector_logs(model: SkylineModel, parameters: Array, offsets: Array, clear: 
     return clear_logs(model.seen.profiles, shifts, clear), prior + model.basis.log_prior(moved[:, 2:])
 
 
+def clear_logs(profiles: Profiles, shifts: Array, clear: Array) -> Array:
+    """(n, SECTORS) log-likelihoods where sectors show the map's skyline with probabilities `clear` (SECTORS,).
+
+    `shifts` (n, SECTORS) [rad] are of the skyline, which has the `profiles`.
+    """
+    # In one layout they are compiled once.
+    return np.asarray(_clear_logs(profiles, np.ascontiguousarray(shifts.T), np.ascontiguousarray(clear)))
+
+
 @njit(cache=True)
-def clear_logs(profiles, shifts, clear):
-    found = np.empty(shifts.T.shape)
-    fill_clear_emissions(profiles, shifts.T.copy(), found)
+def _clear_logs(profiles, shifts, clear):
+    found = np.empty(shifts.shape)
+    fill_clear_emissions(profiles, shifts, found)
     for s in range(found.shape[0]):
         for i in range(found.shape[1]):
             found[s, i] = log(clear[s] * found[s, i] + 1.0 - clear[s])

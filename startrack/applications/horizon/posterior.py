@@ -116,6 +116,13 @@ def add_step_log_likelihood(total: Array, steps: Steps, temper: float) -> None:
     add_steps(total, temper, LOWEST_RAD, GRID_STEP_RAD, *rows, 1 - SHOWN_PROBABILITY)
 
 
+def compile_columns() -> None:
+    """Compile the kernels of the chain, by a skyline with one step of light."""
+    one, total = np.ones(1), column_log_prior()
+    add_step_log_likelihood(total, Steps(np.zeros(1, np.int64), 0.1 * one, 0.01 * one, one, one, 10.0 * one), 1.0)
+    combine_columns(total)
+
+
 def combine_columns(log_likelihood: Array) -> tuple[Array, Array]:
     """Means and standard deviations [rad] of each column by the chain with log-likelihoods (AZIMUTH_COLUMNS, n)."""
     likelihood = np.exp(log_likelihood - log_likelihood.max(axis=1, keepdims=True))

@@ -1,6 +1,6 @@
 """Skylines that `startrack horizon` measures in photographs of a fixed camera, and in sets of them: do they agree?
 
-    python benchmarks/skylines.py PHOTOGRAPH ... [--site 34.7443 -111.4223 2361] [--fov 180] [--without 234 272 ...]
+    python benchmarks/skylines.py PHOTOGRAPH ... [--site 34.7443 -111.4223 2361] [--fov 180] [--without 234 272 343 346]
 
 Photographs of one fixed camera: those of the Lowell all-sky camera are in github.com/mommermi/cloudynight
 (example_data/images, BSD-3-Clause), those of the MAGIC telescopes in
@@ -11,6 +11,7 @@ photographs are compared, and ten random divisions into two sets. Azimuths at wh
 from __future__ import annotations
 
 import argparse
+import shlex
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
@@ -64,7 +65,16 @@ def main() -> None:
     head = ["skylines compared", "azimuths known", "RMS of those within 3 sigma", "RMS of all", "more than 3 sigma"]
     body = f"{count} of {len(exposures)} photographs are identified.\n\n" + table(head, rows)
     print(body)
-    write_section(args.section, "python benchmarks/skylines.py ...", ("numpy",), body)
+    write_section(args.section, command_of(args), ("numpy",), body)
+
+
+def command_of(args: argparse.Namespace) -> str:
+    """The command with these arguments, the photographs without their folder."""
+    words = ["python", "benchmarks/skylines.py", *(path.name for path in args.photographs)]
+    words += ["--site", *(f"{one:.10g}" for one in args.site), "--fov", f"{args.fov:g}"]
+    words += ["--without", *map(str, args.without)] if args.without else []
+    words += ["--clear", *args.clear] if args.clear else []
+    return shlex.join([*words, "--section", args.section])
 
 
 def row_of(pairs: Sequence[tuple[MeasuredSkyline, MeasuredSkyline]], moved: Array) -> list[str]:

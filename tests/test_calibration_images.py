@@ -319,6 +319,8 @@ def test_a_refused_file_is_asked_for_the_site_that_it_was_made_with(cold_calibra
         largest_px=2.0, has_site=site is not None, file_has_site=file_has_site,
     )  # fmt: skip
     assert verify_dict(found)["message"].endswith(advice) and advice in verify_line(found)
+    approximate = replace(found, camera=replace(camera, covariance=None), has_site=True, file_has_site=None)
+    assert "states no error of its own: calibrate again" in approximate.message
     small = replace(found, change_px=0.1)
     assert small.message == ""
     open_question = advice != "the lens has changed: calibrate again"

@@ -52,6 +52,8 @@ class Verification:
             return "the camera file was made without a site and contains the refraction: verify it without --site"
         if not self.has_site and self.file_has_site:
             return "the camera file was made with a site and is free of refraction: give --site LAT,LON[,M] here"
+        if self.camera.covariance is None:
+            return "the lens differs from the camera file, which states no error of its own: calibrate again"
         if not self.has_site and self.file_has_site is None:
             return "the lens has changed: calibrate again; or, if the file was made with --site, give --site here too"
         return "the lens has changed: calibrate again"

@@ -45,7 +45,7 @@ def test_a_filter_is_named_with_the_correlation(filtered):
 
 def test_a_threshold_takes_the_noise():
     stars = np.where(NOISE > 440.0, NOISE, 0.0)
-    assert "noise is removed" in cause_in(stars)
+    assert "noise is lost" in cause_in(stars)
 
 
 def test_stars_slopes_and_steps_are_no_filter():

@@ -14,7 +14,7 @@ from startrack.applications.horizon import measure_skyline
 from startrack.catalog import load_catalog
 from startrack.chain import identify
 from startrack.core.errors import BadInput
-from startrack.estimation.fixed_camera import MOVED_SIGMA_RAD, disagreeing, log_odds_fixed, log_odds_kept, turns_rad
+from startrack.estimation import fixed_camera as fixed
 from startrack.frames import R_enu_icrs, Site
 
 HOURS = (0.0, 3.0, 5.0, -1.5)
@@ -36,7 +36,7 @@ def pictures():
 def split_fixed(pictures, site, **flags):
     """The pictures that agree, and the names and reasons of those that do not."""
     R = np.array([one.attitude_fit.attitude.R_cam_icrs for one in pictures])
-    wrong = disagreeing([one.exposure for one in pictures], R, site, **flags)
+    wrong = fixed.find_disagreeing([one.exposure for one in pictures], R, site, **flags)
     out = [(pictures[k].exposure.name, text) for k, text in wrong.items()]
     return [one for k, one in enumerate(pictures) if k not in wrong], out
 
@@ -146,24 +146,24 @@ def test_a_camera_may_be_turned_between_pictures_and_may_follow_the_stars(pictur
         @ R_enu_icrs(at_the_pole, one.exposure.time_utc)
         for k, one in enumerate(there)
     ]
-    assert disagreeing([one.exposure for one in there], np.array(R_there), at_the_pole, may_move=True) == {}
+    assert fixed.find_disagreeing([one.exposure for one in there], np.array(R_there), at_the_pole, may_move=True) == {}
 
 
 def test_two_pictures_of_a_hand_held_camera_rarely_keep_the_pole():
     """Of 100,000 pairs of attitudes one is taken for a wrong time: the pole stays within 0.3 degrees."""
-    assert log_odds_kept(np.radians(0.2)) > 0.0 > log_odds_kept(np.radians(0.3))
+    assert fixed.log_odds_kept(np.radians(0.2)) > 0.0 > fixed.log_odds_kept(np.radians(0.3))
     assert 0.5 * (1.0 - np.cos(np.radians(0.3))) < 1e-5
 
 
 def test_angles_between_rotations_are_those_of_scipy():
     rotations = Rotation.random(6, random_state=np.random.default_rng(1))
-    found = turns_rad(rotations.as_matrix())
+    found = fixed.turns_rad(rotations.as_matrix())
     np.testing.assert_allclose(found[2], (rotations[2] * rotations.inv()).magnitude(), atol=1e-7)
 
 
 def test_small_moves_of_a_camera_do_not_matter():
     """Of pictures that are turned by the stated sigma, fewer than one of 100,000 is taken for wrong."""
     rng = np.random.default_rng(2)
-    apart = np.linalg.norm(rng.normal(size=(100_000, 2, 3)).sum(axis=1), axis=1) * MOVED_SIGMA_RAD
-    assert (log_odds_fixed(apart) > 0.0).all()
-    assert log_odds_fixed(np.radians(0.5)) > 0.0 > log_odds_fixed(np.radians(0.7))
+    apart = np.linalg.norm(rng.normal(size=(100_000, 2, 3)).sum(axis=1), axis=1) * fixed.MOVED_SIGMA_RAD
+    assert (fixed.log_odds_fixed(apart) > 0.0).all()
+    assert fixed.log_odds_fixed(np.radians(0.5)) > 0.0 > fixed.log_odds_fixed(np.radians(0.7))

@@ -230,6 +230,31 @@ def test_a_drive_from_pixels_shows_depth_and_width(tmp_path, capsys):
     assert "no position" not in before + live
 
 
+def test_odometry_of_the_opposite_sign_is_left_out():
+    frames, odometry, _ = drive(4, stated())
+    wrong = replace(odometry, position_m=-odometry.position_m)
+    track = estimate_track(frames, stated(), TrackErrors.of(stated(), None), odometry=wrong)
+    assert track.odometry_fault in {"the opposite sign", "the opposite order in time"}  # of a straight drive the same
+    assert track.width.sigma_1 > 0.15
+
+
+def test_a_camera_at_rest_knows_the_size_as_stated():
+    """One position shows depth over width; errors are counted from a steepness that is 2 % off."""
+    known, rng = stated(-0.3, 0.2), np.random.default_rng(11)
+    ground = known.with_steepness(1.02 * DEPTH_M / DIAMETER_M * known.diameter_m / known.depth_m)
+    errors, place = TrackErrors.of(ground, None), np.array([700.0, -900.0])
+    frames = []
+    for k in range(3):
+        rows = rays_at(place, rng)
+        at = known.diameter_m / DIAMETER_M * (place + 3.0 * rng.normal(size=2))
+        one = estimate_frame(rows, ground, errors, at, 25.0 * np.eye(2))
+        seen = ObservedFrame(f"{k}", TIME + timedelta(hours=k), np.eye(3), (one,), rows)
+        frames.append(replace(seen, steepness_1=ground.steepness_1))
+    track = estimate_track(frames, known, TrackErrors.of(known, None), at_rest=True)
+    assert track.depth.size_m / track.width.size_m == pytest.approx(DEPTH_M / DIAMETER_M, rel=0.01)
+    assert abs(np.log(track.width.size_m / DIAMETER_M)) < 3.5 * track.width.sigma_m / track.width.size_m
+
+
 def test_without_odometry_the_size_stays_as_stated():
     frames, _, _ = drive(1, stated(), frames=3)
     track = estimate_track(frames, stated(), TrackErrors.of(stated(), None))

@@ -55,7 +55,7 @@ def is_list_of_centroids(image: Any) -> bool:
     if isinstance(image, list | tuple | zip | map | Generator):
         return True
     shape = image.shape if isinstance(image, np.ndarray) else None
-    return shape is not None and (shape == (0,) or (len(shape) == 2 and 2 <= min(shape) <= MAX_LIST_COLUMNS))
+    return shape is not None and (0 in shape or (len(shape) == 2 and 2 <= min(shape) <= MAX_LIST_COLUMNS))
 
 
 def time_input(time: Time) -> datetime | None:

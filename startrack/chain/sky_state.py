@@ -44,7 +44,7 @@ def stating_sky(
     except (NotIdentified, TooFewStars) as cause:
         if cause.reason in (NotIdentified.reason, TooFewStars.reason):
             clear = None if v_mag is None else count_clear(exposure, found, camera, v_mag, fov_rad)
-            lens = (cause.advice or (DARK_VIEW if on_moon else DARK_SKY)) + more
+            lens = (cause.advice or ("" if found else DARK_VIEW if on_moon else DARK_SKY)) + more
             text = sky_text(exposure, found, clear, on_moon, _rounding(exposure, found, camera), lens)
             cause.args = (f"{cause.fact.rstrip('.?')}. {text}",)
         raise
@@ -68,7 +68,8 @@ def sky_text(
         advice = BRIGHT_VIEW if on_moon else BRIGHT_SKY
     elif not rounding and not on_moon and count and clear is not None and count < FEW_PART * clear:
         advice = FEW_STARS
-    return f"Measured: {count} point sources{of_clear}, background from {low:.0f} to {high:.0f} ADU{of_range}: {advice}"
+    measured = f"{count} point sources{of_clear}, background from {low:.0f} to {high:.0f} ADU{of_range}"
+    return f"Measured: {measured}" + (f": {advice}" if advice else "")
 
 
 def _rounding(exposure: Exposure, found: Centroids | None, camera: Camera | None) -> str:

@@ -112,9 +112,7 @@ def _ephemeris() -> str:
 
 
 def _kernels(args: argparse.Namespace) -> str:
-    """Compile the kernels of the cylinder and of a map, of the terrain of the flag with its horizons, and of commands
-    that the self-test does not use.
-    """
+    """Compile the kernels of a cylinder, a map, the flag's terrain, and of commands that the self-test leaves out."""
     from startrack.applications.horizon import compile_columns
     from startrack.cli.images import compile_kernels, prepare
     from startrack.cli.warm_up import compile_narrow_field, small_map

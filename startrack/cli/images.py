@@ -66,10 +66,10 @@ def read_each_once(args: argparse.Namespace) -> list[Exposure]:
     found = [read(path, args) for path in args.images]
     has_time, first, kept = any(one.time_utc is not None for one in found), dict[str, Exposure](), list[Exposure]()
     for one in found:
-        same = first.setdefault(one.sha256, one)
-        why = "" if same is one else f"bad_image: the same picture as {one_line(same.name)}"
-        if not why and has_time and one.time_utc is None:
-            why = f"no_time: {images.NO_TIME}"
+        why = f"no_time: {images.NO_TIME}" if has_time and one.time_utc is None else ""
+        same = one if why else first.setdefault(one.sha256, one)
+        if same is not one:
+            why = f"bad_image: the same picture as {one_line(same.name)}"
         if why:
             print(f"{one_line(one.name)}: left out, {why}", file=sys.stderr, flush=True)
         else:

@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
         (track.follow if args.follow else track.take_all)()
     finally:
         if (out / "track.json").exists() and not track.has_written:
-            print(f"startrack: the files {out}/track.* are of an earlier run", file=sys.stderr, flush=True)
+            print(f"startrack: the files {printable(out)}/track.* are of an earlier run", file=sys.stderr, flush=True)
     return worst_code(track.codes)
 
 

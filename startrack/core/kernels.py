@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.compilation import choose_cache_folder, discard_stale_kernels
-from startrack.core.stored import read_sealed, sealed
+from startrack.core.stored import read_sealed, with_seal
 
 choose_cache_folder()
 discard_stale_kernels()
@@ -107,7 +107,7 @@ class SealedFiles(IndexDataCacheFile):  # type: ignore[misc]
     def _open_for_write(self, path: str) -> Iterator[io.BytesIO]:
         with super()._open_for_write(path) as file:
             yield (data := io.BytesIO())
-            file.write(sealed(data.getvalue()))
+            file.write(with_seal(data.getvalue()))
 
     def _load_index(self) -> Any:
         self._check(self._index_path)
@@ -145,8 +145,9 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
         """Keep the compiled kernel `data` for arguments of types `sig`, where the disk takes it."""
         try:
             super().save_overload(sig, data)
-        except OSError as cause:
-            warn_of_cache(f"compiled code cannot be kept ({cause.strerror}): every command compiles", self.cache_path)
+        except (OSError, Damaged) as cause:
+            why = getattr(cause, "strerror", "damaged files remain")
+            warn_of_cache(f"compiled code cannot be kept ({why}): every command compiles", self.cache_path)
 
 
 class InnerKernel(CPUDispatcher):  # type: ignore[misc]

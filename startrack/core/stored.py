@@ -14,14 +14,14 @@ from startrack.core.files import FilePath, write_atomically
 SEAL_BYTES = hashlib.sha256().digest_size
 
 
-def sealed(data: bytes) -> bytes:
+def with_seal(data: bytes) -> bytes:
     """The `data` and behind them their SHA-256, for `read_sealed`. An archive or a pickle with it opens as without."""
     return data + hashlib.sha256(data).digest()
 
 
 def write_sealed(path: FilePath, data: bytes) -> None:
     """Write `data`, sealed, in the place of a file at `path`. Raises as `write_atomically`."""
-    write_atomically(path, sealed(data), overwrite=True)
+    write_atomically(path, with_seal(data), overwrite=True)
 
 
 def read_sealed(path: FilePath) -> bytearray | None:

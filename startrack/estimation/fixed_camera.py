@@ -34,7 +34,7 @@ def log_odds_fixed(turn_rad: Array) -> Array:
 def log_odds_kept(apart_rad: Array) -> Array:
     """Logarithm of the odds that a direction, (...) [rad] apart among the pixels of two pictures, is the same one.
 
-    They are against a camera that was moved to any attitude.
+    The alternative is a camera that was moved, to any attitude.
     """
     variance = 2.0 * MOVED_SIGMA_RAD**2
     prior = np.log(WRONG_PICTURE_PROBABILITY) + np.log(ALL_DIRECTIONS_SR)
@@ -58,7 +58,7 @@ def are_shifted_in_time(R_cam_icrs: Array, R_cam_enu: Array, site: Site) -> Bool
     return turned & kept(R_cam_enu @ pole_enu) & ~kept(R_cam_enu[:, :, 2]) & ~follows
 
 
-def disagreeing(
+def find_disagreeing(
     exposures: Sequence[Exposure], R_cam_icrs: Array, site: Site, *, may_move: bool = False
 ) -> dict[int, str]:
     """Which of the `exposures` disagree with most others by their times at the `site`, with the reason as text.

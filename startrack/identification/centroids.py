@@ -136,7 +136,7 @@ def sorted_centroids(
     xy = xy.reshape(0, 2) if xy.shape == (0,) else xy
     if xy.ndim != 2 or xy.shape[1] != 2:
         more = ", and further columns by their names, such as flux=table[:, 2]" if xy.shape[1:] in ((3,), (4,)) else ""
-        more = " (the transposed array)" if len(xy) == 2 else more
+        more = " (the transposed array)" if xy.ndim == 2 and len(xy) == 2 else more
         raise ValueError(f"the centroids have the shape {xy.shape}: give (n, 2), x and y [px] of each{more}")
     n = len(xy)
     if flux is None:

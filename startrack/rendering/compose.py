@@ -21,7 +21,6 @@ from startrack.rendering.scene import HotPixels, Scene, Truth
 from startrack.rendering.sky import diffuse_e
 from startrack.rendering.sources import add_sources, flux_e, is_above_terrain, splat
 
-# ECSV 1.0 (astropy enhancement proposal 6), written as text: astropy.table would take longer than the rendering.
 ADC_MAX_ADU = 65535.0  # 16 bits
 POISSON_UP_TO_E = 64.0  # above it the normal distribution is used (skewness under 1/8), five times as fast
 HOT_E_PER_S = (50.0, 50_000.0)  # dark current of hot pixels: even in its logarithm, from barely visible to glaring

@@ -26,7 +26,7 @@ from startrack.chain import stating_sky
 from startrack.core.runner import map_in_threads
 from startrack.core.types import Array, BadInput, Bools, Exposure, Identification, NoSolution, NotIdentified
 from startrack.detection import Detector
-from startrack.estimation.fixed_camera import disagreeing
+from startrack.estimation.fixed_camera import find_disagreeing
 from startrack.estimation.frame_matching import Frame, frame_of, require_body, require_time
 from startrack.estimation.joint_fit import FINAL_ROUNDS, JointFit, fit_frames, grow_from_matches
 from startrack.exposure import combine_masks, with_facts
@@ -109,8 +109,8 @@ def calibrate(
     A calibration that fails a check (`accepted` is False) must not be used.
 
     Raises:
-        BadInput: no_time, size_mismatch, no_calibration, inconsistent_evidence of the times of two pictures.
-        NotIdentified: the stars of no image are identified.
+        BadInput: no_time, size_mismatch, no_calibration.
+        NotIdentified: the stars of no image are identified, or no majority agrees about the times and the site.
     """
     run = _Run(catalog, camera, field_of_view_rad(camera, fov_rad), site, progress)
     frames = _frames(run, exposures)
@@ -292,8 +292,9 @@ def _why_wrong(site: Site | None, joint: JointFit) -> dict[int, str]:
         )
         for k, matched in enumerate(joint.matches) if matched.fraction < SMALLEST_FRACTION
     }  # fmt: skip
-    if len(wrong) == len(joint.matches):  # the checks refuse these
-        return {}
     if wrong or site is None:
-        return wrong
-    return disagreeing([one.exposure for one in joint.frames], joint.fit.R_cam_icrs, site, may_move=True)
+        return wrong if len(wrong) < len(joint.matches) else {}  # the checks refuse all of them
+    try:
+        return find_disagreeing([one.exposure for one in joint.frames], joint.fit.R_cam_icrs, site, may_move=True)
+    except BadInput as cause:  # no majority
+        raise NotIdentified(str(cause), "inconsistent_evidence") from cause

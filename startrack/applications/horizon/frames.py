@@ -21,7 +21,7 @@ from startrack.core.errors import BadInput, Reason
 from startrack.core.runner import map_in_threads
 from startrack.core.types import Array, Body, Detections, Exposure, Ints
 from startrack.estimation.false_alarm import log_p_value_poisson
-from startrack.estimation.fixed_camera import disagreeing
+from startrack.estimation.fixed_camera import find_disagreeing
 from startrack.estimation.frame_matching import frame_of, require_body, require_time
 from startrack.estimation.joint_fit import JointFit, fit_frames
 from startrack.frames import R_enu_icrs, Site
@@ -115,7 +115,7 @@ def orient_frames(
         take(exposure, outcome)
     if not identified:
         return (), tuple(left_out)
-    wrong = disagreeing([one.exposure for one in identified], _attitudes(identified), site)
+    wrong = find_disagreeing([one.exposure for one in identified], _attitudes(identified), site)
     for k, message in wrong.items():
         name = identified[k].exposure.name
         left_out.append(LeftOut(name=name, reason=Reason.INCONSISTENT_EVIDENCE, message=message))

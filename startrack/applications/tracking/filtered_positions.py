@@ -22,7 +22,7 @@ from startrack.applications.tracking.frame_estimate import (
     sample_together,
 )
 from startrack.applications.tracking.observed_frame import ObservedFrame
-from startrack.applications.tracking.track_errors import TrackErrors
+from startrack.applications.tracking.track_errors import SIZE_ROUNDS, TrackErrors
 from startrack.core.types import Array, BadInput, Ints
 from startrack.estimation.observations import UNKNOWN_M, FrameEstimate, Observations, Steps
 from startrack.estimation.trajectory import Smoothed, TrackFilter, smooth
@@ -121,12 +121,18 @@ def positions_at_rest(
     position, covariance = np.zeros((n, 2)), np.repeat([UNKNOWN_M**2 * np.eye(2)], n, axis=0)
 
     def take(k: int, estimate: FrameEstimate) -> Smoothed:
-        found = smooth(Observations.of([estimate], terrain.height_sigma_m), Steps.unknown(1))
+        found = smooth(Observations.of([errors.place(estimate)], terrain.height_sigma_m), Steps.unknown(1))
+        for _ in range(SIZE_ROUNDS if errors.bends else 0):
+            placed = errors.place(estimate, found.position_m[0], found.shared)
+            found = smooth(Observations.of([placed], terrain.height_sigma_m), Steps.unknown(1))
         position[k:], covariance[k:] = found.position_m[0], found.covariance_m2[0]
         return found
 
     first, *later = np.flatnonzero(agreeing.mode >= 0).tolist()
-    found, reference = take(first, modes[first][agreeing.mode[first]]), agreeing.smoothed.position_m[0]
+    one = frames[first].modes[agreeing.mode[first]]
+    found, reference, spread = take(first, one), agreeing.smoothed.position_m[0], agreeing.smoothed.covariance_m2[0]
+    if errors.bends:  # models have positions before these are scaled with the crater
+        reference, spread = one.mean[:2], one.covariance[:2, :2]
     half = max(FRAME_REACH_SIGMAS * largest_sigma(found.covariance_m2[0]), LEAST_FRAME_HALF_M)
     models: list[FrameModel] = []
     for k in (first, *later):
@@ -134,6 +140,6 @@ def positions_at_rest(
         if evidence is not None:
             models.append(FrameModel.of_evidence(evidence, terrain, errors, reference, half))
         if k != first:
-            points = sample_together(models, reference, agreeing.smoothed.covariance_m2[0])
-            found = take(k, errors.place(observe_together(models, points)))
+            points = sample_together(models, reference, spread)
+            found = take(k, observe_together(models, points))
     return replace(agreeing, smoothed=found), position, covariance

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from array import array as Numbers
+import array as arrays
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -85,7 +85,7 @@ class Odometry(Value):
         return position_m, Slerp(self.time_s, Rotation.from_quat(self.quat_xyzw))(at_s)
 
     def require_covers(self, time_s: Array) -> None:
-        """Raises BadInput (bad_odometry) for times (m,) [Unix s] before the first pose or after the last one."""
+        """Raises BadInput (bad_odometry) for one of `time_s` (m,) [Unix s] before the first pose or after the last."""
         first, last = self.time_s[[0, -1]]
         outside = time_s[(time_s < first - SPAN_TOLERANCE_S) | (time_s > last + SPAN_TOLERANCE_S)]
         if len(outside):
@@ -163,7 +163,7 @@ class OdometryFile:
 
 
 def _odometry_of_text(path: FilePath, growing: bool) -> Odometry:
-    values, numbers = Numbers("d"), Numbers("q")  # lists take 620 bytes a pose, these 72
+    values, lines = arrays.array("d"), arrays.array("q")  # lists take 620 bytes a pose, these 72
     text = read_text(path, "bad_odometry", max_bytes=MAX_ODOMETRY_BYTES)
     for number, line in enumerate((_complete_lines(text) if growing else text).splitlines(), start=1):
         words = line.partition("#")[0].split()
@@ -176,8 +176,8 @@ def _odometry_of_text(path: FilePath, growing: bool) -> Odometry:
         except ValueError as cause:
             why = str(cause)[:MAX_CAUSE_CHARS]
             raise BadInput("bad_odometry", f"{printable(path)}: line {number}: {why}") from cause
-        numbers.append(number)
-    return _odometry_of_rows(path, values, lambda row: f"line {numbers[row]}")
+        lines.append(number)
+    return _odometry_of_rows(path, values, lambda row: f"line {lines[row]}")
 
 
 def _complete_lines(text: str) -> str:
@@ -202,8 +202,8 @@ def _odometry_of_bag(path: FilePath, topic: str | None) -> Odometry:
     return _odometry_of_rows(path, rows, lambda row: f"pose {row}")
 
 
-def _odometry_of_rows(path: FilePath, numbers: ArrayLike, name_row: Callable[[int], str]) -> Odometry:
-    values = np.asarray(numbers, dtype=np.float64).reshape(-1, len(TUM_COLUMNS.split()))
+def _odometry_of_rows(path: FilePath, rows: ArrayLike, name_row: Callable[[int], str]) -> Odometry:
+    values = np.asarray(rows, dtype=np.float64).reshape(-1, len(TUM_COLUMNS.split()))
     fault = _first_fault(values)
     if fault is not None:
         _refuse(f"{printable(path)}: {name_row(fault[0])}: {fault[1]}")

@@ -27,7 +27,7 @@ def odometry_moves(
     """Moves between frames by `odometry` as stated, and with each fault that it may have as a whole.
 
     The attitude that the stars show turns them. Without odometry no move is known. `shows_scale`: whether images show a
-    wrong scale; they do not in a crater of unknown size, and what it may be then is what is stated.
+    wrong scale. In a crater of unknown size they do not: its error is the stated one, and no fault changes lengths.
 
     Raises:
         BadInput: bad_odometry for odometry that does not cover the frames, or is impossible.
@@ -42,7 +42,7 @@ def odometry_moves(
     Q = attitude.as_matrix()
     back, first = Q.swapaxes(1, 2), Rotation.from_quat(np.roll(attitude.as_quat(), -1, axis=1)).as_matrix()
     down = np.diag([1.0, -1.0, -1.0])
-    units, axes = (UNITS, AXES) if shows_scale else ((), AXES[:1])  # horizontal moves of other lengths are not seen
+    units, axes = (UNITS, AXES) if shows_scale else ((), AXES[:1])
     faults = {
         "the opposite sign": (-position, Q),
         **{f"lengths {1.0 / to:.4g} times the true ones": (to * position, Q) for to in units},

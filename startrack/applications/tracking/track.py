@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +17,7 @@ from startrack.applications.tracking.filtered_positions import OnlineTrack, filt
 from startrack.applications.tracking.observed_frame import ImageFix, ObservedFrame
 from startrack.applications.tracking.odometry import Odometry
 from startrack.applications.tracking.odometry_moves import odometry_moves
-from startrack.applications.tracking.track_errors import BIAS, CLOCK, DEPTH, WIDTH, TrackErrors
+from startrack.applications.tracking.track_errors import BIAS, CLOCK, DEPTH, SIZE_ROUNDS, WIDTH, TrackErrors
 from startrack.core.types import Array, BadInput, Bools, ClockError, Ints
 from startrack.estimation.observations import UNKNOWN_M, USUAL_ODOMETRY, FrameEstimate, OdometryErrors
 from startrack.estimation.trajectory import Smoothed, radius_holding
@@ -25,7 +27,7 @@ from startrack.terrain import Terrain
 
 SIZES = {DEPTH: "depth_m", WIDTH: "diameter_m"}  # errors of a crater, and the fact of each
 MOST_SIZE_SIGMAS = 4.0  # of the logarithms of a crater's depth and width: what its file states is wrong beyond
-SIZE_ROUNDS, STILL_MOVES_M = 10, 0.01  # of the expansion about a crater's size, until no position moves by more
+STILL_MOVES_M = 0.01  # expanded about a crater's size anew, until no position moves by more
 UNKNOWN_SIGMA_M = 1e-3 * UNKNOWN_M  # a position with a larger error is not known
 
 
@@ -185,7 +187,9 @@ def smooth_placed(
     placed = [[shared.place(one) for one in of] for of in modes]
     if not shared.bends:
         return placed, smooth_robustly(placed, moves, height_sigma_m, names=names)
-    for kinds in (moves[:1], moves):
+
+    def expand(placed: list[list[FrameEstimate]], kinds: Sequence[Moves]) -> tuple[Any, RobustTrack, float]:
+        """The modes and the track by `kinds` of moves, and by how much [m] the last expansion moved it."""
         robust = smooth_robustly(placed, kinds, height_sigma_m, names=names)
         rounds, moved_m = 0, np.inf
         while moved_m > STILL_MOVES_M and rounds < SIZE_ROUNDS:
@@ -196,6 +200,12 @@ def smooth_placed(
             ]
             robust = smooth_robustly(placed, kinds, height_sigma_m, names=names)
             rounds, moved_m = rounds + 1, float(np.abs(robust.smoothed.position_m - before.position_m).max())
+        return placed, robust, moved_m
+
+    if len(moves) > 1:
+        with suppress(BadInput):  # wrong as stated: its faults are compared about the stated size
+            placed, _, _ = expand(placed, moves[:1])
+    placed, robust, moved_m = expand(placed, moves)
     if moved_m > STILL_MOVES_M or not _is_possible(robust.smoothed, shared):
         raise BadInput(
             "inconsistent_evidence",

@@ -17,6 +17,7 @@ from startrack.localization import SharedErrors, clock_at
 from startrack.terrain import Terrain
 
 LINEAR_SIZE_1 = 0.005  # sigma of a crater's size: of positions 15 m off it leaves 0.1 m
+SIZE_ROUNDS = 10  # of the expansion about a crater's size
 BIAS, CLOCK, DEPTH, WIDTH, EDGE = "bias_rad", "clock_s", "depth_1", "diameter_1", "edge_px"
 
 
@@ -26,7 +27,8 @@ class TrackErrors:
 
     Those of the terrain and the clock come first, as `SharedErrors` lists them. Parameters of a track are a position
     (2,) [m] and the errors in units of their standard deviations. Depth and width of a round crater are positive:
-    their logarithms are normal, and the parameters are those of the logarithms.
+    their logarithms are normal. The parameters are those of the logarithms once `place` was applied, before it those
+    of the errors.
     """
 
     listed: SharedErrors  # of the terrain and the clock
@@ -84,7 +86,7 @@ class TrackErrors:
     def _log_sigma(self) -> Array:
         """(k,) standard deviation of the logarithm of depth and width; 0 for other errors."""
         is_size = np.isin(self.names, (DEPTH, WIDTH)) & self.listed.axisymmetric
-        return np.where(is_size, self.sigma / (1.0 + self.mean), 0.0)
+        return np.divide(self.sigma, 1.0 + self.mean, out=np.zeros(len(self)), where=is_size)
 
     def values(self, shared: Array) -> Array:
         """(k,) of the errors in the units of the names, at parameters `shared` (k,)."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 from pathlib import Path
 
 import pytest
 
+from startrack.cli.console import print_outcome
 from startrack.cli.main import main
 from startrack.core.errors import Reason, next_step
 
@@ -124,3 +126,11 @@ def test_calibrate_names_the_path_of_the_camera_and_the_air_in_its_lens(
     assert "the refraction of the air is in the lens: give --site" in heard.err
     assert main([*words, "-O", "--site=34.7443,-111.4223,2361"]) == 0
     assert "refraction" not in capsys.readouterr().err
+
+
+def test_the_advice_of_a_command_comes_before_that_of_the_reason(capsys: pytest.CaptureFixture[str]) -> None:
+    reason = Reason.INCONSISTENT_EVIDENCE
+    for own, shown in (("Check the site.", "Check the site."), (reason.advice, reason.advice)):
+        record = {"status": "refused", "reason": str(reason), "message": "they differ", "advice": own}
+        assert print_outcome(argparse.Namespace(json=False, quiet=False), record, "a  refused") == 3
+        assert capsys.readouterr() == ("a  refused\n", f"  next: {shown}\n")

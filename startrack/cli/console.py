@@ -46,15 +46,20 @@ def print_outcome(args: argparse.Namespace, record: dict[str, Any], line: str) -
     for need in () if args.quiet else record.get("explain", ()):
         print(f"  needs {need}", file=sys.stderr, flush=True)
     if "advice" in record:
-        print_advice(record["reason"], record["message"], args)
+        print_advice(record["reason"], record["message"], args, record["advice"])
     return errors.exit_code_of(record["reason"])
 
 
-def print_advice(reason: str | None, message: str, args: argparse.Namespace) -> None:
-    """What to do after a refusal, on stderr, where its `message` does not contain it; once for each reason."""
+def print_advice(reason: str | None, message: str, args: argparse.Namespace, own: str = "") -> None:
+    """What to do after a refusal, on stderr, where its `message` does not contain it; once for each reason.
+
+    `own` is the advice of the command, which comes before that of the reason.
+    """
     if reason is None or getattr(args, "quiet", False):
         return
     advice = errors.next_step(reason, message, by_fov=getattr(args, "fov", None) is not None)
+    if advice and own not in ("", errors.Reason(reason).advice):
+        advice = own
     printed: set[str] = vars(args).setdefault("printed_advice", set())
     if advice and advice not in printed:
         printed.add(advice)

@@ -100,8 +100,8 @@ def _pointed(args: argparse.Namespace) -> tuple[str, str]:
     if attitude.camera is not None and Path(attitude.camera).stem != Path(args.file).stem:
         raise BadInput(
             "bad_calibration",
-            f"{printable(args.attitude)}: is of the camera {printable(attitude.camera)}, not of "
-            f"{printable(args.file)}: identify the image again with -c",
+            f"{printable(args.attitude)}: was measured by the camera {printable(attitude.camera)}, not by "
+            f"{printable(args.file)}: identify the image again with -c {printable(args.file)}",
         )
     R_cam_icrs = attitude.R_cam_icrs_at(None, None)
     elevation_rad = azel_from_rays(R_enu_icrs(site, attitude.time_utc) @ R_cam_icrs[2])[1]

@@ -149,8 +149,7 @@ class Oriented(Identified):
     @property
     def attitude(self) -> Attitude:
         """Attitude with the error of an unknown time included."""
-        has_time = self.exposure.time_utc is not None
-        return self.attitude_fit.attitude if has_time else self.attitude_fit.attitude_without_time
+        return self.attitude_fit.attitude_of(has_time=self.exposure.time_utc is not None)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

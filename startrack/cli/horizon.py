@@ -17,7 +17,6 @@ from startrack.core.errors import BadInput, BadOutput, NoSolution, Reason, one_l
 
 FORMAT = "startrack.horizon/1"
 UNTESTED = "time and site are not tested by one image: an hour turns the skyline by 15 degrees"
-
 ADVICE = "Check the site (signs) and the times (UTC); measure each picture alone if the camera was turned between them."
 
 

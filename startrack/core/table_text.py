@@ -27,9 +27,7 @@ def column_lines(form: str, values: Any) -> bytes:
         if size.max(initial=0.0) < largest and not (is_general and ((size > 0) & (size < SMALLEST_NUMBER)).any()):
             return bytes(_number_lines(np.ascontiguousarray(values, dtype=np.float64), int(digits), is_general))
     listed = values.tolist() if isinstance(values, np.ndarray) else values
-    if form == "%s":
-        return "".join(["\n" if one is None or one != one else f"{one_line(str(one))}\n" for one in listed]).encode()
-    return "".join(["\n" if one is None or one != one else f"{form % one}\n" for one in listed]).encode()
+    return "".join(["\n" if one is None or one != one else f"{one_line(form % one)}\n" for one in listed]).encode()
 
 
 def join_columns(columns: Sequence[bytes]) -> bytes:

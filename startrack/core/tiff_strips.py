@@ -26,7 +26,8 @@ def check_packed_strips(page: Any, file: Any) -> None:
         raise ValueError(f"{len(strips)} strips, more than the {MAX_STRIPS} allowed")
     if part_bytes > page.nbytes + MAX_SPARE_BYTES:
         raise ValueError(f"tiles of {part_bytes} bytes for a picture of {page.nbytes}")
-    if any(start + count > file.seek(0, SEEK_END) for start, count in strips):  # tifffile makes room for all of it
+    file_bytes = file.seek(0, SEEK_END)
+    if any(start + count > file_bytes for start, count in strips):  # tifffile makes room for all of it
         raise ValueError("a strip ends beyond the end of the file")
     for start, count in strips if page.compression in DEFLATE else ():
         file.seek(start)

@@ -28,9 +28,10 @@ class AttitudeFit:
     extra_sigma_px: float  # error per axis beyond the stated centroid errors (lens, blends, catalogue)
     weight: Array  # (m, 2, 2) inverse covariances of the used stars, times the factor of the robust loss
 
-    @property
-    def attitude_without_time(self) -> Attitude:
-        """The attitude with the error of stars that are taken at J2000.0 and without aberration."""
+    def attitude_of(self, *, has_time: bool) -> Attitude:
+        """The attitude; unless it `has_time`, with the error of stars at J2000.0 and without aberration."""
+        if has_time:
+            return self.attitude
         covariance = self.attitude.covariance_rad2 + UNKNOWN_TIME_SIGMA_RAD**2 * np.eye(3)
         return replace(self.attitude, covariance_rad2=covariance)
 

@@ -17,7 +17,10 @@ class BoundedPath(type(Path())):  # type: ignore[misc]  # the path of this syste
 
 
 class _BoundedReader(io.BufferedReader):
+    def __init__(self, file: io.FileIO) -> None:
+        super().__init__(file)
+        self._most = os.fstat(file.fileno()).st_size
+
     def read(self, size: int | None = -1, /) -> bytes:
         """At most `size` bytes (None or negative: all); a length beyond the file gives what there is."""
-        most = os.fstat(self.fileno()).st_size
-        return super().read(size if size is None else min(size, most))
+        return super().read(size if size is None else min(size, self._most))

@@ -36,7 +36,7 @@ class IdentifiedCentroids:
     @property
     def attitude(self) -> Attitude:
         """R_cam_icrs with its covariance, without a time with what that leaves unknown."""
-        return self.attitude_fit.attitude if self.has_time else self.attitude_fit.attitude_without_time
+        return self.attitude_fit.attitude_of(has_time=self.has_time)
 
     @property
     def detection(self) -> Ints:

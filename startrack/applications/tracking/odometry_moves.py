@@ -68,11 +68,12 @@ def odometry_moves(
     similar, linear = np.zeros_like(unknown.freedom_m), np.zeros_like(unknown.freedom_m)
     similar[..., :2] = moves_by_scale_and_heading(right.delta_m)
     linear[:, 0], linear[:, 1] = right.delta_m @ east, right.delta_m @ north
-    larger = LARGER_PROBABILITY if shows_scale else 0.0
-    sizes = ((1.0 - larger, errors.sigma_1), (larger, max(errors.sigma_1, LARGER_SIGMA_1)))
+    sizes = [(1.0, errors.sigma_1)]  # of the errors that all moves share, with their probabilities before
     named = [moves(fault, *poses) for fault, poses in faults.items()]
     wrong = [replace(unknown, fault="an unknown fault", sigma_m=apart)]
     if shows_scale:
+        larger = max(errors.sigma_1, LARGER_SIGMA_1)
+        sizes = [(1.0 - LARGER_PROBABILITY, errors.sigma_1), (LARGER_PROBABILITY, larger)]
         of_axes = "other axes, quaternions or lengths"
         wrong.append(replace(unknown, fault=of_axes, freedom_m=linear, sigma_m=right.sigma_m))
     prior = np.log(ODOMETRY_WRONG_PROBABILITY / (len(wrong) + 1))
@@ -82,7 +83,6 @@ def odometry_moves(
                 right, freedom_m=size_1 * similar, log_prior=float(np.log(part * (1.0 - ODOMETRY_WRONG_PROBABILITY)))
             )
             for part, size_1 in sizes
-            if part > 0.0
         ),
         *(replace(one, log_prior=float(prior - np.log(len(named)))) for one in named),
         *(replace(one, log_prior=float(prior)) for one in wrong),

@@ -125,6 +125,8 @@ def test_the_tables_agree_with_the_results(night, batch_output):
         assert parquet["east_m"][row] == pytest.approx(east, abs=1e-4)
     assert parquet["east_m"][1] is None
     manifest = json.loads((batch_output / "manifest.json").read_text())
+    records = [json.loads((batch_output / image["result"]).read_text()) for image in manifest["images"]]
+    assert len({tuple(record) for record in records}) == 1  # the same keys, solved or refused
     assert [image["status"] for image in manifest["images"]] == ["ok", "refused", "ok", "ok"]
     check_printed_schema("manifest", {**manifest, "settings": {}})
     with pytest.raises(ValidationError, match="image_sha256"):

@@ -97,7 +97,7 @@ def reason(capsys, *words):
     assert record["status"] == "refused"
     assert record["message"]
     assert "\n" not in record["message"]
-    assert "position" not in record
+    assert record.get("position") is None
     return code, record["reason"]
 
 
@@ -199,6 +199,7 @@ def test_the_exit_code_is_that_of_the_worst_image(folder, capsys, kinds, expecte
     records = [json.loads(line) for line in lines]
     assert [record["image"] for record in records] == images
     assert [record["status"] for record in records] == ["ok" if "ok" in image else "refused" for image in images]
+    assert len({tuple(record) for record in records}) == 1  # the same keys, solved, refused or unread
 
 
 def test_without_json_there_is_one_line_for_each_image(folder, capsys):

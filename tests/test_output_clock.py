@@ -61,7 +61,8 @@ def test_records_of_earlier_versions_fit_the_schema(located):
 def test_only_a_fix_has_a_clock(located):
     result = with_clock(located, CLOCK)
     refused = Refused(reason="inconsistent_evidence", message="no", reached=extend(result, Measured))
-    for record in (result_dict(refused), identification_dict(result), detection_dict(result)):
+    assert result_dict(refused)["clock"] is None
+    for record in (identification_dict(result), detection_dict(result)):
         assert "clock" not in record
         assert record["provenance"]["time_sigma_s"] == 20.0
     assert Solution(refused).clock is None

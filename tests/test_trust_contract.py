@@ -67,7 +67,7 @@ def plain_localizer(evidence: Evidence, terrain: Terrain) -> Fix:
 def require_no_position(outcome: Any) -> None:
     assert isinstance(outcome, Refused)
     record, solution = result_dict(outcome), Solution(outcome)
-    assert "position" not in record and "modes" not in record
+    assert record["position"] is None and record["modes"] == []
     values = (solution.position, solution.position_m, solution.covariance_m2, solution.radius95_m, solution.modes)
     assert values == (None,) * 5
 

@@ -187,7 +187,7 @@ class _Shown:
                     self.counts["error" if record["reason"] == INTERNAL_ERROR else str(record["status"])] += 1
                     self.counts["kept"] += kept
                     self.counts["warned"] += bool(record.get("warnings"))
-                    self.counts["beam"] += record.get("search", {}).get("outcome") == "beam"
+                    self.counts["beam"] += (record.get("search") or {}).get("outcome") == "beam"
                     self._print(record)
                     bar.advance(text="  ".join(self._numbers()))
         except RunStopped as cause:

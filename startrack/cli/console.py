@@ -45,7 +45,7 @@ def print_outcome(args: argparse.Namespace, record: dict[str, Any], line: str) -
         print(line, file=sys.stderr if args.quiet else sys.stdout, flush=True)
     for need in () if args.quiet else record.get("explain", ()):
         print(f"  needs {need}", file=sys.stderr, flush=True)
-    if "advice" in record:
+    if record.get("advice"):
         print_advice(record["reason"], record["message"], args, record["advice"])
     return errors.exit_code_of(record["reason"])
 

@@ -80,7 +80,7 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve) -> int:
         except BadInput as cause:
             record = output.refused_dict(path, cause.reason, str(cause), kind.removesuffix("s"))
             if isinstance(cause, BadOutput):
-                del record["advice"]  # it is about the picture, as is the reason, for lack of a better code
+                record["advice"] = None  # it is about the picture, as is the reason, for lack of a better code
             line = output.refusal_line(path, cause.reason, str(cause))
         except Exception as cause:
             if args.verbose:

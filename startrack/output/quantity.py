@@ -61,7 +61,7 @@ def file_schema(title: str, body: Schema) -> Schema:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title, **body}
 
 
-ABSENT: Any = object()  # of a quantity that has no key before its stage
+ABSENT: Any = object()  # of a quantity whose section is null before its stage
 ASTROPY_UNITS = {
     "m": "m", "m^2": "m2", "deg": "deg", "arcsec": "arcsec", "px": "pix", "s": "s", "mag/arcsec^2": "mag / arcsec2",
 }  # fmt: skip
@@ -101,9 +101,9 @@ class Quantity:
     value: Callable[[Any], Any]  # of such a value; where `derived`, of the function from paths to values
     description: str
     schema: Kind = field(default_factory=dict)
-    before: Any = ABSENT  # in the record of a value that has not come as far: ABSENT, None, a number, or a function
+    before: Any = ABSENT  # in the record of a value that has not come as far: ABSENT, None, 0, [], or a function
     nullable: bool = False  # whether it may be null of a value that has come as far
-    optional: bool = False  # whether records of earlier stages or versions lack it although they have its section
+    optional: bool = False  # whether records of earlier versions lack it although they have its section
     form: str = ""  # printf format of its columns in a table; empty: it has none
     columns: Mapping[str, tuple[int, ...]] = field(default_factory=dict)  # their elements by name; empty: one, the key
     shown: tuple[Show, ...] = ()
@@ -148,17 +148,25 @@ def show_everywhere(label: str, form: str, line: str) -> tuple[Show, ...]:
 
 
 def record_from(quantities: Iterable[Quantity], value: Any) -> dict[str, Any]:
-    """The record of a `value` by a table of `quantities`, in the order of the table."""
+    """The record of a `value` by a table of `quantities`, in the order of the table: the same keys for every value.
+
+    A section is null where a quantity of it is ABSENT, and every one is where the `value` is None: nothing was read.
+    """
     found: dict[str, Any] = {}
     for one in quantities:
         if one.derived or not one.recorded:
             continue
         if one.is_determined(value):
             entry = one.value(value)
+        elif one.section and value is None:
+            entry = ABSENT
         else:
             entry = one.before(value) if callable(one.before) else one.before
-        if entry is not ABSENT:
-            part = found.setdefault(one.section, {}) if one.section else found
+        if not one.section:
+            found[one.key] = entry
+        elif entry is ABSENT:
+            found[one.section] = None
+        elif (part := found.setdefault(one.section, {})) is not None:
             part[one.key] = entry
     return found
 

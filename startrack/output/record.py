@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from startrack import __version__
 from startrack.chain import STAGES, Detected, Identified, Inputs, Outcome, last_value
 from startrack.core.errors import Reason
 from startrack.core.types import Exposure
@@ -14,41 +15,27 @@ from startrack.output.quantity import Schema, record_from, schema_of_kind
 from startrack.output.values import At
 
 FORMATS = {kind: f"startrack.{kind}/1" for kind in ("fix", "identification", "detection")}
+BEFORE_OWN = ("position", "modes", "search", "attitude")
 OF_A_POSITION = ("position", "modes", "search", "evidence", "sky", "clock")  # sections of a fix alone
 
 
 def result_dict(result: Outcome) -> dict[str, Any]:
-    """The fix of one image: `position` where the status is ok, `modes` where there are any.
+    """The fix of one image: its keys are the same whether it is solved or refused.
 
-    The record of a refused `result` holds status, reason, message and the quantities of the stages that have run; other
-    quantities are `null`. Fields in `enu` are absent without terrain and time.
+    A section is null where nothing of it is known: `position` unless the status is ok. Lists are then empty. Quantities
+    of stages that have not run are null: those in `enu` without terrain and time.
     """
-    return _record("fix", result)
+    return _record_of("fix", result)
 
 
 def identification_dict(result: Outcome) -> dict[str, Any]:
     """Attitude, the camera that was used and the matches of a `result`: stars with the positions measured for them."""
-    from startrack.camera import camera_to_dict
-
-    value, own = last_value(result), dict[str, Any]()
-    if value.camera is not None:
-        own["camera"] = camera_to_dict(value.camera)
-    own["matches"] = []
-    if isinstance(value, Identified):
-        xy_px = value.detections.xy_px[value.identification.detection].tolist()
-        hips = value.stars.hip[value.identification.star].tolist()
-        own["matches"] = [{"hip": hip or None, "x_px": x, "y_px": y} for hip, (x, y) in zip(hips, xy_px, strict=True)]
-    return _record("identification", result, own, without=OF_A_POSITION)
+    return _record_of("identification", result)
 
 
 def detection_dict(result: Outcome) -> dict[str, Any]:
     """The point sources of a `result`, brightest first; fluxes are in ADU where the gain is not known."""
-    value, rows = last_value(result), list[dict[str, float]]()
-    if isinstance(value, Detected):
-        found = value.detections
-        columns = zip(found.xy_px.tolist(), found.flux_e.tolist(), found.snr.tolist(), strict=True)
-        rows = [{"x_px": x, "y_px": y, "flux_e": flux, "snr": snr} for (x, y), flux, snr in columns]
-    return _record("detection", result, {"detections": rows}, without=(*OF_A_POSITION, "attitude"))
+    return _record_of("detection", result)
 
 
 def record_of(result: Outcome, kind: str) -> dict[str, Any]:
@@ -56,19 +43,17 @@ def record_of(result: Outcome, kind: str) -> dict[str, Any]:
     return {"fix": result_dict, "identification": identification_dict, "detections": detection_dict}[kind](result)
 
 
-def refused_dict(image: str, reason: str, message: str, kind: str = "fix") -> dict[str, Any]:
+def refused_dict(
+    image: str, reason: str, message: str, kind: str = "fix", image_sha256: str | None = None
+) -> dict[str, Any]:
     """The record of an `image` that could not be read, or whose camera or terrain could not: `reason` and `message`.
 
-    `kind` is fix, identification or detection.
+    `kind` is fix, identification or detection; `image_sha256` that of the file, if it is known.
     """
-    return {
-        "format": FORMATS[kind],
-        "image": Path(image).name,
-        "status": "refused",
-        "reason": str(reason),
-        "message": message,
-        "advice": Reason(reason).advice,
-    }
+    record = _record(kind, Path(image).name, reason, message, None)
+    known = {"version": __version__, "image_sha256": image_sha256}
+    record["provenance"] = {one.key: known.get(one.key) for one in QUANTITIES if one.section == "provenance"}
+    return record
 
 
 def image_name(exposure: Exposure) -> str:
@@ -76,29 +61,66 @@ def image_name(exposure: Exposure) -> str:
     return Path(exposure.path).name or exposure.name
 
 
-def _record(
-    kind: str, result: Outcome, own: dict[str, Any] | None = None, without: tuple[str, ...] = ()
-) -> dict[str, Any]:
-    """The record with its `own` keys after the attitude, and without some sections."""
-    sections = {key: part for key, part in record_from(QUANTITIES, last_value(result)).items() if key not in without}
-    first: dict[str, Any] = {
-        key: sections.pop(key) for key in ("position", "modes", "search", "attitude") if key in sections
-    }
+def _record_of(kind: str, result: Outcome) -> dict[str, Any]:
+    """The record of a `result`."""
+    record = _record(kind, image_name(result.exposure), result.reason, result.message, last_value(result))
+    timing_ms = {stage: round(result.timing_ms.get(stage, 0.0), 3) for stage in STAGES}
+    return record | {"status": result.status, "timing_ms": timing_ms, "warnings": result.warnings}
+
+
+def _record(kind: str, image: str, reason: str | None, message: str, value: Inputs | None) -> dict[str, Any]:
+    """The record of a refused image; its own keys stand after the attitude. The `value` is None where nothing is known.
+
+    The keys of each kind are the same for every image.
+    """
+    own, without = OWN_KEYS[kind]
+    sections = {key: part for key, part in record_from(QUANTITIES, value).items() if key not in without}
+    first: dict[str, Any] = {key: sections.pop(key) for key in BEFORE_OWN if key in sections}
     provenance = sections.pop("provenance")
     return {
         "format": FORMATS[kind],
-        "image": image_name(result.exposure),
-        "status": result.status,
-        "reason": None if result.reason is None else str(result.reason),
-        "message": result.message,
-        **({} if result.reason is None else {"advice": Reason(result.reason).advice}),
+        "image": image,
+        "status": "refused",
+        "reason": None if reason is None else str(reason),
+        "message": message,
+        "advice": None if reason is None else Reason(reason).advice,
         **first,
-        **(own or {}),
+        **own(value),
         **sections,
-        "timing_ms": {stage: round(result.timing_ms.get(stage, 0.0), 3) for stage in STAGES},
+        "timing_ms": None,
         "provenance": provenance,
-        "warnings": result.warnings,
+        "warnings": [],
     }
+
+
+def _camera_and_matches(value: Inputs | None) -> dict[str, Any]:
+    """The camera of a `value`, null without one, and the identified stars."""
+    from startrack.camera import camera_to_dict
+
+    matches = []
+    if isinstance(value, Identified):
+        xy_px = value.detections.xy_px[value.identification.detection].tolist()
+        hips = value.stars.hip[value.identification.star].tolist()
+        matches = [{"hip": hip or None, "x_px": x, "y_px": y} for hip, (x, y) in zip(hips, xy_px, strict=True)]
+    camera = None if value is None or value.camera is None else camera_to_dict(value.camera)
+    return {"camera": camera, "matches": matches}
+
+
+def _point_sources(value: Inputs | None) -> dict[str, Any]:
+    """The point sources of a `value`."""
+    rows = list[dict[str, float]]()
+    if isinstance(value, Detected):
+        found = value.detections
+        columns = zip(found.xy_px.tolist(), found.flux_e.tolist(), found.snr.tolist(), strict=True)
+        rows = [{"x_px": x, "y_px": y, "flux_e": flux, "snr": snr} for (x, y), flux, snr in columns]
+    return {"detections": rows}
+
+
+OWN_KEYS: dict[str, tuple[Callable[[Inputs | None], dict[str, Any]], tuple[str, ...]]] = {  # and the sections left out
+    "fix": (lambda value: {"explain": []}, ()),
+    "identification": (_camera_and_matches, OF_A_POSITION),
+    "detection": (_point_sources, (*OF_A_POSITION, "attitude")),
+}
 
 
 def stage_values(value: Inputs) -> At:

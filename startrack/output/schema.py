@@ -40,13 +40,24 @@ COMMON: Schema = {
     "reason": {"enum": [None, *(one.value for one in Reason)]},
     "message": "text",
 }
-# An image that could not even be read has no more than the common keys.
+# Every record has every key; those beyond the common ones are absent from refusals that earlier versions wrote.
 STAGE_KEYS: Schema = {
     "stars": SECTIONS["stars"],
     "timing_ms": object_schema(dict.fromkeys(STAGES, "positive")),
     "provenance": SECTIONS["provenance"],
 }
-ADVICE_TEXT = schema_of_kind("text", "what to do next, by the reason; absent where the status is ok")
+NULL: Schema = {"const": None}
+ADVICE = "what to do next, by the reason"
+
+
+def _section_or_null(schema: Schema) -> Schema:
+    """The `schema` of an object or null. A list of types, so that a validator names what is wrong with the object."""
+    return {**schema, "type": ["object", "null"]}
+
+
+def _has(*keys: str, **others: Schema) -> Schema:
+    """A record has the sections `keys`, and the `others` fit their schemas where they are there."""
+    return {"properties": {key: {"type": "object"} for key in keys} | others, "required": [*keys]}
 
 
 def _if_status(status: str, then: Schema) -> Schema:
@@ -55,14 +66,15 @@ def _if_status(status: str, then: Schema) -> Schema:
 
 def _result(kind: str, title: str, own: Schema, rules: list[Schema]) -> Schema:
     keys = {"format": {"const": FORMATS[kind]}, **COMMON}
-    warnings = list_schema("text", "what was found in the image's file and not used")
-    found = object_schema(keys, optional={"advice": ADVICE_TEXT, **own, **STAGE_KEYS, "warnings": warnings})
+    more = {"advice": or_null("text", f"{ADVICE}; null: solved"), **own}
+    more |= {key: _section_or_null(part) for key, part in STAGE_KEYS.items()}
+    more["warnings"] = list_schema("text", "what was found in the image's file and not used")
     by_status = [
-        _if_status("ok", {"properties": {"reason": {"const": None}}, "required": [*STAGE_KEYS]}),
-        _if_status("ambiguous", {"properties": {"reason": {"const": "ambiguous"}}, "required": [*STAGE_KEYS]}),
+        _if_status("ok", _has(*STAGE_KEYS, reason=NULL, advice=NULL)),
+        _if_status("ambiguous", _has(*STAGE_KEYS, reason={"const": "ambiguous"})),
         _if_status("refused", {"properties": {"reason": {"enum": REFUSALS}}}),
     ]
-    return file_schema(title, found | {"allOf": [*by_status, *rules]})
+    return file_schema(title, object_schema(keys, optional=more) | {"allOf": [*by_status, *rules]})
 
 
 MATCH = object_schema({
@@ -79,7 +91,7 @@ HORIZON = object_schema(
         "message": "text",
     },
     optional={
-        "advice": ADVICE_TEXT,
+        "advice": schema_of_kind("text", ADVICE),
         "output": "text",
         "images": list_schema("text"),
         "left_out": list_schema(object_schema({"image": "text", "reason": {"enum": REFUSALS}, "message": "text"})),
@@ -99,26 +111,29 @@ SCHEMAS: dict[str, Schema] = {
         "fix",
         "Position and attitude of one image",
         {
-            "position": SECTIONS["position"],
             "modes": schema_of_kind(BY_PATH["modes"].schema, BY_PATH["modes"].description),
-            **{name: SECTIONS[name] for name in ("search", "attitude", "evidence", "sky", "clock")},
+            **{
+                name: _section_or_null(SECTIONS[name])
+                for name in ("position", "search", "attitude", "evidence", "sky", "clock")
+            },
             "explain": list_schema("text", "with --explain: what a refused or wide answer would need"),
         },
         [
-            _if_status("ok", {"required": ["position", "attitude"]}),
-            _if_status("ambiguous", {"required": ["modes", "attitude"], "properties": {"position": False}}),
-            _if_status("refused", {"properties": {"position": False}}),
+            _if_status("ok", _has("position", "attitude")),
+            _if_status("ambiguous", _has("attitude", position=NULL, modes={"minItems": 1})),
+            _if_status("ambiguous", {"required": ["modes"]}),
+            _if_status("refused", {"properties": {"position": NULL}}),
         ],
     ),
     "identification": _result(
         "identification",
         "Stars and attitude of one image",
         {
-            "attitude": SECTIONS["attitude"],
-            "camera": {"title": "Camera file", **camera_keys().schema()},
+            "attitude": _section_or_null(SECTIONS["attitude"]),
+            "camera": _section_or_null({"title": "Camera file", **camera_keys().schema()}),
             "matches": list_schema(MATCH),
         },
-        [_if_status("ok", {"required": ["attitude", "camera", "matches"]})],
+        [_if_status("ok", _has("attitude", "camera")), _if_status("ok", {"required": ["matches"]})],
     ),
     "detection": _result(
         "detection",

@@ -171,7 +171,7 @@ def _terrain_key(record: Record) -> tuple[str, ...]:
 def _timings(records: Sequence[Record]) -> bytes:
     table = [Column("image", [record["image"] for record in records], "string")]
     for stage in STAGES:
-        times = [record.get("timing_ms", {}).get(stage) for record in records]
+        times = [(record.get("timing_ms") or {}).get(stage) for record in records]
         table.append(Column(f"{stage}_ms", times, unit="ms", form="%.3f"))
     return ecsv_text(table).encode()
 

@@ -11,7 +11,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from startrack import __version__, chain, output
+from startrack import chain, output
 from startrack.chain import Outcome, content_sha256
 from startrack.core.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput, Reason, one_line
 from startrack.core.files import FULL_DISK, printable, remove_file
@@ -91,7 +91,7 @@ def valid_stored_record(task: Task) -> dict[str, Any] | None:
 def write_failure(task: Task, message: str, reason: str = INTERNAL_ERROR) -> dict[str, Any]:
     """Write and return the record of an image that failed: without a job hash, so that the next run repeats it."""
     record = _unread_record(task, reason, message, content_sha256(task.path, task.bag_image))
-    record |= {"image": text_of_name(task.name), JOB: None}
+    record |= {"image": text_of_name(task.name), JOB: None, INPUTS: {}}
     with suppress(BadInput):  # the record is returned all the same
         if not is_solved(stored_record(task.result)):
             _remove_former(Path(task.result))
@@ -174,11 +174,8 @@ def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str
 
 def _unread_record(task: Task, reason: str, message: str, sha256: str) -> dict[str, Any]:
     """The record of an image that could not be decoded, or its sidecar not be read: with the hash of its file."""
-    record = output.refused_dict(task.name, reason, message)
-    if sha256 != chain.MISSING:
-        unknown = dict.fromkeys(("camera", "terrain", "catalog", "time_utc", "exposure_s"))
-        record["provenance"] = {"version": __version__, "image_sha256": sha256, **unknown}
-    return record
+    known = None if sha256 == chain.MISSING else sha256
+    return output.refused_dict(task.name, reason, message, image_sha256=known)
 
 
 def stored_record(result: str | Path) -> dict[str, Any] | None:
@@ -237,8 +234,8 @@ def _is_record(found: dict[str, Any]) -> bool:
 def _has_types(found: dict[str, Any]) -> bool:
     """Whether what is printed, and what the tables and the trajectory take, has the types of a record."""
     try:
-        numbers = [(TYPES["float64"], one) for one in found.get("timing_ms", {}).values()]
-        texts = [found["message"], *found.get("warnings", ()), found.get("search", {}).get("outcome", "")]
+        numbers = [(TYPES["float64"], one) for one in (found.get("timing_ms") or {}).values()]
+        texts = [found["message"], *found.get("warnings", ()), (found.get("search") or {}).get("outcome", "")]
         columns = [(TYPES[one.datatype], one.value(found)) for one in output.table_columns()]
         time_utc = found.get("provenance", {}).get("time_utc")
         if time_utc is not None:

@@ -3,10 +3,12 @@
 import bz2
 import gzip
 import io
+from datetime import UTC
 
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.time import Time
 
 from startrack.core.types import BadInput
 from startrack.exposure import read_exposure
@@ -111,12 +113,6 @@ def nan_image():
     return fits_bytes(fits.PrimaryHDU(pixels))
 
 
-def damaged_data():
-    raw = bytearray(fits_bytes(fits.PrimaryHDU(FRAME), checksum=True))
-    raw[2880 + 101] ^= 4
-    return bytes(raw)
-
-
 @pytest.mark.parametrize(
     ("raw", "why"),
     [
@@ -130,7 +126,6 @@ def damaged_data():
         ),
         (nan_image(), "1 of 1457 pixels are NaN"),
         (undefined_image(), "pixels are NaN"),
-        (damaged_data(), "DATASUM"),
         (fits_bytes(fits.PrimaryHDU(FRAME)) + b"x" * 2880, "damaged"),
         (fits_bytes(fits.PrimaryHDU(FRAME))[:-1], "truncated"),
         (fits_bytes(fits.PrimaryHDU(FRAME))[:3000], "truncated"),
@@ -152,6 +147,28 @@ def test_refused_with_the_cause(cause, raw, why):
     assert why in cause(raw)
 
 
+def changed_with_its_old_sum(change, tmp_path):
+    """The file that astropy leaves where a program changes the pixels and keeps the header."""
+    (tmp_path / "whole.fits").write_bytes(fits_bytes(fits.PrimaryHDU(FRAME), checksum=True))
+    with fits.open(tmp_path / "whole.fits") as units:
+        pixels, header = change(units[0].data), units[0].header
+    return pixels, fits_bytes(fits.PrimaryHDU(pixels, header))
+
+
+@pytest.mark.parametrize(
+    "change", [lambda p: p[3:20, 5:40].copy(), lambda p: p // 3, lambda p: np.asarray(p, np.float32) - 7.5]
+)
+def test_pixels_that_a_program_changed_are_read_with_a_warning(read, cause, tmp_path, change):
+    pixels, raw = changed_with_its_old_sum(change, tmp_path)
+    assert b"DATASUM" in raw
+    for packed in (raw, gzip.compress(raw)):
+        exposure = read(packed)
+        np.testing.assert_array_equal(exposure.pixels_adu, pixels)
+        assert [("DATASUM" in text, "kept the old sum" in text) for text in exposure.warnings] == [(True, True)]
+    assert "truncated" in cause(raw[:-1])
+    assert read(fits_bytes(fits.PrimaryHDU(pixels), checksum=True)).warnings == ()
+
+
 def image_with_cards(**cards):
     unit = fits.PrimaryHDU(FRAME)
     for key, value in cards.items():
@@ -170,11 +187,69 @@ def test_facts_of_the_header(read, tmp_path):
     assert exposure.camera == str(tmp_path / "calib/all sky.toml")
     assert exposure.terrain == "shackleton"
     assert exposure.warnings == ()
+    assert exposure.row_order == read(image_with_cards(ROWORDER="unknown")).row_order == ""
+    assert read(image_with_cards(ROWORDER="bottom-up ")).row_order == "BOTTOM-UP"
 
 
 def test_date_avg_goes_before_date_obs(read):
     exposure = read(image_with_cards(DATE_OBS="2018-08-06T05:17:04", DATE_AVG="2018-08-06T05:18:00", EXPTIME=60.0))
     assert exposure.time_utc.isoformat() == "2018-08-06T05:18:00+00:00"
+
+
+BEGIN = {"DATE_BEG": "2018-08-06T05:17:00", "DATE_END": "2018-08-06T05:18:00"}
+MJD = 58336.0 + (5 * 3600 + 17 * 60) / 86400  # 2018-08-06T05:17:00, of which the Julian date is 2458336.72
+
+
+@pytest.mark.parametrize(
+    "cards",
+    [
+        BEGIN,
+        {"DATE_BEG": "2018-08-06T05:17:00", "EXPTIME": 60.0},
+        {"DATE_END": "2018-08-06T05:18:00", "EXPTIME": 60.0},
+        {"DATE_OBS": "2018-08-06T05:17:00", "EXPTIME": 60.0, "MJD_OBS": MJD},
+        {"MJD_OBS": MJD, "EXPTIME": 60.0},
+        {"MJD_AVG": MJD + 30 / 86400},
+        {"MJD_BEG": MJD, "MJD_END": MJD + 60 / 86400},
+        {"MJD_BEG": MJD, "EXPTIME": 60.0},
+        {"MJD_END": MJD + 60 / 86400, "EXPTIME": 60.0, "TIMESYS": "UTC"},
+        {**BEGIN, "DATE_AVG": "2018-08-06T05:17:30", "DATE_OBS": "2018-08-06T05:17:00", "MJD_OBS": MJD},
+        {**BEGIN, "DATE_OBS": "2018-08-06T05:17:00", "EXPTIME": 40.0},  # 40 s of light within a minute
+    ],
+)
+def test_the_middle_by_the_other_times_of_the_standard(read, cards):
+    exposure = read(image_with_cards(**cards))
+    assert exposure.time_utc.isoformat(timespec="milliseconds") == "2018-08-06T05:17:30.000+00:00"
+    assert exposure.warnings == ()
+    astropys = Time(MJD + 30 / 86400, format="mjd", scale="utc").to_datetime(timezone=UTC)
+    assert abs((exposure.time_utc - astropys).total_seconds()) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("cards", "time", "words"),
+    [
+        (
+            {"DATE_OBS": "2018-08-06T03:18:00", "DATE_AVG": "2018-08-06T05:18:30", "EXPTIME": 60.0},
+            "05:18:30", ["that by DATE-AVG, 2018-08-06T05:18:30", "by DATE-OBS it is 2:00:00 (h:mm:ss) before"],
+        ),
+        (
+            {"DATE_OBS": "2018-08-06T05:17:00", "DATE_AVG": "2018-08-06T05:18:30"},
+            "05:18:30", ["by DATE-OBS (without EXPTIME) it is 0:01:30 (h:mm:ss) before"],
+        ),
+        (
+            {**BEGIN, "MJD_AVG": MJD, "DATE_OBS": "2018-08-06T07:17:00", "EXPTIME": 5.0},
+            "05:17:00", ["by MJD-AVG", "by DATE-BEG and DATE-END it is 0:00:30 (h:mm:ss) after", "2:00:30"],
+        ),
+        ({**BEGIN, "DATE_END": "2018-08-06T05:16:00", "MJD_AVG": MJD - 0.5 / 86400}, "05:16:59.5", []),
+        ({"DATE_OBS": "2018-08-06", "MJD_OBS": MJD, "EXPTIME": 60.0}, "05:17:30", ["DATE-OBS not used"]),
+        ({"MJD_OBS": 0.0, "DATE_END": "2018-08-06T05:17:30", "EXPTIME": 60.0}, "05:17:00", ["MJD-OBS not used"]),
+    ],
+)  # fmt: skip
+def test_a_choice_among_times_that_disagree_is_stated(read, cards, time, words):
+    exposure = read(image_with_cards(**cards))
+    assert exposure.time_utc.isoformat().startswith(f"2018-08-06T{time}")
+    assert len(exposure.warnings) == bool(words)
+    for text in words:
+        assert text in exposure.warnings[0]
 
 
 def test_a_card_that_names_the_hardware_is_not_the_camera_file(read):
@@ -200,6 +275,13 @@ def test_facts_of_the_primary_header_hold_for_an_extension(read):
         ({"DATE_OBS": "06/08/99", "EXPTIME": 60.0}, "DATE-OBS not used"),
         ({"DATE_AVG": "2018-08-06T05:17:04+02:00"}, "local time"),
         ({"DATE_AVG": "2018-08-06T05:17:04", "TIMESYS": "TAI"}, "time scale TAI"),
+        ({"MJD_AVG": MJD, "TIMESYS": "TDB"}, "MJD-AVG not used: it is in the time scale TDB"),
+        ({"MJD_OBS": MJD}, "MJD-OBS is when the exposure starts, and without EXPTIME its middle is not known"),
+        ({"DATE_END": "2018-08-06T05:17:04"}, "DATE-END is when the exposure ends"),
+        ({**BEGIN, "DATE_END": "2018-08-06T05:16:00"}, "DATE-BEG and DATE-END not used: the end is before the start"),
+        ({"MJD_AVG": "today"}, "MJD-AVG not used"),
+        ({"MJD_AVG": 1e9}, "MJD-AVG not used"),
+        ({"DATE_OBS": "9999-12-31T23:59:59", "EXPTIME": 60.0}, "DATE-OBS not used"),
         ({"DATE_OBS": "2018-08-06T05:17:04", "EXPTIME": 0.0}, "EXPTIME 0.0"),
         ({"DATE_OBS": "2018-08-06T05:17:04", "EXPTIME": "long"}, "EXPTIME 'long'"),
     ],

@@ -90,6 +90,11 @@ def test_rotating_the_camera_rotates_the_attitude_and_keeps_the_position(located
 def test_a_mirrored_picture_is_refused_as_such(located: Any, catalog: StarCatalog) -> None:
     result = locate_again(located, catalog, located.result.exposure.pixels_adu[:, ::-1])
     assert (result.status, result.reason) == ("refused", "mirrored")
+    assert "set mirrored = true" in result.message
+    upside_down = replace(located.result.exposure, pixels_adu=located.result.exposure.pixels_adu[::-1])
+    result = pipeline.identify(replace(upside_down, row_order="BOTTOM-UP"), located.result.camera, catalog)
+    assert result.reason == "mirrored"
+    assert "ROWORDER in its header is BOTTOM-UP" in result.message and "Flip the rows" in result.message
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from startrack.camera import Camera
+from startrack.core.errors import Reason
 from startrack.core.types import Array, Centroids, Detections, Exposure, NotIdentified, TooFewStars
 from startrack.detection import ROUNDED, is_rounded, smallest_step
 
@@ -23,6 +24,10 @@ ASSUMED_LIMIT_MAG = 5.0
 BRIGHT_SKY = "the sky is bright, by clouds, the Moon or twilight: use a picture of a clear, dark sky"
 BRIGHT_VIEW = "the sky is bright, by the Sun, the Earth or lit ground: use a picture without stray light"
 FEW_STARS = "clouds or poor focus hide the stars: use a picture of a clear sky in focus, or expose longer"
+OTHER_ROWS = (
+    "ROWORDER in its header is {}, and rows are taken in the order of the file: is the camera file of pictures with "
+    "the other order? Flip the rows of this one, or make a camera file of such pictures"
+)
 DARK_SKY = "do clouds or the lens cap cover the sky, or was the exposure too short?"
 DARK_VIEW = "was the lens cap on, or the exposure too short?"
 
@@ -34,10 +39,10 @@ def stating_sky(
 ) -> Iterator[None]:  # fmt: skip
     """In the block a refusal that no attitude fits also states what the `exposure` shows of its sky.
 
-    Its advice is that of the likely cause. `found` are the point sources (None: there are none). `camera` (None: not
-    known, then `fov_rad` is the field of view, if known) gives with `v_mag` (n,), magnitudes of the whole sky in
-    ascending order, how many stars a clear sky would show. `on_moon`: above ground without air. `more` follows the
-    advice about the lens.
+    Its advice is that of the likely cause; that of a mirror image names the order of rows in its header. `found` are
+    the point sources (None: there are none). `camera` (None: not known, then `fov_rad` is the field of view, if known)
+    gives with `v_mag` (n,), magnitudes of the whole sky in ascending order, how many stars a clear sky would show.
+    `on_moon`: above ground without air. `more` follows the advice about the lens.
     """
     try:
         yield
@@ -47,6 +52,8 @@ def stating_sky(
             lens = (cause.advice or ("" if found else DARK_VIEW if on_moon else DARK_SKY)) + more
             text = sky_text(exposure, found, clear, on_moon, _rounding(exposure, found, camera), lens)
             cause.args = (f"{cause.fact.rstrip('.?')}. {text}",)
+        elif cause.reason is Reason.MIRRORED and exposure.row_order:
+            cause.args = (f"{cause.fact}: {OTHER_ROWS.format(exposure.row_order)}",)
         raise
 
 

@@ -91,6 +91,7 @@ class Exposure(Value):
     sha256: str = ""
     warnings: tuple[str, ...] = ()
     header_site_rad: tuple[float, float] | None = None  # latitude and longitude that the header states; only compared
+    row_order: str = ""  # ROWORDER of the header, TOP-DOWN or BOTTOM-UP; the rows are those of the file all the same
     correction: Correction | None = None  # by dark frame and flat field; None: `pixels_adu` are the recorded counts
 
     def __post_init__(self) -> None:

@@ -10,15 +10,15 @@ import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import datetime, timedelta
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from startrack.core.declaration import SHOWN_CHARS, value_text
-from startrack.core.files import MAX_CAUSE_CHARS
 from startrack.core.types import TIME_SIGMA_S, BadInput, Exposure, Mask
+from startrack.exposure.header_times import TIME_NAMES, apart_text, is_other_time, middle_of_exposure
 from startrack.exposure.sidecar import BAYER_PATTERNS, NAMED_FILES, NUMBERS, SIDECAR, Sidecar, resolve_path
-from startrack.frames import as_utc, format_utc, parse_utc
+from startrack.frames import as_utc, format_utc
 
 NO_TIME = (
     "the mid-exposure time is not known: give --time UTC, a sidecar NAME.json with time_utc, or a header with it; "
@@ -31,8 +31,8 @@ HEADER_OF = {  # the sidecar's key of a fact and its name in a header: FITS keyw
 # The names of the sidecar's keys are valid in a header too, except in FITS, where a card called CAMERA is common and
 # names the hardware.
 SITE_NAMES = (("OBSLAT", "OBSLONG"), ("SITELAT", "SITELONG"), ("LAT-OBS", "LONG-OBS"), ("OBSGEO-B", "OBSGEO-L"))
-_NAMES = ("DATE-OBS", "TIME-OBS", "TIMESYS", *HEADER_OF.values(), *(name for pair in SITE_NAMES for name in pair))
-SAME_TIME_S = 1.0  # between a stated time and that of a file, below which they are the same
+ROW_ORDERS = ("TOP-DOWN", "BOTTOM-UP")
+_NAMES = (*TIME_NAMES, "ROWORDER", *HEADER_OF.values(), *(name for pair in SITE_NAMES for name in pair))
 HEADER_KEYS = {name: name for name in _NAMES} | HEADER_OF
 
 
@@ -54,6 +54,7 @@ class Facts:
     dark: str | None = None  # path of the dark frame
     flat: str | None = None  # path of the flat field
     site_rad: tuple[float, float] | None = None  # latitude and longitude in the header
+    row_order: str = ""  # of ROW_ORDERS, in the header
     bayer_pattern: str | None = None  # RGGB and the like: the pixels are a mosaic of colours
     warnings: tuple[str, ...] = ()  # values that were ignored, and why
 
@@ -87,7 +88,7 @@ def with_facts(
     """
     given: dict[str, Any] = {"exposure_s": exposure_s, "camera": camera, "terrain": terrain, "mask": mask}
     given["time_utc"] = None if time_utc is None else as_utc(time_utc)
-    if time_sigma_s is None and time_utc is not None and _is_other_time(time_utc, exposure.time_utc):
+    if time_sigma_s is None and time_utc is not None and is_other_time(time_utc, exposure.time_utc):
         given |= {"time_sigma_s": TIME_SIGMA_S, "time_sigma_is_stated": False}
     if time_sigma_s is not None:
         given |= {"time_sigma_s": check_time_sigma_s(time_sigma_s, "time_sigma_s"), "time_sigma_is_stated": True}
@@ -110,7 +111,7 @@ def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts
         if value is None and key in NUMBERS:
             value = header_number(header, key, notes)
         elif value is None and key == "time_utc":
-            value = _header_time(header, found["exposure_s"], notes)
+            value = middle_of_exposure(header, found["exposure_s"], notes)
         elif value is None and key in HEADER_OF:
             value = _header_text(header, key, notes)
             if value is not None and key in NAMED_FILES:
@@ -121,7 +122,9 @@ def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts
         notes += other
         if other:  # what the file states of its clock is not about this time
             found["time_sigma_s"] = given.time_sigma_s
-    return Facts(**found, site_rad=_header_site_rad(header), warnings=tuple(notes))
+    row_order = str(header.get("ROWORDER", "")).strip().upper()
+    found |= {"site_rad": _header_site_rad(header), "row_order": row_order if row_order in ROW_ORDERS else ""}
+    return Facts(**found, warnings=tuple(notes))
 
 
 def _other_time_notes(
@@ -129,17 +132,10 @@ def _other_time_notes(
 ) -> list[str]:  # fmt: skip
     """What the time in the sidecar, else in the header, differs by from the `stated` one that is used."""
     with suppress(BadInput):  # a time that cannot be read is none
-        other = sidecar.value("time_utc") or _header_time(header, exposure_s, [])
-        if other is not None and _is_other_time(stated, other):
-            late_s = (stated - as_utc(other)).total_seconds()
-            way = "after" if late_s > 0 else "before"
-            return [f"the time used is {timedelta(seconds=round(abs(late_s)))} (h:mm:ss) {way} that of the file, "
-                    f"{format_utc(as_utc(other))}"]  # fmt: skip
+        other = sidecar.value("time_utc") or middle_of_exposure(header, exposure_s, [])
+        if other is not None and is_other_time(stated, other):
+            return [f"the time used is {apart_text(stated, other)} that of the file, {format_utc(as_utc(other))}"]
     return []
-
-
-def _is_other_time(stated: datetime, of_file: datetime | None) -> bool:
-    return of_file is not None and abs((as_utc(stated) - as_utc(of_file)).total_seconds()) >= SAME_TIME_S
 
 
 def facts_in_text(text: str) -> dict[str, Any]:
@@ -185,38 +181,6 @@ def header_number(header: Mapping[str, Any], key: str, notes: list[str]) -> floa
     except (TypeError, ValueError, OverflowError):
         notes.append(f"{name} {value_text(value)} is not a number of seconds {declared.limits}; not used")
         return None
-
-
-def _header_time(header: Mapping[str, Any], exposure_s: float | None, notes: list[str]) -> datetime | None:
-    """Mid-exposure from DATE-AVG, or from DATE-OBS and half the exposure; the notes have the cause if there is none."""
-    given = [key for key in ("DATE-AVG", "DATE-OBS") if str(header.get(key) or "").strip()]
-    scale = str(header.get("TIMESYS") or "UTC").strip().upper()
-    if given and scale != "UTC" and not scale.startswith("UTC("):  # FITS allows UTC(NIST) and the like
-        notes.append(f"{given[0]} not used: it is in the time scale {scale[:20]}, not UTC")
-        return None
-    of_day = str(header.get("TIME-OBS") or "").strip()  # an older form, in which DATE-OBS is a date alone
-    for key in given:
-        text = str(header[key]).strip()
-        if key == "DATE-OBS" and of_day and "T" not in text:
-            text += f"T{of_day}"
-        try:
-            time = parse_utc(text)
-        except BadInput as error:
-            notes.append(f"{key} not used: {str(error)[:MAX_CAUSE_CHARS]}")
-            continue
-        if key == "DATE-AVG":
-            return time
-        if exposure_s is None:
-            notes.append(
-                "DATE-OBS is when the exposure starts, and without EXPTIME its middle is not known: "
-                "give the time of the middle (time_utc in a sidecar), or exposure_s"
-            )
-            continue
-        try:
-            return time + timedelta(seconds=exposure_s / 2)
-        except OverflowError:
-            notes.append(f"DATE-OBS not used: {time} plus half the exposure is beyond the calendar")
-    return None
 
 
 def _header_text(header: Mapping[str, Any], key: str, notes: list[str]) -> str | None:

@@ -29,14 +29,18 @@ MAX_PADDING_BYTES = 100 * BLOCK_BYTES  # zeros or blanks after the last unit
 MAX_TILES = 2**15  # of a tile-compressed image, by default one a row
 MAX_AXES, MAX_FIELDS = 99, 999  # largest legal is 999 for both; readers loop over them
 INTEGER_CARD = re.compile(rb"(Z?NAXIS\d*|ZTILE\d|TFIELDS|BITPIX|PCOUNT|GCOUNT) *= *([+-]?\d+)")
+STALE_SUM = (
+    "the data do not agree with DATASUM in the header: a program changed the pixels and kept the old sum, or the file "
+    "is damaged"
+)
 GZIP, BZIP2 = b"\x1f\x8b", b"BZh"
 
 
 def decode(raw: bytes) -> Decoded:
     """Pixels and header of the only image of a FITS file: BZERO applied, native byte order, rows as stored.
 
-    Raises BadInput bad_image if it is truncated, damaged (DATASUM), a cube, or if it has several images or undefined
-    pixels (NaN, BLANK).
+    Data that do not agree with DATASUM are read with a warning. Raises BadInput bad_image if the file is truncated or
+    damaged, a cube, or if it has several images or undefined pixels (NaN, BLANK).
     """
     from astropy.io import fits
 
@@ -53,11 +57,11 @@ def decode(raw: bytes) -> Decoded:
             header = _metadata(units, unit)
             saturation = _saturation(unit.header)
             stored = np.asarray(unit.data)
-            if any("Datasum verification failed" in str(w.message) for w in issued):
-                raise bad_image("damaged FITS: its data do not agree with DATASUM")
     if stored.shape[-2:] != shape:  # of a damaged tile-compressed image
         raise bad_image(f"damaged FITS: its data are {stored.shape}, its header gives {shape}")
     pixels, notes = grey_float32(stored.reshape(shape))
+    if any("Datasum verification failed" in str(w.message) for w in issued):
+        notes += (STALE_SUM,)
     return Decoded(pixels_adu=pixels, saturation_adu=saturation, header=header, warnings=notes)
 
 

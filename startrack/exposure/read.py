@@ -85,6 +85,7 @@ def exposure_of_decoded(decoded: decoding.Decoded, facts: Facts, *, raw: bytes, 
         saturation_adu=decoded.saturation_adu,
         sha256=hashlib.sha256(raw).hexdigest(),
         header_site_rad=facts.site_rad,
+        row_order=facts.row_order,
         warnings=notes + facts.warnings,
         correction=correction,
     )

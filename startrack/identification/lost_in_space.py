@@ -92,9 +92,10 @@ class Identifier:
         mirror, lenient = AttitudeSearch(sources.mirror_image()), replace(self, whole_field=False)
         if lenient._find_accepted(mirror, mirror.hypotheses(tolerance_px, rough_px))[0] is not None:
             raise NotIdentified(
-                "the image is a mirror image, compared with the camera file: is the array transposed? Else flip the "
-                f"image, or set mirrored = {str(not camera.mirrored).lower()} in the camera file",
+                "the image is a mirror image, compared with the camera file",
                 reason="mirrored",
+                advice="is the array transposed? Else flip the image, or set mirrored = "
+                f"{str(not camera.mirrored).lower()} in the camera file",
             )
         where, advice = ("", "") if self.near_sky is None else (f" within {self.near_sky}", " and where it points")
         is_known = camera.name != UNKNOWN_LENS

@@ -13,6 +13,7 @@ from startrack.applications.calibration.run import identify_with_camera, load_fr
 from startrack.applications.calibration.shared_errors import widen_covariance
 from startrack.camera import Camera, cap_grid, difference_px, projection_covariance_px2
 from startrack.catalog import StarCatalog
+from startrack.chain import stating_sky
 from startrack.core.files import printable
 from startrack.core.types import Exposure, NotIdentified
 from startrack.estimation.joint_fit import fit_frames, grow_from_matches
@@ -82,7 +83,8 @@ def verify(
     frame = load_frame(exposure, catalog, site, camera=camera)
     found_camera, found = identify_with_camera(camera, frame)
     if found_camera.mirrored != camera.mirrored:
-        raise NotIdentified("the picture is a mirror image, compared with the camera file", reason="mirrored")
+        with stating_sky(exposure):
+            raise NotIdentified("the picture is a mirror image, compared with the camera file", reason="mirrored")
     start, R = grow_from_matches(frame, found_camera, found.R_cam_icrs, found.star, found.detection)
     joint = widen_covariance(fit_frames((frame,), start, R[None]))
     for check in horizon_checks(joint, catalog, site):

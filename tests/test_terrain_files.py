@@ -30,7 +30,7 @@ from startrack.terrain import (
     write_map,
 )
 from startrack.terrain.import_map import MEASURED_PER_ESTIMATE
-from startrack.terrain.raster import ORTHOGRAPHIC, projection_of
+from startrack.terrain.projection import ORTHOGRAPHIC, projection_of
 
 ROOT = Path(__file__).parent.parent
 pytestmark = pytest.mark.usefixtures("own_cache")

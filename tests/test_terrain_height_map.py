@@ -29,7 +29,7 @@ from startrack.terrain import (
 from startrack.terrain import table_cache as cache
 from startrack.terrain.derived_maps import DeformedMap, HorizonInterpolator
 from startrack.terrain.ground import ground_up_m
-from startrack.terrain.raster import ORTHOGRAPHIC
+from startrack.terrain.projection import ORTHOGRAPHIC
 
 DATA = Path(__file__).parent / "data"
 pytestmark = pytest.mark.usefixtures("own_cache")

@@ -17,7 +17,7 @@ from startrack.frames import enu_from_latlon
 from startrack.localization import ExactPosterior
 from startrack.terrain import STEREOGRAPHIC, HeightMap, Projection, Raster, load_terrain, read_map, write_map
 from startrack.terrain.map_comparison import MapComparison, compare_maps
-from startrack.terrain.raster import ORTHOGRAPHIC
+from startrack.terrain.projection import ORTHOGRAPHIC
 
 DATA = Path(__file__).parent / "data"
 pytestmark = pytest.mark.usefixtures("own_cache")

@@ -175,16 +175,27 @@ COMMANDS = (
                 "a terrain file and GeoTIFF crops from elevation data", None,
                 {
                     "input": (
-                        flag("maps MAP", "GeoTIFF, COG, PDS label, .hgt, USGS .dem ..., the finest first", nargs="+"),
+                        flag(
+                            "maps MAP", "GeoTIFF, COG, PDS label, .hgt, USGS .dem ..., or an array .npy; the finest "
+                            "first", nargs="+",
+                        ),
                         flag("--latitude DEG", "of the origin, north positive", number, required=True),
                         flag("--longitude DEG", "east positive", number, required=True),
                         flag("--radius M", "of the search area", positive_number, default=10_000.0),
                         flag("--half M", "half side of each map's crop (30000 for the first, then 300000; on the Earth "
                              "150000 at most)", positive_number,
                              nargs="+"),
-                        flag("--scale M", "metres per unit of each map; needed for integers if the files lack it",
+                        flag("--scale M", "metres per unit of each map, in the place of what the files state; needed "
+                             "for integers without it", number, nargs="+"),
+                        flag("--offset M", "height of value 0 of each map, in the place of what the files state",
                              number, nargs="+"),
-                        flag("--offset M", "height of value 0 of each map, if the files lack it", number, nargs="+"),
+                        flag("--unusual-heights", "the heights are right, though flatter, higher or lower than the "
+                             "body's ground"),
+                        flag("--post M", "of an array: between posts; rows from the north, columns to the east, its "
+                             "middle at the origin", positive_number),
+                        flag("--crs TEXT", "of an array: its reference system, as PROJ reads it (default: the "
+                             "stereographic plane of the Moon about the origin)", default=""),
+                        flag("--corner X Y", "of an array: the first post, in the units of --crs", number, nargs=2),
                         flag("--sigma M", "error of single posts (default: measured or estimated)", amount),
                         flag(
                             "--compare MAP",

@@ -21,12 +21,12 @@ from startrack.cli.console import progress
 from startrack.cli.flags import check_cluster, check_extra, check_localizer
 from startrack.cli.images import absolute_reference, compile_kernels, odometry_errors, prepare
 from startrack.core.compilation import announce_compilation, is_compiled
-from startrack.core.errors import EXIT_STOPPED, one_line
+from startrack.core.errors import EXIT_STOPPED, how_to_install, one_line
 from startrack.core.files import make_folder, printable
 from startrack.core.runner import RunStopped, count_cores
 from startrack.frames import parse_utc
 from startrack.rendering import read_drive
-from startrack.terrain import load_terrain
+from startrack.terrain import can_write_maps, load_terrain
 
 MAX_DRAWS = 1000
 POINTS_OF_PATH = 25  # of the default spacing
@@ -44,6 +44,8 @@ def predict(args: argparse.Namespace) -> int:
     plan.check_folder(out, overwrite=args.overwrite)
     if not args.quiet:
         print(f"predict: places: {len(plan.points.places)}, draws at each: {args.draws}", file=sys.stderr, flush=True)
+    if args.path is None and not can_write_maps():
+        print(f"predict: no predict.tif, which needs rasterio: {how_to_install('dem')}", file=sys.stderr, flush=True)
     prepare(plan.terrain, args)
     if args.cluster is None and not is_compiled():
         compile_kernels(plan.terrain)

@@ -72,11 +72,15 @@ def import_map(args: argparse.Namespace) -> int:
     announce_compilation()
     half = list(args.half or [])
     half += [30_000.0 if not half and k == 0 else 300_000.0 for k in range(len(half), len(args.maps))]
+    if args.post is None and (args.crs or args.corner):
+        args.usage_error("--crs and --corner are of an array: give --post too")
+    corner = None if args.corner is None else (args.corner[0], args.corner[1])
+    grid = None if args.post is None else terrains.Grid(post=args.post, crs=args.crs, corner=corner)
     imported = terrains.import_maps(
         args.maps, args.output, latitude_rad=radians(args.latitude), longitude_rad=radians(args.longitude), half_m=half,
         radius_m=args.radius, scale=args.scale or (), offset_m=args.offset or (), height_sigma_m=args.sigma,
         compare=args.compare, camera_height_m=args.camera_height, highest_beyond_m=args.highest_beyond,
-        geoid_grid=args.geoid, overwrite=args.overwrite,
+        geoid_grid=args.geoid, grid=grid, unusual_heights=args.unusual_heights, overwrite=args.overwrite,
     )  # fmt: skip
     facts = _facts_of(load_terrain(imported.path))
     facts |= {"sigma_from": imported.errors.origin, "sigma_comment": imported.errors.comment}

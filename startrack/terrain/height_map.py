@@ -144,13 +144,15 @@ class HeightMap(TracedMap):
 
     def error_warnings(self) -> list[str]:
         """Lines of text: errors that the terrain file leaves out, so that they count as 0; datums of unknown place."""
-        shifts = [(one.source, one.projection.transformation_warning) for one in self.maps]
+        of_maps = [
+            (one.source, text) for one in self.maps for text in (one.projection.transformation_warning, *one.notes)
+        ]
         return [
             f"terrain {self.name}: its file states no {key}: taken as 0; circles are too small unless the ground is "
             "exactly so; state the errors (0 for a model from which pictures are rendered)"
             for key in self.unstated_errors
             if not getattr(self, key)
-        ] + [f"map {source}: {warning}" for source, warning in shifts if warning]
+        ] + [f"map {source}: {warning}" for source, warning in of_maps if warning]
 
     def facts(self) -> dict[str, Any]:
         """Facts about the maps and their errors, as JSON values."""

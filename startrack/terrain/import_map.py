@@ -14,6 +14,7 @@ from startrack.core.errors import BadOutput, length_text
 from startrack.core.files import check_output, data_dir, printable, write_atomically
 from startrack.core.types import BadInput
 from startrack.frames import EARTH_RADIUS_M, Site
+from startrack.terrain.array_map import SUFFIX, Grid, map_of_array, read_array
 from startrack.terrain.earth_projection import geoid_at
 from startrack.terrain.height_map import HeightMap
 from startrack.terrain.io import terrain_from_dict
@@ -76,17 +77,19 @@ def import_maps(
     maps: Sequence[str | Path], output: str | Path, *, latitude_rad: float, longitude_rad: float,
     half_m: Sequence[float], radius_m: float, scale: Sequence[float] = (), offset_m: Sequence[float] = (),
     height_sigma_m: float | None = None, compare: Sequence[str | Path] = (), camera_height_m: float = 1.5,
-    highest_beyond_m: float | None = None, geoid_grid: str | None = None, overwrite: bool = False,
+    highest_beyond_m: float | None = None, geoid_grid: str | None = None, grid: Grid | None = None,
+    unusual_heights: bool = False, overwrite: bool = False,
 ) -> ImportedTerrain:  # fmt: skip
     """Write the terrain file `output` and, beside it, a crop of each map: NAME-1.tif, the finest, and so on.
 
     latitude_rad, longitude_rad: the origin. half_m: half the side of each crop about it [m]. radius_m: of the search
-    area. scale, offset_m: of each map, the finest first, where the files do not state them. height_sigma_m: error
+    area. scale, offset_m: of each map, the finest first, in the place of what the files state. height_sigma_m: error
     of single posts [m]; None measures it where a finer map covers a part of the map that makes the horizon: one of the
     `maps`, of the files `compare`, or a shipped one; else it is estimated from the map's roughness, with the published
     error of products that are known. camera_height_m: above the ground [m]. highest_beyond_m: ground off the maps is no
     higher; None: as `io.KEYS` says. geoid_grid: of PROJ, from which heights of the maps count (None: their geoid is not
-    known). overwrite: replace existing files.
+    known). grid: where the posts of arrays (`.npy`) stand. unusual_heights: see `read_map`. overwrite: replace existing
+    files.
 
     Raises BadInput bad_terrain, BadOutput of `output`; nothing is then written.
     """
@@ -102,9 +105,16 @@ def import_maps(
         check_output(path, overwrite=overwrite, reason="bad_terrain")
     wholes: list[Raster] = []
     for k, source in enumerate(maps):
-        own = {"scale": scale[k] if k < len(scale) else None, "offset_m": offset_m[k] if k < len(offset_m) else None}
+        own: dict[str, Any] = {
+            "scale": scale[k] if k < len(scale) else None, "offset_m": offset_m[k] if k < len(offset_m) else None,
+            "unusual_heights": unusual_heights,
+        }  # fmt: skip
         body = wholes[0].projection.body if wholes else None
-        wholes.append(read_map(source, near=origin, body=body, **own))
+        if grid is not None and Path(source).suffix.lower() == SUFFIX:
+            own |= {"latitude_rad": latitude_rad, "longitude_rad": longitude_rad, "source": str(source)}
+            wholes.append(map_of_array(read_array(source), grid, **own))
+        else:
+            wholes.append(read_map(source, near=origin, body=body, **own))
     require_origin(wholes, *origin)
     crops: list[Raster] = []
     for source, whole, half in zip(maps, wholes, half_m, strict=True):
@@ -139,7 +149,8 @@ def import_maps(
     if geoid_grid is not None:
         values["dem"] |= _geoid_values(geoid_grid, values)
     _write_terrain(output, values, errors, dict(zip(files, crops, strict=True)))
-    warnings = [*errors.warnings, *spacing_warnings(crops, radius_m), *_place_warnings(crops, values)]
+    notes = [f"{one.source}: {note}" for one in crops for note in one.notes]
+    warnings = [*notes, *errors.warnings, *spacing_warnings(crops, radius_m), *_place_warnings(crops, values)]
     warnings += smoothness_warnings(rim, errors.height_sigma_m)
     return ImportedTerrain(path=output, errors=errors, warnings=warnings)
 
@@ -169,7 +180,13 @@ def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, c
         for path, crop in crops.items():
             written.append(path)
             write_map(path, crop)
-        terrain = terrain_from_dict(values, folder=output.parent)
+            if not _is_usual(path):
+                values["dem"]["unusual_heights"] = True
+        try:
+            terrain = terrain_from_dict(values, folder=output.parent)
+        except BadInput as cause:
+            notes = [f"{crop.source}: {note}" for crop in crops.values() for note in crop.notes]
+            raise BadInput(cause.reason, "; ".join([str(cause), *notes])) from cause
         if errors.common_crest_sigma_m is not None:
             angle_rad = errors.common_crest_sigma_m * crest_angle_rad_per_m(cast(HeightMap, terrain))
             values["dem"]["horizon_sigma_deg"] = float(f"{np.degrees(angle_rad):.2g}")
@@ -179,6 +196,14 @@ def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, c
         for path in written:
             path.unlink(missing_ok=True)
         raise
+
+
+def _is_usual(path: Path) -> bool:
+    """Whether a crop that was written is read again without `unusual_heights` as it is: a small one may be flat."""
+    try:
+        return not read_map(path).notes
+    except BadInput:
+        return False
 
 
 def measure_errors(rim: Raster, others: Sequence[Raster]) -> StatedErrors:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from startrack.core.declaration import Choice, Either, List, Number, Table, Text
+from startrack.core.declaration import Choice, Either, Flag, List, Number, Table, Text
 from startrack.core.files import parse_toml, printable, read_text, resolve_named
 from startrack.core.obstacles import Obstacles, read_obstacles
 from startrack.core.types import BadInput
@@ -49,9 +49,11 @@ KEYS = Table(
                 "height_sigma_m": replace(shape.AMOUNT, description="of single posts, independent of each other; if "
                                           "absent 0, with a warning"),
                 **{fact.key: fact.limits for fact in (shape.BIAS, shape.STRETCH, shape.VERTICAL)},
-                "scale": Number(low=-1e6, high=1e6, description="metres per unit, where the files do not state it"),
+                "scale": Number(low=-1e6, high=1e6, description="metres per unit, in place of what the files state"),
                 "offset_m": Number(low=-shape.MAX_LENGTH_M, high=shape.MAX_LENGTH_M,
-                                   description="height of value 0, where the files do not state it"),
+                                   description="height of value 0, in place of what the files state"),
+                "unusual_heights": Flag(description="the heights are right, though flatter, higher or lower than the "
+                                        "body's ground; no value is taken for a void that the file does not state"),
                 "geoid_m": replace(HEIGHT, description="height of the geoid above the ellipsoid at the origin, if "
                                    "heights are above the geoid; earth only"),
                 "geoid_slope_arcsec": List(each=Number(low=-600.0, high=600.0), count=2, description="rise of the "
@@ -221,7 +223,7 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
     dem, rover, search = keys["dem"], keys["rover"], keys["search"]
     near, files = (site.latitude_rad, site.longitude_rad), _map_files(keys, folder)
     obstacles, more_files = _obstacles(keys, folder)
-    scaling = {key: dem[key] for key in ("scale", "offset_m") if key in dem}
+    scaling = {key: dem[key] for key in ("scale", "offset_m", "unusual_heights") if key in dem}
     maps = tuple(read_map(file, near=near, body=site.body, **scaling) for file in files)
     require_origin(maps, *near)
     on_earth = {}

@@ -1,11 +1,12 @@
-"""Height maps from files: GeoTIFF and SRTM decoded here, everything else (PDS, USGS DEM ...) through rasterio."""
+"""Height maps from files, by rasterio; the shipped ones without it."""
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,17 +15,17 @@ from typing import Any
 import numpy as np
 
 from startrack.core.errors import how_to_install
+from startrack.core.files import data_dir
 from startrack.core.types import MAX_PIXELS, BadInput
-from startrack.frames import MOON_RADIUS_M
-from startrack.terrain.earth_projection import FOOT_M, EarthProjection, is_earth, project_earth
-from startrack.terrain.map_formats import UNITS_M, Stored, one_line_refusal, read_geotiff, read_hgt
-from startrack.terrain.raster import MAX_NUMBER, Projection, Raster, projection_of
-from startrack.terrain.shape import MAX_LENGTH_M
+from startrack.terrain.earth_projection import EarthProjection, is_earth, project_earth
+from startrack.terrain.map_heights import Stored, heights_of, note_bands
+from startrack.terrain.plain_tiff import one_line_refusal, read_shipped
+from startrack.terrain.projection import EQUIRECTANGULAR, Projection, projection_of
+from startrack.terrain.raster import Raster
 
 # Half the side of what is read about the origin. On the Moon 10 km mountains are below the horizontal farther away. On
 # the Earth the highest stand 2.8 degrees high at most farther away, where the air leaves few stars.
 WINDOW_HALF_M = {"moon": 300_000.0, "earth": 150_000.0}
-LOWEST_M, HIGHEST_ABOVE_SEA_M = -11_050.0, 9_000.0  # of the Earth: the deepest sea and the highest mountain, and 100 m
 MAX_BLOCK_POSTS = 50_000_000  # 200 MB of floating point, for any window
 # GDAL's readers of heights in one file, or in a file that it names; mosaics and map services name any address.
 DRIVERS = (
@@ -37,33 +38,48 @@ WITHOUT_NETWORK = {
     "CPL_VSIL_CURL_ALLOWED_FILENAME": "none",
     "GDAL_HTTP_PROXY": "0.0.0.0:0",
 }  # for a label that names one
+HINTS = {  # by suffix
+    ".img": " (of a PDS map give the label, {stem}.LBL)",
+    ".vrt": ": a mosaic names other files; make one file of it (gdal_translate)",
+    ".npy": ": an array has no place; give terrain import --post M",
+    ".npz": ": an archive of arrays; give one of them, written by numpy.save, to terrain import --post M",
+    ".toml": ": give a map to terrain import, and a terrain file with -t",
+    ".zip": ": an archive; give the map in it",
+}
 HEIGHT_NAMES = "altitude", "dem", "elevation", "height", "topo", "z"  # of the grid of heights among others of a file
 
 
 def read_map(
     path: str | Path, *, scale: float | None = None, offset_m: float | None = None,
-    near: tuple[float, float] | None = None, body: str | None = None,
+    near: tuple[float, float] | None = None, body: str | None = None, unusual_heights: bool = False,
 ) -> Raster:  # fmt: skip
     """The height map of the file `path`.
 
-    scale and offset_m: height = offset + scale x value, unless the file states them.
+    scale and offset_m: height [m] = offset + scale x value, in the place of what the file states.
     near: latitude and longitude [rad] about which large maps are cut. body: that it must be of, "moon" or "earth".
+    unusual_heights: the heights are right though no ground of the body is as high, as low or as flat; no value is then
+    taken for a void that the file does not state.
     Raises BadInput bad_terrain for a file that is missing or damaged, or that is no height map of this body near there.
     """
     path = Path(path)
     if not os.path.isfile(path):  # False also for names that the system cannot take
         raise BadInput("bad_terrain", f"{path}: no such file")
-    reader = READERS.get(path.suffix.lower(), lambda _: None)
-    stored = reader(path) or _read_with_rasterio(path, near)
-    found = stored.values.projection.body
+    if path.suffix == ".tif" and path.resolve().parent == data_dir("terrain").resolve():
+        whole = read_shipped(path)
+        if scale is not None or offset_m is not None:
+            raise BadInput("bad_terrain", f"{path}: it states its scale; leave --scale and --offset out")
+    else:
+        stored = _read_with_rasterio(path, near)
+        whole = heights_of(stored, str(path), scale, offset_m, unusual_heights)
+    found = whole.projection.body
     if body is not None and found != body:
         raise BadInput(
             "bad_terrain", f"{path}: it is a map of the {found.title()}, and the terrain's body is the {body.title()}"
         )
-    raster = _heights_of(stored, path, scale, offset_m)
-    cut = raster if near is None else raster.crop_around(*near, WINDOW_HALF_M[found])
+    whole = replace(whole, source=path.name)
+    cut = whole if near is None else whole.crop_around(*near, WINDOW_HALF_M[found])
     if min(cut.heights_m.shape) < 2:
-        raise _not_on(str(path), raster)
+        raise _not_on(str(path), whole)
     return cut
 
 
@@ -89,74 +105,10 @@ def _not_on(name: str, whole: Raster) -> BadInput:
     )
 
 
-def _heights_of(stored: Stored, path: Path, scale: float | None, offset_m: float | None) -> Raster:
-    """The heights [m above the sphere], NaN where the file has none. Raises BadInput bad_terrain."""
-    raster, values = stored.values, stored.values.heights_m
-    if values.ndim != 2 or min(values.shape) < 2:
-        raise BadInput(
-            "bad_terrain",
-            f"{path}: too small for a height map: {' x '.join(map(str, values.shape))} posts; give a larger one",
-        )
-    if values.dtype.kind not in "iuf":
-        raise BadInput("bad_terrain", f"{path}: values of type {values.dtype} are no heights")
-    scale = stored.scale if scale is None else scale
-    offset = stored.offset_m if offset_m is None else offset_m
-    if scale is None and np.issubdtype(values.dtype, np.integer):
-        raise BadInput(
-            "bad_terrain",
-            f"{path}: it holds whole numbers and no scale: give the metres of one unit (1 where they are "
-            "metres), with --scale of terrain import or as scale in [dem]",
-        )
-    scale = 1.0 if scale is None else scale
-    numbers = (raster.x0_m, raster.y0_m, raster.dx_m, raster.dy_m, scale, offset)
-    if not np.isfinite(numbers).all() or 0.0 in numbers[2:4] or max(map(abs, numbers)) > MAX_NUMBER:
-        raise BadInput(
-            "bad_terrain", f"{path}: its position, its scale or its offset is not a usable number: {numbers}"
-        )
-    with np.errstate(over="ignore", invalid="ignore"):
-        heights = values.astype(np.float64) * scale + offset
-    missing = ~(np.abs(heights) < MAX_LENGTH_M)  # NaN too; larger values are marks
-    if stored.no_data is not None:
-        missing |= values == stored.no_data
-    if missing.all():
-        raise BadInput("bad_terrain", f"{path}: no post has a height")
-    if raster.projection.body == "earth":
-        _check_range(path, float(heights[~missing].min()), float(heights[~missing].max()))
-    elif np.median(heights[~missing]) > MOON_RADIUS_M / 2:  # counted from the Moon's centre
-        heights -= MOON_RADIUS_M
-    heights[missing] = np.nan
-    return replace(raster, heights_m=heights.astype(np.float32), source=path.name)
-
-
-def _check_range(path: Path, lowest_m: float, highest_m: float) -> None:
-    """Raise BadInput bad_terrain for heights that no ground of the Earth has."""
-    if lowest_m >= LOWEST_M and highest_m <= HIGHEST_ABOVE_SEA_M:
-        return
-    fits = lowest_m * FOOT_M >= LOWEST_M and highest_m * FOOT_M <= HIGHEST_ABOVE_SEA_M
-    cause = (
-        f"are they feet? Then state --scale {FOOT_M} of terrain import, or scale = {FOOT_M} in [dem]"
-        if fits
-        else "is a value for voids unstated, or the unit another?"
-    )
-    raise BadInput(
-        "bad_terrain",
-        f"{path}: heights from {lowest_m:.0f} to {highest_m:.0f} m are not of the Earth's ground: {cause}",
-    )
-
-
 def _read_with_rasterio(path: Path, near: tuple[float, float] | None) -> Stored:
     """The content, cut to a window about `near`. Raises BadInput bad_terrain."""
-    hints = {
-        ".img": f" (of a PDS map give the label, {path.stem}.LBL)",
-        ".vrt": ": a mosaic names other files; make one file of it (gdal_translate)",
-    }
-    hint = hints.get(path.suffix.lower(), "")
-    if find_spec("rasterio") is None or find_spec("pyproj") is None:
-        raise BadInput(
-            "bad_terrain",
-            f"{path}: not a GeoTIFF on the Moon in a known projection, or in longitude and latitude of WGS 84, with a "
-            f"known compression; other maps need rasterio and pyproj: {how_to_install('dem')}",
-        )
+    hint = HINTS.get(path.suffix.lower(), "").format(stem=path.stem)
+    require_extra(str(path))
     import rasterio
     from rasterio.io import DatasetReader  # in place of rasterio.open, which takes one driver
 
@@ -181,9 +133,16 @@ def _heights_among(parts: Sequence[str], path: Path) -> str:
     raise BadInput("bad_terrain", f"{path}: which of its grids has the heights? It has {names}; cut out one (gdalwarp)")
 
 
+def require_extra(name: str) -> None:
+    """Raise BadInput bad_terrain, with the `name` of a map, without the packages that read maps."""
+    if find_spec("rasterio") is None or find_spec("pyproj") is None:
+        raise BadInput("bad_terrain", f"{name}: maps are read by rasterio and pyproj: {how_to_install('dem')}")
+
+
 def _content_of(file: Any, path: Path, near: tuple[float, float] | None, hint: str) -> Stored:
     """The content of an open rasterio file."""
     import pyproj
+    from rasterio.enums import ColorInterp
     from rasterio.windows import Window
 
     if file.crs is None or file.transform.is_identity:
@@ -195,33 +154,94 @@ def _content_of(file: Any, path: Path, near: tuple[float, float] | None, hint: s
     if t.b or t.d:
         raise BadInput("bad_terrain", f"{path}: a rotated grid; bring it to north up (gdalwarp)")
     crs = pyproj.CRS.from_wkt(file.crs.to_wkt())
-    projection: Projection | EarthProjection
-    if crs.ellipsoid is not None and is_earth(crs.ellipsoid.semi_major_metre):
-        projection = project_earth(crs, (t.c + 0.5 * t.a * file.width, t.f + 0.5 * t.e * file.height), near)
-    else:
-        projection = projection_of(crs.to_dict())
-    raster = Raster(
-        heights_m=np.broadcast_to(np.float32(0), (file.height, file.width)), projection=projection,
-        x0_m=t.c + 0.5 * t.a, y0_m=t.f + 0.5 * t.e, dx_m=float(t.a), dy_m=float(t.e),
-    )  # fmt: skip
+    unread = np.broadcast_to(np.float32(0), (file.height, file.width))
+    raster = place_on(crs, unread, (t.c + 0.5 * t.a, t.f + 0.5 * t.e), (float(t.a), float(t.e)), near)
     rows, columns = slice(0, file.height), slice(0, file.width)
     if near is not None:
-        rows, columns = raster.window(*near, WINDOW_HALF_M[projection.body])
+        rows, columns = raster.window(*near, WINDOW_HALF_M[raster.projection.body])
     shape = rows.stop - rows.start, columns.stop - columns.start
     if min(file.height, file.width) >= 2 > min(shape):
         raise _not_on(str(path), raster)
     if shape[0] * shape[1] > MAX_PIXELS:
         raise BadInput("bad_terrain", f"{path}: too large; cut it to the area (startrack terrain import --half)")
-    if math.prod(file.block_shapes[0]) > MAX_BLOCK_POSTS:  # of which a window is a part
+    _require_small_blocks(file, path)
+    window = Window(columns.start, rows.start, shape[1], shape[0])
+    values = file.read(1, window=window)
+    missing = file.read_masks(1, window=window) == 0
+    if file.nodata is not None:
+        missing |= values == file.nodata  # where the file has a mask too, that is not in it
+    alphas = [k for k, kind in enumerate(file.colorinterp) if kind == ColorInterp.alpha]
+    for k in alphas:
+        missing |= file.read(k + 1, window=window) == 0
+    scale, offset = float(file.scales[0]), float(file.offsets[0])
+    raster = raster.crop(rows, columns)
+    return Stored(
+        values=replace(raster, heights_m=values), missing=missing,
+        scale=None if (scale, offset) == (1.0, 0.0) else scale, offset=offset, units=tuple(_units_of(file, crs, path)),
+        notes=note_bands(file.count, alphas, file.descriptions),
+    )  # fmt: skip
+
+
+def place_on(
+    crs: Any, heights_m: np.ndarray, first_xy: tuple[float, float], steps: tuple[float, float],
+    near: tuple[float, float] | None,
+) -> Raster:  # fmt: skip
+    """Heights (rows, columns) in a reference system of pyproj, from the place of the first post and the steps dx, dy.
+
+    Raises BadInput bad_terrain for a system that is not known.
+    """
+    rows, columns = heights_m.shape
+    middle = first_xy[0] + 0.5 * steps[0] * (columns - 1), first_xy[1] + 0.5 * steps[1] * (rows - 1)
+    projection: Projection | EarthProjection
+    metres = 1.0
+    if crs.ellipsoid is not None and is_earth(crs.ellipsoid.semi_major_metre):
+        projection = project_earth(crs, middle, near)
+    else:
+        horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
+        projection = projection_of(horizontal.to_dict())
+        axis = horizontal.axis_info[0]
+        if horizontal.is_projected:
+            metres = axis.unit_conversion_factor
+        elif abs(np.radians(1.0) / axis.unit_conversion_factor - 1.0) > 1e-9:
+            raise BadInput("bad_terrain", f"{crs.name!r} counts angles in {axis.unit_name}, not degrees")
+        half_turn = math.pi * projection.radius_m * projection.scale
+        reach = abs(metres * middle[0] - projection.false_x_m) + 0.5 * metres * abs(steps[0]) * columns
+        if projection.kind == EQUIRECTANGULAR and reach > half_turn * (1 + 1e-9):
+            projection = projection.centred_at(metres * middle[0])
+    return Raster(
+        heights_m=heights_m, projection=projection, x0_m=metres * first_xy[0], y0_m=metres * first_xy[1],
+        dx_m=metres * steps[0], dy_m=metres * steps[1],
+    )  # fmt: skip
+
+
+def _require_small_blocks(file: Any, path: Path) -> None:
+    """Raise BadInput bad_terrain where a window takes the decoding of much more, also of the mask beside the file."""
+    from rasterio.io import DatasetReader
+
+    blocks = [math.prod(file.block_shapes[0]) * file.count]
+    if os.path.isfile(f"{file.name}.msk"):
+        with DatasetReader(f"{file.name}.msk", driver=DRIVERS) as mask:
+            blocks.append(math.prod(mask.block_shapes[0]))
+    if max(blocks) > MAX_BLOCK_POSTS:
         raise BadInput("bad_terrain", f"{path}: stored in one piece; write it in tiles (gdal_translate -co TILED=YES)")
-    values = file.read(1, window=Window(columns.start, rows.start, shape[1], shape[0]))
-    scale, offset = file.scales[0], file.offsets[0]
-    unit = UNITS_M.get(str(file.units[0]).lower())
-    stated = (scale, offset) != (1.0, 0.0) or unit is not None
-    x0_m, y0_m = raster.x0_m + columns.start * t.a, raster.y0_m + rows.start * t.e
-    raster = replace(raster, heights_m=values, x0_m=x0_m, y0_m=y0_m)
-    scale, offset = float(scale) * (unit or 1.0), float(offset) * (unit or 1.0)
-    return Stored(raster, scale if stated else None, offset, file.nodata)
 
 
-READERS = {".tif": read_geotiff, ".tiff": read_geotiff, ".hgt": read_hgt}  # by suffix: without rasterio
+def _units_of(file: Any, crs: Any, path: Path) -> Iterator[str]:
+    """Every unit of heights that a file states: of its first band, its reference system, and a PDS3 label."""
+    if file.units[0]:
+        yield file.units[0]
+    for axis in crs.axis_info[2:]:
+        if axis.direction != "up":
+            raise BadInput("bad_terrain", f"{path}: it counts depths ({axis.name}): turn it to heights")
+        yield axis.unit_name
+    for head, rest in file.tags(ns="json:PDS").items():  # rasterio cuts the text at its first colon
+        yield from _label_units(json.loads(f"{head}:{rest}"))
+
+
+def _label_units(label: dict[str, Any]) -> Iterator[str]:
+    """UNIT of each image that a PDS3 `label` describes, which GDAL does not tell."""
+    for name, entry in label.items():
+        if isinstance(entry, dict):
+            if name.endswith("IMAGE") and "UNIT" in entry:
+                yield str(entry["UNIT"])
+            yield from _label_units(entry)

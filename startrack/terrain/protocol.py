@@ -15,7 +15,7 @@ from startrack.core.obstacles import Obstacles
 from startrack.core.types import Array, Bools, Ints
 from startrack.frames import Air, Site
 from startrack.terrain.earth_projection import EarthProjection
-from startrack.terrain.raster import STEREOGRAPHIC, Projection
+from startrack.terrain.projection import STEREOGRAPHIC, Projection
 from startrack.terrain.shape import ShapeError
 
 Progress = Callable[[int, int], None]  # parts done, of how many

@@ -17,8 +17,9 @@ from startrack.terrain.earth_projection import EarthProjection
 from startrack.terrain.ground import Ground, ground_up_m, pack_maps
 from startrack.terrain.horizon_kernel import surfaces
 from startrack.terrain.horizon_table import AZIMUTH_BINS, FIELDS, HorizonTable, Square
+from startrack.terrain.projection import Projection
 from startrack.terrain.protocol import Progress, Terrain
-from startrack.terrain.raster import Projection, Raster
+from startrack.terrain.raster import Raster
 from startrack.terrain.rays import flatten, flatten_rays, rows_of_rays, run_in_threads
 from startrack.terrain.table_cache import (
     TABLES_IN_MEMORY,
@@ -74,8 +75,18 @@ class TracedMap(Terrain):
             raise BadInput(
                 "bad_terrain",
                 f"the maps do not cover the search area of {self.search_radius_m:.0f} m about the origin, or have "
-                "holes in it: give a wider map, or a smaller radius",
+                f"holes in it{self._voids_text()}: give a wider map, or a smaller radius",
             )
+
+    def _voids_text(self) -> str:
+        """The voids of each map, in brackets, with what its reader noted; empty where there are none."""
+        counts = [(one, np.count_nonzero(np.isnan(one.heights_m))) for one in self.maps]
+        found = [
+            ", ".join([f"{count} of {one.heights_m.size} posts of {one.source or 'a map'} are voids", *one.notes])
+            for one, count in counts
+            if count
+        ]
+        return f" ({'; '.join(found)})" if found else ""
 
     @property
     def projection(self) -> Projection | EarthProjection:  # type: ignore[override]

@@ -32,7 +32,7 @@ from startrack.core.files import check_regular, remove_file, write_atomically
 from startrack.core.stored import read_json_object
 from startrack.estimation.observations import OdometryErrors
 from startrack.frames import format_utc, latlon_from_enu
-from startrack.terrain import Terrain, load_terrain, write_bands
+from startrack.terrain import Terrain, can_write_maps, load_terrain, write_bands
 
 RECORD_FILE, MAP, STYLE = "predict.json", "predict.tif", "predict.qml"
 CELL_TABLE, MAP_PICTURE = "predict.ecsv", "predict.png"
@@ -171,12 +171,15 @@ def _median_error_text(radius95_m: float | None) -> str:
 def write_report(report: Report, out: Path, *, plots: bool) -> list[Path]:
     """Write the files of a `report` into the folder `out`, with pictures if `plots`; returns their paths.
 
-    Files of an earlier prediction that this one does not make are removed.
+    Files of an earlier prediction that this one does not make are removed. Without rasterio there is no predict.tif.
     """
-    points, made = report.plan.points, dict[str, bytes]()
-    if isinstance(points, AreaCells):  # the quantities as bands, in the projection of the terrain's map
+    points, made, maps = report.plan.points, dict[str, bytes](), list[str]()
+    if (
+        isinstance(points, AreaCells) and can_write_maps()
+    ):  # the quantities as bands, in the projection of the terrain's map
         bands = {one.key: points.band(report.cells[one.key]) for one in CELL_QUANTITIES}
         write_bands(out / MAP, points.frame, bands)
+        maps = [MAP]
         if classes := output.radius_classes(report.cells[STYLED]):
             made[STYLE] = output.qgis_style_text(1 + list(bands).index(STYLED), classes).encode()
     made[CELL_TABLE] = _table(report).encode()
@@ -190,7 +193,7 @@ def write_report(report: Report, out: Path, *, plots: bool) -> list[Path]:
     made[RECORD_FILE] = (json.dumps(report.record, indent=1) + "\n").encode()
     for name, data in made.items():
         write_atomically(out / name, data, overwrite=True)
-    names = [*([MAP] if isinstance(points, AreaCells) else []), *made]
+    names = [*maps, *made]
     for name in PREDICTION_FILES - set(names):
         remove_file(out / name)
     return [out / name for name in names]

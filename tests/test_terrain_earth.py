@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import lzma
+import re
 import struct
 import tomllib
 from dataclasses import replace
@@ -240,12 +241,9 @@ def tile_of_srtm(folder: Path) -> Path:
     return path
 
 
-def test_a_tile_of_srtm_and_a_geotiff_need_no_other_packages(tmp_path, monkeypatch):
+def test_a_tile_of_srtm_is_the_map_that_it_was_made_of(tmp_path):
     path = tile_of_srtm(tmp_path)
     write_map(tmp_path / "jacksboro.tif", jacksboro(), step_m=1.0, offset_m=0.0)
-    write_map(tmp_path / "utm.tif", in_projection("EPSG:32616", 75.0))
-    monkeypatch.setattr("startrack.terrain.map_reading.find_spec", lambda name: None)
-    monkeypatch.setattr("startrack.terrain.earth_projection.find_spec", lambda name: None)
     near = SITE.latitude_rad, SITE.longitude_rad
     tile, tiff = read_map(path, near=near), read_map(tmp_path / "jacksboro.tif", near=near)
     assert np.nanmax(tile.heights_m) == tiff.heights_m.max() == 1076.0
@@ -253,8 +251,6 @@ def test_a_tile_of_srtm_and_a_geotiff_need_no_other_packages(tmp_path, monkeypat
         assert one.sample(one.row_column(*map(np.array, near))) == pytest.approx(550.0, abs=15.0)
     by_tiff = on_earth(tiff).horizon_rad(np.zeros(2), np.arange(0, 6.0, 0.5))
     assert np.degrees(by_tiff.max()) > 5.0
-    with pytest.raises(BadInput, match=r"pip install '\.\[dem\]'"):
-        read_map(tmp_path / "utm.tif")
 
 
 def test_import_writes_a_terrain_of_the_earth(tmp_path, capsys):
@@ -347,10 +343,14 @@ def test_what_cannot_be_used_is_refused_and_named(changes, named, tmp_path):
 
 
 def test_heights_in_feet_are_named_by_their_range(tmp_path):
-    high = replace(jacksboro(), heights_m=(jacksboro().heights_m * 12.0 / 0.3048 / 3).astype(np.float32))
-    write_map(tmp_path / "feet.tif", high)
-    with pytest.raises(BadInput, match=r"are they feet\? Then state --scale 0\.3048"):
+    """Following the advice gives the heights, also of steps with an offset."""
+    true_m = jacksboro().heights_m * 4.0
+    write_map(tmp_path / "feet.tif", replace(jacksboro(), heights_m=(true_m / 0.3048).astype(np.float32)))
+    with pytest.raises(BadInput, match=r"are they feet\? Then state --scale .* --offset") as refusal:
         read_map(tmp_path / "feet.tif")
+    advice = re.findall(r"(scale|offset_m) = ([\d.]+)", str(refusal.value))
+    read = read_map(tmp_path / "feet.tif", **{key: float(value) for key, value in advice})
+    assert np.abs(read.heights_m - true_m).max() < 0.2
 
 
 def test_what_is_for_the_earth_is_refused_on_the_moon(tmp_path):

@@ -273,12 +273,16 @@ def _cause_of_range(
             f"is {float(wrong[most]):g}, the value of {counts[most]} posts, that for voids? Then state it "
             f"(rio edit-info --nodata {float(wrong[most]):g} FILE)"
         )
-    for unit, metres in UNITS_TO_TRY.items():
-        if metres * heights_m.min() >= ground.lowest_m and metres * heights_m.max() <= ground.highest_m:
-            return f"are they {unit}? {_advice_to_scale(scaling, metres)}"
+    causes = [
+        f"are they {unit}? {_advice_to_scale(scaling, metres)}"
+        for unit, metres in UNITS_TO_TRY.items()
+        if metres * heights_m.min() >= ground.lowest_m and metres * heights_m.max() <= ground.highest_m
+    ][:1]
     if np.ptp(heights_m) <= ground.highest_m - ground.lowest_m:
-        return "do they count from another level? Then state the height of value 0: --offset, or offset_m in [dem]"
-    return "is a value for voids unstated (rio edit-info --nodata), or the unit another (--scale)?"
+        causes.append(
+            "do they count from another level? Then state the height of value 0: --offset, or offset_m in [dem]"
+        )
+    return "; ".join(causes) or "is a value for voids unstated (rio edit-info --nodata), or the unit another (--scale)?"
 
 
 def note_bands(count: int, alphas: Sequence[int], descriptions: Sequence[str | None]) -> tuple[str, ...]:

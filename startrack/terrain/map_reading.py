@@ -114,8 +114,7 @@ def _read_with_rasterio(path: Path, near: tuple[float, float] | None) -> Stored:
 
     refusal = one_line_refusal(f"{path}: not a map that can be read{hint}")
     with refusal, rasterio.Env(**WITHOUT_NETWORK), warnings.catch_warnings():
-        # About files without a position, which have their own message, and about terms that PROJ lacks beside WKT.
-        warnings.simplefilter("ignore")
+        warnings.simplefilter("ignore")  # about files without a position, which have their own message
         with DatasetReader(os.fspath(path), driver=DRIVERS) as file:
             parts = file.subdatasets if file.crs is None else []
             if not parts:
@@ -198,7 +197,13 @@ def place_on(
         projection = project_earth(crs, middle, near)
     else:
         horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
-        projection = projection_of(horizontal.to_dict())
+        if not (horizontal.is_geographic or horizontal.is_projected):
+            raise BadInput("bad_terrain", f"the reference system {crs.name!r} is not known: bring the map to another")
+        if "west" in [axis.direction for axis in horizontal.axis_info]:
+            raise BadInput("bad_terrain", "the map counts to the west: bring it to east and north (gdalwarp)")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about terms that PROJ's parameters lack
+            projection = projection_of(horizontal.to_dict())
         axis = horizontal.axis_info[0]
         if horizontal.is_projected:
             metres = axis.unit_conversion_factor

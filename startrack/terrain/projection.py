@@ -139,8 +139,6 @@ def projection_of(p: Mapping[str, Any]) -> Projection:
         raise BadInput("bad_terrain", "the map is of the Earth, not of the Moon")
     if "a" in p and "b" in p and abs(float(p["a"]) - float(p["b"])) > 1:
         raise BadInput("bad_terrain", "the map is on an ellipsoid, not on the Moon's 1737.4 km sphere")
-    if str(p.get("axis", "enu")) != "enu":
-        raise BadInput("bad_terrain", f"the map's axes point to {p['axis']}: bring it to east and north (gdalwarp)")
     meridian = p.get("pm", 0.0)
     if not isinstance(meridian, int | float):
         raise BadInput("bad_terrain", f"the map counts longitudes from {meridian}: bring it to the body's (gdalwarp)")

@@ -32,7 +32,7 @@ class Grid:
     corner: tuple[float, float] | None = None
 
     def place(self, heights_m: np.ndarray, near: tuple[float, float]) -> Raster:
-        """Heights (rows, columns) in their place, `near` the latitude and longitude [rad] of the origin.
+        """The array `heights_m` (rows, columns) in its place, `near` the latitude and longitude [rad] of the origin.
 
         Raises BadInput bad_terrain for a reference system that is not known.
         """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from page_helpers import ROOT
 from scipy.spatial.transform import Rotation
 
 from startrack.camera import Camera, Decentring, KannalaBrandt, Pinhole, decentring_rms_px, load_camera
@@ -246,7 +248,7 @@ def test_the_calibrated_angle_is_given_or_that_of_the_nearest_edge(program, tmp_
     edge = np.array([801.25, -0.5])  # the frame is 1600 x 1200 and its centre at 801, 598
     assert camera.calibrated_angle_rad == pytest.approx(float(camera.angle_rad(edge)))
     assert camera.calibrated_angle_rad < 0.7 * camera.max_angle_rad
-    assert "the file states none; give --calibrated-angle" in capsys.readouterr().err
+    assert "the file states none; startrack calibrate convert --calibrated-angle" in capsys.readouterr().err
     assert main([*words, "--calibrated-angle", "50", "-O"]) == 0
     assert load_camera(made).calibrated_angle_rad == pytest.approx(np.radians(50))
     assert capsys.readouterr().err == ""
@@ -281,7 +283,7 @@ OTHER_FILES = [
     ("kalibr", "camera_model: pinhole", "camera_model: omni", "camera_model 'omni' has no counterpart"),
     ("colmap", "OPENCV_FISHEYE", "OPENCV", "camera model OPENCV with 8 parameters has no counterpart"),
     ("opencv", "fisheye_model: 1", "fisheye_model: 0", "distortion pinhole with coefficients other than 0"),
-    ("ros", "camera_matrix", "matrix", "not a camera file of startrack (.toml), ROS, Kalibr, COLMAP or OpenCV"),
+    ("ros", "camera_matrix", "matrix", "not a camera file of startrack (.toml), ROS, Kalibr, COLMAP, OpenCV or RMS"),
 ]
 
 
@@ -293,3 +295,169 @@ def test_a_lens_that_cannot_be_converted_exactly_is_refused(program, old, new, c
         load_camera(file)
     assert refusal.value.reason == "bad_calibration"
     assert str(file) in str(refusal.value)
+
+
+# As `ros2 topic echo` prints it; binning of 2 of the whole sensor.
+ECHO = """header:
+  stamp:
+    sec: 1759842258
+    nanosec: 831630048
+  frame_id: cam
+height: 1200
+width: 1920
+distortion_model: equidistant
+d:
+- -0.012
+- 0.003
+- -0.0005
+- 0.0001
+k:
+- 620.0
+- 0.0
+- 960.7
+- 0.0
+- 621.0
+- 600.8
+- 0.0
+- 0.0
+- 1.0
+r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+p: [620.0, 0.0, 960.7, 0.0, 0.0, 620.0, 600.8, 0.0, 0.0, 0.0, 1.0, 0.0]
+binning_x: BX
+binning_y: BY
+roi:
+  x_offset: RX
+  y_offset: RY
+  height: RH
+  width: RW
+  do_rectify: false
+---
+"""
+WHOLE = {"BX": 0, "BY": 0, "RX": 0, "RY": 0, "RW": 0, "RH": 0}
+
+
+def echo(**values):
+    text = ECHO
+    for key, value in (WHOLE | values).items():
+        text = text.replace(f": {key}\n", f": {value}\n")
+    return text
+
+
+def shrunk(frame, start, size, by):
+    """The part of a `frame` (H, W) of that size (W, H) at `start`, each `by` pixels of it one: their mean."""
+    (x, y), (w, h), (bx, by_) = start, size, by
+    part = frame[y : y + h // by_ * by_, x : x + w // bx * bx]
+    return part.reshape(h // by_, by_, w // bx, bx).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize(
+    ("start", "size", "by"),
+    [((0, 0), (1920, 1200), (2, 2)), ((300, 101), (1400, 1000), (1, 1)), ((301, 99), (1400, 1001), (3, 2))],
+)
+def test_binning_and_region_of_a_camera_info_are_applied(start, size, by):
+    """A blob painted on the sensor has its centroid in the binned part where the camera projects its ray."""
+    whole = from_text(echo(), "ros", "whole")
+    window = (0, 0) if size == (1920, 1200) else size
+    text = echo(BX=by[0], BY=by[1], RX=start[0], RY=start[1], RW=window[0], RH=window[1])
+    camera = from_text(text, "ros", "part")
+    assert camera.size_px == (size[0] // by[0], size[1] // by[1])
+    assert f"pictures of {camera.size_px[0]} x {camera.size_px[1]} px" in camera.notes[0]
+    px = np.array([1033.37, 512.81])
+    y, x = np.indices((1200, 1920))
+    part = shrunk(np.exp(-((x - px[0]) ** 2 + (y - px[1]) ** 2) / (2 * 6.0**2)), start, size, by)
+    rows, columns = np.indices(part.shape)
+    centroid = [(columns * part).sum() / part.sum(), (rows * part).sum() / part.sum()]
+    np.testing.assert_allclose(camera.project(whole.unproject(px))[0], centroid, atol=2e-3)
+
+
+def test_a_camera_info_printed_from_a_topic_is_read_as_the_file_of_it(tmp_path):
+    (tmp_path / "info.yaml").write_text(echo())
+    camera = load_camera(tmp_path / "info.yaml")
+    assert (camera.size_px, camera.focal_px, camera.centre_px) == ((1920, 1200), (620.0, 621.0), (960.7, 600.8))
+    assert camera.lens == KannalaBrandt((-0.012, 0.003, -0.0005, 0.0001))
+    assert len(camera.notes) == 1  # no word on binning, region or stereo: only the calibrated angle
+    again = from_text(echo() + echo().replace("sec: 1", "sec: 2"), "ros", "info")  # a second message
+    assert again == replace(camera, R_body_cam=again.R_body_cam)
+    ros1 = re.sub(r"^([dkrp]):", lambda m: m[0].upper(), echo(), flags=re.MULTILINE)
+    assert from_text(ros1, "ros", "info").focal_px == camera.focal_px
+    other = echo() + echo(BX=2, BY=2)
+    with pytest.raises(
+        BadInput, match=r"has several cameras: choose .* FILE#1, of 1 \(1920 x 1200\), 2 \(1920 x 1200\)"
+    ):
+        from_text(other, "ros", "info")
+    assert from_text(other, "ros", "info", wanted="2").size_px == (960, 600)
+
+
+def test_the_file_of_a_camera_info_may_have_binning_and_stereo():
+    text = to_text(FISHEYE, "ros")
+    assert from_text(text + "binning_x: 2\nbinning_y: 2\n", "ros", "x").size_px == (800, 600)
+    stereo = text.replace("801.25, 0.0, 0.0, 479.8", "801.25, -58.0, 0.0, 479.8")
+    assert stereo != text
+    camera = from_text(stereo, "ros", "x")
+    assert "the rectification of a stereo camera (r, p) is left out" in camera.notes[0]
+    assert camera.focal_px == FISHEYE.focal_px
+    with pytest.raises(BadInput, match=r"roi 1600 x 1200 at 8, 0 is not within the sensor"):
+        from_text(text + "roi: {x_offset: 8, y_offset: 0, width: 1600, height: 1200}\n", "ros", "x")
+
+
+def several(program):
+    """A file of two cameras, the second a pinhole, and their names."""
+    one, two = to_text(FISHEYE, program), to_text(PINHOLE, program)
+    if program == "kalibr":
+        return one + two.replace("cam0:", "cam1:"), ("cam0", "cam1"), ("1600 x 1200", "1024 x 768")
+    return one + two.replace("\n1 PINHOLE", "\n7 PINHOLE"), ("1", "7"), ("1600 x 1200", "1024 x 768")
+
+
+@pytest.mark.parametrize("program", ["kalibr", "colmap"])
+def test_of_several_cameras_one_is_chosen_by_its_name(program, tmp_path, capsys):
+    text, names, sizes = several(program)
+    file = tmp_path / "rig.yaml"
+    file.write_text(text)
+    listed = ", ".join(f"{name} ({size})" for name, size in zip(names, sizes, strict=True))
+    with pytest.raises(
+        BadInput, match=re.escape(f"has several cameras: choose by the file's name, as FILE#{names[0]}")
+    ):
+        load_camera(file)
+    for words in (["show", str(file)], ["convert", str(file), "-o", str(tmp_path / "c.toml")]):
+        assert main(["calibrate", *words]) == 4
+        assert listed in capsys.readouterr().err
+    with pytest.raises(
+        BadInput, match=re.escape(f"has no camera 'cam9': choose by the file's name, as FILE#{names[0]}")
+    ):
+        load_camera(f"{file}#cam9")
+    for name, camera in zip(names, (FISHEYE, PINHOLE), strict=True):
+        found = load_camera(f"{file}#{name}")
+        assert (found.focal_px, found.name) == (camera.focal_px, f"rig-{name}")
+    assert main(["calibrate", "convert", f"{file}#{names[1]}", "-o", str(tmp_path / "c.toml")]) == 0
+    assert load_camera(tmp_path / "c.toml").size_px == PINHOLE.size_px
+    (tmp_path / "one.yaml").write_text(to_text(FISHEYE, "opencv"))
+    with pytest.raises(BadInput, match="has no name: leave #cam0 out"):
+        load_camera(tmp_path / "one.yaml#cam0")
+
+
+def test_equal_cameras_of_colmap_are_one():
+    line = to_text(FISHEYE, "colmap")
+    assert from_text(line + line.replace("\n1 ", "\n2 "), "colmap", "x").focal_px == FISHEYE.focal_px
+
+
+def test_what_was_chosen_is_among_the_warnings_of_an_image(tmp_path, capsys):
+    file = tmp_path / "rig.yaml"
+    file.write_text(to_text(load_camera("fisheye-2048"), "ros"))
+    assert (
+        main(
+            [
+                "detect",
+                str(ROOT / "sample_images/near-wall.png"),
+                "-c",
+                str(file),
+                "--json",
+                "--no-plots",
+                "-D",
+                str(tmp_path),
+            ]
+        )
+        == 0
+    )
+    found = capsys.readouterr()
+    assert "the lens is taken as calibrated to" in found.err
+    assert any("the file states none" in text for text in json.loads(found.out)["warnings"])

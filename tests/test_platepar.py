@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -12,7 +13,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from startrack.camera import Camera, Decentring, KannalaBrandt, Pinhole, cap_grid, load_camera, platepar_of
+from startrack.camera import (
+    Camera,
+    Decentring,
+    KannalaBrandt,
+    Pinhole,
+    camera_from_foreign_text,
+    cap_grid,
+    difference_px,
+    load_camera,
+    platepar_of,
+    read_foreign_camera,
+)
 from startrack.cli.main import main
 from startrack.core.types import BadInput
 from startrack.frames import R_enu_icrs, Site, angle_between_rad
@@ -153,9 +165,9 @@ def record(folder: Path, time: str | None) -> Path:
 def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["calibrate", "convert", "fisheye-2048", "--to", "platepar", "-D", str(tmp_path), "--site", "46.1,14.5,300"]
     assert main([*words, "--attitude", str(record(tmp_path, "2024-08-12T22:13:05Z"))]) == 0
-    assert "largest errors of its polynomials up to 92.0 degrees off the axis: 0.00 px" in capsys.readouterr().out
+    assert "largest errors of its radial7-odd up to 92.0 degrees off the axis: 0.00 px" in capsys.readouterr().out
     plate = json.loads((tmp_path / "platepar_cmn2010.cal").read_text())
-    assert plate["distortion_type"] == "radial9-odd"
+    assert plate["distortion_type"] == "radial7-odd"
     assert plate["lat"] == pytest.approx(46.1)
     assert main([*words, "--attitude", str(record(tmp_path, None))]) == 4
     assert "states no time" in capsys.readouterr().err
@@ -180,3 +192,84 @@ def test_what_is_missing_is_wrong_usage(words: list[str], cause: str, capsys: py
         main(["calibrate", "convert", "fisheye-2048", *words])
     assert stop.value.code == 2
     assert cause in capsys.readouterr().err
+
+
+PLATES = json.loads((Path(__file__).parent / "data/rms-platepar-directions.json").read_text())
+
+
+@pytest.mark.parametrize("kind", PLATES["cases"])
+def test_a_platepar_is_read_as_rms_reads_it(kind: str, tmp_path: Path) -> None:
+    """Angles between the rays of pixels are those of the directions that RMS's own code gave (tests/data/README.md)."""
+    case = PLATES["cases"][kind]
+    file, px = tmp_path / "platepar_cmn2010.cal", np.array(PLATES["px"])
+    file.write_text(json.dumps(case["platepar"]))
+    camera = read_foreign_camera(file, None, 1.0)
+    ra, dec = np.radians([case["ra_deg"], case["dec_deg"]])
+    sky = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
+    rays = camera.unproject(px)
+    turn, _ = Rotation.align_vectors(rays, sky)  # proper: a mirrored lens would leave tens of degrees
+    off_px = np.hypot(*(camera.project_unlimited(turn.apply(sky)) - px).T)
+    assert off_px.max() < (0.35 if kind == "radial3-all" else 0.15)  # even powers are not smooth on the axis
+    assert camera.name == "platepar_cmn2010" and camera.size_px == (1280, 720)
+    assert camera.refraction == ("taken out" if case["platepar"]["refraction"] else "contained")
+    assert f"RMS's {kind} to" in camera.notes[0]
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.name)
+def test_a_platepar_written_is_read_again(camera: Camera) -> None:
+    found = platepar_of(camera, np.eye(3), TIME, SITE)
+    again = camera_from_foreign_text(found.text, "platepar", "again", camera.calibrated_angle_rad)
+    rays = cap_grid(camera.calibrated_angle_rad)
+    rays = rays[camera.project(rays)[1]]
+    assert np.hypot(*difference_px(camera, again, rays).T).max() < found.to_sky_px + 0.3
+    assert again.calibrated_angle_rad == pytest.approx(min(camera.calibrated_angle_rad, again.max_angle_rad))
+
+
+def test_a_lens_is_written_as_the_usual_type_where_that_holds_it() -> None:
+    kinds = [platepar_of(camera, np.eye(3), TIME, SITE).kind for camera in CAMERAS]
+    assert kinds == ["radial7-odd", "radial9-odd", "radial7-odd", "radial7-odd", "radial9-odd"]
+    for camera, kind in zip(CAMERAS, kinds, strict=True):
+        plate = json.loads(platepar_of(camera, np.eye(3), TIME, SITE).text)
+        flags = 2 * plate["asymmetry_corr"] + (not plate["equal_aspect"])
+        assert (plate["distortion_type"], len(plate["x_poly_fwd"])) == (kind, 2 + flags + (3 if "7" in kind else 4))
+
+
+def test_platepars_of_the_first_version_are_read() -> None:
+    """Without names for the direction, type and flags: the polynomial, from x_poly and y_poly."""
+    plate = PLATES["cases"]["poly3+radial"]["platepar"]
+    old = {key: plate[key] for key in ("X_res", "Y_res", "F_scale")}
+    old |= {"x_poly": plate["x_poly_fwd"], "y_poly": plate["y_poly_fwd"]}
+    one, other = (camera_from_foreign_text(json.dumps(p), "platepar", "x", 0.6) for p in (plate, old))
+    assert one.focal_px == other.focal_px and one.lens == other.lens
+
+
+SPOILED = [
+    ({"distortion_type": "radial11-odd"}, "'radial11-odd' has no counterpart: known are poly3+radial"),
+    ({"F_scale": 0}, "F_scale is 0"),
+    ({"F_scale": "wide"}, "could not convert"),
+    ({"x_poly_fwd": [0.0, 0.0, 0.3, 0.1, 0.5, -0.4], "asymmetry_corr": True}, "the best differs by up to"),
+    ({"x_poly_fwd": [0.0, 0.0, 1e300]}, "the centre is outside the frame"),
+    ({"x_poly_fwd": 3}, "x_poly_fwd must be finite numbers"),
+    ({"x_poly_fwd": [0.999, 0.0, 0.1], "X_res": 2}, "too small a part"),
+    ({"Y_res": None}, "float"),
+]
+
+
+@pytest.mark.parametrize(("change", "cause"), SPOILED, ids=range(len(SPOILED)))
+def test_a_platepar_that_cannot_be_used_is_refused_by_name(change: dict[str, Any], cause: str) -> None:
+    plate = PLATES["cases"]["radial9-odd"]["platepar"] | change
+    with pytest.raises(BadInput, match=re.escape(cause)) as refusal:
+        camera_from_foreign_text(json.dumps(plate), "platepar", "x", 0.0001 if plate["X_res"] == 2 else None)
+    assert refusal.value.reason == "bad_calibration" and "RMS" in str(refusal.value)
+
+
+def test_a_platepar_is_a_camera_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, made = tmp_path / "platepar_cmn2010.cal", tmp_path / "station.toml"
+    file.write_text(json.dumps(PLATES["cases"]["radial7-odd"]["platepar"] | {"station_code": "XX0001"}))
+    assert main(["calibrate", "show", str(file)]) == 0
+    shown = capsys.readouterr().out
+    assert "XX0001: kannala_brandt, 1280 x 720" in shown and "photometry are not part of a camera file" in shown
+    assert main(["calibrate", "convert", str(file), "--calibrated-angle", "38", "-o", str(made)]) == 0
+    assert "up to 38.0 degrees off the axis; its pointing, time, site" in capsys.readouterr().err
+    assert np.degrees(load_camera(made).calibrated_angle_rad) == pytest.approx(38.0)
+    assert load_camera(made).refraction == "taken out"

@@ -22,7 +22,14 @@ from startrack.camera.io import (
 )
 from startrack.camera.lens import Lens
 from startrack.camera.lenses import KannalaBrandt, Pinhole, default_lens, lens_kinds
-from startrack.camera.load import camera_from_foreign_text, decentring_rms_px, foreign_text, load_camera
+from startrack.camera.load import (
+    camera_from_foreign_text,
+    decentring_rms_px,
+    foreign_text,
+    load_camera,
+    read_camera,
+    read_foreign_camera,
+)
 from startrack.camera.optics import MIN_THROUGHPUT_1, Decentring, Sensor
 from startrack.camera.platepar import Platepar, platepar_of
 from startrack.camera.virtualsky import VirtualSkyOverlay, virtualsky_of
@@ -32,5 +39,6 @@ __all__ = [
     "Lens", "Pinhole", "Platepar", "Sensor", "VirtualSkyOverlay", "camera_from_dict", "camera_from_foreign_text",
     "camera_keys", "camera_text", "camera_to_dict", "cap_grid", "compensating_rotation", "decentring_rms_px",
     "default_lens", "difference_px", "foreign_text", "lens_jacobian", "lens_kinds", "load_camera", "platepar_of",
-    "projection_covariance_px2", "save_camera", "virtualsky_of", "with_covariance", "with_update",
+    "projection_covariance_px2", "read_camera", "read_foreign_camera", "save_camera", "virtualsky_of",
+    "with_covariance", "with_update",
 ]  # fmt: skip

@@ -48,6 +48,7 @@ class Camera:
     refraction: str = ""  # of the Earth's air: "contained" in the lens, or "taken out"; empty: not known
     mask: str | Mask | None = None  # path of the file, or the mask, of pixels that never show the sky
     obstacles: str | Obstacles | None = None  # path of the file, or themselves, about the body: what hides the sky
+    notes: tuple[str, ...] = ()  # on the file of another program: what was chosen there, derived or left out
 
     @property
     def handed_focal_px(self) -> tuple[float, float]:

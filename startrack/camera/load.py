@@ -1,7 +1,7 @@
 """A camera by the name or the path of a file, and cameras from and to the files of other programs.
 
-Other programs share our axes (x right, y down, z along the boresight) and our radial polynomial; none of them has
-mirrored images, image circles, calibrated angles, sensors or covariances.
+Other programs share our axes (x right, y down, z along the boresight) and, but for RMS, our radial polynomial; none of
+them has mirrored images, image circles, calibrated angles, sensors or covariances.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from startrack.camera.camera import Camera, cap_grid, difference_px, require_not_mirrored
-from startrack.camera.formats import FOREIGN_FORMATS, find_program
+from startrack.camera.formats import FOREIGN_FORMATS, choose_part, find_program
 from startrack.camera.io import camera_from_dict
 from startrack.camera.optics import Decentring
 from startrack.core.files import (
@@ -25,6 +25,7 @@ from startrack.core.files import (
     printable,
     read_text,
     resolve_named,
+    split_camera,
 )
 from startrack.core.types import Array, BadInput
 
@@ -33,34 +34,62 @@ SMALL_ANGLE_DEG = 1e-3  # of an image circle within any lens
 
 
 def load_camera(name_or_path: str | Path) -> Camera:
-    """The camera of a file of startrack, ROS, Kalibr, COLMAP or OpenCV; the program is found by the content.
+    """The camera of a file of startrack or of another program, which is found by the content.
 
-    `name_or_path` is a path if it contains a separator or ends in .toml, .yaml, .yml, .xml or .txt, else the name of a
-    shipped file. Raises BadInput: no_calibration if there is no such file, bad_calibration if it cannot be used.
+    `name_or_path` is a path if it contains a separator or ends in .toml, .yaml, .yml, .xml, .txt or .cal, else the name
+    of a shipped file. FILE#NAME is one camera of a file of several. What was chosen or left out stands in its `notes`,
+    and is logged. Raises BadInput: no_calibration if there is no such file, bad_calibration if it cannot be used.
     """
-    path = resolve_named(name_or_path, "calib", "no_calibration")
+    camera = read_camera(name_or_path)
+    _log_notes(printable(name_or_path), camera.notes)
+    return camera
+
+
+def read_camera(name_or_path: str | Path) -> Camera:
+    """The same as `load_camera`, but nothing is logged."""
+    file, wanted = split_camera(name_or_path)
+    path = resolve_named(file, "calib", "no_calibration")
     text = read_text(path, "bad_calibration")
     try:
         program = None if path.suffix == ".toml" else find_program(text)
         if program is not None:
-            camera = camera_from_foreign_text(text, program, printable(path.stem))
-            _log_angle(printable(path), program, float(np.degrees(camera.calibrated_angle_rad)))
-            return camera
+            return camera_from_foreign_text(text, program, _stem(path, wanted), wanted=wanted)
         if path.suffix in FOREIGN_CAMERA_SUFFIXES:
-            raise BadInput("bad_calibration", "not a camera file of startrack (.toml), ROS, Kalibr, COLMAP or OpenCV")
+            raise BadInput("bad_calibration", f"not a camera file of startrack (.toml), {known_programs()}")
         keys = parse_toml(text, "bad_calibration")
         return camera_from_dict(keys, default_name=printable(path.stem), folder=path.parent)
     except BadInput as cause:
         raise BadInput(cause.reason, f"{printable(path)}: {cause}") from cause
 
 
+def read_foreign_camera(name_or_path: str | Path, program: str | None, calibrated_angle_rad: float | None) -> Camera:
+    """The camera of a file of `program`, None: found by the content; FILE#NAME is one camera of a file of several.
+
+    Raises BadInput as `load_camera`.
+    """
+    file, wanted = split_camera(name_or_path)
+    text = read_text(file, "no_calibration")
+    program = program or find_program(text)
+    if program is None:
+        raise BadInput("bad_calibration", f"{printable(file)}: not a camera file of {known_programs()}")
+    return camera_from_foreign_text(text, program, _stem(Path(file), wanted), calibrated_angle_rad, wanted)
+
+
+def known_programs() -> str:
+    """The programs whose camera files are read, as text."""
+    *titles, last = [one.title for one in FOREIGN_FORMATS.values()]
+    return f"{', '.join(titles)} or {last}"
+
+
+def _stem(path: Path, wanted: str | None) -> str:
+    """The name of a camera from that of its file."""
+    return printable(path.stem + (f"-{wanted}" if wanted else ""))
+
+
 @lru_cache  # once for a file, however many images name it
-def _log_angle(path: str, program: str, angle_deg: float) -> None:
-    LOG.warning(
-        "%s: the lens is taken as calibrated to %.1f degrees off the axis, the frame's nearest edge: the file states "
-        "no angle (startrack calibrate convert --from %s --calibrated-angle DEG sets one)",
-        path, angle_deg, program,
-    )  # fmt: skip
+def _log_notes(path: str, notes: tuple[str, ...]) -> None:
+    for note in notes:
+        LOG.warning("%s: %s", path, note)
 
 
 def foreign_text(camera: Camera, program: str) -> str:
@@ -73,20 +102,33 @@ def foreign_text(camera: Camera, program: str) -> str:
     if distortion is None:
         raise BadInput("bad_calibration", f"no other program's format has the {camera.lens.model} lens")
     model, coefficients = distortion
-    return FOREIGN_FORMATS[program].write(camera, None if model == "pinhole" else coefficients)
+    write = FOREIGN_FORMATS[program].write
+    if write is None:
+        raise ValueError(f"a file of {program} holds a pointing too: it is not written from a camera alone")
+    return write(camera, None if model == "pinhole" else coefficients)
 
 
-def camera_from_foreign_text(text: str, program: str, name: str, calibrated_angle_rad: float | None = None) -> Camera:
+def camera_from_foreign_text(
+    text: str, program: str, name: str, calibrated_angle_rad: float | None = None, wanted: str | None = None
+) -> Camera:
     """The camera of the `text` of a file of `program`, called `name` unless the file names it.
 
     No such file states `calibrated_angle_rad`, the angle off the axis up to which the lens was calibrated: None takes
-    the angle at the edge of the frame that is nearest to the centre. Raises BadInput bad_calibration.
+    the angle at the edge of the frame that is nearest to the centre. `wanted` is the name of one camera of several.
+    Raises BadInput bad_calibration.
     """
     refusal = f"not a camera file of {FOREIGN_FORMATS[program].title} that can be used"
     try:
-        camera = _camera(FOREIGN_FORMATS[program].read(text), name)
-        angle = _nearest_edge_rad(camera) if calibrated_angle_rad is None else calibrated_angle_rad
-        return replace(camera, calibrated_angle_rad=min(angle, camera.max_angle_rad))
+        content = choose_part(program, text, wanted)
+        camera = _camera(FOREIGN_FORMATS[program].read(content, calibrated_angle_rad), name)
+        if calibrated_angle_rad is not None:
+            return replace(camera, calibrated_angle_rad=min(calibrated_angle_rad, camera.max_angle_rad))
+        angle = min(_nearest_edge_rad(camera), camera.max_angle_rad)
+        note = (
+            f"the lens is taken as calibrated to {np.degrees(angle):.1f} degrees off the axis, the frame's nearest "
+            "edge: the file states none; startrack calibrate convert --calibrated-angle DEG sets it"
+        )
+        return replace(camera, calibrated_angle_rad=angle, notes=(*camera.notes, note))
     except BadInput as error:
         raise BadInput("bad_calibration", f"{refusal}: {error}") from error
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
@@ -96,13 +138,13 @@ def camera_from_foreign_text(text: str, program: str, name: str, calibrated_angl
 
 def _camera(keys: dict[str, Any], name: str) -> Camera:
     """A camera whose image circle ends at the frame's farthest corner, or where the radius stops rising."""
-    R_body_cam = keys.pop("R_body_cam", None)
+    R_body_cam, notes = keys.pop("R_body_cam", None), keys.pop("notes", ())
     named = {"name": keys.get("name") or name, "max_angle_deg": SMALL_ANGLE_DEG}
     camera = camera_from_dict(keys | named)  # the limits are checked here
     if R_body_cam is not None:
         camera = replace(camera, R_body_cam=R_body_cam)
     edge = float(np.max(camera.angle_rad(np.stack(np.meshgrid(*_frame_edges(camera)), axis=-1))))
-    return replace(camera, max_angle_rad=edge, calibrated_angle_rad=edge)
+    return replace(camera, max_angle_rad=edge, calibrated_angle_rad=edge, notes=notes)
 
 
 def _frame_edges(camera: Camera) -> Array:

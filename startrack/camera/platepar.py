@@ -1,9 +1,9 @@
 """The platepar of the Raspberry Meteor Station (RMS): lens, pointing and site of a camera at a time.
 
 RMS's model (github.com/CroatianMeteorNetwork/RMS, RMS/Astrometry/CyFunctions.pyx): from the distortion centre the
-radius r of a pixel, in half widths of the frame, becomes r + k1 r^3 + k2 r^5 + k3 r^7 + k4 r^9, which is the angle off
-the axis times `F_scale` [px/deg]. Of the way back it is r - k1 r^3 - ... of that angle. Pixel (0, 0) is the centre of
-the first pixel.
+radius r of a pixel, in half widths of the frame, becomes r + k1 r^3 + k2 r^5 + k3 r^7 (+ k4 r^9), which is the angle
+off the axis times `F_scale` [px/deg]. Of the way back it is r - k1 r^3 - ... of that angle. Pixel (0, 0) is the centre
+of the first pixel.
 """
 
 from __future__ import annotations
@@ -20,7 +20,12 @@ from startrack.camera.io import REFRACTION_REMOVED
 from startrack.core.types import Array, BadInput
 from startrack.frames import R_enu_icrs, R_from_rotvec, Site, azel_from_rays, length_xy, seconds_since_2000
 
-DISTORTION, POWERS = "radial9-odd", np.array([2, 4, 6, 8])  # of the radius, in the scale
+RADIAL_POWERS = {  # of RMS's distortion types, in the radius
+    "radial3-all": (2, 3), "radial4-all": (2, 3, 4), "radial5-all": (2, 3, 4, 5), "radial3-odd": (3,),
+    "radial5-odd": (3, 5), "radial7-odd": (3, 5, 7), "radial9-odd": (3, 5, 7, 9),
+}  # fmt: skip
+USUAL, FULL = "radial7-odd", "radial9-odd"  # RMS's default; and where it is not the lens to USUAL_PX
+USUAL_PX = 0.1  # largest error: 5 % more than the 0.3 px of a meteor's centroid alone
 MAX_PLATEPAR_PX = 0.5  # largest error of RMS's model against the lens; a centroid of a meteor has 0.3 or so
 FITTED_RAYS = 2000
 RIGHT_PX = 10.0  # from the axis to the pixel that shows its rotation above the horizon
@@ -36,6 +41,7 @@ class Platepar:
     """The text of a platepar, and how well RMS's polynomials are the lens within the calibrated angle."""
 
     text: str
+    kind: str  # RMS's distortion type
     to_sky_px: float  # largest error of a pixel's direction, in pixels on the axis
     to_image_px: float  # largest error of a direction's pixel
 
@@ -47,12 +53,14 @@ def platepar_of(camera: Camera, R_cam_icrs: Array, time: datetime, site: Site) -
     MAX_PLATEPAR_PX; no_time outside the years of the ephemeris.
     """
     require_not_mirrored(camera)
-    lens = _fit_lens(camera)
+    kind, lens = USUAL, _fit_lens(camera, len(RADIAL_POWERS[USUAL]))
+    if not max(lens.to_sky_px, lens.to_image_px) <= USUAL_PX:
+        kind, lens = FULL, _fit_lens(camera, len(RADIAL_POWERS[FULL]))
     to_sky_px, to_image_px = lens.to_sky_px, lens.to_image_px
     if not max(to_sky_px, to_image_px) <= MAX_PLATEPAR_PX:
         raise BadInput(
             "bad_calibration",
-            f"RMS's {DISTORTION} differs from the lens by up to {max(to_sky_px, to_image_px):.2f} px within "
+            f"RMS's {kind} differs from the lens by up to {max(to_sky_px, to_image_px):.2f} px within "
             f"{np.degrees(camera.calibrated_angle_rad):.1f} degrees of the axis (allowed are {MAX_PLATEPAR_PX:g}): no "
             "platepar of this lens is of use",
         )
@@ -66,18 +74,18 @@ def platepar_of(camera: Camera, R_cam_icrs: Array, time: datetime, site: Site) -
         "lon": float(np.degrees(site.longitude_rad)), "elev": site.height_m, "X_res": width, "Y_res": height,
         "F_scale": float(np.radians(camera.focal_px[0])), "UT_corr": 0, **_fields_of_view_deg(camera),
         **_pointing(camera, lens.R_axis_cam @ np.asarray(R_cam_icrs, dtype=float), time, site),
-        "distortion_type": DISTORTION, "poly_length": len(x_fwd), "equal_aspect": not has_aspect,
+        "distortion_type": kind, "poly_length": len(x_fwd), "equal_aspect": not has_aspect,
         "force_distortion_centre": False, "asymmetry_corr": has_asymmetry, "x_poly": x_fwd, "y_poly": zeros,
         "x_poly_fwd": x_fwd, "x_poly_rev": x_rev, "y_poly_fwd": zeros, "y_poly_rev": zeros, "refraction": False,
         "measurement_apparent_to_true_refraction": camera.refraction == REFRACTION_REMOVED,
         "auto_check_fit_refined": False, "auto_recalibrated": False, "star_list": [], **RMS_PHOTOMETRY,
     }  # fmt: skip
-    return Platepar(json.dumps(values, indent=4, sort_keys=True) + "\n", to_sky_px, to_image_px)
+    return Platepar(json.dumps(values, indent=4, sort_keys=True) + "\n", kind, to_sky_px, to_image_px)
 
 
 @dataclass(frozen=True)
 class _RmsLens:
-    """RMS's model nearest to a lens: shift [half widths], asymmetry (2 numbers each) and k1 to k4, both ways (8,)."""
+    """RMS's model nearest to a lens: shift [half widths], asymmetry (2 numbers each), k1, k2, ..., both ways (n,)."""
 
     R_axis_cam: Array  # (3, 3) to the camera about RMS's axis
     forward: Array
@@ -86,8 +94,8 @@ class _RmsLens:
     to_image_px: float
 
 
-def _fit_lens(camera: Camera) -> _RmsLens:
-    """RMS's model of a lens, by least squares over the calibrated angle.
+def _fit_lens(camera: Camera, terms: int) -> _RmsLens:
+    """RMS's model of a lens with so many `terms` k1, k2, ..., by least squares over the calibrated angle.
 
     A decentred lens is not in it. Its axis, centre and asymmetry, which are then free, leave a fifth of the difference.
     """
@@ -97,11 +105,11 @@ def _fit_lens(camera: Camera) -> _RmsLens:
     px, inside = camera.project(rays)
     rays, fx, half = rays[inside], camera.focal_px[0], camera.size_px[0] / 2
     image = (px[inside] - np.array(camera.centre_px)) * [1.0, fx / camera.focal_px[1]] / half
-    free = np.array([bool(camera.decentring)] * 4 + [True] * 4)
+    free = np.array([bool(camera.decentring)] * 4 + [True] * terms)
 
     def wide(p: Array, start: int = 0) -> Array:
-        """All eight parameters from those that are free."""
-        full = np.zeros(8)
+        """All parameters from those that are free."""
+        full = np.zeros(len(free))
         full[free] = p[start:]
         return full
 
@@ -127,11 +135,12 @@ def _fit_lens(camera: Camera) -> _RmsLens:
 def _bent(xy: Array, parameters: Array, sign: float) -> Array:
     """Positions (n, 2) [half widths] times 1 + `sign` (k1 r^2 + k2 r^4 + ...), r the radius with its asymmetry."""
     radius = length_xy(xy[:, 0], xy[:, 1]) + xy[:, ::-1] @ parameters[2:4]
-    return np.asarray(xy * (1.0 + sign * (radius[:, None] ** POWERS) @ parameters[4:])[:, None])
+    powers = 2 * np.arange(1, len(parameters) - 3)
+    return np.asarray(xy * (1.0 + sign * (radius[:, None] ** powers) @ parameters[4:])[:, None])
 
 
 def _rms_row(camera: Camera, parameters: Array, aspect: list[float]) -> list[float]:
-    """The numbers of RMS's x_poly: centre, aspect and asymmetry where they are in use, k1 to k4."""
+    """The numbers of RMS's x_poly: centre, aspect and asymmetry where they are in use, k1, k2, ..."""
     (width, height), half = camera.size_px, camera.size_px[0] / 2
     x = camera.centre_px[0] + half * parameters[0]
     y = camera.centre_px[1] + half * parameters[1] * camera.focal_px[1] / camera.focal_px[0]

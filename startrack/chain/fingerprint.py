@@ -15,7 +15,7 @@ from typing import Any
 from startrack import __version__
 from startrack.catalog import has_deep_catalog
 from startrack.core.errors import BadInput
-from startrack.core.files import is_path, parse_toml, read_text, relative_path
+from startrack.core.files import is_path, parse_toml, read_text, relative_path, split_camera
 from startrack.exposure import IMAGE_KEYS, RAW_SUFFIXES, BagImage, Sidecar, sidecar_of
 from startrack.terrain import files_of_terrain
 
@@ -71,7 +71,7 @@ def input_hashes(image: str, cameras: Iterable[str | None], terrain: str | None,
     Shipped files do not count: they belong to the version. Paths are relative to the folder of the `image`, so that a
     tree may move.
     """
-    named = [reference for reference in cameras if reference and is_path(reference)]
+    named = [split_camera(reference)[0] for reference in cameras if reference and is_path(reference)]
     files = [
         Path(reference) for reference in (*named, terrain, *others) if isinstance(reference, str) and is_path(reference)
     ]

@@ -103,8 +103,9 @@ class Inputs:
 
     @property
     def warnings(self) -> list[str]:
-        """Facts in the image's file that were not used."""
-        return [*self.exposure.warnings, *([self.damage.message] if self.damage is not None else [])]
+        """Facts in the files of image and camera that were not used, or derived."""
+        notes = () if self.camera is None else self.camera.notes
+        return [*self.exposure.warnings, *notes, *([self.damage.message] if self.damage is not None else [])]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

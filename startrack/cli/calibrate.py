@@ -21,7 +21,7 @@ from startrack.cli.flags import checked_flag
 from startrack.cli.images import approximate_camera, check_one_time, flag_site, read, read_each_once, site_of
 from startrack.core.compilation import announce_compilation
 from startrack.core.errors import BadInput, NoSolution
-from startrack.core.files import printable, resolve_named
+from startrack.core.files import printable, resolve_named, split_camera
 
 MIN_SIDE, MAX_SIDE = 3, 100  # corners or squares of a board
 SENSOR_FLAGS = {"gain_e_per_adu": "gain", "read_noise_e": "read_noise", "bias_adu": "bias"}  # by keys of camera files
@@ -110,7 +110,7 @@ def verify(args: argparse.Namespace) -> int:
             try:
                 show_step(f"verifying with {exposure.name}")
                 camera, site = load_camera(named), site_of(args, [exposure])
-                file = resolve_named(named, "calib", "no_calibration")
+                file = resolve_named(split_camera(named)[0], "calib", "no_calibration")
                 refraction = camera.refraction or value_in_record(file, "lens", "refraction")
                 known = None if not refraction else bool(refraction == REFRACTION_REMOVED)
                 found = calibration.verify(exposure, camera, load_catalog(), site, file_has_site=known)

@@ -17,7 +17,7 @@ import numpy as np
 from startrack import camera as cameras
 from startrack.cli.flags import checked_flag
 from startrack.core.errors import BadInput
-from startrack.core.files import check_output, file_stem, printable, read_text, write_atomically
+from startrack.core.files import check_output, file_stem, is_path, printable, write_atomically
 from startrack.core.types import Exposure
 from startrack.exposure import write_exposure
 from startrack.frames import R_enu_icrs, azel_from_rays
@@ -44,7 +44,7 @@ def show(args: argparse.Namespace) -> int:
     from startrack.applications.calibration import camera_properties, camera_summary
 
     for name in args.cameras:
-        camera = cameras.load_camera(name)
+        camera = cameras.read_camera(name)  # its notes are printed below
         print(json.dumps(camera_properties(camera)) if args.json else camera_summary(camera))
     return 0
 
@@ -52,6 +52,10 @@ def show(args: argparse.Namespace) -> int:
 def convert(args: argparse.Namespace) -> int:
     """Convert one camera file; 0."""
     check_name(args)
+    if (args.to, args.source) == (None, None) and (args.file.endswith(".toml") or not is_path(args.file)):
+        args.usage_error("a camera file of startrack needs --to, the format that it is converted to")
+    if args.to is not None and args.calibrated_angle is not None:
+        args.usage_error("--calibrated-angle is for a file of another program, not for --to")
     if args.to not in POINTED and (args.attitude, args.site) != (None, None):
         args.usage_error(f"--attitude and --site are for --to {' and --to '.join(POINTED)}")
     if args.to in POINTED:
@@ -64,18 +68,12 @@ def convert(args: argparse.Namespace) -> int:
         lost = cameras.decentring_rms_px(camera) if camera.decentring and args.to != "colmap" else 0.0
         note = f"; {args.to} has no decentring: {lost:.2f} px RMS are lost" if lost else ""
     else:
-        foreign, stem = read_text(args.file, "no_calibration"), printable(Path(args.file).stem)
         angle_rad = None if args.calibrated_angle is None else math.radians(args.calibrated_angle)
-        camera = cameras.camera_from_foreign_text(foreign, args.source, stem, angle_rad)
+        camera = cameras.read_foreign_camera(args.file, args.source, angle_rad)
         text = cameras.camera_text(replace(camera, name=args.name or camera.name))
-        default, note = f"{stem}.toml", ""
-        if angle_rad is None:
-            print(
-                f"{printable(args.file)}: calibrated_angle_deg is set to "
-                f"{math.degrees(camera.calibrated_angle_rad):.1f}, the nearest edge of the frame: the file states "
-                "none; give --calibrated-angle",
-                file=sys.stderr,
-            )
+        default, note = f"{printable(Path(args.file).stem)}.toml", ""
+        for line in camera.notes:
+            print(f"{printable(args.file)}: {line}", file=sys.stderr)
     out = _output_path(args, default)
     write_atomically(out, text.encode("utf-8"), overwrite=args.overwrite)
     if not args.quiet:
@@ -119,7 +117,7 @@ def _pointed(args: argparse.Namespace) -> tuple[str, str]:
     found = cameras.platepar_of(camera, R_cam_icrs, attitude.time_utc, site)
     angle_deg = math.degrees(camera.calibrated_angle_rad)
     return found.text, (
-        f"; largest errors of its polynomials up to {angle_deg:.1f} degrees off the axis: {found.to_sky_px:.2f} px to "
+        f"; largest errors of its {found.kind} up to {angle_deg:.1f} degrees off the axis: {found.to_sky_px:.2f} px to "
         f"the sky, {found.to_image_px:.2f} px to the image; its photometry is RMS's default"
     )
 

@@ -154,7 +154,7 @@ IMAGES = flag("images IMAGE", "PNG, TIFF, FITS, JPEG, camera raw, ROS bag, or BA
 PHOTOGRAPHS = flag("images IMAGE", "PNG, TIFF, FITS, JPEG or camera raw", nargs="+")
 TOPIC = flag("--image-topic TOPIC", "of a ROS bag with several")
 CAMERA = flag(
-    "-c --camera FILE", "camera file of startrack, ROS, Kalibr, COLMAP or OpenCV, or the name of a shipped one"
+    "-c --camera FILE", "camera file of startrack, ROS, Kalibr, COLMAP, OpenCV or RMS, or the name of a shipped one"
 )
 TERRAIN = flag("-t --terrain FILE", "terrain file, or the name of a shipped one")
 TIME = flag("--time UTC", "middle of the exposure, ISO 8601 (of one image)")

@@ -75,20 +75,21 @@ COMMANDS = (
     ),
     Command(
         "calibrate convert", function_at("camera_files.convert"), None,
-        "Convert a camera file to another program's format, or from it.",
+        "Convert a camera file to another program's format with --to, or from it.",
         {
             "input": (
-                flag("file FILE", "camera file with --to; the other program's file with --from"),
-                Either(
-                    (
-                        flag("--to", "write this format", choices=(*FORMATS, "platepar", "indi-allsky")),
-                        flag("--from", "read this format", choices=FORMATS, dest="source"),
-                    ),
-                    required=True,
+                flag(
+                    "file FILE",
+                    "camera file with --to; else the other program's file, FILE#NAME for one camera of several",
                 ),
+                Either((
+                    flag("--to", "write this format", choices=(*FORMATS, "platepar", "indi-allsky")),
+                    flag("--from", "read this format (default: by the content)", choices=(*FORMATS, "platepar"),
+                         dest="source"),
+                )),
                 flag(
                     "--calibrated-angle DEG",
-                    "with --from: angle off the axis up to which the lens was calibrated, which no such file states "
+                    "without --to: angle off the axis up to which the lens was calibrated, which no such file states "
                     "(default: that of the frame's nearest edge)",
                     limit_type(number, lambda deg: 0 < deg <= 180, "{} is not above 0 and up to 180 degrees"),
                 ),

@@ -24,7 +24,7 @@ FULL_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}  # errors of wr
 MAX_KEY_PARTS = 16  # of a TOML key such as origin.latitude_deg
 _KEY_PART = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
 LONG_KEY = re.compile(rf"(?<![\w.-])(?:{_KEY_PART}[ \t]*+\.[ \t]*+){{{MAX_KEY_PARTS}}}")
-FOREIGN_CAMERA_SUFFIXES = ".yaml", ".yml", ".xml", ".txt"  # of other programs' camera files
+FOREIGN_CAMERA_SUFFIXES = ".yaml", ".yml", ".xml", ".txt", ".cal"  # of other programs' camera files
 FilePath = str | os.PathLike[str]
 
 
@@ -54,8 +54,20 @@ def is_path(reference: FilePath) -> bool:
 
     A path ends in .toml, or as other programs' camera files do, or contains a separator: "/", or "\\" as on Windows.
     """
-    text = os.fspath(reference)
+    text = split_camera(reference)[0]
     return text.endswith((".toml", *FOREIGN_CAMERA_SUFFIXES)) or "/" in text or "\\" in text
+
+
+def split_camera(reference: FilePath) -> tuple[str, str | None]:
+    """The file and the name of one of its cameras of a `reference` FILE#NAME; None for a file alone.
+
+    Only other programs' camera files hold several. A file whose own name is so written stays one.
+    """
+    text = os.fspath(reference)
+    file, mark, name = text.rpartition("#")
+    if mark and file.endswith(FOREIGN_CAMERA_SUFFIXES) and not os.path.isfile(text):
+        return file, name
+    return text, None
 
 
 def relative_path(file: FilePath, folder: FilePath) -> str:

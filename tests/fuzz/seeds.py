@@ -9,6 +9,7 @@ import json
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -197,10 +198,14 @@ def _cameras() -> list[str]:
 def _converted() -> list[bytes]:
     """The camera file in other programs' formats; `targets.PROGRAMS` has the same order."""
     from startrack.camera import foreign_text as to_text
-    from startrack.camera import load_camera
+    from startrack.camera import load_camera, platepar_of
     from startrack.camera.formats import FOREIGN_FORMATS
+    from startrack.frames import Site
 
-    return [*(to_text(load_camera("fisheye-2048"), program).encode() for program in FOREIGN_FORMATS), XML]
+    camera, time = load_camera("fisheye-2048"), datetime(2024, 8, 12, tzinfo=UTC)
+    plate = platepar_of(camera, np.eye(3), time, Site("earth", 0.8, 0.25, 300.0)).text.encode()
+    programs = [program for program, one in FOREIGN_FORMATS.items() if one.write is not None]
+    return [*(to_text(camera, program).encode() for program in programs), plate, XML]
 
 
 def hill_map() -> bytes:

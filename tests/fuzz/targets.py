@@ -19,7 +19,7 @@ from .seeds import CYLINDER, HEIGHT_MAP, hill_map, seeds
 from .seeds_beside import OBSTACLES
 
 SUFFIXES = {"png": ".png", "jpeg": ".jpg", "tiff": ".tif", "fits": ".fits", "raw": ".dng"}
-PROGRAMS = ("ros", "kalibr", "colmap", "opencv", "opencv")  # of the seeds in order
+PROGRAMS = ("ros", "kalibr", "colmap", "opencv", "platepar", "opencv")  # of the seeds in order
 MAX_MESSAGE_CHARS = 1200  # with two paths of a temporary folder in it
 OUT_OF_MEMORY = ("MemoryError", "Unable to allocate", "Insufficient memory", "bad_alloc", "cannot allocate")
 

@@ -162,7 +162,11 @@ def camera_properties(camera: Camera) -> dict[str, Any]:
     sigma = sigma if camera.covariance is not None else MAP_ANGLES * [None]
     keys = ("angle_deg", "radius_px", "arcmin_per_px", "map_sigma_px")
     rows = zip(np.degrees(angle).tolist(), radius, scale, sigma, strict=True)
-    return {"camera": camera_to_dict(camera), "map": [dict(zip(keys, row, strict=True)) for row in rows]}
+    return {
+        "camera": camera_to_dict(camera),
+        "notes": list(camera.notes),
+        "map": [dict(zip(keys, row, strict=True)) for row in rows],
+    }
 
 
 def projection_by_angle(camera: Camera, angle_rad: Array) -> tuple[Array, Array, Array]:
@@ -194,6 +198,7 @@ def camera_summary(camera: Camera) -> str:
         f"  image circle to {np.degrees(camera.max_angle_rad):.2f}°, calibrated to "
         f"{np.degrees(camera.calibrated_angle_rad):.2f}°; "
         + ("no covariance" if camera.covariance is None else "with covariance"),
+        *(f"  {note}" for note in camera.notes),
         "  angle °   radius px   arcmin/px   map sigma px",
     ]
     for row in camera_properties(camera)["map"]:

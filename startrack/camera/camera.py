@@ -267,13 +267,12 @@ def with_update(camera: Camera, step: Mapping[str, float]) -> Camera:
 
 
 def with_covariance(camera: Camera, free: tuple[str, ...], covariance: Array) -> Camera:
-    """The camera with the covariance (m, m) of its free parameters; f becomes fx and fy."""
+    """The camera with the covariance (m, m) of its free parameters; f becomes fx and fy, beyond which fy may be free."""
     if free[0] == "fx":
         return replace(camera, covariance_order=free, covariance=0.5 * (covariance + covariance.T))
-    names = ("fx", "fy", *free[1:])
-    by_free = np.zeros((len(names), len(free)))  # d names / d free
+    names = ("fx", "fy", *(name for name in free if name not in ("f", "fy")))
+    by_free = np.array([[float(name == one) for one in free] for name in names])  # d names / d free
     by_free[0, 0], by_free[1, 0] = 1.0, camera.focal_px[1] / camera.focal_px[0]
-    by_free[np.arange(2, len(names)), np.arange(1, len(free))] = 1.0
     wide = by_free @ covariance @ by_free.T
     # With fx / fy exactly known the matrix would be singular, and no use as a weight.
     wide[[0, 1], [0, 1]] += 0.5 * (SQUARE_PIXEL_SIGMA_1 * camera.focal_px[0]) ** 2

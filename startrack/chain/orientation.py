@@ -15,6 +15,7 @@ from startrack.chain.stages import Detected, Identified, Inputs, Oriented, Setti
 from startrack.core.compilation import announce_compilation
 from startrack.core.types import Array, BadInput, Exposure, NotIdentified, Stars, TooFewStars
 from startrack.detection import Detector
+from startrack.estimation.attitude import solve_attitude
 from startrack.estimation.lens_correction import correct_lens
 from startrack.exposure import NO_TIME, are_fractions
 from startrack.frames import Site
@@ -109,6 +110,7 @@ def identify_stars(
         camera=camera,
         stars=stars,
         bodies=apparent_bodies(site, when) if site is not None and when is not None else (),
+        site=site,
         identification=found,
     )
 
@@ -154,14 +156,14 @@ def solve_orientation(identified: Identified, has_file: bool = True) -> Oriented
     """The attitude that fits the `identified` stars. Raises NotIdentified.
 
     Where the stars show that the lens differs from its file the value's camera is the corrected one. Without `has_file`
-    the identification found the camera, and there is nothing that it differs from.
+    the identification found the camera by these very stars.
     """
     found, detections = identified.identification, identified.detections
-    camera, fit, change_px = correct_lens(
+    matches = (
         identified.camera, detections.xy_px[found.detection], detections.covariance_px2[found.detection],
         identified.stars.rays_icrs[found.star], found.R_cam_icrs,
     )  # fmt: skip
-    change_px = change_px if has_file else 0.0
+    camera, fit, change_px = correct_lens(*matches) if has_file else (matches[0], solve_attitude(*matches), 0.0)
     return extend(identified, Oriented, camera=camera, attitude_fit=fit, lens_change_px=change_px)
 
 

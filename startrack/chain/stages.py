@@ -130,6 +130,7 @@ class Identified(Detected):
     camera: Camera  # the given one, or the one found
     stars: Stars  # the catalogue at the time of the exposure
     bodies: tuple[Body, ...]  # planets, Sun, Moon, Earth; empty without a site and a time
+    site: Site | None = None  # that the stars are seen from; None: not known
     identification: Identification
 
 

@@ -22,6 +22,7 @@ class AttitudeFit:
 
     attitude: Attitude
     centroid_covariance_rad2: Array  # (3, 3) part of the attitude's covariance that is not the lens's
+    turn_by_lens: Array  # (3, m) rotation [rad] per step of the m parameters of the camera's covariance
     residual_px: Array  # (n, 2) measured minus predicted
     used: Bools  # (n,) not rejected as outliers
     rms_px: float  # of the used stars, per axis
@@ -53,6 +54,7 @@ def solve_attitude(
     used = found.chi2 < STAR_OUTLIER_CHI2
     pose, weight, residual = found.terms.pose[used], found.weight[used], found.residual_px[used]
     by_stars = _covariance_by_stars(pose, found.inverse[used], weight, residual)
+    response = np.zeros((3, len(camera.covariance_order)))
     by_lens = np.zeros((3, 3))
     if camera.covariance is not None:
         # For a lens fitted to these very stars the sum of both covariances is the marginal of the joint fit, provided
@@ -64,6 +66,7 @@ def solve_attitude(
     return AttitudeFit(
         attitude=Attitude(R_cam_icrs=found.state.R_cam_icrs[0], covariance_rad2=by_stars + by_lens),
         centroid_covariance_rad2=by_stars,
+        turn_by_lens=response,
         residual_px=found.residual_px,
         used=used,
         rms_px=float(np.sqrt(np.mean(residual**2))),

@@ -20,8 +20,9 @@ REGION_ROUNDS = 2  # of matching and fitting within a stage
 FEWEST = 5  # matches
 GATE_OVER_SIGMA = 4.0  # the gate over the sigma of the loss
 MATCH_LOSS = cauchy_loss(HALF_WEIGHT_CHI2)
-LENGTH_SIGMAS = {"f": 0.1, "cx": 0.06, "cy": 0.06}  # prior sigmas in focal lengths
-PRIOR_SIGMAS = {"shape": 0.5, "k1": 0.1, "k2": 0.1, "k3": 0.05, "k4": 0.02}  # of the family, of the polynomial
+LENGTH_SIGMAS = {"f": 0.1, "fy": 0.1, "cx": 0.06, "cy": 0.06}  # prior sigmas in focal lengths; "fy": of fy - fx
+# Of the family, of the polynomial, and of decentring, which also describes refraction that differs over a narrow field.
+PRIOR_SIGMAS = {"shape": 0.5, "k1": 0.1, "k2": 0.1, "k3": 0.05, "k4": 0.02, "p1": 0.002, "p2": 0.002}
 STARS_PER_DETECTION = 1.5
 SAME_RADIUS_1 = 1e-12  # relative difference of the radii of lenses that are the same
 TANGENT = (1 / 3, 2 / 15, 17 / 315, 62 / 2835)  # series of tan a beyond a: to 1e-7 up to 20 degrees
@@ -126,8 +127,12 @@ def prior_of(camera: Camera, prior: Camera, free: tuple[str, ...]) -> Prior:
     """Prior of the free parameters: expected at the camera `prior`, the adjustment starting at `camera`."""
     sigma = PRIOR_SIGMAS | {name: part * prior.focal_px[0] for name, part in LENGTH_SIGMAS.items()}
     now, expected = (
-        {"f": c.focal_px[0], "cx": c.centre_px[0], "cy": c.centre_px[1], **c.lens.parameters} for c in (camera, prior)
-    )
+        {
+            "f": c.focal_px[0], "fy": c.focal_px[1] - c.focal_px[0], "cx": c.centre_px[0], "cy": c.centre_px[1],
+            "p1": c.decentring.p1, "p2": c.decentring.p2, **c.lens.parameters,
+        }
+        for c in (camera, prior)
+    )  # fmt: skip
     return Prior(np.array([sigma[n] for n in free]), np.array([expected[n] - now[n] for n in free]))
 
 

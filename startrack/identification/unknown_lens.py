@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.camera import Camera, with_covariance
+from startrack.camera import Camera
 from startrack.core import FIELD_TOLERANCE_1
 from startrack.core.types import Array, Centroids, Identification, NotIdentified, Stars
-from startrack.estimation.adjust import HUBER_WITH_CUT, Scheme, State, adjust
 from startrack.estimation.false_alarm import probability
 from startrack.estimation.normal_equations import observations_of_image
 from startrack.identification.attitude_search import MIN_MATCHES
+from startrack.identification.found_lens import fit_found_lens
 from startrack.identification.hypotheses import HypothesisSearch, Window, remove_clumps
 from startrack.identification.lens_guesses import (
     MIDDLE_SHAPES,
@@ -28,7 +28,7 @@ from startrack.identification.lens_guesses import (
 from startrack.identification.lost_in_space import MAX_FALSE_ALARM
 from startrack.identification.narrow_field import narrow_lenses
 from startrack.identification.near_sky import NearSky
-from startrack.identification.region_growing import WIDE_STAGES, GrowthStage, grow, prior_of
+from startrack.identification.region_growing import WIDE_STAGES, GrowthStage, grow
 from startrack.identification.similar_triangles import (
     MAX_DETECTIONS,
     PatternSizes,
@@ -56,7 +56,6 @@ CLUMP_FRACTION = 0.01  # of the frame: detections used for patterns are no close
 CIRCLE_EDGE = 1.01  # of the disc's radius: detections beyond it are no stars
 FIELD_STEPS_PER_E = 4.0  # indexes are made for fields a fourth part of a factor e apart
 SAME_LENS_RAD = 0.05  # between attitudes
-JOINT_FIT = Scheme(loss=HUBER_WITH_CUT, steps=12, settled_px=3e-4, estimates_extra=True)
 ADVICE = "check the field of view and the focus; with a camera file fewer stars suffice"
 
 
@@ -86,7 +85,11 @@ def identify_unknown_lens(
     search = _Search(centroids, size_px, fov_rad, stars, tolerance, background, near_sky)
     for lens in search.lenses():
         if lens.log_p < LOG_FALSE_ALARM and len(lens.star) >= search.min_matches:
-            camera, R = _fit_with_covariance(lens, centroids, stars.rays_icrs[lens.star], centre=not search.narrow)
+            seen = lens.detection
+            points = observations_of_image(
+                centroids.xy_px[seen], centroids.covariance_px2[seen], stars.rays_icrs[lens.star]
+            )
+            camera, R = fit_found_lens(lens.camera, lens.R_cam_icrs, points, search.centre_px)
             if near_sky is not None and not near_sky.contains(R):
                 continue
             identification = Identification(
@@ -103,30 +106,6 @@ def identify_unknown_lens(
         detected=len(centroids),
         tried=tried,
     )
-
-
-def _fit_with_covariance(
-    lens: VerifiedLens, centroids: Centroids, rays_icrs: Array, *, centre: bool
-) -> tuple[Camera, Array]:
-    """Camera and attitude from least squares over both; the camera's covariance is the marginal one.
-
-    `centre`: whether the lens's centre is free; a narrow field cannot distinguish it from a rotation, and it stays in
-    the middle of the frame.
-    """
-    camera = lens.camera
-    free = ("f", *(("cx", "cy") if centre else ()), *camera.lens.parameters)
-    seen = lens.detection
-    points = observations_of_image(centroids.xy_px[seen], centroids.covariance_px2[seen], rays_icrs)
-    start = State(camera=camera, R_cam_icrs=lens.R_cam_icrs[None])
-    found = adjust(start, points, free, JOINT_FIT, prior=prior_of(camera, camera, free))
-    fitted = found.state.camera
-    widest = fitted.lens.max_invertible_rad
-    fitted = replace(
-        fitted,
-        max_angle_rad=min(camera.max_angle_rad, widest),
-        calibrated_angle_rad=min(camera.calibrated_angle_rad, widest),
-    )
-    return with_covariance(fitted, free, found.equations.lens_covariance), found.state.R_cam_icrs[0]
 
 
 class _Search:
@@ -154,6 +133,8 @@ class _Search:
                 detected=len(centroids),
             )
         self.hypotheses = HypothesisSearch(self.xy_px[chosen], size_px, near_sky, 0.5 * fov_rad * tolerance)
+        middle = (size_px[0] - 1) / 2, (size_px[1] - 1) / 2
+        self.centre_px = middle if self.circle is None else self.circle.centre_px  # expected one of the lens
         half = np.tan(fov_rad / 2)
         other = half * size_px[1] / size_px[0]
         # Solid angle of the image circle, or of the frame.

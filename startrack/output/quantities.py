@@ -10,7 +10,7 @@ from startrack import __version__
 from startrack.chain import Detected, Identified, Inputs, Located, Measured, Oriented
 from startrack.core.ecsv import Column
 from startrack.frames import format_utc
-from startrack.output.quantities_pose import ATTITUDE_QUANTITIES, POSITION_QUANTITIES
+from startrack.output.quantities_pose import ATTITUDE_QUANTITIES, MIDDLE_QUANTITIES, POSITION_QUANTITIES
 from startrack.output.quantity import Listed, Quantity, Show, list_schema, show_everywhere
 from startrack.output.values import blocked_deg, chance_text, file_or_name, predicted_visible, ranges_text
 
@@ -109,7 +109,9 @@ RUN_QUANTITIES: tuple[Quantity, ...] = (
       lambda v: None if v.exposure.correction is None else v.exposure.correction.flat_sha256,
       "of the file of the flat field; null: none was used", "text", before=None, nullable=True, optional=True),
 )  # fmt: skip
-QUANTITIES: tuple[Quantity, ...] = POSITION_QUANTITIES + ATTITUDE_QUANTITIES + LIGHT_QUANTITIES + RUN_QUANTITIES
+QUANTITIES: tuple[Quantity, ...] = (
+    POSITION_QUANTITIES + ATTITUDE_QUANTITIES + MIDDLE_QUANTITIES + LIGHT_QUANTITIES + RUN_QUANTITIES
+)
 BY_PATH = {one.path: one for one in QUANTITIES}
 # The batch's columns came in this order before the table did; a column that is not named here is appended.
 FIRST_COLUMNS = (

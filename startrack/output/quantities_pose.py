@@ -8,9 +8,11 @@ from startrack.chain import Located, Measured, Oriented
 from startrack.frames import quat_xyzw_from_R
 from startrack.localization import RISK
 from startrack.output import values
+from startrack.output.middle import in_middle, middle_px
 from startrack.output.quantity import Listed, Quantity, Schema, Show, list_schema, object_schema, or_null
 
 Q = Quantity
+DEG_PER_RAD = 180.0 / np.pi
 SEARCHES: Schema = {"enum": ["proven", "beam", "approximate"]}
 UNSTATED = object_schema({"fact": "text", "radius999_m_if_exact": "positive"})
 MODE = object_schema(
@@ -126,20 +128,21 @@ POSITION_QUANTITIES: tuple[Quantity, ...] = (
 )  # fmt: skip
 _ARCSEC = "{0[0]:.2f}, {0[1]:.2f}, {0[2]:.2f} arcsec about"
 _HEADING = "attitude.heading_deg"
+_SHOWN = f"{_HEADING} middle.ra_deg"  # in place of the boresight
 ATTITUDE_QUANTITIES: tuple[Quantity, ...] = (
     Q("attitude.quat_xyzw_cam_icrs", "", Oriented, lambda v: quat_xyzw_from_R(v.attitude.R_cam_icrs).tolist(),
       "v_cam = R v_icrs, SciPy's order", "quaternion",
       form="%.12f", columns={f"q{axis}_cam_icrs": (i,) for i, axis in enumerate("xyzw")}),
     Q("attitude.ra_deg", "deg", Oriented, values.boresight_deg(0), "right ascension of the boresight", "turn",
-      shown=(Show("summary", "ra", "RA {:.3f}°", _HEADING), Show("text", "boresight", "RA {:.4f}°"),
-             Show("panel", "Boresight", "RA {:.3f}°", _HEADING), Show("notebook page", "right ascension", "{:.4f}°"))),
+      shown=(Show("summary", "ra", "RA {:.3f}°", _SHOWN), Show("text", "boresight", "RA {:.4f}°"),
+             Show("panel", "Boresight", "RA {:.3f}°", _SHOWN), Show("notebook page", "right ascension", "{:.4f}°"))),
     Q("attitude.dec_deg", "deg", Oriented, values.boresight_deg(1), "declination of the boresight", "latitude",
-      shown=(Show("summary", "dec", "Dec {:+.3f}°", _HEADING), Show("text", "boresight", ", Dec {:+.4f}°"),
-             Show("panel", "Boresight", "   Dec {:+.3f}°", _HEADING), Show("notebook page", "declination", "{:.4f}°"))),
+      shown=(Show("summary", "dec", "Dec {:+.3f}°", _SHOWN), Show("text", "boresight", ", Dec {:+.4f}°"),
+             Show("panel", "Boresight", "   Dec {:+.3f}°", _SHOWN), Show("notebook page", "declination", "{:.4f}°"))),
     Q("attitude.roll_deg", "deg", Oriented, values.boresight_deg(2),
       "position angle of the image's top, from north through east", "turn",
-      shown=(Show("summary", "roll", "roll {:.3f}°", _HEADING), Show("text", "boresight", ", roll {:.4f}°"),
-             Show("panel", "Boresight", "   roll {:.3f}°", _HEADING),
+      shown=(Show("summary", "roll", "roll {:.3f}°", _SHOWN), Show("text", "boresight", ", roll {:.4f}°"),
+             Show("panel", "Boresight", "   roll {:.3f}°", _SHOWN),
              Show("notebook", "roll", "{:.4f}° (image's top, from north through east)"),
              Show("page", "Image's top", "{:.4f}°"))),
     Q("attitude.sigma_arcsec", "arcsec", Oriented,
@@ -181,4 +184,37 @@ ATTITUDE_QUANTITIES: tuple[Quantity, ...] = (
       "standard deviation of the roll", "positive", before=None, optional=True, form="%.6f",
       shown=(Show("text", "body", ", {:.5f}°"), Show("notebook", "roll of the body", " ± {:.5f}°"),
              Show("page", "Roll", " ± {:.5f}°"))),
+)  # fmt: skip
+MIDDLE_QUANTITIES: tuple[Quantity, ...] = (
+    Q("middle.x_px", "px", Oriented, lambda v: float(middle_px(v)[0]),
+      "pixel of the picture's middle, (width - 1) / 2; pixel centres are at integers", "number", before=None),
+    Q("middle.y_px", "px", Oriented, lambda v: float(middle_px(v)[1]), "likewise, (height - 1) / 2", "number",
+      before=None),
+    Q("middle.ra_deg", "deg", Oriented, in_middle("ra_rad", DEG_PER_RAD),
+      "right ascension there, ICRS as in the catalogue: without aberration and refraction; this and the following are "
+      "null where the middle is beyond the lens", "turn", before=None, nullable=True, form="%.7f",
+      columns={"middle_ra_deg": ()},
+      shown=(Show("summary", "ra", "RA {:.3f}°", _HEADING), Show("text", "middle", "RA {:.4f}°"),
+             Show("panel", "Middle", "RA {:.3f}°", _HEADING), Show("notebook page", "middle", "RA {:.4f}°"))),
+    Q("middle.dec_deg", "deg", Oriented, in_middle("dec_rad", DEG_PER_RAD), "declination there", "latitude",
+      before=None, nullable=True, form="%.7f", columns={"middle_dec_deg": ()},
+      shown=(Show("summary", "dec", "Dec {:+.3f}°", _HEADING), Show("text", "middle", ", Dec {:+.4f}°"),
+             Show("panel", "Middle", "   Dec {:+.3f}°", _HEADING), Show("notebook page", "middle", ", Dec {:+.4f}°"))),
+    Q("middle.sigma_deg", "deg", Oriented, in_middle("sigma_rad", DEG_PER_RAD),
+      "standard deviation of this direction per axis: the errors of attitude and lens together, which nearly cancel "
+      "where the lens was fitted to the picture's own stars", "positive", before=None, nullable=True, form="%.7f",
+      columns={"middle_sigma_deg": ()},
+      shown=(Show("summary", "dec", " ± {:.2g}°", _HEADING), Show("text", "middle", " ± {:.2g}°"),
+             Show("panel", "Middle", " ± {:.2g}°", _HEADING), Show("notebook page", "middle", " ± {:.2g}°"))),
+    Q("middle.scale_arcsec_per_px", "arcsec/px", Oriented, in_middle("scale_rad_per_px", values.ARCSEC_PER_RAD),
+      "size of a pixel there", "positive", before=None, nullable=True, form="%.5f",
+      columns={"middle_scale_arcsec_per_px": ()},
+      shown=(Show("summary", "scale", '{:.4g}"/px', _HEADING), Show("text", "middle", ", {:.5g} arcsec/px"),
+             Show("notebook page", "scale in the middle", "{:.5g} arcsec/px"))),
+    Q("middle.rotation_deg", "deg", Oriented, in_middle("rotation_rad", DEG_PER_RAD),
+      "position angle of image up there, from north through east", "turn", before=None, nullable=True, form="%.6f",
+      columns={"middle_rotation_deg": ()},
+      shown=(Show("summary", "up", "up {:.2f}°", _HEADING), Show("text", "middle", ", up at {:.3f}°"),
+             Show("panel", "Middle", "   up {:.2f}°", _HEADING),
+             Show("notebook page", "up in the middle", "{:.3f}° from north through east"))),
 )  # fmt: skip

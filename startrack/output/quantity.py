@@ -63,7 +63,7 @@ def file_schema(title: str, body: Schema) -> Schema:
 
 ABSENT: Any = object()  # of a quantity whose section is null before its stage
 ASTROPY_UNITS = {
-    "m": "m", "m^2": "m2", "deg": "deg", "arcsec": "arcsec", "px": "pix", "s": "s", "mag/arcsec^2": "mag / arcsec2",
+    "m": "m", "m^2": "m2", "deg": "deg", "arcsec": "arcsec", "arcsec/px": "arcsec / pix", "px": "pix", "s": "s", "mag/arcsec^2": "mag / arcsec2",
 }  # fmt: skip
 
 
@@ -72,8 +72,8 @@ class Show:
     """One place where a quantity is shown; the quantities of one row are joined.
 
     `place` is summary, text, panel, notebook or page, or several; `row` names the line of text or the row of a table,
-    with a capital on the page; `form` makes the text, by str.format or as a function. Nothing is shown where the
-    quantity at the path `unless` is known.
+    with a capital on the page; `form` makes the text, by str.format or as a function. Nothing is shown where a
+    quantity of the paths `unless` is known.
     """
 
     place: str

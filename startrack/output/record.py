@@ -15,7 +15,7 @@ from startrack.output.quantity import Schema, record_from, schema_of_kind
 from startrack.output.values import At
 
 FORMATS = {kind: f"startrack.{kind}/1" for kind in ("fix", "identification", "detection")}
-BEFORE_OWN = ("position", "modes", "search", "attitude")
+BEFORE_OWN = ("position", "modes", "search", "attitude", "middle")
 OF_A_POSITION = ("position", "modes", "search", "evidence", "sky", "clock")  # sections of a fix alone
 
 
@@ -119,7 +119,7 @@ def _point_sources(value: Inputs | None) -> dict[str, Any]:
 OWN_KEYS: dict[str, tuple[Callable[[Inputs | None], dict[str, Any]], tuple[str, ...]]] = {  # and the sections left out
     "fix": (lambda value: {"explain": []}, ()),
     "identification": (_camera_and_matches, OF_A_POSITION),
-    "detection": (_point_sources, (*OF_A_POSITION, "attitude")),
+    "detection": (_point_sources, (*OF_A_POSITION, "attitude", "middle")),
 }
 
 

@@ -27,6 +27,7 @@ SECTIONS = {
         "position": "The camera's centre. covariance_m2 is of (east, north).",
         "search": "How far other positions are excluded.",
         "attitude": "Of the camera among the stars and, with terrain and time, of the rover's body.",
+        "middle": "The sky at the middle of the picture.",
         "evidence": "What is left out of the evidence, and why.",
         "sky": "Diffuse light of the sky.",
         "clock": "Error of the stated time.",
@@ -114,7 +115,7 @@ SCHEMAS: dict[str, Schema] = {
             "modes": schema_of_kind(BY_PATH["modes"].schema, BY_PATH["modes"].description),
             **{
                 name: _section_or_null(SECTIONS[name])
-                for name in ("position", "search", "attitude", "evidence", "sky", "clock")
+                for name in ("position", "search", "attitude", "middle", "evidence", "sky", "clock")
             },
             "explain": list_schema("text", "with --explain: what a refused or wide answer would need"),
         },
@@ -130,6 +131,7 @@ SCHEMAS: dict[str, Schema] = {
         "Stars and attitude of one image",
         {
             "attitude": _section_or_null(SECTIONS["attitude"]),
+            "middle": _section_or_null(SECTIONS["middle"]),
             "camera": _section_or_null({"title": "Camera file", **camera_keys().schema()}),
             "matches": list_schema(MATCH),
         },

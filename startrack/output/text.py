@@ -42,7 +42,7 @@ def rows(place: str, at: At, sections: Collection[str] | None = None) -> Rows:
         if sections is not None and one.section not in sections:
             continue
         for show in one.shown:
-            if place not in show.place.split() or (show.unless and at(show.unless) is not None):
+            if place not in show.place.split() or any(at(path) is not None for path in show.unless.split()):
                 continue
             value = at(one.path)
             if value is None:

@@ -53,13 +53,17 @@ def boresight_rad(R_cam_icrs: Array) -> tuple[float, float, float]:
     celestial pole right ascension and roll are poorly determined; the quaternion is not.
     """
     up, ahead = -R_cam_icrs[1], R_cam_icrs[2]
-    ra = np.arctan2(ahead[1], ahead[0])
+    ra = turn_rad(ahead[1], ahead[0])
     dec = np.arctan2(ahead[2], np.hypot(ahead[0], ahead[1]))
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
     north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
-    roll = np.arctan2(up @ east, up @ north)
-    ra, roll = (angle if angle < 2 * np.pi else 0.0 for angle in np.mod([ra, roll], 2 * np.pi).tolist())
-    return ra, float(dec), roll  # a tiny negative angle leaves the modulo as 2 pi itself
+    return ra, float(dec), turn_rad(up @ east, up @ north)
+
+
+def turn_rad(y: float, x: float) -> float:
+    """The angle of the point (x, y) in [0, 2 pi) [rad]."""
+    angle = float(np.arctan2(y, x) % (2 * np.pi))
+    return angle if angle < 2 * np.pi else 0.0  # a tiny negative angle leaves the modulo as 2 pi itself
 
 
 def carrying_azimuths(value: Located) -> list[list[float]] | None:

@@ -164,7 +164,7 @@ def facts_of(at: At) -> list[list[Any]]:
     """The quantities of a record for people: title of each group, and its rows of a name and a text."""
     groups = (
         ("Position", ("position", "search", "clock")),
-        ("Attitude", ("attitude",)),
+        ("Attitude", ("attitude", "middle")),
         ("Stars", ("stars", "evidence", "sky")),
     )
     found = [(title, rows("page", at, sections)) for title, sections in groups]

@@ -32,6 +32,7 @@ KEYS = {
     "search": "outcome dropped_probability",
     "attitude": "quat_xyzw_cam_icrs ra_deg dec_deg roll_deg sigma_arcsec lens_error_included quat_xyzw_body_enu "
     "heading_deg pitch_deg roll_body_deg sigma_heading_deg sigma_pitch_deg sigma_roll_body_deg",
+    "middle": "x_px y_px ra_deg dec_deg sigma_deg scale_arcsec_per_px rotation_deg",
     "stars": "detected identified unexplained predicted_visible rms_px false_alarm_probability",
     "evidence": "blocked damage",
     "sky": "brightness_mag_arcsec2 unused",

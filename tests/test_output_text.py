@@ -69,7 +69,8 @@ def test_other_results(located):
     assert f"  places     {places}; search {result.fix.search}\n" in verbose_text(ambiguous)
     identified = extend(result, Oriented, terrain=None)
     assert re.search(
-        r"small  ok  RA \d+\.\d{3}°  Dec [+-]\d+\.\d{3}°  roll \d+\.\d{3}°  \d+ stars", summary_line(identified)
+        r"small  ok  RA \d+\.\d{4}°  Dec [+-]\d+\.\d{4}° ± 0\.0\d+°  [\d.]+\"/px  up \d+\.\d{2}°  \d+ stars",
+        summary_line(identified),
     )
     detected = extend(result, Detected)
     assert summary_line(detected, seconds=0.2) == f"small  ok  {len(result.detections)} point sources  0.2 s with files"

@@ -87,6 +87,18 @@ def apparent_stars(catalog: StarCatalog, time_utc: datetime | None, site: Site |
     return replace(stars, rays_icrs=site.air.refract(stars.rays_icrs, R_enu_icrs(site, time_utc)))
 
 
+def catalog_rays(apparent_icrs: Array, time_utc: datetime | None, site: Site | None) -> Array:
+    """Directions (n, 3) in the catalogue of what appears in `apparent_icrs` (n, 3): no refraction, no aberration.
+
+    The inverse of `apparent_stars` at the same time and site.
+    """
+    if time_utc is None:
+        return apparent_icrs  # the catalogue was taken without aberration
+    if site is not None and site.air is not None:
+        apparent_icrs = site.air.straighten(apparent_icrs, R_enu_icrs(site, time_utc))
+    return aberrate(apparent_icrs, -observer_velocity_m_s(site or DEFAULT_SITE, time_utc))
+
+
 def apparent_bodies(site: Site, time_utc: datetime) -> tuple[Body, ...]:
     """Planets, Sun, Earth and Moon in apparent directions at `time_utc` over a `site`, refraction included."""
     found, air = bodies(site, time_utc), site.air

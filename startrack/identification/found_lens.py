@@ -12,7 +12,7 @@ from itertools import product
 
 import numpy as np
 
-from startrack.camera import Camera, with_covariance
+from startrack.camera import Camera, Decentring, with_covariance
 from startrack.core.types import Array
 from startrack.estimation.adjust import HUBER_WITH_CUT, Scheme, Solution, State, adjust
 from startrack.estimation.normal_equations import Observations
@@ -32,14 +32,15 @@ def fit_found_lens(
     lens's centre is expected. Raises NotIdentified where fewer than 3 stars agree.
     """
     free = ("f", "fy", "cx", "cy", *camera.lens.parameters, "p1", "p2")
-    expected = replace(camera, centre_px=centre_px)
+    focal_px = camera.focal_px[0]
+    expected = replace(camera, centre_px=centre_px, focal_px=(focal_px, focal_px), decentring=Decentring())
     whole = _fit(camera, R_cam_icrs, points, free, expected)
     prior = prior_of(whole.state.camera, expected, free)
     normal = np.linalg.inv(whole.equations.lens_covariance)
-    right = -normal @ prior.offset  # about the expected lens
+    right, sigma = -normal @ prior.offset, prior.sigma.tolist()  # about the expected lens
     sets = [{name for names, shows in zip(CHOICES, shown, strict=True) if not shows for name in names}
             for shown in product((False, True), repeat=len(CHOICES))]  # fmt: skip
-    roots = [np.diag(np.where([name in fixed for name in free], 0.0, prior.sigma)) for fixed in sets]
+    roots = [np.diag([0.0 if name in fixed else s for name, s in zip(free, sigma, strict=True)]) for fixed in sets]
     fixed = sets[solve_with_best_prior(normal - np.diag(prior.precision), right, roots).prior]
     last = whole
     if fixed:

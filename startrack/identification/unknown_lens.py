@@ -36,7 +36,7 @@ from startrack.identification.similar_triangles import (
     patterns_for,
     wide_sizes,
 )
-from startrack.identification.verify_unknown_lens import FITTED_BEYOND_1, VerifiedLens, verify
+from startrack.identification.verify_unknown_lens import FITTED_BEYOND_1, VerifiedLens, match_lens, verify
 
 WIDE_FIELD_RAD = np.radians(100.0)  # from here up, `fov_rad` is the angle of the image circle
 NARROW_FIELD_RAD = np.radians(40.0)  # up to here all lenses are nearly pinholes
@@ -55,6 +55,7 @@ MAX_TRIED_BEYOND = 100_000  # further patterns without the image circle, in case
 CLUMP_FRACTION = 0.01  # of the frame: detections used for patterns are no closer
 CIRCLE_EDGE = 1.01  # of the disc's radius: detections beyond it are no stars
 FIELD_STEPS_PER_E = 4.0  # indexes are made for fields a fourth part of a factor e apart
+SETTLING_ROUNDS = 4  # of matching and fitting a lens that is found
 SAME_LENS_RAD = 0.05  # between attitudes
 ADVICE = "check the field of view and the focus; with a camera file fewer stars suffice"
 
@@ -85,11 +86,7 @@ def identify_unknown_lens(
     search = _Search(centroids, size_px, fov_rad, stars, tolerance, background, near_sky)
     for lens in search.lenses():
         if lens.log_p < LOG_FALSE_ALARM and len(lens.star) >= search.min_matches:
-            seen = lens.detection
-            points = observations_of_image(
-                centroids.xy_px[seen], centroids.covariance_px2[seen], stars.rays_icrs[lens.star]
-            )
-            camera, R = fit_found_lens(lens.camera, lens.R_cam_icrs, points, search.centre_px)
+            lens, camera, R = search.settle(lens)
             if near_sky is not None and not near_sky.contains(R):
                 continue
             identification = Identification(
@@ -159,6 +156,22 @@ class _Search:
             yield from self._grow_all(guess_fisheyes(self.size_px, self.fov_rad, self.circle), MAX_TRIED_IN_CIRCLE)
             most = self.hypotheses.tried + MAX_TRIED_BEYOND
         yield from self._grow_all(guess_fisheyes(self.size_px, self.fov_rad, None), most)
+
+    def settle(self, lens: VerifiedLens) -> tuple[VerifiedLens, Camera, Array]:
+        """The `lens` with the stars of its last fit, the camera and attitude of that fit.
+
+        A fit with more unknowns than those of the search places more stars: it is repeated with these.
+        """
+        for _ in range(SETTLING_ROUNDS):
+            seen, rays_icrs = lens.detection, self.stars.rays_icrs[lens.star]
+            xy_px, covariance_px2 = self.centroids.xy_px[seen], self.centroids.covariance_px2[seen]
+            points = observations_of_image(xy_px, covariance_px2, rays_icrs)
+            camera, R = fit_found_lens(lens.camera, lens.R_cam_icrs, points, self.centre_px)
+            more = match_lens(camera, R, self.centroids, self.stars, self.hypotheses.log_trials, self.widest_rad)
+            if more is None or len(more.star) <= len(lens.star):
+                break
+            lens = replace(more, log_p=min(lens.log_p, more.log_p))
+        return lens, camera, R
 
     def _grow_all(self, guesses: list[LensGuess], max_tried: int) -> Iterator[VerifiedLens]:
         """The lenses that the hypotheses of these guesses grow to, until so many patterns have been tried."""

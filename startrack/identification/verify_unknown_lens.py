@@ -117,9 +117,17 @@ def verify(
     hypotheses so far. `widest_rad`: half the field of view, its tolerance added.
     """
     refined = _refine(camera, R, matched, centroids, stars, widest_rad)
-    if refined is None:
-        return None
-    camera, R = refined
+    return None if refined is None else match_lens(*refined, centroids, stars, log_trials, widest_rad)
+
+
+def match_lens(
+    camera: Camera, R: Array, centroids: Centroids, stars: Stars, log_trials: float, widest_rad: float
+) -> VerifiedLens | None:
+    """The lens with all stars that lie where it and `R` place them; None where too few do.
+
+    The other arguments are those of `verify`.
+    """
+    camera = _limit_angles(camera, widest_rad)
     tested = centroids.take(slice(TESTED))
     near = match_by_flux(tested, camera, stars, R, GATE_PX, 0.0)
     trusted_rad = trusted_radius(camera.angle_rad(centroids.xy_px[near.detection]), near.distance_px < INLIER_PX)

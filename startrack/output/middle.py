@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.camera import lens_jacobian
+from startrack.catalog import catalog_rays
 from startrack.chain import Oriented
 from startrack.core.types import Array
 from startrack.output.values import ARCSEC_PER_RAD, turn_rad
-from startrack.output.wcs import catalog_rays
 
 HALF_STEP_PX = 0.5  # of the numerical derivative of the sky by pixels
 
@@ -47,7 +47,9 @@ def sky_at_middle(value: Oriented) -> Middle | None:
         return None
     step = HALF_STEP_PX * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     rays_cam = camera.unproject(middle + step)
-    here, right, left, below, above = catalog_rays(value, rays_cam @ value.attitude.R_cam_icrs)
+    here, right, left, below, above = catalog_rays(
+        rays_cam @ value.attitude.R_cam_icrs, value.exposure.time_utc, value.site
+    )
     ra, dec = turn_rad(here[1], here[0]), float(np.arctan2(here[2], np.hypot(here[0], here[1])))
     axes = np.array([
         [-np.sin(ra), np.cos(ra), 0.0], [-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)],

@@ -194,12 +194,12 @@ MIDDLE_QUANTITIES: tuple[Quantity, ...] = (
       "right ascension there, ICRS as in the catalogue: without aberration and refraction; this and the following are "
       "null where the middle is beyond the lens", "turn", before=None, nullable=True, form="%.7f",
       columns={"middle_ra_deg": ()},
-      shown=(Show("summary", "ra", "RA {:.3f}°", _HEADING), Show("text", "middle", "RA {:.4f}°"),
-             Show("panel", "Middle", "RA {:.3f}°", _HEADING), Show("notebook page", "middle", "RA {:.4f}°"))),
+      shown=(Show("summary", "ra", "RA {:.4f}°", _HEADING), Show("text", "middle", "RA {:.4f}°"),
+             Show("panel", "Middle", "RA {:.4f}°", _HEADING), Show("notebook page", "middle", "RA {:.4f}°"))),
     Q("middle.dec_deg", "deg", Oriented, in_middle("dec_rad", DEG_PER_RAD), "declination there", "latitude",
       before=None, nullable=True, form="%.7f", columns={"middle_dec_deg": ()},
-      shown=(Show("summary", "dec", "Dec {:+.3f}°", _HEADING), Show("text", "middle", ", Dec {:+.4f}°"),
-             Show("panel", "Middle", "   Dec {:+.3f}°", _HEADING), Show("notebook page", "middle", ", Dec {:+.4f}°"))),
+      shown=(Show("summary", "dec", "Dec {:+.4f}°", _HEADING), Show("text", "middle", ", Dec {:+.4f}°"),
+             Show("panel", "Middle", "   Dec {:+.4f}°", _HEADING), Show("notebook page", "middle", ", Dec {:+.4f}°"))),
     Q("middle.sigma_deg", "deg", Oriented, in_middle("sigma_rad", DEG_PER_RAD),
       "standard deviation of this direction per axis: the errors of attitude and lens together, which nearly cancel "
       "where the lens was fitted to the picture's own stars", "positive", before=None, nullable=True, form="%.7f",

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from startrack import __version__
 from startrack.camera import Camera, Decentring
-from startrack.catalog.sky import DEFAULT_SITE
+from startrack.catalog import catalog_rays
 from startrack.chain import Oriented
 from startrack.core.types import Array
 from startrack.exposure import BLOCK_BYTES
-from startrack.frames import R_enu_icrs, aberrate, format_utc, observer_velocity_m_s, wahba
+from startrack.frames import format_utc, wahba
 
 Card = bool | int | float | str
 SIP_ORDER = 4
@@ -87,7 +87,7 @@ def matches_bytes(value: Oriented) -> bytes:
     """
     camera, R = value.camera, _R_cam_catalog(value)
     found, stars = value.identification, value.stars.take(value.identification.star)
-    still = catalog_rays(value, stars.rays_icrs)
+    still = catalog_rays(stars.rays_icrs, value.exposure.time_utc, value.site)
     measured = value.detections.xy_px[found.detection]
     predicted, _ = camera.project(stars.rays_icrs @ value.attitude.R_cam_icrs.T)
     field_deg, index_deg = _radec_deg(camera.unproject(measured) @ R), _radec_deg(still)
@@ -145,26 +145,13 @@ def _whole_blocks(content: bytes, filler: bytes) -> bytes:
     return content + filler * (-len(content) % BLOCK_BYTES)
 
 
-def catalog_rays(value: Oriented, apparent_icrs: Array) -> Array:
-    """Directions (n, 3) in the catalogue of what appears in `apparent_icrs` (n, 3): no refraction, no aberration.
-
-    `value` has the time and the site.
-    """
-    when, site = value.exposure.time_utc, value.site or DEFAULT_SITE
-    if when is None:
-        return apparent_icrs  # the catalogue was taken without aberration
-    if site.air is not None:
-        apparent_icrs = site.air.straighten(apparent_icrs, R_enu_icrs(site, when))
-    return aberrate(apparent_icrs, -observer_velocity_m_s(site, when))
-
-
 def _R_cam_catalog(value: Oriented) -> Array:
     """R_cam_icrs (3, 3) that takes catalogue directions, without aberration, nearest to where they appear."""
     camera = value.camera
     if value.exposure.time_utc is None:
         return value.attitude.R_cam_icrs
     rays_cam = camera.unproject(_grid(camera))
-    return wahba(rays_cam, catalog_rays(value, rays_cam @ value.attitude.R_cam_icrs))
+    return wahba(rays_cam, catalog_rays(rays_cam @ value.attitude.R_cam_icrs, value.exposure.time_utc, value.site))
 
 
 def _grid(camera: Camera) -> Array:

@@ -267,7 +267,7 @@ def with_update(camera: Camera, step: Mapping[str, float]) -> Camera:
 
 
 def with_covariance(camera: Camera, free: tuple[str, ...], covariance: Array) -> Camera:
-    """The camera with the covariance (m, m) of its free parameters; f becomes fx and fy, beyond which fy may be free."""
+    """The camera with the covariance (m, m) of its free parameters; f becomes fx and fy; fy may be free too."""
     if free[0] == "fx":
         return replace(camera, covariance_order=free, covariance=0.5 * (covariance + covariance.T))
     names = ("fx", "fy", *(name for name in free if name not in ("f", "fy")))

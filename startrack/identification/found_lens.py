@@ -36,7 +36,7 @@ def fit_found_lens(
     expected = replace(camera, centre_px=centre_px, focal_px=(focal_px, focal_px), decentring=Decentring())
     whole = _fit(camera, R_cam_icrs, points, free, expected)
     prior = prior_of(whole.state.camera, expected, free)
-    normal = np.linalg.inv(whole.equations.lens_covariance)
+    normal = np.asarray(np.linalg.inv(whole.equations.lens_covariance), dtype=np.float64)
     right, sigma = -normal @ prior.offset, prior.sigma.tolist()  # about the expected lens
     sets = [{name for names, shows in zip(CHOICES, shown, strict=True) if not shows for name in names}
             for shown in product((False, True), repeat=len(CHOICES))]  # fmt: skip

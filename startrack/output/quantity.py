@@ -63,7 +63,8 @@ def file_schema(title: str, body: Schema) -> Schema:
 
 ABSENT: Any = object()  # of a quantity whose section is null before its stage
 ASTROPY_UNITS = {
-    "m": "m", "m^2": "m2", "deg": "deg", "arcsec": "arcsec", "arcsec/px": "arcsec / pix", "px": "pix", "s": "s", "mag/arcsec^2": "mag / arcsec2",
+    "m": "m", "m^2": "m2", "deg": "deg", "arcsec": "arcsec", "px": "pix", "s": "s", "mag/arcsec^2": "mag / arcsec2",
+    "arcsec/px": "arcsec / pix",
 }  # fmt: skip
 
 

@@ -26,7 +26,7 @@ PRIOR_SIGMAS = {"shape": 0.5, "k1": 0.1, "k2": 0.1, "k3": 0.05, "k4": 0.02, "p1"
 STARS_PER_DETECTION = 1.5
 SAME_RADIUS_1 = 1e-12  # relative difference of the radii of lenses that are the same
 TANGENT = (1 / 3, 2 / 15, 17 / 315, 62 / 2835)  # series of tan a beyond a: to 1e-7 up to 20 degrees
-WHOLE_LENS = ("f", "shape", "cx", "cy")
+WHOLE_LENS = ("f", "fy", "shape", "cx", "cy")
 FIT = Scheme(loss=MATCH_LOSS, steps=4, settled_px=1e-3)
 
 
@@ -148,8 +148,8 @@ def with_file_lens(camera: Camera, size: int, widest_rad: float) -> Camera:
         if not kind.parameter_names and np.allclose(kind().rho(a), rho, rtol=SAME_RADIUS_1, atol=0.0):
             return replace(camera, lens=kind())
     lens, scale = default_lens().fit_curve(a, rho, size)
-    focal = scale * camera.focal_px[0]
-    return replace(camera, lens=lens, focal_px=(focal, focal))
+    fx, fy = camera.focal_px
+    return replace(camera, lens=lens, focal_px=(scale * fx, scale * fy))
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ MAX_TRIED_BEYOND = 100_000  # further patterns without the image circle, in case
 CLUMP_FRACTION = 0.01  # of the frame: detections used for patterns are no closer
 CIRCLE_EDGE = 1.01  # of the disc's radius: detections beyond it are no stars
 FIELD_STEPS_PER_E = 4.0  # indexes are made for fields a fourth part of a factor e apart
-SETTLING_ROUNDS = 4  # of matching and fitting a lens that is found
+LAST_FITS = 4  # of matching and fitting a lens that is found
 SAME_LENS_RAD = 0.05  # between attitudes
 ADVICE = "check the field of view and the focus; with a camera file fewer stars suffice"
 
@@ -162,7 +162,7 @@ class _Search:
 
         A fit with more unknowns than those of the search places more stars: it is repeated with these.
         """
-        for _ in range(SETTLING_ROUNDS):
+        for _ in range(LAST_FITS):
             seen, rays_icrs = lens.detection, self.stars.rays_icrs[lens.star]
             xy_px, covariance_px2 = self.centroids.xy_px[seen], self.centroids.covariance_px2[seen]
             points = observations_of_image(xy_px, covariance_px2, rays_icrs)

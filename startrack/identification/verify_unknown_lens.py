@@ -194,7 +194,7 @@ def _refine(
         if len(star) < FEWEST:
             return None
         # Of a lens of fixed shape the focal length alone is free.
-        centre = ("cx", "cy") if camera.lens.parameters and len(star) >= MIN_FOR_CENTRE else ()
+        centre = ("fy", "cx", "cy") if camera.lens.parameters and len(star) >= MIN_FOR_CENTRE else ()
         free = ("f", *camera.lens.parameters, *centre)
         xy_px, sigma_px = centroids.xy_px[detection], gate_px / GATE_OVER_SIGMA
         camera, R, _ = fit_camera(camera, R, xy_px, stars.rays_icrs[star], free, sigma_px, prior)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -36,15 +37,21 @@ def middle_px(value: Oriented) -> Array:
     return 0.5 * (np.array(value.camera.size_px) - 1.0)
 
 
-def sky_at_middle(value: Oriented) -> Middle | None:
-    """The sky at the middle of the picture of an oriented `value`; None where that is beyond the lens.
+def has_middle(value: Any) -> bool:
+    """Whether a `value` of the pipeline has an attitude and a lens that shows the picture's middle."""
+    if not isinstance(value, Oriented):
+        return False
+    camera = value.camera
+    return bool(camera.angle_rad(middle_px(value)) < min(camera.max_angle_rad, camera.lens.max_invertible_rad))
+
+
+def sky_at_middle(value: Oriented) -> Middle:
+    """The sky at the middle of the picture of a `value` that has one.
 
     The error is that of attitude and lens together, with their correlation: of a lens fitted to the picture's own stars
     they nearly cancel.
     """
     camera, middle = value.camera, middle_px(value)
-    if not camera.angle_rad(middle) < min(camera.max_angle_rad, camera.lens.max_invertible_rad):
-        return None
     step = HALF_STEP_PX * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     rays_cam = camera.unproject(middle + step)
     here, right, left, below, above = catalog_rays(
@@ -81,11 +88,6 @@ def covariance_px2(value: Oriented, ray_cam: Array) -> Array:
     return np.asarray(covariance)
 
 
-def in_middle(part: str, per_unit: float) -> Callable[[Oriented], float | None]:
-    """The `part` of the sky at the middle, times `per_unit`, of an oriented value."""
-
-    def value_of(value: Oriented) -> float | None:
-        found = sky_at_middle(value)
-        return None if found is None else float(getattr(found, part) * per_unit)
-
-    return value_of
+def in_middle(part: str, per_unit: float) -> Callable[[Oriented], float]:
+    """The `part` of the sky at the middle, times `per_unit`, of a value that has one."""
+    return lambda value: float(getattr(sky_at_middle(value), part) * per_unit)

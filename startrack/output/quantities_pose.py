@@ -8,7 +8,7 @@ from startrack.chain import Located, Measured, Oriented
 from startrack.frames import quat_xyzw_from_R
 from startrack.localization import RISK
 from startrack.output import values
-from startrack.output.middle import in_middle, middle_px
+from startrack.output.middle import has_middle, in_middle, middle_px
 from startrack.output.quantity import Listed, Quantity, Schema, Show, list_schema, object_schema, or_null
 
 Q = Quantity
@@ -186,33 +186,32 @@ ATTITUDE_QUANTITIES: tuple[Quantity, ...] = (
              Show("page", "Roll", " ± {:.5f}°"))),
 )  # fmt: skip
 MIDDLE_QUANTITIES: tuple[Quantity, ...] = (
-    Q("middle.x_px", "px", Oriented, lambda v: float(middle_px(v)[0]),
-      "pixel of the picture's middle, (width - 1) / 2; pixel centres are at integers", "number", before=None),
-    Q("middle.y_px", "px", Oriented, lambda v: float(middle_px(v)[1]), "likewise, (height - 1) / 2", "number",
-      before=None),
-    Q("middle.ra_deg", "deg", Oriented, in_middle("ra_rad", DEG_PER_RAD),
-      "right ascension there, ICRS as in the catalogue: without aberration and refraction; this and the following are "
-      "null where the middle is beyond the lens", "turn", before=None, nullable=True, form="%.7f",
+    Q("middle.x_px", "px", has_middle, lambda v: float(middle_px(v)[0]),
+      "pixel of the picture's middle, (width - 1) / 2: pixel centres are at integers; `middle` is null where "
+      "it is beyond the lens", "number"),
+    Q("middle.y_px", "px", has_middle, lambda v: float(middle_px(v)[1]), "likewise, (height - 1) / 2", "number"),
+    Q("middle.ra_deg", "deg", has_middle, in_middle("ra_rad", DEG_PER_RAD),
+      "right ascension there, ICRS as in the catalogue: without aberration and refraction", "turn", form="%.7f",
       columns={"middle_ra_deg": ()},
       shown=(Show("summary", "ra", "RA {:.4f}°", _HEADING), Show("text", "middle", "RA {:.4f}°"),
              Show("panel", "Middle", "RA {:.4f}°", _HEADING), Show("notebook page", "middle", "RA {:.4f}°"))),
-    Q("middle.dec_deg", "deg", Oriented, in_middle("dec_rad", DEG_PER_RAD), "declination there", "latitude",
-      before=None, nullable=True, form="%.7f", columns={"middle_dec_deg": ()},
+    Q("middle.dec_deg", "deg", has_middle, in_middle("dec_rad", DEG_PER_RAD), "declination there", "latitude",
+      form="%.7f", columns={"middle_dec_deg": ()},
       shown=(Show("summary", "dec", "Dec {:+.4f}°", _HEADING), Show("text", "middle", ", Dec {:+.4f}°"),
              Show("panel", "Middle", "   Dec {:+.4f}°", _HEADING), Show("notebook page", "middle", ", Dec {:+.4f}°"))),
-    Q("middle.sigma_deg", "deg", Oriented, in_middle("sigma_rad", DEG_PER_RAD),
+    Q("middle.sigma_deg", "deg", has_middle, in_middle("sigma_rad", DEG_PER_RAD),
       "standard deviation of this direction per axis: the errors of attitude and lens together, which nearly cancel "
-      "where the lens was fitted to the picture's own stars", "positive", before=None, nullable=True, form="%.7f",
+      "where the lens was fitted to the picture's own stars", "positive", form="%.7f",
       columns={"middle_sigma_deg": ()},
       shown=(Show("summary", "dec", " ± {:.2g}°", _HEADING), Show("text", "middle", " ± {:.2g}°"),
              Show("panel", "Middle", " ± {:.2g}°", _HEADING), Show("notebook page", "middle", " ± {:.2g}°"))),
-    Q("middle.scale_arcsec_per_px", "arcsec/px", Oriented, in_middle("scale_rad_per_px", values.ARCSEC_PER_RAD),
-      "size of a pixel there", "positive", before=None, nullable=True, form="%.5f",
+    Q("middle.scale_arcsec_per_px", "arcsec/px", has_middle, in_middle("scale_rad_per_px", values.ARCSEC_PER_RAD),
+      "size of a pixel there", "positive", form="%.5f",
       columns={"middle_scale_arcsec_per_px": ()},
       shown=(Show("summary", "scale", '{:.4g}"/px', _HEADING), Show("text", "middle", ", {:.5g} arcsec/px"),
              Show("notebook page", "scale in the middle", "{:.5g} arcsec/px"))),
-    Q("middle.rotation_deg", "deg", Oriented, in_middle("rotation_rad", DEG_PER_RAD),
-      "position angle of image up there, from north through east", "turn", before=None, nullable=True, form="%.6f",
+    Q("middle.rotation_deg", "deg", has_middle, in_middle("rotation_rad", DEG_PER_RAD),
+      "position angle of image up there, from north through east", "turn", form="%.6f",
       columns={"middle_rotation_deg": ()},
       shown=(Show("summary", "up", "up {:.2f}°", _HEADING), Show("text", "middle", ", up at {:.3f}°"),
              Show("panel", "Middle", "   up {:.2f}°", _HEADING),

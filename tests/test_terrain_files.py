@@ -359,6 +359,12 @@ def test_no_map_opens_a_network_connection(tmp_path, capfd, monkeypatch):
                 read_map(tmp_path / name)
             with pytest.raises(TimeoutError):
                 server.accept()
+        write_map(tmp_path / "hill.tif", hill())
+        (tmp_path / "hill.tif.msk").write_text(WMS.format(address=address))
+        with pytest.raises(BadInput, match=r"hill\.tif: not a map that can be read"):
+            read_map(tmp_path / "hill.tif")
+        with pytest.raises(TimeoutError):
+            server.accept()
     assert capfd.readouterr().err == ""
 
 

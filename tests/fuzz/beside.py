@@ -75,17 +75,21 @@ def _read_bag(data: bytes, number: int, folder: Path) -> None:
 
 
 def _read_grid(data: bytes, number: int, folder: Path) -> None:
-    from startrack.terrain.map_reading import read_map
+    from startrack.terrain import Grid, map_of_array, read_map
+    from startrack.terrain.array_map import SUFFIX, read_array
 
     path = folder / GRIDS[number]
     path.write_bytes(data)
-    read_map(path)
+    if path.suffix == SUFFIX:
+        map_of_array(read_array(path), Grid(post=10.0), latitude_rad=0.1, longitude_rad=0.2)
+    else:
+        read_map(path)
 
 
 def _read_label(data: bytes, number: int, folder: Path) -> None:
     from startrack.terrain.map_reading import read_map
 
-    (folder / "HILL.IMG").write_bytes(61 * 61 * b"\x10\0")
+    (folder / "HILL.IMG").write_bytes((61 * np.arange(61 * 61) % 997).astype("<i2").tobytes())
     path = folder / "HILL.LBL"
     path.write_bytes(data)
     read_map(path)

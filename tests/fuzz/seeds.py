@@ -48,7 +48,7 @@ longitude_deg = 0.0
 file = ["hill.tif"]
 height_sigma_m = 2.0
 horizon_sigma_deg = 0.01
-scale = 1.0
+scale = 0.0123
 offset_m = 0.0
 [search]
 radius_m = 800.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import lzma
 import tempfile
@@ -25,7 +26,7 @@ ATTITUDE = {
     "provenance": {"time_utc": "2031-03-26T20:58:11Z"},
 }  # fmt: skip
 BAG_FORMS = "ros1.bag", "ros2.db3", "ros2.mcap"
-GRIDS = "st-helens.dem", "N45W123.hgt"
+GRIDS = "st-helens.dem", "heights.npy"
 RECORDS = "sky.fix.json", "sky.stars.ecsv", "sky.skyline.ecsv"
 PICTURE = "sky.annotated.png"
 RECORD = {
@@ -99,9 +100,10 @@ def results() -> dict[str, bytes]:
 
 
 def grids() -> list[bytes]:
-    """Maps that are no GeoTIFF, in the order of `GRIDS`."""
+    """Maps that are no GeoTIFF, and an array, in the order of `GRIDS`."""
     dem = lzma.decompress((Path(__file__).resolve().parents[1] / "data" / "st-helens.dem.xz").read_bytes())
-    return [dem, (np.arange(121 * 121) % 2000).astype(">i2").tobytes()]
+    np.save(array := io.BytesIO(), 9.0 * (np.arange(31 * 41) % 97).reshape(31, 41))
+    return [dem, array.getvalue()]
 
 
 def seeds_beside() -> dict[str, tuple[bytes, ...]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from xml.etree import ElementTree
@@ -126,6 +127,17 @@ def test_two_workers_write_the_same_bytes(area, tmp_path):
     assert run(tmp_path, "--spacing", 9000, "--draws", 1, "-j", 2) == 0
     for name in ("predict.tif", "predict.qml", "predict.ecsv", "predict.json", "predict.png"):
         assert (tmp_path / name).read_bytes() == (area / name).read_bytes(), name
+
+
+def test_without_rasterio_all_but_the_map_is_written(area, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("startrack.terrain.map_writing.find_spec", lambda name: None)
+    out = tmp_path / "out"
+    shutil.copytree(area, out)
+    assert run(out, "--spacing", 9000, "--draws", 1) == 0
+    assert "no predict.tif, which needs rasterio: pip install '.[dem]'" in capsys.readouterr().err
+    assert {path.name for path in area.iterdir()} - {path.name for path in out.iterdir()} == {
+        "predict.tif", "predict.qml",
+    }  # fmt: skip
 
 
 def test_a_stopped_run_is_resumed(area, capsys, monkeypatch):

@@ -13,7 +13,10 @@ import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
-MESSAGES = ("sensor_msgs/Image", "nav_msgs/Odometry", "geometry_msgs/PoseWithCovarianceStamped")
+MESSAGES = (
+    "sensor_msgs/Image", "nav_msgs/Odometry", "geometry_msgs/PoseWithCovarianceStamped",
+    "geometry_msgs/TransformStamped",
+)  # fmt: skip
 
 
 def empty_message(kind):
@@ -58,6 +61,17 @@ class Publisher:
         self.messages.append(message)
 
 
+class TransformBroadcaster:
+    """As of tf2_ros; the node keeps what was sent."""
+
+    def __init__(self, node):
+        self.messages = node.transforms = []
+
+    def sendTransform(self, message):
+        STORE.serialize_cdr(message, message.__msgtype__)
+        self.messages.append(message)
+
+
 class Parameter:
     def __init__(self, value):
         self.value = value
@@ -90,12 +104,14 @@ def install(monkeypatch, **parameters):
     parts = {
         "rclpy": {"init": lambda: None, "spin": lambda node: None},
         "rclpy.node": {"Node": node},
+        "tf2_ros": {"TransformBroadcaster": TransformBroadcaster},
         "rclpy.qos": {"qos_profile_sensor_data": object()},
     }
     for kind in MESSAGES:
         package, _, name = kind.partition("/")
         make = staticmethod(lambda full=f"{package}/msg/{name}": empty_message(full))
-        parts |= {package: {}, f"{package}.msg": {name: make}}
+        parts[package] = {}
+        parts.setdefault(f"{package}.msg", {})[name] = make
     for name, values in parts.items():
         module = ModuleType(name)
         vars(module).update(values)

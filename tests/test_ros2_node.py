@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from drive_helpers import render_small_drive
 from page_helpers import ROOT
+from scipy.spatial.transform import Rotation
 
 import startrack
 from startrack.applications.tracking import read_odometry
@@ -20,6 +21,7 @@ from ros_stand_in import image_message, install, odometry_message, stamped
 
 EXAMPLE = ROOT / "docs/examples/ros2_track_node.py"
 REFUSED = 1  # number of the image that shows no star
+CAMERA_IN_BODY_M = [0.4, -0.1, 1.2]
 TOLERANCE_M = 1e-4  # a time in seconds has 0.2 us as a float: less than 1 um of the sky's turn, or of a rover's move
 
 
@@ -44,7 +46,7 @@ def drive(tmp_path_factory):
 def node(drive, monkeypatch):
     """The example's node, with the drive's camera and the thesis's crater."""
     first = drive[1][0]
-    facts = {"exposure_s": first.exposure_s, "time_sigma_s": first.time_sigma_s}
+    facts = {"exposure_s": first.exposure_s, "time_sigma_s": first.time_sigma_s, "camera_in_body_m": CAMERA_IN_BODY_M}
     install(monkeypatch, camera=str(drive[0]), terrain="shackleton-thesis", **facts)
     spec = importlib.util.spec_from_file_location("ros2_track_node", EXAMPLE)
     module = importlib.util.module_from_spec(spec)
@@ -72,6 +74,20 @@ def test_poses_are_those_of_the_track_and_a_refused_image_has_none(drive, node):
         counts.append(len(published))
     assert counts == [0, 1, 2, 3]  # the first image waits for a second pose, the second one is refused
     used = [k for k in range(len(exposures)) if k != REFUSED]
+    assert len(node.transforms) == len(used)  # none of the refused image
+    for sent, message, k in zip(node.transforms, published, used, strict=True):
+        assert (sent.header.frame_id, sent.child_frame_id) == ("map", "odom")
+        lasts_ns = sent.header.stamp.sec * 10**9 + sent.header.stamp.nanosec - stamp_ns(exposures[k])
+        assert lasts_ns == 60 * 10**9
+        moved, turned = sent.transform.translation, sent.transform.rotation
+        R_map_odom = Rotation.from_quat([turned.x, turned.y, turned.z, turned.w])
+        R_odom_body = Rotation.from_quat(odometry.quat_xyzw[k])  # the odometry has a pose at each image
+        body_m = R_map_odom.apply(np.array(odometry.position_m[k])) + np.array([moved.x, moved.y, moved.z])
+        camera_m = body_m + (R_map_odom * R_odom_body).apply(CAMERA_IN_BODY_M)
+        at, q = message.pose.pose.position, message.pose.pose.orientation
+        np.testing.assert_allclose(camera_m, [at.x, at.y, at.z], rtol=0, atol=1e-6)
+        off = R_map_odom * R_odom_body * Rotation.from_quat([q.x, q.y, q.z, q.w]).inv()
+        assert off.magnitude() < 1e-6
     for message, k in zip(published, used, strict=True):
         stamp = message.header.stamp
         assert message.header.frame_id == "map" and stamp.sec * 10**9 + stamp.nanosec == stamp_ns(exposures[k])
@@ -101,6 +117,7 @@ def test_messages_that_cannot_be_used_are_named_and_publish_nothing(drive, node)
     for (_, text), words in zip(lines, ("earlier than the odometry", "not later than", "encoding 'rgb8'"), strict=True):
         assert words in text
     assert node.publishers["pose"].messages == []
+    assert node.transforms == []
 
 
 def test_a_message_without_time_is_refused(drive):

@@ -3,7 +3,8 @@
 Subscriptions: `image` (sensor_msgs/Image; the stamp is the middle of the exposure) and `odom` (nav_msgs/Odometry of the
 rover's body). Publication: `pose` (geometry_msgs/PoseWithCovarianceStamped) in the frame of the parameter `map_frame`:
 x east, y north, z up (REP-103, REP-105) from the terrain's origin; its orientation is that of the body (x forward, y
-left, z up), its position that of the camera. An image that is refused, or left out, gives no pose.
+left, z up), its position that of the camera. With it the transform from `map_frame` to `odom_frame` is broadcast (tf2).
+An image that is refused, or left out, gives neither.
 
     python ros2_track_node.py --ros-args -p camera:=fisheye-2048 -p terrain:=shackleton-thesis \
         -r image:=/camera/image_raw -r odom:=/wheel/odometry
@@ -13,11 +14,13 @@ import math
 
 import numpy as np
 import rclpy
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry as OdometryMessage
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image
+from tf2_ros import TransformBroadcaster
 
 from startrack import BadInput, load_camera, load_terrain
 from startrack.applications.tracking import Odometry, Track, TrackSession
@@ -25,10 +28,14 @@ from startrack.estimation.observations import OdometryErrors
 from startrack.exposure import exposure_of_message
 
 ODOMETRY_QUEUE = 10_000  # messages: odometry that comes while an image is located must wait, not be dropped
+MAX_VARIANCE_M2 = 1e6  # a position that is no better (1 km) gives no transform: a track that nothing vouches for yet
 PARAMETERS = {
     "camera": "fisheye-2048",  # a file, or the name of a shipped one
     "terrain": "shackleton-thesis",  # the same
     "map_frame": "map",
+    "odom_frame": "odom",  # of the odometry's poses; empty: no transform is broadcast
+    "camera_in_body_m": [0.0, 0.0, 0.0],  # x, y, z of the camera in the body whose poses the odometry has
+    "transform_lasts_s": 60.0,  # a transform holds so long after its image
     "exposure_s": math.nan,  # that an image message does not have; not a number: not known
     "time_sigma_s": math.nan,  # of the clock, the same
     "odometry_sigma": 0.02,  # of a move's length
@@ -47,7 +54,8 @@ class TrackNode(Node):
     def __init__(self) -> None:
         super().__init__("startrack")
         given = {name: self.declare_parameter(name, value).value for name, value in PARAMETERS.items()}
-        self.map_frame = given["map_frame"]
+        self.map_frame, self.odom_frame = given["map_frame"], given["odom_frame"]
+        self.camera_in_body_m, self.lasts_s = given["camera_in_body_m"], given["transform_lasts_s"]
         self.facts = {name: given[name] for name in ("exposure_s", "time_sigma_s") if not math.isnan(given[name])}
         self.session = TrackSession(
             stated_camera=load_camera(given["camera"]), stated_terrain=load_terrain(given["terrain"]),
@@ -60,6 +68,7 @@ class TrackNode(Node):
         self.poses: list[list[float]] = []  # rows time, position, quaternion
         self.stamps: dict[str, object] = {}  # of images that were not filtered yet, by their names
         self.images = 0
+        self.broadcaster = TransformBroadcaster(self)
         self.publisher = self.create_publisher(PoseWithCovarianceStamped, "pose", 10)
         self.create_subscription(Image, "image", self.on_image, qos_profile_sensor_data)
         self.create_subscription(OdometryMessage, "odom", self.on_odometry, ODOMETRY_QUEUE)
@@ -99,12 +108,12 @@ class TrackNode(Node):
             rows = np.array(self.poses)
             odometry = Odometry(time_s=rows[:, 0], position_m=rows[:, 1:4], quat_xyzw=rows[:, 4:])
             for track in self.session.newest(odometry):
-                self.publish(track)
+                self.publish(track, odometry)
         except (BadInput, ValueError) as cause:
             self.get_logger().error(f"the odometry cannot be used: {cause}")
 
-    def publish(self, track: Track) -> None:
-        """Publish the pose of a `track` of one image; nothing where it is not used, or not known."""
+    def publish(self, track: Track, odometry: Odometry) -> None:
+        """Publish the pose of a `track` of one image, and the transform; nothing where it is not used, or not known."""
         frame, position_m = track.frames[0], track.filtered.position_enu_m[0]
         stamp = self.stamps.pop(frame.name, None)
         if stamp is None or frame.status != "used" or frame.quat_xyzw_body_enu is None:
@@ -120,6 +129,21 @@ class TrackNode(Node):
         covariance[:2, :2] = track.filtered.covariance_m2[0]
         message.pose.covariance = covariance.ravel().tolist()
         self.publisher.publish(message)
+        if self.odom_frame and np.trace(track.filtered.covariance_m2[0]) < MAX_VARIANCE_M2:
+            R_map_body = Rotation.from_quat(frame.quat_xyzw_body_enu).inv()
+            self.broadcast(stamp, position_m - R_map_body.apply(self.camera_in_body_m), R_map_body, odometry)
+
+    def broadcast(self, stamp: object, body_m: np.ndarray, R_map_body: Rotation, odometry: Odometry) -> None:
+        """Broadcast map <- odom = (map <- body) (odom <- body)^-1, with the `odometry` at the time of the image."""
+        ((at_m,), (R_odom_body,)) = odometry.poses_at(np.array([stamp.sec + 1e-9 * stamp.nanosec]))
+        R_map_odom = R_map_body * R_odom_body.inv()
+        message, until = TransformStamped(), stamp.sec * 10**9 + stamp.nanosec + round(self.lasts_s * 1e9)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(until, 10**9)
+        message.header.frame_id, message.child_frame_id = self.map_frame, self.odom_frame
+        move, turn = message.transform.translation, message.transform.rotation
+        move.x, move.y, move.z = (body_m - R_map_odom.apply(at_m)).tolist()
+        turn.x, turn.y, turn.z, turn.w = R_map_odom.as_quat().tolist()
+        self.broadcaster.sendTransform(message)
 
 
 def main() -> None:

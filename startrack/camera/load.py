@@ -46,7 +46,7 @@ def load_camera(name_or_path: str | Path) -> Camera:
 
 
 def read_camera(name_or_path: str | Path) -> Camera:
-    """The same as `load_camera`, but nothing is logged."""
+    """The camera of `name_or_path` as by `load_camera`, but nothing is logged."""
     file, wanted = split_camera(name_or_path)
     path = resolve_named(file, "calib", "no_calibration")
     text = read_text(path, "bad_calibration")
@@ -63,9 +63,11 @@ def read_camera(name_or_path: str | Path) -> Camera:
 
 
 def read_foreign_camera(name_or_path: str | Path, program: str | None, calibrated_angle_rad: float | None) -> Camera:
-    """The camera of a file of `program`, None: found by the content; FILE#NAME is one camera of a file of several.
+    """The camera of a file of `program`, None: found by the content.
 
-    Raises BadInput as `load_camera`.
+    `name_or_path` is the file, or FILE#NAME, one camera of a file of several; `calibrated_angle_rad` is the angle off
+    the axis up to which the lens was calibrated, None: that of the frame's nearest edge. Raises BadInput as
+    `load_camera`.
     """
     file, wanted = split_camera(name_or_path)
     text = read_text(file, "no_calibration")

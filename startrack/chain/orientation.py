@@ -13,7 +13,7 @@ from startrack.catalog import StarCatalog, apparent_bodies, apparent_stars
 from startrack.chain.sky_state import stating_sky
 from startrack.chain.stages import Detected, Identified, Inputs, Oriented, Settings, extend
 from startrack.core.compilation import announce_compilation
-from startrack.core.types import Array, BadInput, Exposure, NotIdentified, Stars, TooFewStars
+from startrack.core.types import Array, BadInput, Detections, Exposure, NotIdentified, Stars, TooFewStars
 from startrack.detection import Detector
 from startrack.estimation.attitude import solve_attitude
 from startrack.estimation.lens_correction import correct_lens
@@ -83,7 +83,13 @@ def detect_sources(inputs: Inputs, camera: Camera | None, detector: Detector) ->
             "give those (8- or 16-bit integers, or floating point in ADU)",
         )
     with stating_sky(inputs.exposure, on_moon=_on_moon(inputs)):
-        return extend(inputs, Detected, detections=detector(inputs.exposure, camera))
+        detections = detector(inputs.exposure, camera)
+    if not isinstance(detections, Detections):
+        raise TypeError(
+            f"the detector returned {type(detections).__name__}, not Detections: put a function that returns (xy_px, "
+            "flux_adu) into startrack.detection.PositionDetector(...)"
+        )
+    return extend(inputs, Detected, detections=detections)
 
 
 def _on_moon(inputs: Inputs) -> bool:

@@ -69,31 +69,13 @@ class Detector:
 
         Raises TooFewStars (reason no_stars) if the frame has no point source, BadInput for a mask that cannot be used.
         """
-        image, dead = electrons(exposure, camera)
-        mask = combine_masks(
-            exposure.mask, None if camera is None else camera.mask, exposure.size_px, exposure.correction
-        )
-        parts = find_dead_parts(exposure.recorded_adu)
-        if parts is not None:
-            mask = mask or Mask(masked=np.zeros_like(parts), sha256="")
-            mask = replace(mask, masked=mask.masked | parts, dead_part=float(parts.mean()))
-        if mask is not None:
-            image, dead = fill_masked(image, mask.masked), dead & ~mask.masked
-        if float(image[0, 0]) == float(image[-1, -1]) == float(image[::64, ::64].max()) and not np.ptp(image):
-            raise TooFewStars("the frame is flat: every pixel has the same value")
+        source, mask = prepare_frame(exposure, camera)
         known = camera.sensor.psf_sigma_px if camera is not None and camera.sensor is not None else None
-        # Dark frame and flat field do not undo the rounding of the counts.
-        gain = 1.0 if camera is None or camera.sensor is None else camera.sensor.gain_e_per_adu
-        quantum = smallest_step(image) if exposure.correction is None else gain * smallest_step(exposure.recorded_adu)
-        source = _FrameSource(
-            image, quantum, dead if dead.any() else None, SourceNoise(per_unit=0.0 if known is None else 1.0),
-            None if mask is None else mask.masked,
-        )  # fmt: skip
         candidates = self._candidates(source, self.psf_sigma_px or known)
         frame, sigma, side = candidates.frame, candidates.sigma, candidates.side
         complete = partial(
-            Detections, image_e=image, dead=dead if mask is None else dead | mask.masked,
-            background=frame.background, noise=frame.noise, mask=mask,
+            Detections, image_e=source.image, dead=source.unusable, background=frame.background, noise=frame.noise,
+            mask=mask,
         )  # fmt: skip
         centres = side * candidates.fitted.stamps.centres + side // 2
         if are_elongated(frame, centres) and (streaks := find_streaks(frame)) is not None:
@@ -107,7 +89,7 @@ class Detector:
             )  # fmt: skip
         stars = self._select_stars(frame, candidates.fitted, side, sigma)
         covered_px = len(stars.flux) * np.pi * np.square(WINGS_SIGMAS * sigma)  # overlaps counted twice
-        if side > 1 or covered_px > CROWDED_PART * image.size:
+        if side > 1 or covered_px > CROWDED_PART * source.image.size:
             frame, stars = self._detect_again(source, candidates, unbin_fits(stars, side))
         if not len(stars.flux):
             raise _nothing_seen(frame)
@@ -121,7 +103,7 @@ class Detector:
             background=frame.background, noise=frame.noise,
         )  # fmt: skip
 
-    def _candidates(self, source: _FrameSource, expected: float | None) -> _Candidates:
+    def _candidates(self, source: FrameSource, expected: float | None) -> _Candidates:
         """Candidates and their fits, with the PSF width measured in the frame."""
         if expected is None:
             return self._candidates_at(source, guess_psf_width(source.frame, UNKNOWN_WIDTH_PX))
@@ -134,14 +116,14 @@ class Detector:
             return found
         return self._candidates_at(source, guess_psf_width(source.frame, measured * side))
 
-    def _candidates_at(self, source: _FrameSource, sigma: float) -> _Candidates:
+    def _candidates_at(self, source: FrameSource, sigma: float) -> _Candidates:
         """Candidates and their fits; where the PSF is wide, in the binned frame."""
         side, frame = binning_factor(sigma), source.frame(sigma)
         small = bin_frame(frame, side)
         peaks = self._find_peaks(frame, small, side, sigma)
         return _Candidates(frame, small, side, sigma, fit_all(small, peaks, sigma / side))
 
-    def _detect_again(self, source: _FrameSource, candidates: _Candidates, stars: PointFits) -> tuple[Frame, PointFits]:
+    def _detect_again(self, source: FrameSource, candidates: _Candidates, stars: PointFits) -> tuple[Frame, PointFits]:
         """The frame and its stars; known stars are subtracted before the background and faint stars are measured."""
         side, sigma = candidates.side, candidates.sigma
         frame = source.frame(sigma, paint_sources(stars, sigma, source.image.shape))
@@ -177,7 +159,32 @@ class Detector:
         return stars.take(np.flatnonzero(clear))
 
 
-class _FrameSource:
+def prepare_frame(exposure: Exposure, camera: Camera | None) -> tuple[FrameSource, Mask | None]:
+    """The image of an `exposure` in electrons, or ADU, with its unusable pixels, and the mask of camera and image.
+
+    Raises TooFewStars (reason no_stars) for a flat frame, BadInput for a mask that cannot be used.
+    """
+    image, dead = electrons(exposure, camera)
+    mask = combine_masks(exposure.mask, None if camera is None else camera.mask, exposure.size_px, exposure.correction)
+    parts = find_dead_parts(exposure.recorded_adu)
+    if parts is not None:
+        mask = mask or Mask(masked=np.zeros_like(parts), sha256="")
+        mask = replace(mask, masked=mask.masked | parts, dead_part=float(parts.mean()))
+    if mask is not None:
+        image, dead = fill_masked(image, mask.masked), dead & ~mask.masked
+    if float(image[0, 0]) == float(image[-1, -1]) == float(image[::64, ::64].max()) and not np.ptp(image):
+        raise TooFewStars("the frame is flat: every pixel has the same value")
+    sensor = None if camera is None else camera.sensor
+    # Dark frame and flat field do not undo the rounding of the counts.
+    gain = 1.0 if sensor is None else sensor.gain_e_per_adu
+    quantum = smallest_step(image) if exposure.correction is None else gain * smallest_step(exposure.recorded_adu)
+    return FrameSource(
+        image, quantum, dead if dead.any() else None, SourceNoise(per_unit=0.0 if sensor is None else 1.0),
+        None if mask is None else mask.masked,
+    ), mask  # fmt: skip
+
+
+class FrameSource:
     """An image with its unusable pixels; backgrounds are computed once for each block size."""
 
     def __init__(
@@ -185,6 +192,12 @@ class _FrameSource:
     ) -> None:
         self.image, self.quantum, self.dead, self.source_noise, self.masked = image, quantum, dead, source_noise, masked
         self._kept: dict[int, tuple[SmoothImage, SmoothImage]] = {}
+
+    @property
+    def unusable(self) -> Bools:
+        """Saturated and masked pixels (H, W)."""
+        found = np.zeros(self.image.shape, dtype=bool) if self.dead is None else self.dead
+        return found if self.masked is None else found | self.masked
 
     def frame(self, sigma: float, found: Image | None = None) -> Frame:
         """The prepared frame; stars in `found` are excluded from background and noise."""

@@ -205,7 +205,7 @@ class Measured(StarRays, Oriented):
     def warnings(self) -> list[str]:
         """Facts in the image's file that were not used; what the terrain does not cover or state; a Sun that is up."""
         day = [] if self.exposure.time_utc is None else daylight_warnings(self.site, self.exposure.time_utc)
-        return [*super().warnings, *self.terrain.masked_sectors(), *self.terrain.error_warnings(), *day]
+        return [*super().warnings, *self.terrain.warnings(), *day]
 
 
 class SkyEvidence(NamedTuple):

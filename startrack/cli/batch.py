@@ -17,7 +17,7 @@ from typing import Any
 
 from startrack.applications import batch
 from startrack.applications.batch import Image, ImageDone, Task
-from startrack.cli.console import discard_stdout, progress
+from startrack.cli.console import discard_stdout, print_warnings, progress
 from startrack.cli.flags import check_cluster, check_localizer
 from startrack.cli.images import absolute_facts, compile_kernels, maps_left_out, prepare_reference, settings_of
 from startrack.cli.report import write_page_of
@@ -129,6 +129,8 @@ def _prepare(task: Task, args: argparse.Namespace) -> None:
     with suppress(BadInput):  # reported when the image is located
         reference = reference or batch.read_task(task).terrain
     terrain = prepare_reference(reference, args)
+    if terrain is not None and args.verbose:
+        print_warnings(args, terrain.name, terrain.warnings(), of_all=True)
     if terrain is not None and not is_compiled():
         compile_kernels(terrain)
 
@@ -200,8 +202,8 @@ class _Shown:
         reason, args = record["reason"], self.args
         if reason == INTERNAL_ERROR:
             print(f"{record['image']}: {record['message']}", file=sys.stderr, flush=True)
-        for warning in record.get("warnings", ()) if args.verbose else ():
-            print(f"{record['image']}: {warning}", file=sys.stderr, flush=True)
+        if args.verbose:
+            print_warnings(args, record["image"], record.get("warnings", ()))
         try:
             if args.json:
                 print(json.dumps(record), flush=True)

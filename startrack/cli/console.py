@@ -7,7 +7,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
 
 STEP_S = {  # of a step, by the first word of what is done: images of 4 Mpx, draws on a height map, 2 cores
-    "calibrate": 0.25, "calibrate-board": 1.0, "horizon": 0.7, "horizons": 30.0, "locate": 0.6, "predict": 1.0,
+    "calibrate": 0.25, "calibrate-board": 1.0, "horizon": 0.7, "locate": 0.6, "predict": 1.0,
     "render": 1.3, "track": 1.0,
 }  # fmt: skip
 LINE_S = 10.0
@@ -64,6 +64,16 @@ def print_advice(reason: str | None, message: str, args: argparse.Namespace, own
     if advice and advice not in printed:
         printed.add(advice)
         print(f"  next: {advice}", file=sys.stderr, flush=True)
+
+
+def print_warnings(args: argparse.Namespace, name: str, warnings: Iterable[str], *, of_all: bool = False) -> None:
+    """A line on stderr for each of the `warnings` about `name`; those `of_all` images once, under that name."""
+    printed: set[str] = vars(args).setdefault("printed_of_all", set())
+    for warning in () if args.quiet else warnings:
+        if warning not in printed:
+            print(f"{errors.one_line(name)}: {warning}", file=sys.stderr, flush=True)
+        if of_all:
+            printed.add(warning)
 
 
 def print_left_out(images: Any) -> None:
@@ -119,10 +129,13 @@ class Progress:
 
 
 @contextmanager
-def progress(what: str, total: int | None = None, *, shown: bool = True, jobs: int = 1) -> Iterator[Progress]:
+def progress(
+    what: str, total: int | None = None, *, shown: bool = True, jobs: int = 1, about_s: float | None = None
+) -> Iterator[Progress]:
     """A bar on stderr with the time left and a text, if `shown`; it disappears at the end.
 
-    A line before it says what is done, by the first word of `what`, in `jobs` processes, and how long that may take.
+    A line before it says what is done, by the first word of `what`, in `jobs` processes, and how long that may take:
+    `about_s`, or by the number of steps.
     Where stderr is no terminal, a line every LINE_S seconds shows that the work goes on, and the time left.
     """
     if not shown or total == 0:
@@ -136,7 +149,8 @@ def progress(what: str, total: int | None = None, *, shown: bool = True, jobs: i
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as RichProgress
 
-    if (wait_s := STEP_S.get(what.split()[0], 0.0) * (total or 1) / jobs) > ANNOUNCED_S:
+    wait_s = STEP_S.get(what.split()[0], 0.0) * (total or 1) / jobs if about_s is None else about_s
+    if wait_s > ANNOUNCED_S:
         print(f"{what}: about {duration_text(wait_s)}", file=sys.stderr, flush=True)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with RichProgress(*columns, TextColumn("{task.fields[text]}"), console=Console(stderr=True), transient=True) as bar:

@@ -211,7 +211,9 @@ def prepare(terrain: Terrain, args: argparse.Namespace) -> None:
     if terrain.is_prepared:
         return
     announce_compilation()
-    with _terrain_log(args), progress(f"horizons of {terrain.name}, once", shown=not args.quiet) as bar:
+    what, shown = f"horizons of {terrain.name}, once", not args.quiet
+    about_s = terrain.costs_s().get("horizons") if shown and sys.stderr.isatty() else None
+    with _terrain_log(args), progress(what, shown=shown, about_s=about_s) as bar:
         terrain.prepare(bar.update)
 
 

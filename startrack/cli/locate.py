@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import importlib
 import math
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +16,7 @@ from startrack import chain, output
 from startrack.applications.batch import result_stems
 from startrack.camera import Camera, load_camera
 from startrack.catalog import load_catalog
-from startrack.cli.console import Outcome, print_outcome, wait_lines, worst_code
+from startrack.cli.console import Outcome, print_outcome, print_warnings, wait_lines, worst_code
 from startrack.cli.flags import check_localizer
 from startrack.cli.images import check_fov, compile_beside, near_attitude_of, prepare, read, settings_of
 from startrack.cli.report import write_page_of_images
@@ -88,8 +87,7 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve) -> int:
             message = f"internal error: {type(cause).__name__}: {cause} (-v shows the traceback)"
             record = output.refused_dict(path, INTERNAL_ERROR, message, kind.removesuffix("s"))
             line = f"{printable(name)}  {message}"
-        for warning in () if args.quiet else record.get("warnings", ()):
-            print(f"{printable(name)}: {warning}", file=sys.stderr, flush=True)
+        print_warnings(args, name, record.get("warnings", ()))
         codes.add(print_outcome(args, record, line))
     return worst_code(codes)
 
@@ -110,6 +108,7 @@ def _solve_image(args: argparse.Namespace, path: str, out: Path, solve: Solve) -
     read_s = time.perf_counter() - start
     if terrain is not None and exposure.terrain is not None and exposure.time_utc is not None:
         prepare(terrain, args)
+        print_warnings(args, terrain.name, terrain.warnings(), of_all=True)
         compile_beside(exposure.terrain)
     start = time.perf_counter()
     with wait_lines(args, f"{args.command} {printable(exposure.name)}"):

@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 
 from startrack import terrain as terrains
+from startrack.cli.console import duration_text
 from startrack.cli.flag_types import amount
 from startrack.cli.images import prepare
 from startrack.cli.input_commands import STATED_ERRORS, state_flag
 from startrack.core import files
 from startrack.core.compilation import announce_compilation
-from startrack.core.errors import BadInput, one_line
+from startrack.core.errors import BadInput, length_text, one_line
 from startrack.frames import Site, latlon_from_enu
 from startrack.terrain import StateableError, Terrain, load_terrain, require_place
 
@@ -58,8 +59,10 @@ def build(args: argparse.Namespace) -> int:
         if terrain.table_path is not None:
             if args.force:
                 terrain.discard_table()
-            start = time.perf_counter()
+            announce_compilation()
             known = terrain.is_prepared
+            facts |= {key: value for key, value in terrain.facts().items() if key == "maps_end"} | _cost_facts(terrain)
+            start = time.perf_counter()
             prepare(terrain, args)
             facts |= {"horizons": str(terrain.table_path), "known_before": known}
             facts["seconds"] = round(time.perf_counter() - start, 1)
@@ -108,7 +111,35 @@ def _facts_of(terrain: Terrain) -> dict[str, Any]:
         "search_radius_m": terrain.search_radius_m,
         "camera_height_m": terrain.camera_height_m,
         **terrain.facts(),
+        **_cost_facts(terrain),
     }
+
+
+def _cost_facts(terrain: Terrain) -> dict[str, Any]:
+    """About how long work on a `terrain` takes, as JSON values; {} where nothing takes long."""
+    costs_s = {what: float(f"{seconds:.2g}") for what, seconds in terrain.costs_s().items()}
+    return {"about_s": costs_s} if costs_s else {}
+
+
+def _cost_text(about_s: dict[str, float]) -> str:
+    """About how long the table of horizons takes, where it is not there, and the position of an image."""
+    texts = {"horizons": "for the table of horizons, once", "frame": "for the position of an image"}
+    return ", ".join(f"about {duration_text(seconds)} {texts[what]}" for what, seconds in about_s.items())
+
+
+def _end_lines(ends: dict[str, Any]) -> Iterator[str]:
+    """Where the maps end, how high unknown ground beyond counts, and the azimuths in which it may hide stars."""
+    source = {"map": "the maps' highest", "stated": "highest_beyond_m"}[ends["highest_beyond_from"]]
+    yield (
+        f"  ends      {length_text(ends['nearest_m'], 3)} from the origin, where they are nearest (azimuth "
+        f"{ends['nearest_azimuth_deg']}); ground beyond may be up to {ends['highest_beyond_m']} m high ({source})"
+    )
+    for one in ends["missing"]:
+        yield (
+            f"  missing   azimuths {one['from_deg']} to {one['to_deg']}: the maps end "
+            f"{length_text(one['nearest_m'], 3)} off, and ground beyond could stand up to {one['up_to_deg']:g} degrees "
+            "high; no evidence is taken below that"
+        )
 
 
 def _site_of(terrain: Terrain) -> Site:
@@ -149,6 +180,8 @@ def _lines_of(facts: dict[str, Any]) -> Iterator[str]:
             f"  map       {m['file']}: {columns} x {rows} posts, {m['post_m']:g} m apart, {m['projection']}, "
             f"heights {m['lowest_m']:g} to {m['highest_m']:g} m"
         )
+    if "maps_end" in facts:
+        yield from _end_lines(facts["maps_end"])
     if "height_sigma_m" in facts:
         sources = {
             "map": " (from the map's roughness)", "comparison": " (compared with a finer map)",
@@ -166,6 +199,8 @@ def _lines_of(facts: dict[str, Any]) -> Iterator[str]:
         yield f"  horizons  {facts['horizons'] if ready else 'not computed yet: startrack terrain build'}"
     elif "horizons" in facts:
         yield "  horizons  need no table: those of a cylinder are a formula"
+    if "about_s" in facts:
+        yield f"  takes     {_cost_text(facts['about_s'])}, on this machine"
     if "ground_m" in facts:
         yield (
             f"  position     E {facts['east_m']:g} m, N {facts['north_m']:g} m: "

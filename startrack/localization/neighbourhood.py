@@ -77,8 +77,8 @@ class Neighbourhood:
 
         Posts that make the skyline at several azimuths err there together: each azimuth is given the variance that the
         sum over its neighbours has, which is right for errors that go far around the compass, as of a position. What
-        follows no post is common to neighbours as the square of their correlation by posts. Ground of which facts are
-        not stated is rough by ROUGH_RAD besides.
+        follows no post is common to neighbours as the square of their correlation by posts; where the skyline follows
+        none at all it is that azimuth's alone. Ground of which facts are not stated is rough by ROUGH_RAD besides.
         """
         rough = 0.0 if all(one.is_stated for one in self.terrain.shape_errors) else ROUGH_RAD
         if self.crests is None:
@@ -86,7 +86,10 @@ class Neighbourhood:
             return np.hypot(by_posts, rough)
         of_posts, own = self._covariance_by_posts(self.crests), self.crests.own_sigma_rad
         sigma = np.sqrt(np.diag(of_posts))
-        total = of_posts + np.outer(own, own) * np.square(of_posts / np.outer(sigma, sigma))
+        sigma[sigma == 0.0] = np.inf
+        correlation = of_posts / np.outer(sigma, sigma)
+        np.fill_diagonal(correlation, 1.0)
+        total = of_posts + np.outer(own, own) * np.square(correlation)
         return np.sqrt(np.maximum(total.sum(axis=1), np.diag(total)) + rough**2)
 
     @cached_property

@@ -197,6 +197,8 @@ class Search:
         while True:
             count = len(centres)
             centres, upper = self._bound(centres, half)
+            if not len(centres):  # the best position known is in none: between the points where boxes were tested
+                return self._about_best(upper, half)
             is_last = 4 * len(centres) > LAST_MOST_BOXES
             if 16 * len(centres) > LAST_MOST_BOXES and self._climb(centres, half):
                 continue
@@ -269,6 +271,11 @@ class Search:
         return Explored(centres, half, log_likelihood, self.log_dropped, "proven")
 
     def _about_best(self, upper: Array, half: float) -> Explored:
-        """The neighbourhoods of the best positions known, where boxes with bounds (n,) are left open."""
+        """The neighbourhoods of the best positions known, where boxes with bounds (n,) are left open.
+
+        Raises NotLocated (outside_search_area) where none is known.
+        """
         self._drop(upper, half)
+        if not len(self.guess.points_m):
+            raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
         return local_posterior(self.likelihood, self.guess, self.log_dropped)

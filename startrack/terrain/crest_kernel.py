@@ -32,7 +32,8 @@ def crests(ground, camera_height, sigma, points, azimuths, tan, distance, mean, 
 
     `tan` and `distance` (n,) are those of the map. Filled are `mean` and `own` (n,), the mean tangent and the variance
     that follows no post, and `post` and `response` (n, POSTS), the posts and the mean rise of the tangent by a metre
-    of each, as of a camera that stays where it is. A post of -1 is none.
+    of each, as of a camera that stays where it is. A post of -1 is none. Where no place of a map makes the skyline, as
+    at the edge where a ray leaves the maps, it is the map's own, wrong by `sigma` at its distance.
     """
     grid, heights, posts, _, _, _, _, _, _, _, radius, _, _ = ground
     seat, weight = np.empty(4, dtype=np.int64), np.empty(4)
@@ -49,8 +50,10 @@ def crests(ground, camera_height, sigma, points, azimuths, tan, distance, mean, 
         last = OCTAVES
         for octave in range(OCTAVES - 1, -1, -1):
             take_larger(numbers, posts_of, responses, last, octave, sigma)
-        mean[k], own[k] = numbers[last, MEAN], numbers[last, OWN]
         post[k], response[k] = -1, 0.0
+        mean[k], own[k] = numbers[last, MEAN], numbers[last, OWN]
+        if numbers[last, USED] == 0.0:
+            mean[k], own[k] = tan[k], (sigma / max(distance[k], NUDGE_M)) ** 2
         for j in range(int(numbers[last, USED])):
             post[k, j], response[k, j] = posts_of[last, j], responses[last, j]
             for i in range(4):

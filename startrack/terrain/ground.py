@@ -95,7 +95,7 @@ def pack_maps(site: Site, maps: Sequence[Raster], *, keep_voids: bool = False) -
         slope_unit=np.array(units),
         post_m=np.array([m.post_m for m in maps]),
         radius_m=sphere_radius_m(site),
-        highest_m=float(np.nanmax([np.nanmax(part) for part in tops])),
+        highest_m=float(max(np.nanmax(part) for part in heights)),
     )
 
 

@@ -15,8 +15,10 @@ from startrack.terrain.crest_kernel import POSTS, crests
 from startrack.terrain.derived_maps import DeformedMap, HorizonInterpolator
 from startrack.terrain.ground import cell_posts, post_positions
 from startrack.terrain.horizon_table import AZIMUTH_BINS, HorizonSigma
+from startrack.terrain.map_ends import circular_runs, facts_of_ends, unknown_elevations_rad
 from startrack.terrain.protocol import ExpectedCrests, Terrain
 from startrack.terrain.refracted import refraction_errors, refraction_slopes_rad, with_refraction_error
+from startrack.terrain.table_cache import load_table
 from startrack.terrain.traced_map import TracedMap
 
 COMMON_PER_POST = 3.0
@@ -140,7 +142,13 @@ class HeightMap(TracedMap):
 
     def masked_sectors(self) -> list[str]:
         """One line of text per range of azimuths that is not informative."""
-        return describe_masks(self.glare_rad, self.table.unknown_rad)
+        return describe_masks(self.glare_rad, self.unknown_rad)
+
+    @cached_property
+    def unknown_rad(self) -> Array:
+        """(AZIMUTH_BINS,) elevation below which ground off the maps could stand, or -pi/2; needs no table."""
+        table = load_table(self.table_key, self.square)
+        return unknown_elevations_rad(self) if table is None else table.unknown_rad
 
     def error_warnings(self) -> list[str]:
         """Lines of text: errors that the terrain file leaves out, so that they count as 0; datums of unknown place."""
@@ -160,6 +168,7 @@ class HeightMap(TracedMap):
         return {
             "kind": "dem",
             "maps": [raster.facts() for raster in self.maps],
+            "maps_end": facts_of_ends(self, self.unknown_rad),
             "height_sigma_m": self.height_sigma_m,
             "horizon_sigma_deg": None if common is None else round(float(np.degrees(common)), 6),
             "horizons": str(self.table_path),
@@ -224,24 +233,13 @@ def describe_masks(glare_rad: Sectors, unknown_rad: Array) -> list[str]:
         for start, end in glare_rad
     ]
     step = 2 * np.pi / len(unknown_rad)
-    for first, last in _circular_runs(unknown_rad > -np.pi / 2):
+    for first, last in circular_runs(unknown_rad > -np.pi / 2):
         highest = np.degrees(np.take(unknown_rad, range(first, last), mode="wrap").max())
         lines.append(
             f"azimuths {_range_text(first * step, last * step)}: the maps end, and {OFF_MAP} could stand up to "
             f"{highest:.1f} degrees high; no evidence is taken below that"
         )
     return lines
-
-
-def _circular_runs(flags: Bools) -> list[tuple[int, int]]:
-    """First index, and last plus one, of each run of True around the circle; indices may exceed the length."""
-    n = len(flags)
-    if flags.all():
-        return [(0, n)]
-    offset = int(np.argmin(flags))  # of an element that is False
-    steps = np.diff(np.concatenate([[0], np.roll(flags, -offset).astype(np.int8), [0]]))
-    first, last = (np.flatnonzero(steps == sign) + offset for sign in (1, -1))
-    return [(int(a) % n, int(a) % n + int(b - a)) for a, b in zip(first, last, strict=True)]
 
 
 def _range_text(start_rad: float, end_rad: float) -> str:

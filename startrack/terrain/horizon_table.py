@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.kernels import njit
-from startrack.core.types import SECTORS, Array, Bools
+from startrack.core.types import SECTORS, Array, Bools, Ints
 from startrack.terrain.ground import merge_blocks
 from startrack.terrain.rays import rows_of_rays
 
@@ -50,6 +50,11 @@ class Square:
         line = self.half_m * (2 * np.arange(self.across) + 1) - self.reach_m
         east, north = np.meshgrid(line, line, indexing="ij")
         return np.stack([east.ravel(), north.ravel()], axis=-1)
+
+    @property
+    def cells_within_reach(self) -> Ints:
+        """Numbers (n,) of the cells that may hold a position within reach, in the order of `centres_m`."""
+        return np.flatnonzero(np.hypot(*self.centres_m.T) < self.reach_m + 1.42 * self.half_m)
 
 
 class BoxMemory:

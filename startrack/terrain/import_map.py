@@ -13,17 +13,18 @@ import numpy as np
 from startrack.core.errors import BadOutput, length_text
 from startrack.core.files import check_output, data_dir, printable, write_atomically
 from startrack.core.types import BadInput
-from startrack.frames import EARTH_RADIUS_M, Site
+from startrack.frames import Site
 from startrack.terrain.array_map import SUFFIX, Grid, map_of_array, read_array
 from startrack.terrain.earth_projection import geoid_at
 from startrack.terrain.height_map import HeightMap
+from startrack.terrain.horizon_table import AZIMUTH_BINS
 from startrack.terrain.io import terrain_from_dict
 from startrack.terrain.map_comparison import compare_with_finest, crest_angle_rad_per_m
 from startrack.terrain.map_error import carried_spacing, error_between_posts_m, find_product
 from startrack.terrain.map_reading import read_map, require_origin
 from startrack.terrain.map_writing import write_map
 from startrack.terrain.raster import Raster
-from startrack.terrain.shape import CAMERA_ERROR, EARTH_HIGHEST_M, REFRACTION, REFRACTION_1, STRETCH, vertical_fact
+from startrack.terrain.shape import CAMERA_ERROR, REFRACTION, REFRACTION_1, STRETCH, vertical_fact
 
 RIM_RADII = 1.5  # of the search area: most of the rim is nearer
 MAX_POST_RADII = 0.2  # of the search area: with posts further apart its shape is not resolved
@@ -37,7 +38,6 @@ OTHER_FACTS = (
     "The map is taken to be to scale (stretch_sigma_1) and {place}, the camera at its height to 2 cm "
     "(camera_height_sigma_m): change what you know better."
 )
-SEEN_BEYOND_RAD = float(np.radians(5.0))  # higher ground off the maps is warned of: it hides what decides positions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,9 +148,11 @@ def import_maps(
         values["air"] = {"terrestrial_refraction": REFRACTION_1, REFRACTION.key: REFRACTION.sigma}
     if geoid_grid is not None:
         values["dem"] |= _geoid_values(geoid_grid, values)
-    _write_terrain(output, values, errors, dict(zip(files, crops, strict=True)))
-    notes = [f"{one.source}: {note}" for one in crops for note in one.notes]
-    warnings = [*notes, *errors.warnings, *spacing_warnings(crops, radius_m), *_place_warnings(crops, values)]
+    terrain = _write_terrain(output, values, errors, dict(zip(files, crops, strict=True)))
+    shifts = [(one.source, one.projection.transformation_warning) for one in crops]
+    warnings = [f"{one.source}: {note}" for one in crops for note in one.notes]
+    warnings += [*errors.warnings, *spacing_warnings(crops, radius_m), *(f"{a}: {b}" for a, b in shifts if b)]
+    warnings += end_warnings(terrain)
     warnings += smoothness_warnings(rim, errors.height_sigma_m)
     return ImportedTerrain(path=output, errors=errors, warnings=warnings)
 
@@ -167,8 +169,8 @@ def _geoid_values(grid: str, values: dict[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, crops: dict[Path, Raster]) -> None:
-    """Write the maps, check them as a terrain, and write its file. After an exception no file is left.
+def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, crops: dict[Path, Raster]) -> HeightMap:
+    """The terrain, whose maps and file are written. After an exception no file is left.
 
     The horizon's sigma, where it was measured, follows from the distance of the crests on the terrain.
     """
@@ -183,12 +185,12 @@ def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, c
             if not _is_usual(path):
                 values["dem"]["unusual_heights"] = True
         try:
-            terrain = terrain_from_dict(values, folder=output.parent)
+            terrain = cast(HeightMap, terrain_from_dict(values, folder=output.parent))
         except BadInput as cause:
             notes = [f"{crop.source}: {note}" for crop in crops.values() for note in crop.notes]
             raise BadInput(cause.reason, "; ".join([str(cause), *notes])) from cause
         if errors.common_crest_sigma_m is not None:
-            angle_rad = errors.common_crest_sigma_m * crest_angle_rad_per_m(cast(HeightMap, terrain))
+            angle_rad = errors.common_crest_sigma_m * crest_angle_rad_per_m(terrain)
             values["dem"]["horizon_sigma_deg"] = float(f"{np.degrees(angle_rad):.2g}")
         text = errors.comment_lines(values["body"]) + tomli_w.dumps(values)
         write_atomically(output, text.encode("utf-8"), overwrite=True, reason="bad_terrain")
@@ -196,6 +198,7 @@ def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, c
         for path in written:
             path.unlink(missing_ok=True)
         raise
+    return terrain
 
 
 def _is_usual(path: Path) -> bool:
@@ -258,22 +261,17 @@ def smoothness_warnings(rim: Raster, height_sigma_m: float) -> list[str]:
     ]
 
 
-def _place_warnings(maps: Sequence[Raster], values: dict[str, Any]) -> list[str]:
-    """Warnings about datums of unknown place, and about unknown ground that may hide stars beyond the maps' ends."""
-    found = [f"{one.source}: {one.projection.transformation_warning}" for one in maps]
-    found = [line for line, one in zip(found, maps, strict=True) if one.projection.transformation_warning]
-    if values["body"] == "moon":
-        return found
-    reach_m = max(0.5 * min(one.heights_m.shape) * one.post_m for one in maps)
-    highest_m = values["dem"].get("highest_beyond_m", EARTH_HIGHEST_M) - values["origin"]["height_m"]
-    beyond_rad = float(np.arctan((highest_m - 0.5 * reach_m**2 / EARTH_RADIUS_M) / reach_m))
-    if beyond_rad > SEEN_BEYOND_RAD:
-        found.append(
-            f"the maps end about {length_text(reach_m)} from the origin: ground beyond could stand up to "
-            f"{np.degrees(beyond_rad):.0f} degrees high, and no evidence is taken below that where the "
-            "maps' horizon is lower; add a wider map, or state how high ground beyond is (--highest-beyond M)"
-        )
-    return found
+def end_warnings(terrain: HeightMap) -> list[str]:
+    """A warning if ground off the maps of a `terrain` may hide stars that they show."""
+    missing = int(np.count_nonzero(terrain.unknown_rad > -np.pi / 2)) * 360 // AZIMUTH_BINS
+    if not missing:
+        return []
+    highest_deg = float(np.degrees(terrain.unknown_rad.max()))
+    return [
+        f"the maps end in {missing} of 360 degrees of azimuth, and ground beyond could stand up to {highest_deg:.1f} "
+        "degrees high: no evidence is taken below that; add a wider map, or state how high ground beyond is "
+        "(--highest-beyond M)"
+    ]
 
 
 def spacing_warnings(maps: Sequence[Raster], radius_m: float) -> list[str]:

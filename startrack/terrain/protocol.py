@@ -148,6 +148,10 @@ class Terrain(ABC):
         """One line of text if the terrain file leaves out errors: the ground then counts as exact."""
         return []
 
+    def warnings(self) -> list[str]:
+        """What the ground does not cover, and what its file does not state: the same for every image."""
+        return [*self.masked_sectors(), *self.error_warnings()]
+
     def expected_crests(self, point_m: Array, azimuths_rad: Array) -> ExpectedCrests | None:
         """The skyline seen from `point_m` (2,) at the azimuths (n,), with all errors of posts; None without such."""
         return None
@@ -226,6 +230,13 @@ class Terrain(ABC):
     def facts(self) -> dict[str, Any]:
         """Facts about the ground that `startrack terrain show` prints, as JSON values; "kind" is one of them."""
         return {"kind": "other"}
+
+    def costs_s(self) -> dict[str, float]:
+        """About how long work on this machine takes [s], measured on a part of it; {} where nothing takes long.
+
+        "horizons" is the table that `prepare` computes, where it is not there; "frame" the position of an image.
+        """
+        return {}
 
 
 class ForwardingTerrain(Terrain):

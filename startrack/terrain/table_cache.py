@@ -19,7 +19,7 @@ from startrack.core.errors import BadInput
 from startrack.core.files import hold_lock
 from startrack.core.runner import count_cores
 from startrack.core.stored import read_sealed, write_sealed
-from startrack.core.types import Array, Ints
+from startrack.core.types import Ints
 from startrack.terrain.horizon_table import (
     AZIMUTH_BINS,
     FARTHEST,
@@ -29,6 +29,8 @@ from startrack.terrain.horizon_table import (
     Square,
     quantize_fields,
 )
+from startrack.terrain.map_cost import seconds_of_table
+from startrack.terrain.map_ends import unknown_elevations_rad
 from startrack.terrain.protocol import Progress
 from startrack.terrain.table_kernel import fill_cells
 
@@ -36,8 +38,7 @@ if TYPE_CHECKING:
     from startrack.terrain.traced_map import TracedMap
 
 LOG = logging.getLogger(__name__)
-VERSION = 6  # of the tracing and of the table's format
-UNKNOWN_FROM = 12  # points across the square at which the ends of the maps are looked up
+VERSION = 7  # of the tracing and of the table's format
 
 # Terrains that need the same table share one in memory, for as long as one of them lives.
 TABLES_IN_MEMORY: WeakValueDictionary[str, HorizonTable] = WeakValueDictionary()
@@ -107,7 +108,8 @@ def load_or_build_table(ground: TracedMap, progress: Progress | None = None) -> 
         if table is None:
             if os.path.lexists(path_of_table(key)):
                 LOG.warning("the table of horizons %s is damaged: made anew", path_of_table(key))
-            LOG.info("horizons of %s: computed now, once; this may take minutes", ground.name)
+            about_s = seconds_of_table(ground)
+            LOG.info("horizons of %s: computed now, once; this takes about %.2g s", ground.name, about_s)
             start = clock.perf_counter()
             table = build_table(ground, progress)
             is_kept, path = keep_table(key, table), path_of_table(key)
@@ -142,7 +144,7 @@ def build_table(ground: TracedMap, progress: Progress | None = None) -> HorizonT
     centres, half_turn = square.centres_m, np.pi / AZIMUTH_BINS
     middles = (np.arange(AZIMUTH_BINS) + 0.5) * 2 * np.pi / AZIMUTH_BINS
     sines, cosines = np.sin(middles), np.cos(middles)
-    cells = np.flatnonzero(np.hypot(*centres.T) < square.reach_m + 1.42 * square.half_m)
+    cells = square.cells_within_reach
     done = 0
 
     def trace_cells(part: Ints) -> int:
@@ -160,20 +162,4 @@ def build_table(ground: TracedMap, progress: Progress | None = None) -> HorizonT
                 progress(done, len(cells))
     finally:
         pool.shutdown(cancel_futures=True)  # an interrupted build does not wait for the other parts
-    return HorizonTable(square, values, _unknown_rad(ground))
-
-
-def _unknown_rad(ground: TracedMap) -> Array:
-    """(AZIMUTH_BINS,) elevation below which ground beyond the maps might be seen from somewhere in the search area."""
-    line = np.linspace(-1, 1, UNKNOWN_FROM) * ground.search_radius_m
-    places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    places = places[np.hypot(*places.T) <= ground.search_radius_m]
-    bins = np.repeat((np.arange(AZIMUTH_BINS)[:, None] + [0.02, 0.5, 0.98]).ravel(), len(places))
-    azimuths, where = bins * 2 * np.pi / AZIMUTH_BINS, np.tile(places, (3 * AZIMUTH_BINS, 1))
-    tan, _, edge = ground.with_voids().horizons(where, azimuths)
-    up = ground.ground_m(places) + ground.camera_height_m
-    away = where + edge[:, None] * np.stack([np.sin(azimuths), np.cos(azimuths)], axis=-1)
-    drop = np.sum(np.minimum(np.abs(away), 1e7) ** 2, axis=-1) / (2 * ground.ground.radius_m)
-    possible = (ground.ground.highest_m - drop - np.tile(up, 3 * AZIMUTH_BINS)) / edge + ground.ground.sag_per_m * edge
-    unknown = np.where((edge < 1e9) & (possible > tan), np.arctan(possible), -np.pi / 2)
-    return np.asarray(unknown.reshape(AZIMUTH_BINS, -1).max(axis=1))
+    return HorizonTable(square, values, unknown_elevations_rad(ground))

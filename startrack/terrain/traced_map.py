@@ -17,6 +17,7 @@ from startrack.terrain.earth_projection import EarthProjection
 from startrack.terrain.ground import Ground, ground_up_m, pack_maps
 from startrack.terrain.horizon_kernel import surfaces
 from startrack.terrain.horizon_table import AZIMUTH_BINS, FIELDS, HorizonTable, Square
+from startrack.terrain.map_cost import seconds_of_frame, seconds_of_table
 from startrack.terrain.projection import Projection
 from startrack.terrain.protocol import Progress, Terrain
 from startrack.terrain.raster import Raster
@@ -158,6 +159,11 @@ class TracedMap(Terrain):
         """Remove the table of horizons from memory and disk."""
         self.__dict__.pop("table", None)
         discard_table(self.table_key)
+
+    def costs_s(self) -> dict[str, float]:
+        """See `Terrain`."""
+        table = {} if self.is_prepared else {"horizons": seconds_of_table(self)}
+        return table | {"frame": seconds_of_frame(self)}
 
     def without_table(self) -> Self:
         """The same map whose traces begin at the camera; see `Terrain`."""

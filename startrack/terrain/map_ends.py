@@ -1,0 +1,85 @@
+"""Where the maps of a ground end, and how high unknown ground beyond could stand: no evidence is taken below that."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from startrack.core.types import Array, Bools
+from startrack.frames import latlon_from_enu
+from startrack.terrain.horizon_table import AZIMUTH_BINS
+
+if TYPE_CHECKING:
+    from startrack.terrain.traced_map import TracedMap
+
+UNKNOWN_FROM, RIM_POINTS = 12, 48  # places across the search area, and on its rim, at which ends are looked up
+LEAST_END_M = 1.0  # distance from a camera to the ends of the maps: nearer ones count as at it
+MIDDLES_RAD = (np.arange(AZIMUTH_BINS) + 0.5) * 2 * np.pi / AZIMUTH_BINS
+MOST_STEPS = 1000  # from the origin to the farthest post of the maps
+
+
+def unknown_elevations_rad(ground: TracedMap) -> Array:
+    """(AZIMUTH_BINS,) elevation below which ground off the maps might be seen from somewhere in the search area.
+
+    -pi/2 where none might.
+    """
+    line = np.linspace(-1, 1, UNKNOWN_FROM) * ground.search_radius_m
+    places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    around = np.arange(RIM_POINTS) * 2 * np.pi / RIM_POINTS
+    rim = ground.search_radius_m * np.stack([np.sin(around), np.cos(around)], axis=-1)
+    places = np.vstack([places[np.hypot(*places.T) < ground.search_radius_m], rim])
+    bins = np.repeat((np.arange(AZIMUTH_BINS)[:, None] + [0.02, 0.5, 0.98]).ravel(), len(places))
+    azimuths, where = bins * 2 * np.pi / AZIMUTH_BINS, np.tile(places, (3 * AZIMUTH_BINS, 1))
+    tan, _, edge = ground.with_voids().horizons(where, azimuths)
+    edge = np.maximum(edge, LEAST_END_M)
+    up = ground.ground_m(places) + ground.camera_height_m
+    away = where + edge[:, None] * np.stack([np.sin(azimuths), np.cos(azimuths)], axis=-1)
+    drop = np.sum(np.minimum(np.abs(away), 1e7) ** 2, axis=-1) / (2 * ground.ground.radius_m)
+    possible = (ground.ground.highest_m - drop - np.tile(up, 3 * AZIMUTH_BINS)) / edge + ground.ground.sag_per_m * edge
+    unknown = np.where((edge < 1e9) & (possible > tan), np.arctan(possible), -np.pi / 2)
+    return np.asarray(unknown.reshape(AZIMUTH_BINS, -1).max(axis=1))
+
+
+def distances_to_end_m(ground: TracedMap) -> Array:
+    """(AZIMUTH_BINS,) distance from the origin [m] at which the maps end or have a void, in the middle of each bin."""
+    posts_m = np.array([one.post_m for one in ground.maps])
+    farthest_m = 1.5 * max(float(np.hypot(*one.heights_m.shape)) * one.post_m for one in ground.maps)
+    s = np.linspace(0.0, farthest_m, int(min(farthest_m / posts_m.min(), MOST_STEPS)) + 1)[1:]
+    places = latlon_from_enu(ground.site, np.outer(np.sin(MIDDLES_RAD), s), np.outer(np.cos(MIDDLES_RAD), s), 0.0)
+    known = np.zeros((AZIMUTH_BINS, len(s)), dtype=bool)
+    for one in ground.maps:
+        known |= np.isfinite(one.sample(one.row_column(*places)))
+    return np.asarray(np.where(known.all(axis=1), farthest_m, s[np.argmin(known, axis=1)]))
+
+
+def facts_of_ends(ground: TracedMap, unknown_rad: Array) -> dict[str, Any]:
+    """Where the maps of a `ground` end, as JSON values; `unknown_rad` is that of `unknown_elevations_rad`."""
+    end_m = distances_to_end_m(ground)
+    nearest = int(np.argmin(end_m))
+    highest_post_m = max(float(np.nanmax(one.heights_m)) for one in ground.maps)
+    return {
+        "nearest_m": round(float(end_m[nearest])),
+        "nearest_azimuth_deg": round(float(np.degrees(MIDDLES_RAD[nearest]))),
+        "highest_beyond_m": round(max(ground.highest_beyond_m, highest_post_m)),
+        "highest_beyond_from": "map" if ground.highest_beyond_m <= highest_post_m else "stated",
+        "missing": [
+            {
+                "from_deg": first * 360 // AZIMUTH_BINS, "to_deg": (last * 360 // AZIMUTH_BINS - 1) % 360 + 1,
+                "nearest_m": round(float(np.take(end_m, range(first, last), mode="wrap").min())),
+                "up_to_deg": round(float(np.degrees(np.take(unknown_rad, range(first, last), mode="wrap").max())), 1),
+            }
+            for first, last in circular_runs(unknown_rad > -np.pi / 2)
+        ],
+    }  # fmt: skip
+
+
+def circular_runs(flags: Bools) -> list[tuple[int, int]]:
+    """First index, and last plus one, of each run of True around the circle; indices may exceed the length."""
+    n = len(flags)
+    if flags.all():
+        return [(0, n)]
+    offset = int(np.argmin(flags))  # of an element that is False
+    steps = np.diff(np.concatenate([[0], np.roll(flags, -offset).astype(np.int8), [0]]))
+    first, last = (np.flatnonzero(steps == sign) + offset for sign in (1, -1))
+    return [(int(a) % n, int(a) % n + int(b - a)) for a, b in zip(first, last, strict=True)]

@@ -12,7 +12,7 @@ from startrack.core.smooth_image import SmoothImage
 from startrack.detection import Detector
 from startrack.detection.classify import detection_threshold
 from startrack.detection.frame import Frame, SourceNoise, bin_frame, binning_factor
-from startrack.detection.peaks import _group_touching, bright_pixels
+from startrack.detection.peaks import bright_pixels, group_touching
 
 SIZE = 1024
 BACKGROUND, READ_NOISE = 94.0, 2.5
@@ -57,7 +57,7 @@ def test_binned_frames_keep_flux_and_noise() -> None:
 def test_touching_pixels_are_grouped_as_opencv_groups_them() -> None:
     dead = np.random.default_rng(3).random((90, 120)) < 0.2
     row, column = np.nonzero(dead)
-    count, label = _group_touching(row, column)
+    count, label = group_touching(row, column)
     expected_count, expected = cv2.connectedComponents(dead.astype(np.uint8))
     assert count == expected_count - 1 > 20
     assert len(set(zip(label.tolist(), expected[row, column].tolist(), strict=True))) == count

@@ -52,7 +52,8 @@ def test_gaia_stars_are_added_to_the_whole_catalogue_only(located, monkeypatch):
     whole = load_catalog().at(result.exposure.time_utc, None)
     number = np.searchsorted(np.sort(whole.hip), result.stars.hip[result.identification.star])
     rows = np.argsort(whole.hip)[number]
-    full = replace(result, stars=whole, identification=replace(result.identification, star=rows))
+    names = replace(result.names, stars=result.names.stars.take(slice(0)))
+    full = replace(result, stars=whole, identification=replace(result.identification, star=rows), names=names)
     deep = measurement.add_gaia_stars(full, site)
     assert deep.catalog_name == "hipparcos+gaia"
     assert np.array_equal(deep.stars.hip[deep.identification.star], whole.hip[rows])

@@ -18,9 +18,11 @@ from startrack.chain.stages import Detected, Inputs, Measured, Oriented, Refused
 from startrack.core.types import Mode
 from startrack.localization.rim_plane import point_fix
 from startrack.output import write_annotated
-from startrack.output.picture.annotate import PANEL_WIDTH, STATUS, annotate
+from startrack.output.picture.annotate import PANEL_WIDTH, STATUS, _legend, annotate
 from startrack.output.picture.backdrop import View, fit_to_canvas, remove_hot_pixels
-from startrack.output.picture.canvas import Ink
+from startrack.output.picture.canvas import TEXT_PX, Canvas, Ink, text_box
+from startrack.output.picture.marks import draw_marks, overlay_of
+from startrack.output.tables import status_of
 
 
 def has_colour_near(picture, place, colour, reach=2, tolerance=60):
@@ -119,14 +121,60 @@ def test_hot_pixels_go_and_stars_stay(psf_sigma_px):
 def test_detections_beyond_the_image_circle_are_not_drawn(located, view):
     found = located.result.detections
     astray = replace(found, xy_px=np.concatenate([[[20.0, 20.0]], found.xy_px[1:]]))
-    others = replace(
-        located.result.identification,
-        detection=located.result.identification.detection[located.result.identification.detection != 0],
-        star=located.result.identification.star[located.result.identification.detection != 0],
-    )
-    drawn = annotate(replace(located.result, detections=astray, identification=others))
+    names = located.result.names
+    others = replace(names, stars=names.stars.take(located.result.identification.detection != 0),
+                     is_nameless=names.is_nameless | (np.arange(len(found)) == 0))  # fmt: skip
+    drawn = annotate(replace(located.result, detections=astray, names=others))
     x, y = np.rint(view.canvas_px((20.0, 20.0))).astype(int)
     assert np.ptp(drawn[y - 12 : y + 13, x - 12 : x + 13].reshape(-1, 3), axis=0).max() == 0
+
+
+def test_names_lie_on_no_other_name_and_no_bright_mark(located, view):
+    result = located.result
+    canvas = Canvas(2048, 2048)
+    overlay = overlay_of(result)
+    draw_marks(canvas, view, result, overlay)
+    names = [(text, text_box(xy, text, anchor, size)) for xy, text, anchor, size, _, _ in canvas._texts]
+    assert len(names) > 20
+    seen = result.names.stars
+    first = seen.xy_px[np.argsort(result.stars.v_mag[seen.star], kind="stable")[:20]]
+    hidden_px = result.light.xy_px[status_of(result.light) == "hidden"][:10]
+    marks = [view.canvas_px(place) for place in (*first, *hidden_px, *(body[1:3] for body in overlay["bodies"]))]
+    for k, (text, (left, top, right, bottom)) in enumerate(names):
+        assert "hidden" not in text
+        assert not any(left < x < right and top < y < bottom for x, y in marks), text
+        for other, (x0, y0, x1, y1) in names[:k]:
+            assert not (left < x1 and x0 < right and top < y1 and y0 < bottom), (text, other)
+
+
+def test_a_letter_of_the_compass_steps_aside_for_a_star(located, view):
+    overlay = overlay_of(located.result)
+    north = next(tick for tick in overlay["compass"] if tick[0] == 0)
+
+    def place_of_north(bodies):
+        canvas = Canvas(2048, 2048)
+        draw_marks(canvas, view, located.result, overlay | {"bodies": bodies})
+        return next(xy for xy, text, *_ in canvas._texts if text == "N")
+
+    assert np.allclose(place_of_north([]), view.canvas_px(north[3]))
+    assert np.hypot(*(place_of_north([["Venus", *north[3], False]]) - view.canvas_px(north[3]))) > 2 * TEXT_PX / 3
+
+
+def test_the_most_significant_of_many_sources_without_a_name_are_drawn(located):
+    result = located.result
+    overlay = overlay_of(result)
+    nameless = result.names.is_nameless & (
+        result.camera.angle_rad(result.detections.xy_px) <= result.camera.max_angle_rad
+    )
+    assert len(overlay["others"]) == np.count_nonzero(nameless & (result.detections.snr > 10.0))
+    assert len(overlay["others"]) + overlay["undrawn"] == np.count_nonzero(nameless)
+    detected = extend(result, Detected)
+    assert len(overlay_of(detected)["others"]) == 300
+    assert overlay_of(detected)["undrawn"] > 0
+    assert any(
+        f"{overlay['undrawn']} further point sources not drawn" in words
+        for _, _, words in _legend(result, False, overlay["undrawn"])
+    )
 
 
 def test_truth_is_drawn_only_when_given(picture, located):

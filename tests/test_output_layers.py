@@ -74,7 +74,9 @@ def test_marks_are_where_the_exposure_shows_them(layers, located):
     others = {tuple(one) for one in layers.overlay["others"]}
     assert not named & others
     inside = camera.angle_rad(result.detections.xy_px) <= camera.max_angle_rad
-    assert len(layers.overlay["others"]) == inside.sum() - len(result.identification.detection)
+    assert len(layers.overlay["others"]) + layers.overlay["undrawn"] == inside.sum() - len(
+        result.identification.detection
+    )
     north = next(tick for tick in layers.overlay["compass"] if tick[0] == 0)
     foot = camera.unproject(np.array(north[1])) @ located.truth.R_cam_enu
     assert abs(np.arctan2(foot[0], foot[1])) < 0.01

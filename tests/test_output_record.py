@@ -71,8 +71,8 @@ def flat_frame(result):
 def test_the_keys_are_those_of_the_format(fix):
     assert list(fix)[:5] == ["format", "image", "status", "reason", "message"]
     assert list(fix)[5:] == [
-        "advice", "position", "modes", "search", "attitude", "middle", "explain", "stars", "evidence", "sky", "clock",
-        "timing_ms", "provenance", "warnings",
+        "advice", "position", "modes", "search", "attitude", "middle", "explain", "stars", "bodies", "evidence", "sky",
+        "clock", "timing_ms", "provenance", "warnings",
     ]  # fmt: skip
     for part, keys in KEYS.items():
         assert " ".join(fix[part]) == keys

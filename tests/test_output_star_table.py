@@ -16,8 +16,8 @@ from startrack.output import Column, ecsv_text, write_star_table
 from startrack.output.tables import star_table_text, status_of
 
 COLUMNS = (
-    "catalog_id hip name v_mag azimuth_deg elevation_deg x_px y_px x_measured_px y_measured_px expected_e flux_e "
-    "sigma_e evidence status cause"
+    "catalog_id hip name v_mag azimuth_deg elevation_deg x_px y_px x_measured_px y_measured_px saturated "
+    "expected_e flux_e sigma_e evidence status cause"
 )
 
 
@@ -83,7 +83,7 @@ def test_without_a_terrain_there_are_matches_and_predictions(located, tmp_path):
     result = extend(located.result, Oriented, terrain=None)
     write_star_table(tmp_path / "t.ecsv", result, catalog=True)
     table = Table.read(tmp_path / "t.ecsv", format="ascii.ecsv")
-    assert table.colnames == [*COLUMNS.split()[:4], *COLUMNS.split()[6:10], "status"]
+    assert table.colnames == [*COLUMNS.split()[:4], *COLUMNS.split()[6:11], "status"]
     matched = ~np.ma.getmaskarray(table["x_measured_px"])
     assert matched.sum() == len(result.identification)
     assert (~matched).sum() > 100
@@ -100,8 +100,8 @@ def test_a_full_table_has_a_line_for_each_star(located):
     light = located.result.light
     many = np.resize(np.arange(len(light.star)), 35_000)
     rows = {name: getattr(light, name)[many] for name in vars(light) if name != "causes"}
-    nobody = replace(located.result.identification, detection=np.empty(0), star=np.empty(0))
-    result = replace(located.result, light=replace(light, **rows), identification=nobody)
+    nobody = replace(located.result.names, stars=located.result.names.stars.take(slice(0)))
+    result = replace(located.result, light=replace(light, **rows), names=nobody)
     text = star_table_text(result)
     assert text.count("\n") > 35_000
 

@@ -9,6 +9,7 @@ from startrack.catalog.sky import (
     apparent_bodies,
     apparent_stars,
     bodies,
+    bodies_from_centre,
     catalog_rays,
     daylight_warnings,
     is_below_horizon,
@@ -27,7 +28,7 @@ from startrack.catalog.stars import (
 
 __all__ = [
     "LOWEST_STAR_RAD", "MOST_BELOW_PART", "NIGHT_RAD", "Sky", "StarCatalog", "airmass_at", "apparent_bodies",
-    "apparent_stars", "bodies", "catalog_rays", "daylight_warnings", "has_deep_catalog", "hipparcos_rows_in_deep",
-    "is_below_horizon",
-    "load_catalog", "load_deep_catalog", "proper_name_designations", "sky_at", "star_names", "sun_elevation_rad",
+    "apparent_stars", "bodies", "bodies_from_centre", "catalog_rays", "daylight_warnings", "has_deep_catalog",
+    "hipparcos_rows_in_deep", "is_below_horizon", "load_catalog", "load_deep_catalog", "proper_name_designations",
+    "sky_at", "star_names", "sun_elevation_rad",
 ]  # fmt: skip

@@ -16,6 +16,7 @@ from startrack.catalog.stars import JULIAN_YEAR_S, StarCatalog
 from startrack.core.types import Array, Body, Bools, Stars
 from startrack.frames import (
     LOWEST_PREDICTED_RAD,
+    MOON_RADIUS_M,
     SPEED_OF_LIGHT_M_S,
     R_enu_icrs,
     Site,
@@ -35,6 +36,7 @@ NIGHT_RAD = float(np.radians(-18.0))  # elevation of the Sun below which the sky
 LOWEST_STAR_RAD = np.radians(-3.0)  # apparent elevation, as seen from a mountain
 MOST_BELOW_PART = 0.01  # of the identified stars; right sites: 0; a wrong sign of latitude or longitude: 0.3 to 0.5
 DEFAULT_SITE = Site("moon", 0.0, 0.0)  # without a site; at most 0.7 arcsec of aberration off
+EQUATOR_M = {"earth": 6_378_137.0, "moon": MOON_RADIUS_M}  # radius: WGS 84, and the sphere of the Moon's maps
 ASTRONOMICAL_UNIT_M = 149_597_870_700.0  # IAU 2012, resolution B2
 
 
@@ -106,6 +108,11 @@ def apparent_bodies(site: Site, time_utc: datetime) -> tuple[Body, ...]:
         return tuple(found)
     R = R_enu_icrs(site, time_utc)
     return tuple(replace(body, ray_icrs=air.refract(body.ray_icrs, R)) for body in found)
+
+
+def bodies_from_centre(of: str, time_utc: datetime) -> tuple[Body, ...]:
+    """Planets, Sun, and Earth or Moon at `time_utc` as seen from the centre `of` the body "earth" or "moon"."""
+    return tuple(bodies(Site(of, 0.0, 0.0, -EQUATOR_M[of]), time_utc))
 
 
 def sun_elevation_rad(site: Site, time_utc: datetime) -> float:

@@ -104,12 +104,13 @@ def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
     limiting_mag = scale.zero_mag - 2.5 * np.log10(SURE_SIGMAS * filtered_noise_e(oriented.detections))
     if limiting_mag < COMPLETE_V_MAG:
         return oriented
-    deep = load_deep_catalog()
+    deep, row, named = load_deep_catalog(), hipparcos_rows_in_deep(), oriented.names.stars
     return replace(
         oriented,
         catalog_name=deep.name,
         stars=apparent_stars(deep, when, site),
-        identification=replace(found, star=hipparcos_rows_in_deep()[found.star]),
+        identification=replace(found, star=row[found.star]),
+        names=replace(oriented.names, stars=replace(named, star=row[named.star])),
     )
 
 

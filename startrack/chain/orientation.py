@@ -10,10 +10,22 @@ import numpy as np
 
 from startrack.camera import REFRACTION_CONTAINED, Camera
 from startrack.catalog import StarCatalog, apparent_bodies, apparent_stars
+from startrack.chain.bright_stars import name_bright_sources
 from startrack.chain.sky_state import stating_sky
+from startrack.chain.source_names import identified_names
 from startrack.chain.stages import Detected, Identified, Inputs, Oriented, Settings, extend
 from startrack.core.compilation import announce_compilation
-from startrack.core.types import Array, BadInput, Detections, Exposure, NotIdentified, Stars, TooFewStars
+from startrack.core.types import (
+    Array,
+    BadInput,
+    Body,
+    Detections,
+    Exposure,
+    Identification,
+    NotIdentified,
+    Stars,
+    TooFewStars,
+)  # fmt: skip
 from startrack.detection import Detector
 from startrack.estimation.attitude import solve_attitude
 from startrack.estimation.lens_correction import correct_lens
@@ -110,15 +122,19 @@ def identify_stars(
     near_R_cam_icrs = None if near is None else near.R_cam_icrs_at(when, site)
     with stating_sky(detected.exposure, detected.detections, camera, stars.v_mag, on_moon=_on_moon(detected)):
         found = settings.identifier(detected.detections, camera, stars, near_R_cam_icrs)
+    bodies = apparent_bodies(site, when) if site is not None and when is not None else ()
+    return _identified(detected, camera, stars, bodies, site, found)
+
+
+def _identified(
+    detected: Detected, camera: Camera, stars: Stars, bodies: tuple[Body, ...], site: Site | None,
+    found: Identification,
+) -> Identified:  # fmt: skip
+    """The next value, with the names of the stars that were `found`."""
     return extend(
-        detected,
-        Identified,
-        camera=camera,
-        stars=stars,
-        bodies=apparent_bodies(site, when) if site is not None and when is not None else (),
-        site=site,
-        identification=found,
-    )
+        detected, Identified, camera=camera, stars=stars, bodies=bodies, site=site, identification=found,
+        names=identified_names(detected.detections, found, bodies),
+    )  # fmt: skip
 
 
 def identify_unknown_lens(
@@ -147,9 +163,7 @@ def _identify_at_fovs(detected: Detected, fovs_rad: Array, stars: Stars, near_sk
             if len(fovs_rad) == 1:
                 raise
             continue
-        return extend(
-            detected, Identified, camera=found.camera, stars=stars, bodies=(), identification=found.identification
-        )
+        return _identified(detected, found.camera, stars, (), None, found.identification)
     step = (fovs_rad[-1] / fovs_rad[0]) ** (1 / (len(fovs_rad) - 1))  # each is the middle of a part of the range
     low, high = np.degrees([fovs_rad[0], fovs_rad[-1] * step]) * 2 / (1 + step)
     raise NotIdentified(
@@ -170,7 +184,14 @@ def solve_orientation(identified: Identified, has_file: bool = True) -> Oriented
         identified.stars.rays_icrs[found.star], found.R_cam_icrs,
     )  # fmt: skip
     camera, fit, change_px = correct_lens(*matches) if has_file else (matches[0], solve_attitude(*matches), 0.0)
-    return extend(identified, Oriented, camera=camera, attitude_fit=fit, lens_change_px=change_px)
+    names = name_bright_sources(
+        detections, camera, identified.stars, found, fit.attitude.R_cam_icrs, identified.bodies,
+        identified.exposure.time_utc,
+    )  # fmt: skip
+    return extend(
+        identified, Oriented, camera=camera, attitude_fit=fit, lens_change_px=change_px, names=names,
+        bodies=names.bodies,
+    )  # fmt: skip
 
 
 def check_one_attitude(oriented: Oriented) -> None:

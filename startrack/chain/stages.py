@@ -18,6 +18,7 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.catalog import daylight_warnings
 from startrack.chain.near_attitude import NearAttitude
+from startrack.chain.source_names import SourceNames
 from startrack.core.errors import Reason
 from startrack.core.types import (
     Array,
@@ -132,6 +133,7 @@ class Identified(Detected):
     bodies: tuple[Body, ...]  # planets, Sun, Moon, Earth; empty without a site and a time
     site: Site | None = None  # that the stars are seen from; None: not known
     identification: Identification
+    names: SourceNames  # what the sources are; with an attitude the brightest too
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -127,7 +127,7 @@ def _saturated_blobs(dead: NDArray[np.bool_] | None, margin: int) -> Array:
     row, column = np.divmod(np.flatnonzero(dead), width)
     if not len(row):
         return np.zeros((0, 2))
-    count, label = _group_touching(row, column)
+    count, label = group_touching(row, column)
     area = np.bincount(label, minlength=count)
     middle = np.stack([np.bincount(label, q, count) / np.maximum(area, 1) for q in (column, row)], axis=1)
     inside = (middle >= margin).all(axis=1) & (middle[:, 0] < width - margin) & (middle[:, 1] < height - margin)
@@ -136,7 +136,7 @@ def _saturated_blobs(dead: NDArray[np.bool_] | None, margin: int) -> Array:
     return np.asarray(middle[chosen], dtype=np.float64)
 
 
-def _group_touching(row: Ints, column: Ints) -> tuple[int, Ints]:
+def group_touching(row: Ints, column: Ints) -> tuple[int, Ints]:
     """Number of groups of touching pixels (corners count), and the group (n,) of each pixel."""
     i, j = _without_gaps(row), _without_gaps(column)
     mask = np.zeros((i.max() + 1, j.max() + 1), dtype=np.uint8)

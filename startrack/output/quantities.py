@@ -11,21 +11,30 @@ from startrack.chain import Detected, Identified, Inputs, Located, Measured, Ori
 from startrack.core.ecsv import Column
 from startrack.frames import format_utc
 from startrack.output.quantities_pose import ATTITUDE_QUANTITIES, MIDDLE_QUANTITIES, POSITION_QUANTITIES
-from startrack.output.quantity import Listed, Quantity, Show, list_schema, show_everywhere
-from startrack.output.values import blocked_deg, chance_text, file_or_name, predicted_visible, ranges_text
+from startrack.output.quantity import Listed, Quantity, Show, list_schema, object_schema, show_everywhere
+from startrack.output.values import (
+    blocked_deg,
+    bodies_record,
+    chance_text,
+    file_or_name,
+    predicted_visible,
+    ranges_text,
+)
 
 Q = Quantity
+BODY = object_schema({"name": "text", "v_mag": "number", "x_px": "number", "y_px": "number"})
 LIGHT_QUANTITIES: tuple[Quantity, ...] = (
     Q("stars.detected", "", Detected, lambda v: len(v.detections), "point sources", "count", before=0, form="%d",
       shown=(Show("summary", "sources", "{} point sources", "stars.identified"),
              Show("text", "stars", "{} point sources"), Show("panel", "Stars", "{:,} point sources"),
              Show("page", "Point sources", "{:,}"))),
-    Q("stars.identified", "", Identified, lambda v: len(v.identification), "point sources with a name", "count",
+    Q("stars.identified", "", Identified, lambda v: len(v.names.stars), "sources with the name of a star", "count",
       before=0, form="%d",
       shown=(Show("summary", "stars", "{} stars"), Show("text", "stars", ", {} identified"),
              Show("panel", "Stars", ", {:,} identified"), Show("page", "Named", "{:,}")), listed=Listed("Stars", 0)),
-    Q("stars.unexplained", "", Identified, lambda v: v.identification.unexplained,
-      "significant point sources that no catalogue star explains; null: not identified", "count", before=None,
+    Q("stars.unexplained", "", Identified, lambda v: v.names.unexplained,
+      "significant point sources that no catalogue star and no planet explains; null: not identified", "count",
+      before=None,
       shown=(Show("text", "stars", ", {} significant ones unexplained"), Show("page", "Unexplained", "{:,}"))),
     Q("stars.measured", "", Measured, lambda v: int(v.light.usable.sum()), "catalogue stars whose light was measured",
       recorded=False,
@@ -46,6 +55,9 @@ LIGHT_QUANTITIES: tuple[Quantity, ...] = (
       shown=(Show("text", "stars", lambda p: f"; false alarm {chance_text(p)}"),
              Show("panel", "Residual", lambda p: f"   false alarm {chance_text(p)}"),
              Show("page", "Chance match", chance_text))),
+    Q("bodies", "", Oriented, bodies_record,
+      "list of `name`, `v_mag`, `x_px`, `y_px`: planets, Sun, Moon and Earth in the frame, where they must be; without "
+      "a site those that have a source there, without a time none", list_schema(BODY), before=[]),
     Q("evidence.blocked", "deg", Located, blocked_deg,
       "list of [from, to]: azimuths in which something on no map more likely hides the map's skyline than not; across "
       "north `to` is the smaller", list_schema(list_schema("number", count=2)), before=[], optional=True,

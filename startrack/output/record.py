@@ -99,9 +99,12 @@ def _camera_and_matches(value: Inputs | None) -> dict[str, Any]:
 
     matches = []
     if isinstance(value, Identified):
-        xy_px = value.detections.xy_px[value.identification.detection].tolist()
-        hips = value.stars.hip[value.identification.star].tolist()
-        matches = [{"hip": hip or None, "x_px": x, "y_px": y} for hip, (x, y) in zip(hips, xy_px, strict=True)]
+        named = value.names.stars
+        columns = (value.stars.hip[named.star].tolist(), named.xy_px.tolist(), named.saturated.tolist())
+        matches = [
+            {"hip": hip or None, "x_px": x, "y_px": y, "saturated": saturated}
+            for hip, (x, y), saturated in zip(*columns, strict=True)
+        ]
     camera = None if value is None or value.camera is None else camera_to_dict(value.camera)
     return {"camera": camera, "matches": matches}
 
@@ -119,7 +122,7 @@ def _point_sources(value: Inputs | None) -> dict[str, Any]:
 OWN_KEYS: dict[str, tuple[Callable[[Inputs | None], dict[str, Any]], tuple[str, ...]]] = {  # and the sections left out
     "fix": (lambda value: {"explain": []}, ()),
     "identification": (_camera_and_matches, OF_A_POSITION),
-    "detection": (_point_sources, (*OF_A_POSITION, "attitude", "middle")),
+    "detection": (_point_sources, (*OF_A_POSITION, "attitude", "middle", "bodies")),
 }
 
 

@@ -82,7 +82,9 @@ MATCH = object_schema({
     "hip": or_null({"type": "integer", "minimum": 1}, "Hipparcos number; null: the star has none"),
     "x_px": "number",
     "y_px": "number",
+    "saturated": schema_of_kind("flag", "whether its light is cut off: it may be named by place and brightness"),
 })  # fmt: skip
+BODIES = schema_of_kind(BY_PATH["bodies"].schema, BY_PATH["bodies"].description)
 POINT_SOURCE = object_schema({"x_px": "number", "y_px": "number", "flux_e": "number", "snr": "number"})
 HORIZON = object_schema(
     {
@@ -117,6 +119,7 @@ SCHEMAS: dict[str, Schema] = {
                 name: _section_or_null(SECTIONS[name])
                 for name in ("position", "search", "attitude", "middle", "evidence", "sky", "clock")
             },
+            "bodies": BODIES,
             "explain": list_schema("text", "with --explain: what a refused or wide answer would need"),
         },
         [
@@ -134,6 +137,7 @@ SCHEMAS: dict[str, Schema] = {
             "middle": _section_or_null(SECTIONS["middle"]),
             "camera": _section_or_null({"title": "Camera file", **camera_keys().schema()}),
             "matches": list_schema(MATCH),
+            "bodies": BODIES,
         },
         [_if_status("ok", _has("attitude", "camera")), _if_status("ok", {"required": ["matches"]})],
     ),

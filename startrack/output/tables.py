@@ -44,9 +44,9 @@ def star_table_text(value: Inputs, *, catalog: bool = False) -> str:
     """
     if not isinstance(value, Oriented):
         raise ValueError("no star table without identified stars")
-    light = value.light if isinstance(value, Measured) else None
+    light, named = value.light if isinstance(value, Measured) else None, value.names.stars
     if light is None and not catalog:
-        star = np.sort(value.identification.star)
+        star = np.sort(named.star)
         xy_px, _ = value.camera.project(value.stars.rays_icrs[star] @ value.attitude.R_cam_icrs.T)
     elif light is None:  # stars in the frame down to the depth of the matches
         faintest = float(value.stars.v_mag[value.identification.star].max(initial=-np.inf))
@@ -57,8 +57,10 @@ def star_table_text(value: Inputs, *, catalog: bool = False) -> str:
         star, xy_px = light.star, light.xy_px
     stars, hips = value.stars, value.stars.hip[star]
     measured_px = np.full((len(star), 2), np.nan)
-    _, row, match = np.intersect1d(star, value.identification.star, return_indices=True)
-    measured_px[row] = value.detections.xy_px[value.identification.detection[match]]
+    _, row, match = np.intersect1d(star, named.star, return_indices=True)
+    measured_px[row] = named.xy_px[match]
+    saturated = np.full(len(star), None)
+    saturated[row] = named.saturated[match]
     columns = [
         Column("catalog_id", stars.catalog_id[star], "string", description="source and number"),
         Column("hip", [hip or None for hip in hips.tolist()], "int64", description="Hipparcos number"),
@@ -77,6 +79,7 @@ def star_table_text(value: Inputs, *, catalog: bool = False) -> str:
         Column("y_px", xy_px[:, 1], "float64", "pix", "%.3f", "predicted"),
         Column("x_measured_px", measured_px[:, 0], "float64", "pix", "%.3f", centroid),
         Column("y_measured_px", measured_px[:, 1], "float64", "pix", "%.3f", centroid),
+        Column("saturated", saturated, "bool", description="whether that source is; empty: none is identified"),
     ]
     if light is not None:
         flux_e, sigma_e, llr = (np.where(light.usable, one, np.nan) for one in (light.flux_e, light.sigma_e, light.llr))

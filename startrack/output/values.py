@@ -211,3 +211,14 @@ def dominant_fact(at: At) -> str | None:
 def ranges_text(ranges: list[list[float]]) -> str:
     """Ranges of azimuth [deg] in words; empty where there are none."""
     return ", ".join(f"{start:.0f}° to {end:.0f}°" for start, end in ranges)
+
+
+def bodies_record(value: Oriented) -> list[dict[str, Any]]:
+    """Name, magnitude and predicted pixel of the planets, Sun, Moon and Earth of a `value` that lie in the frame."""
+    rays_icrs = np.array([body.ray_icrs for body in value.bodies]).reshape(-1, 3)
+    xy_px, inside = value.camera.project(rays_icrs @ value.attitude.R_cam_icrs.T)
+    return [
+        {"name": body.name, "v_mag": body.v_mag, "x_px": x, "y_px": y}
+        for body, (x, y), is_inside in zip(value.bodies, xy_px.tolist(), inside, strict=True)
+        if is_inside
+    ]

@@ -141,15 +141,20 @@ function skyView(detail, stars, name) {
       if (star.name) names.push([star.name, at, onSky(shownKind(star.kind)), r + 4]);
     }
     const bodies = chosen.has("bodies") ? marks.bodies : [];
-    for (const [, x, y, hidden] of bodies) ring(g, place([x, y]), hidden ? 6 : 9, onSky("body"), 2);
-    names.unshift(...bodies.map(([text, x, y, hidden]) => [hidden ? `${text} (hidden)` : text, place([x, y]), onSky("body"), 13]));
+    for (const [, x, y, hidden] of bodies) {
+      g.globalAlpha = hidden ? 0.6 : 1;
+      ring(g, place([x, y]), hidden ? 6 : 9, onSky("body"), 2);
+    }
+    g.globalAlpha = 1;
+    names.unshift(...bodies.map(([text, x, y]) => [text, place([x, y]), onSky("body"), 13]));
     if (chosen.has("names")) drawNames(v, g, names);
   };
   image.onload = () => view.redraw();
   image.src = picture.src;
   const redraw = () => view.redraw();
   if (placed.length) view.node.append(kindBoxes("Mark stars", KINDS, placed, chosen, redraw));
-  if (marks) view.node.append(kindBoxes("Also draw", LAYERS, layersWithin(marks, placed), chosen, redraw, (g, at, kind) => LAYER_SAMPLES[kind](g, at)));
+  const words = marks?.undrawn ? { ...LAYERS, others: [`${LAYERS.others[0]} (${say(marks.undrawn, 0)} further not drawn)`] } : LAYERS;
+  if (marks) view.node.append(kindBoxes("Also draw", words, layersWithin(marks, placed), chosen, redraw, (g, at, kind) => LAYER_SAMPLES[kind](g, at)));
   return view;
 }
 

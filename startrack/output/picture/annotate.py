@@ -126,17 +126,17 @@ def _draw_picture(
     top = (canvas.size[1] - size[1]) // 2
     canvas.pixels[top : top + size[1], : size[0]] = bare
     draw_marks(canvas, View(scale, (0.0, float(top)), size), value, overlay)
-    _draw_panel(canvas, size[0], outcome, truth_enu_m)
+    _draw_panel(canvas, size[0], outcome, truth_enu_m, overlay["undrawn"])
     return canvas.rendered_pixels()
 
 
-def _draw_panel(canvas: Canvas, left: float, outcome: Outcome, truth_enu_m: EastNorth) -> None:
-    """Fill the canvas from `left` to its right edge, top to bottom."""
+def _draw_panel(canvas: Canvas, left: float, outcome: Outcome, truth_enu_m: EastNorth, undrawn: int) -> None:
+    """Fill the canvas from `left` to its right edge, top to bottom; `undrawn` point sources have no ring."""
     width, height = canvas.size
     canvas.rectangle((left, 0, width - 1, height - 1), Ink.PANEL)
     left, right = left + TITLE_PX, width - TITLE_PX
     value = last_value(outcome)
-    facts, legend = _facts(value), _legend(value, truth_enu_m is not None)
+    facts, legend = _facts(value), _legend(value, truth_enu_m is not None, undrawn)
     legend_top = height - TITLE_PX - LINE_PX * len(legend)
     top = _draw_header(canvas, left, right, outcome)
     y = _draw_figures(canvas, (left, top, right, legend_top - FACT_STEP_PX * (len(facts) + 2)), value, truth_enu_m)
@@ -229,17 +229,18 @@ def _facts(value: Inputs) -> Rows:
     return found + rows("panel", stage_values(value))
 
 
-def _legend(value: Inputs, truth: bool) -> Legend:
+def _legend(value: Inputs, truth: bool, undrawn: int) -> Legend:
     found: Legend = []
     if isinstance(value, Identified):
         found += [("ring", Ink.IDENTIFIED, "star of the catalogue, identified")]
     if isinstance(value, Detected):
         other = "other point source" if isinstance(value, Identified) else "point source"
-        found += [("ring", Ink.DETECTION, other)]
+        further = f"; {undrawn:,} further point sources not drawn" if undrawn else ""
+        found += [("ring", Ink.DETECTION, f"{other}{further}")]
     if isinstance(value, Measured):
         found += [("cross", Ink.HIDDEN, "star that should be here, and is hidden")]
     if isinstance(value, Oriented) and value.bodies:
-        found += [("ring", Ink.BODY, "planet, Sun, Earth or Moon, where it must be")]
+        found += [("ring", Ink.BODY, "planet, Sun, Earth or Moon, where it must be; dim: hidden")]
     if isinstance(value, Located) and not value.fix.ambiguous:
         found += [("line", Ink.SKYLINE, "skyline of the terrain seen from the position found")]
         if value.sky is not None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from startrack.chain import Detected, Identified, Inputs, Located, Measured, Oriented
 from startrack.core.types import Array, Bools, Ints
+from startrack.estimation.match import SIGNIFICANT_SNR
 from startrack.frames import azel_from_rays, heading_pitch_roll_from_R_body_enu, rays_from_azel
 from startrack.output.picture.axes import known_runs
 from startrack.output.picture.backdrop import AZIMUTHS_RAD, KNEE_SNR, View, horizon_at_fix
@@ -23,7 +24,11 @@ COMPASS_DEG = np.arange(0.0, 60.0, 0.5)  # elevations from the horizontal up at 
 COMPASS = {0: "N", 90: "E", 180: "S", 270: "W"}
 TICK_RAD = np.radians([0.0, 2.2, 5.0])  # foot and top of a tick of the compass and the middle of its letter
 MAX_CROSSES = 150  # of hidden stars, the brightest: more would hide the picture
+MAX_OTHERS = 300  # of rings about sources without a name, the most significant
 MAX_NAMES = 20  # of stars, and half as many of hidden ones
+KEPT_CLEAR = 3 * MAX_NAMES  # of the marks of seen and of hidden stars, the brightest: no name lies on them
+MARK_PX = 8.0  # half the side of the box about a mark that is kept clear
+LETTER_PARTS = (1.0, 1.5, 2.0, 2.5)  # of the way from a tick's foot to the usual place of its letter
 FAINTEST_SNR = KNEE_SNR  # with the smallest mark
 BRIGHTEST_SNR = 300.0  # with the largest one
 
@@ -31,16 +36,18 @@ BRIGHTEST_SNR = 300.0  # with the largest one
 def overlay_of(value: Inputs) -> dict[str, Any]:
     """Marks of a stage's `value` for JSON: those that no table of the result holds. Pixels of the exposure.
 
-    `size` of the exposure; `others`, point sources that are no named star; `skyline`, its stretches in the frame;
+    `size` of the exposure; `others`, point sources that are no named star, and `undrawn`, how many more there are;
+    `skyline`, its stretches in the frame;
     `measured`, where the light of the sky shows it; `bodies`; `compass`, [azimuth_deg, foot, top, letter] of each tick;
     `nose`, [foot, top, letter] of the rover's nose, or None.
     """
     found: dict[str, Any] = {
-        "size": list(value.exposure.size_px), "others": [], "skyline": [], "measured": [], "bodies": [], "compass": [],
-        "nose": None,
+        "size": list(value.exposure.size_px), "others": [], "undrawn": 0, "skyline": [], "measured": [], "bodies": [],
+        "compass": [], "nose": None,
     }  # fmt: skip
     if isinstance(value, Detected):
-        found["others"] = _pairs(value.detections.xy_px[_other_sources(value)])
+        others, drawn = _other_sources(value)
+        found["others"], found["undrawn"] = _pairs(value.detections.xy_px[drawn]), len(others) - len(drawn)
     if isinstance(value, Oriented):
         found["bodies"] = _bodies(value)
     if isinstance(value, Measured):
@@ -58,15 +65,18 @@ def overlay_of(value: Inputs) -> dict[str, Any]:
     return found
 
 
-def _other_sources(value: Detected) -> Bools:
-    """Which detections (n,) are no identified star, and lie where light of the lens can reach."""
-    xy_px, camera = value.detections.xy_px, value.camera
-    others = np.ones(len(xy_px), dtype=bool)
+def _other_sources(value: Detected) -> tuple[Ints, Ints]:
+    """Detections that are no named star or body and lie where light of the lens can reach, and those that are drawn.
+
+    The most significant are drawn, the first of them first; beside identified stars only those that should be a star.
+    """
+    sources, camera = value.detections, value.camera
+    others = value.names.is_nameless.copy() if isinstance(value, Identified) else np.ones(len(sources), dtype=bool)
     if camera is not None and camera.size_px == value.exposure.size_px:
-        others = camera.angle_rad(xy_px) <= camera.max_angle_rad
-    if isinstance(value, Identified):
-        others[value.identification.detection] = False
-    return others
+        others &= camera.angle_rad(sources.xy_px) <= camera.max_angle_rad
+    found = np.flatnonzero(others)
+    drawn = found[np.argsort(-sources.snr[found], kind="stable")[:MAX_OTHERS]]
+    return found, drawn[sources.snr[drawn] > SIGNIFICANT_SNR] if isinstance(value, Identified) else drawn
 
 
 def _bodies(value: Oriented) -> list[list[Any]]:
@@ -120,40 +130,55 @@ def draw_marks(canvas: Canvas, view: View, value: Inputs, overlay: dict[str, Any
         canvas.curve(view.canvas_px(stretch), Ink.SKYLINE, 2.5)
     for place in overlay["measured"]:
         canvas.mark(view.canvas_px(place), "disc", 2.0, Ink.MEASURED)
+    seen, seen_px = _seen_stars(value)
+    for xy_px in (seen_px[:KEPT_CLEAR], hidden_px[:KEPT_CLEAR], [body[1:3] for body in overlay["bodies"]]):
+        for place in xy_px:
+            canvas.reserve(box_around(view.canvas_px(place), MARK_PX))
     _draw_compass(canvas, view, overlay)
     for name, x, y, behind in overlay["bodies"]:
         colour = mix_colours(Ink.BODY, Ink.SKY_DARK, 0.4) if behind else Ink.BODY
         canvas.mark(view.canvas_px((x, y)), "ring", 6.0 if behind else 9.0, colour)
-        words = f"{name} (hidden)" if behind else name
-        canvas.label(view.canvas_px((x, y)), words, colour, TEXT_PX, view.box)
-    if isinstance(value, Identified):
-        order = np.argsort(value.stars.v_mag[value.identification.star], kind="stable")
-        star = value.identification.star[order]
-        xy_px = value.detections.xy_px[value.identification.detection[order]]
-        faded = mix_colours(Ink.HIDDEN, Ink.SKY_DARK, 0.15)
-        for stars, px, most, colour, size in (
-            (star, xy_px, MAX_NAMES, Ink.PLAIN, LARGE_PX), (hidden, hidden_px, MAX_NAMES // 2, faded, TEXT_PX)
-        ):  # fmt: skip
+        any(
+            canvas.label(view.canvas_px((x, y)), name, colour, gap, view.box) for gap in (0.75 * LARGE_PX, 2 * LARGE_PX)
+        )
+    faded = mix_colours(Ink.HIDDEN, Ink.SKY_DARK, 0.15)
+    for stars, px, most, colour, size in (
+        (seen, seen_px, MAX_NAMES, Ink.PLAIN, LARGE_PX), (hidden, hidden_px, MAX_NAMES // 2, faded, TEXT_PX)
+    ):  # fmt: skip
+        if isinstance(value, Identified):
             first = names_of(value.stars.hip[stars[: 4 * most]])
             for place, name in [pair for pair in zip(px, first, strict=False) if pair[1]][:most]:
                 canvas.label(view.canvas_px(place), name, colour, 0.75 * LARGE_PX, view.box, size)
 
 
 def _draw_detections(canvas: Canvas, view: View, value: Detected) -> None:
-    """A green circle about each identified star; a grey one about each other detection inside the image circle."""
-    found = value.detections
-    identified = np.zeros(len(found), dtype=bool)
+    """A green circle about each named star; a grey one about each other detection that is drawn."""
+    sources, (_, others) = value.detections, _other_sources(value)
+    xy_px, snr, colours = sources.xy_px[others], sources.snr[others], [Ink.DETECTION] * len(others)
     if isinstance(value, Identified):
-        identified[value.identification.detection] = True
-    shown = np.flatnonzero(identified | _other_sources(value))
-    strength = np.log(np.maximum(found.snr, FAINTEST_SNR) / FAINTEST_SNR) / np.log(BRIGHTEST_SNR / FAINTEST_SNR)
-    places = view.canvas_px(found.xy_px).tolist()
+        named, known = value.names.stars, value.identification
+        star_snr = np.full(
+            len(named), BRIGHTEST_SNR
+        )  # of those that the identification has not, which are the brightest
+        _, row, match = np.intersect1d(named.star, known.star, return_indices=True)
+        star_snr[row] = sources.snr[known.detection[match]]
+        xy_px, snr = np.concatenate([xy_px, named.xy_px]), np.concatenate([snr, star_snr])
+        colours += [Ink.IDENTIFIED] * len(named)
+    strength = np.log(np.maximum(snr, FAINTEST_SNR) / FAINTEST_SNR) / np.log(BRIGHTEST_SNR / FAINTEST_SNR)
+    places = view.canvas_px(xy_px).tolist()
     # The bright ones last, on top; the faint ones dim, so that a thousand of them do not drown the stars.
-    for k in shown[::-1]:
+    for k in np.argsort(snr, kind="stable").tolist():
         bright = min(float(strength[k]), 1.0)
-        colour = Ink.IDENTIFIED if identified[k] else Ink.DETECTION
-        colour = mix_colours(colour, Ink.SKY_DARK, 0.6 * (1.0 - bright))
-        canvas.circle(places[k], 4.5 + 5.5 * bright, colour)
+        canvas.circle(places[k], 4.5 + 5.5 * bright, mix_colours(colours[k], Ink.SKY_DARK, 0.6 * (1.0 - bright)))
+
+
+def _seen_stars(value: Inputs) -> tuple[Ints, Array]:
+    """The named stars and their measured pixels, brightest first."""
+    if not isinstance(value, Identified):
+        return np.empty(0, dtype=np.int64), np.empty((0, 2))
+    named = value.names.stars
+    order = np.argsort(value.stars.v_mag[named.star], kind="stable")
+    return named.star[order], named.xy_px[order]
 
 
 def _hidden_stars(value: Inputs) -> tuple[Ints, Array]:
@@ -169,9 +194,11 @@ def _draw_compass(canvas: Canvas, view: View, overlay: dict[str, Any]) -> None:
     frame shows.
     """
     ticks = [(azimuth_deg, view.canvas_px(tick)) for azimuth_deg, *tick in overlay["compass"]]
-    for azimuth_deg, (_, _, letter) in ticks:
+    for azimuth_deg, (foot, _, letter) in ticks:
         if azimuth_deg in COMPASS:
-            canvas.text(letter, COMPASS[azimuth_deg], Ink.PLAIN, "mm", 2 * TEXT_PX, halo=True)
+            further = [foot + part * (letter - foot) for part in LETTER_PARTS]  # where no mark stands
+            place = next((one for one in further if canvas.is_free(box_around(one, TEXT_PX))), letter)
+            canvas.text(place, COMPASS[azimuth_deg], Ink.PLAIN, "mm", 2 * TEXT_PX, halo=True)
     if overlay["nose"] is not None:
         _draw_nose(canvas, *view.canvas_px(overlay["nose"]))
     for azimuth_deg, (foot, top, letter) in ticks:

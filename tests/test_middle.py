@@ -153,6 +153,20 @@ def test_pixels_that_are_not_square_are_found_with_the_lens(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("aspect", [0.9, 0.95, 1.067, 45 / 64])
+def test_a_narrow_picture_that_was_stretched_is_solved(aspect: float) -> None:
+    true = lens_camera(Pinhole(), 14, 700)
+    true = replace(true, focal_px=(true.focal_px[0], true.focal_px[0] / aspect), max_angle_rad=0.4)
+    seen, truth, R = picture(true, seed=9, limit=7.5, hidden=0.0)
+    found = identify_unknown_lens(seen, SIZE, np.radians(14), sky())
+    names, camera = found.identification, found.camera
+    assert np.mean(truth[names.detection] == names.star) >= 0.96
+    assert camera.focal_px[0] / camera.focal_px[1] == pytest.approx(aspect, rel=1e-3)
+    stars = sky().rays_icrs[names.star]
+    assert off_sigmas(oriented(camera, seen.xy_px[names.detection], stars, names.R_cam_icrs), true, R) < 3.5
+
+
+@pytest.mark.slow
 def test_a_frame_and_its_jpeg_agree_within_their_sigmas(tmp_path) -> None:
     import cv2
 

@@ -55,6 +55,9 @@ MAX_TRIED_BEYOND = 100_000  # further patterns without the image circle, in case
 CLUMP_FRACTION = 0.01  # of the frame: detections used for patterns are no closer
 CIRCLE_EDGE = 1.01  # of the disc's radius: detections beyond it are no stars
 FIELD_STEPS_PER_E = 4.0  # indexes are made for fields a fourth part of a factor e apart
+# Ratios fx / fy that are tried in a narrow field where square pixels explain nothing, each good for 2 % to either side:
+# those of video of 720 x 576 (15/16, 45/64) and 720 x 480 (9/8, 27/32), and pictures stretched or squeezed by a tenth.
+ASPECTS = (15 / 16, 16 / 15, 9 / 8, 8 / 9, 27 / 32, 45 / 64)
 LAST_FITS = 4  # of matching and fitting a lens that is found
 SAME_LENS_RAD = 0.05  # between attitudes
 ADVICE = "check the field of view and the focus; with a camera file fewer stars suffice"
@@ -150,12 +153,36 @@ class _Search:
         if not self.wide:
             shapes = (PINHOLE,) if self.narrow else MIDDLE_SHAPES
             yield from self._grow_all(guess_lenses(self.size_px, self.fov_rad, shapes), MAX_TRIED)
+            if self.narrow:
+                yield from self._stretched_lenses()
             return
         most = MAX_TRIED
         if self.circle is not None:
             yield from self._grow_all(guess_fisheyes(self.size_px, self.fov_rad, self.circle), MAX_TRIED_IN_CIRCLE)
             most = self.hypotheses.tried + MAX_TRIED_BEYOND
         yield from self._grow_all(guess_fisheyes(self.size_px, self.fov_rad, None), most)
+
+    def _stretched_lenses(self) -> Iterator[VerifiedLens]:
+        """Lenses of a narrow field whose pixels are not square, from detections stretched to square ones."""
+        for aspect in ASPECTS:
+            by_px = np.array([1.0 / aspect, 1.0])
+            shift_px = 0.5 * (by_px - 1.0)  # pixel centres are at integers
+            size_px = round(self.size_px[0] / aspect), self.size_px[1]
+            xy_px = self.hypotheses.xy_px * by_px + shift_px
+            search = HypothesisSearch(xy_px, size_px, self.hypotheses.near_sky, self.hypotheses.margin_rad)
+            search.tried = self.hypotheses.tried
+            seen = replace(
+                self.centroids,
+                xy_px=self.centroids.xy_px * by_px + shift_px,
+                covariance_px2=self.centroids.covariance_px2 * np.outer(by_px, by_px),
+            )
+            for lens in narrow_lenses(seen, search, self.fov_rad, self.rounded_sr, self.stars):
+                x, y = ((np.array(lens.camera.centre_px) - shift_px) / by_px).tolist()
+                focal_px = lens.camera.focal_px[0] * aspect, lens.camera.focal_px[1]
+                yield replace(
+                    lens, camera=replace(lens.camera, size_px=self.size_px, focal_px=focal_px, centre_px=(x, y))
+                )
+            self.hypotheses.tried = search.tried
 
     def settle(self, lens: VerifiedLens) -> tuple[VerifiedLens, Camera, Array]:
         """The `lens` with the stars of its last fit, the camera and attitude of that fit.

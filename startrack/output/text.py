@@ -75,8 +75,10 @@ def refusal_line(image: str, reason: str, message: str) -> str:
 def lens_text(camera: Camera) -> str:
     """The lens of a `camera` that an identification without a camera file found: model, focal length, centre."""
     x, y = camera.centre_px
+    fx, fy = camera.focal_px
+    focal = f"focal length {fx:.1f} px" if fx == fy else f"focal lengths {fx:.1f} and {fy:.1f} px ({fx / fy:.5f})"
     return (
-        f"lens found: {camera.lens.model}, focal length {camera.focal_px[0]:.1f} px, centre ({x:.1f}, {y:.1f}) px"
+        f"lens found: {camera.lens.model}, {focal}, centre ({x:.1f}, {y:.1f}) px"
         f"{_centre_error_text(camera)}, "
         f"{'mirrored' if camera.mirrored else 'not mirrored'}, known to {np.degrees(camera.calibrated_angle_rad):.0f} "
         "degrees off the axis"

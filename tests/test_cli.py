@@ -202,6 +202,14 @@ def test_the_exit_code_is_that_of_the_worst_image(folder, capsys, kinds, expecte
     assert len({tuple(record) for record in records}) == 1  # the same keys, solved, refused or unread
 
 
+@pytest.mark.parametrize("words", [["--help"], ["schema", "fix"]])
+def test_a_closed_output_is_a_closed_pipe(folder, words):
+    command = f'"{sys.executable}" -m startrack.cli.main {" ".join(words)} >&-'
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, env=environment, check=False)
+    assert (done.returncode, done.stderr) == (5, "")
+
+
 def test_without_json_there_is_one_line_for_each_image(folder, capsys):
     code, lines, err = run(capsys, "detect", stars(), black_image(), "missing.png", "--no-plots")
     assert code == BAD_INPUT

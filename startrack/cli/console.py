@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from threading import Event, Thread
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 from startrack.core import errors
 from startrack.core.errors import BadInput, NoSolution, Reason
@@ -86,6 +86,32 @@ def worst_code(codes: set[int]) -> int:
     """The exit code of a command whose images have these `codes`."""
     order = (errors.EXIT_INTERNAL_ERROR, errors.EXIT_BAD_INPUT, errors.EXIT_STOPPED, errors.EXIT_REFUSED)
     return next((code for code in order if code in codes), errors.EXIT_OK)
+
+
+def open_closed_streams() -> None:
+    """Open the standard streams that the shell has closed (>&-): output as a pipe that nobody reads, others as empty.
+
+    Their numbers are then taken, so that no file that is opened later gets what is printed.
+    """
+    if sys.stdin is None:
+        sys.stdin = _stream(0, os.open(os.devnull, os.O_RDONLY), "r")
+    if sys.stdout is None:
+        reader, writer = os.pipe()
+        os.close(reader)
+        sys.stdout = _stream(1, writer, "w")
+    if sys.stderr is None:
+        sys.stderr = _stream(2, os.open(os.devnull, os.O_WRONLY), "w")
+
+
+def _stream(number: int, descriptor: int, mode: Literal["r", "w"]) -> TextIO:
+    """The text stream of a `descriptor`, under its usual `number` if that is free."""
+    try:
+        os.fstat(number)
+    except OSError:
+        os.dup2(descriptor, number)
+        os.close(descriptor)
+        descriptor = number
+    return open(descriptor, mode, encoding="utf-8", errors="backslashreplace")
 
 
 def discard_stdout() -> None:

@@ -6,7 +6,8 @@ import argparse
 import importlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 
@@ -22,6 +23,7 @@ from startrack.cli.images import check_fov, compile_beside, near_attitude_of, pr
 from startrack.cli.report import write_page_of_images
 from startrack.core.errors import INTERNAL_ERROR, BadInput, BadOutput
 from startrack.core.files import make_folder, printable
+from startrack.core.memory import refusing_shortage
 from startrack.core.types import Exposure
 from startrack.exposure import read_mask, split_bag_path
 from startrack.identification import WIDE_FIELD_RAD, Identifier
@@ -70,12 +72,13 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve) -> int:
     if args.image_topic is not None and not any(split_bag_path(path) for path in args.images):
         args.usage_error("--image-topic is for ROS bags, and none is given")
     needed = NEEDED_LATER[:-1] if args.no_plots else NEEDED_LATER
-    Thread(target=lambda: [importlib.import_module(name) for name in needed]).start()
+    Thread(target=_import_beside, args=(needed,)).start()
     codes = set()
     for path, stem in zip(args.images, result_stems(args.images), strict=True):
         name = Path(path).name
         try:
-            record, line = _solve_image(args, path, Path(args.dir) / f"{stem}.{kind}.json", solve)
+            with refusing_shortage():
+                record, line = _solve_image(args, path, Path(args.dir) / f"{stem}.{kind}.json", solve)
         except BadInput as cause:
             record = output.refused_dict(path, cause.reason, str(cause), kind.removesuffix("s"))
             if isinstance(cause, BadOutput):
@@ -90,6 +93,13 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve) -> int:
         print_warnings(args, name, record.get("warnings", ()))
         codes.add(print_outcome(args, record, line))
     return worst_code(codes)
+
+
+def _import_beside(names: Sequence[str]) -> None:
+    """Import modules in a thread; one that cannot be imported raises where it is needed."""
+    with suppress(ImportError, MemoryError, OSError, RuntimeError):
+        for name in names:
+            importlib.import_module(name)
 
 
 def _solve_image(args: argparse.Namespace, path: str, out: Path, solve: Solve) -> Outcome:

@@ -21,11 +21,12 @@ from typing import Any, NoReturn
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: a second thread waits for work, 0.2 s a start
 
 from startrack import __version__
-from startrack.cli.console import discard_stdout, print_advice
+from startrack.cli.console import discard_stdout, open_closed_streams, print_advice
 from startrack.cli.flags import Command
 from startrack.core import errors
 from startrack.core.errors import BadInput, BadOutput, NoSolution
 from startrack.core.files import FULL_DISK
+from startrack.core.memory import check_memory, refusing_shortage
 
 COMMANDS = {  # name to the module of startrack.cli that declares it
     "locate": "image_commands", "batch": "image_commands", "track": "image_commands", "identify": "image_commands",
@@ -37,7 +38,8 @@ COMMANDS = {  # name to the module of startrack.cli that declares it
 USAGE, INTERRUPTED = 2, 130
 NEW_OBJECTS = 50_000  # until garbage is collected: Python's 700 cost a tenth of the time of a start
 EPILOG = """exit codes: 0 every image solved; 1 internal error; 2 usage; 3 an image ambiguous or refused; 4 bad input;
-5 batch: some image not solved; 5 also if the reader of the output has gone before the end (a closed pipe)
+5 batch: some image not solved; 5 also if the reader of the output has gone before the end (a closed pipe);
+130 interrupted (Ctrl-C)
 
 startrack locate sample_images/near-centre.png     where is the rover?
 startrack identify sky.png -c camera.toml          which stars are these?
@@ -54,40 +56,56 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
     gc.set_threshold(NEW_OBJECTS, *gc.get_threshold()[1:])
     atexit.register(gc.freeze)  # no search for garbage among all that lives at the end: 0.15 s
+    open_closed_streams()
     try:
-        for stream in (sys.stdout, sys.stderr):
-            if isinstance(stream, io.TextIOWrapper):  # LC_ALL=C and a name beyond ASCII: escaped, no failure
-                stream.reconfigure(errors="backslashreplace")
-        with _end_by_interrupt():
-            parser, commands = _parser()
-        if "_ARGCOMPLETE" in os.environ and importlib.util.find_spec("argcomplete") is not None:
-            import argcomplete  # of the extra `completion`: the shell requests words
-
-            argcomplete.autocomplete(parser)
-        words = list(sys.argv[1:] if argv is None else argv)
-        if words and not words[0].startswith("-") and words[0] not in COMMANDS:
-            parser.error(f"no command is called {words[0]!r}; there are: {', '.join(COMMANDS)}")
-        if " ".join(words[:2]) in commands and words[1:]:  # an action with its own parser and help
-            words = [" ".join(words[:2]), *words[2:]]
-        if len(words) == 1 and words[0] in commands and commands[words[0]].start:
-            print(commands[words[0]].start)
-            return USAGE
-        args = parser.parse_args(words)
-        if not args.command:
-            print(START)
-            return USAGE
-        return _run(args)
+        try:
+            return _run_words(list(sys.argv[1:] if argv is None else argv))
+        finally:
+            sys.stdout.flush()  # here, where a closed pipe is distinguished from an error; also after --help
+    except BrokenPipeError:
+        discard_stdout()
+        return errors.EXIT_STOPPED
     except KeyboardInterrupt:
         return _report_failure("interrupted", INTERRUPTED)
+    except OSError as cause:
+        if cause.errno not in FULL_DISK or cause.filename is not None:
+            raise
+        discard_stdout()
+        return _report_failure(f"the output cannot be written ({cause.strerror})", errors.EXIT_BAD_INPUT)
+
+
+def _run_words(words: list[str]) -> int:
+    """Run the command that `words` name; the exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # LC_ALL=C and a name beyond ASCII: escaped, no failure
+            stream.reconfigure(errors="backslashreplace")
+    with _end_by_interrupt():
+        parser, commands = _parser()
+    if "_ARGCOMPLETE" in os.environ and importlib.util.find_spec("argcomplete") is not None:
+        import argcomplete  # of the extra `completion`: the shell requests words
+
+        argcomplete.autocomplete(parser)
+    if words and not words[0].startswith("-") and words[0] not in COMMANDS:
+        parser.error(f"no command is called {words[0]!r}; there are: {', '.join(COMMANDS)}")
+    if " ".join(words[:2]) in commands and words[1:]:  # an action with its own parser and help
+        words = [" ".join(words[:2]), *words[2:]]
+    if len(words) == 1 and words[0] in commands and commands[words[0]].start:
+        print(commands[words[0]].start)
+        return USAGE
+    args = parser.parse_args(words)
+    if not args.command:
+        print(START)
+        return USAGE
+    return _run(args)
 
 
 def _run(args: argparse.Namespace) -> int:
-    """Run the command that was parsed; the exit code."""
+    """Run the command that was parsed; the exit code. Raises OSError where the standard output takes no more."""
     logging.getLogger("startrack").setLevel(logging.ERROR if getattr(args, "quiet", False) else logging.NOTSET)
     try:
-        code = int(args.run(args))
-        sys.stdout.flush()  # here, where a closed pipe is distinguished from an error
-        return code
+        with refusing_shortage():
+            check_memory()
+            return int(args.run(args))
     except BadOutput as cause:
         print(f"startrack {args.command}: error: {cause.command_message}", file=sys.stderr)
         return USAGE
@@ -96,14 +114,9 @@ def _run(args: argparse.Namespace) -> int:
         _report_failure(f"{cause.reason}: {cause}", code)
         print_advice(cause.reason, str(cause), args)
         return code
-    except BrokenPipeError:
-        discard_stdout()
-        return errors.EXIT_STOPPED
     except Exception as cause:
-        if isinstance(cause, OSError) and cause.errno in FULL_DISK and cause.filename is None:
-            discard_stdout()
-            return _report_failure(f"the output cannot be written ({cause.strerror})", errors.EXIT_BAD_INPUT)
-        if getattr(args, "verbose", 0):
+        is_output = isinstance(cause, BrokenPipeError) or getattr(cause, "errno", None) in FULL_DISK
+        if getattr(args, "verbose", 0) or (is_output and getattr(cause, "filename", None) is None):
             raise
         message = f"internal error: {type(cause).__name__}: {cause} (-v shows the traceback)"
         return _report_failure(message, errors.EXIT_INTERNAL_ERROR)

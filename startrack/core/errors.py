@@ -65,6 +65,11 @@ class Reason(StrEnum):
         "disk_full", EXIT_BAD_INPUT, "The disk is full, or takes no file of this size",
         "Free space there, or write the results to another disk with -D; then run the same command again.",
     )  # fmt: skip
+    OUT_OF_MEMORY = (
+        "out_of_memory", EXIT_BAD_INPUT, "Memory is short",
+        "Raise the limit of memory (ulimit -v, or that of the container), close other programs, use fewer processes "
+        "(-j), or take smaller pictures; then run the same command again.",
+    )  # fmt: skip
     NO_CLUSTER = (
         "no_cluster", EXIT_BAD_INPUT, "The cluster of --cluster cannot be reached",
         "Start a Dask scheduler and give its address, such as tcp://host:8786.",

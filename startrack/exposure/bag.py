@@ -17,6 +17,7 @@ import numpy as np
 
 from startrack.core.errors import BadInput, how_to_install
 from startrack.core.files import MAX_CAUSE_CHARS, MAX_TEXT_BYTES, FilePath, printable
+from startrack.core.memory import memory_refusal
 from startrack.core.types import Exposure
 from startrack.exposure.bounded_path import BoundedPath
 from startrack.exposure.decoding import Decoded, bad_image, check_size, decode_bytes, grey_float32, largest_value
@@ -225,7 +226,8 @@ def _refusals(path: FilePath, reason: str) -> Iterator[None]:
         raise BadInput(reason, f"{printable(path)}: cannot be read ({error.strerror or error})") from error
     except Exception as error:  # rosbags raises many types for a damaged file
         cause = _escape(f"{type(error).__name__}: {error}")[:MAX_CAUSE_CHARS]
-        raise BadInput(reason, f"{printable(path)}: damaged or unknown ROS bag ({cause})") from error
+        damaged = BadInput(reason, f"{printable(path)}: damaged or unknown ROS bag ({cause})")
+        raise memory_refusal(error) or damaged from error
 
 
 def _escape(text: str) -> str:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.files import MAX_CAUSE_CHARS, FilePath, missing_text, printable
+from startrack.core.memory import check_memory, memory_refusal
 from startrack.core.types import MAX_PIXELS, BadInput
 from startrack.exposure.sidecar import RAW_SUFFIXES
 
@@ -57,12 +58,16 @@ def bad_image(cause: str) -> BadInput:
 
 
 def check_size(width_px: int, height_px: int) -> None:
-    """Raise BadInput bad_image unless the image has 1 to 200 Mpx. Called with header values, before decoding."""
+    """Raise BadInput bad_image unless the image has 1 to 200 Mpx, out_of_memory where the memory is too small for it.
+
+    Called with header values, before decoding.
+    """
     if width_px < 1 or height_px < 1:
         raise bad_image(f"holds no pixels ({width_px} x {height_px})")
     if width_px * height_px > MAX_PIXELS:
         size, most = width_px * height_px / 1e6, MAX_PIXELS / 1e6
         raise bad_image(f"{width_px} x {height_px} is {size:.1f} Mpx, more than the {most:.0f} allowed")
+    check_memory(width_px * height_px)
 
 
 def grey_float32(stored: NDArray[Any]) -> tuple[NDArray[np.float32], tuple[str, ...]]:
@@ -170,7 +175,7 @@ def decode_bytes(raw: bytes, *, camera_raw: bool = False) -> Decoded:
 
     Camera raw files are known by their suffix: they are TIFFs with a thumbnail.
 
-    Raises BadInput bad_image; whatever else a decoder raises for damaged bytes is turned into it.
+    Raises BadInput bad_image; whatever else a decoder raises for damaged bytes is turned into it. Or out_of_memory.
     """
     kind = next((kind for kind, starts in STARTS.items() if raw.startswith(starts)), None)
     if camera_raw:
@@ -186,6 +191,6 @@ def decode_bytes(raw: bytes, *, camera_raw: bool = False) -> Decoded:
     except BadInput:
         raise
     except Exception as error:
-        raise bad_image(
+        raise memory_refusal(error) or bad_image(
             f"truncated or damaged {kind} ({type(error).__name__}: {str(error)[:MAX_CAUSE_CHARS]})"
         ) from error

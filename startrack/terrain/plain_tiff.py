@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from startrack.core.files import MAX_CAUSE_CHARS
+from startrack.core.memory import memory_refusal
 from startrack.core.types import BadInput
 from startrack.terrain.projection import Projection, projection_of
 from startrack.terrain.raster import Raster
@@ -30,7 +31,7 @@ def one_line_refusal(what: str) -> Iterator[None]:
         raise
     except Exception as cause:
         text = " ".join(str(cause).split())[:MAX_CAUSE_CHARS] or type(cause).__name__
-        raise BadInput("bad_terrain", f"{what}: {text}") from cause
+        raise memory_refusal(cause) or BadInput("bad_terrain", f"{what}: {text}") from cause
     finally:
         log.disabled = False
 

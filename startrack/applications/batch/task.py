@@ -15,6 +15,7 @@ from startrack import chain, output
 from startrack.chain import Outcome, content_sha256
 from startrack.core.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput, Reason, one_line
 from startrack.core.files import FULL_DISK, printable, remove_file
+from startrack.core.memory import refusing_shortage
 from startrack.core.runner import Died, Runner, RunStopped
 from startrack.core.stored import read_json_object
 from startrack.core.types import Exposure
@@ -70,7 +71,8 @@ def locate_image(task: Task) -> ImageDone:
         sha256 = content_sha256(task.path, task.bag_image)
         key = _key(task, sha256)
         before = None if task.overwrite else _valid_record(task, key)
-        return (before, True) if before is not None else (_locate_and_write(task, sha256, key), False)
+        with refusing_shortage():
+            return (before, True) if before is not None else (_locate_and_write(task, sha256, key), False)
     except Exception as cause:
         if isinstance(cause, BadInput):  # not of the image, which would be a record: the results cannot be written
             if isinstance(cause.__cause__, OSError) and cause.__cause__.errno in DISK_ERRORS:
@@ -134,7 +136,8 @@ def _locate_and_write(task: Task, sha256: str, key: str) -> dict[str, Any]:
         record = output.result_dict(found)
     else:
         record = output.write_results(found, result, plots=task.plots, write_record=False)
-    record = {**record, "image": text_of_name(task.name), JOB: key, INPUTS: inputs}
+    again = record["reason"] == Reason.OUT_OF_MEMORY  # by the next run
+    record = {**record, "image": text_of_name(task.name), JOB: None if again else key, INPUTS: inputs}
     if not keeps_former:
         output.write_json(result, record)
     return record

@@ -1,0 +1,88 @@
+"""Shortage of memory as a refusal: before libraries begin that end the process without it, and by exceptions."""
+
+from __future__ import annotations
+
+import errno
+import mmap
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+from startrack.core.errors import BadInput, NoSolution, Reason
+from startrack.core.files import MAX_CAUSE_CHARS
+
+# Address space of a command and of each pixel of its picture (VmPeak of `detect` on two cores: 1.10 GB at 0.26 Mpx,
+# 2.68 GB at 67 Mpx). It works with a tenth less, as arrays are smaller then; below that OpenBLAS blocks or ends the
+# process, and LLVM aborts it.
+COMMAND_BYTES = 1.0e9
+PIXEL_BYTES = 24
+LIBRARY_BYTES = 2**27  # a library that cannot be loaded, or a thread not started, lacks less (llvmlite has 0.12 GB)
+OPENCV_NO_MEMORY = -4  # cv2.error.code, StsNoMem
+
+
+def check_memory(pixels: int = 0) -> None:
+    """Raise BadInput (out_of_memory) where the limit of address space is too small for a picture of so many pixels."""
+    limit_bytes, needed_bytes = _limit_bytes(), COMMAND_BYTES + PIXEL_BYTES * pixels
+    if limit_bytes is not None and limit_bytes < needed_bytes:
+        picture = f" with a picture of {pixels / 1e6:.1f} Mpx" if pixels else ""
+        raise BadInput(
+            Reason.OUT_OF_MEMORY,
+            f"the limit of address space (ulimit -v) is {limit_bytes / 1e9:.2f} GB, and a command takes "
+            f"{needed_bytes / 1e9:.2f} GB{picture}",
+        )
+
+
+@contextmanager
+def refusing_shortage() -> Iterator[None]:
+    """In the block exceptions that come from a lack of memory become BadInput (out_of_memory)."""
+    try:
+        yield
+    except (BadInput, NoSolution):
+        raise
+    except Exception as cause:
+        if (refusal := memory_refusal(cause)) is None:
+            raise
+        raise refusal from cause
+
+
+def memory_refusal(cause: BaseException) -> BadInput | None:
+    """The refusal (out_of_memory) of a `cause` that comes from a lack of memory; None for others."""
+    chain: list[BaseException] = []
+    one: BaseException | None = cause
+    while one is not None and one not in chain:
+        chain.append(one)
+        one = one.__cause__ or one.__context__
+    lacking = next((one for one in chain if _states_shortage(one)), None)
+    if lacking is None and _has_room():
+        return None
+    lacking = lacking or cause
+    limit_bytes = _limit_bytes()
+    limit = "" if limit_bytes is None else f" within the limit of {limit_bytes / 1e9:.2f} GB (ulimit -v)"
+    text = " ".join(f"{type(lacking).__name__}: {lacking}".split()).rstrip(":")[:MAX_CAUSE_CHARS]
+    return BadInput(Reason.OUT_OF_MEMORY, f"memory is short{limit} ({text})")
+
+
+def _states_shortage(cause: BaseException) -> bool:
+    """Whether an exception means a lack of memory by itself. SPICE's classes are MemoryErrors of its own tables too."""
+    if isinstance(cause, MemoryError):
+        return not type(cause).__module__.startswith("spiceypy") or "MALLOC" in type(cause).__name__
+    return (isinstance(cause, OSError) and cause.errno == errno.ENOMEM) or (
+        type(cause).__module__ == "cv2" and getattr(cause, "code", None) == OPENCV_NO_MEMORY
+    )
+
+
+def _has_room() -> bool:
+    """Whether a library could still be loaded: libraries and threads fail with exceptions of any class without it."""
+    with suppress(OSError, ValueError):
+        mmap.mmap(-1, LIBRARY_BYTES).close()
+        return True
+    return False
+
+
+def _limit_bytes() -> int | None:
+    """The limit of this process's address space; None without one."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    soft = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return None if soft == resource.RLIM_INFINITY else soft

@@ -1,0 +1,102 @@
+"""A lack of memory is a refusal in words, with the exit code of an environment that does not suffice."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from startrack.cli import locate
+from startrack.cli.main import main
+from startrack.core import memory
+from startrack.core.types import BadInput
+from startrack.exposure import decoding
+
+resource = pytest.importorskip("resource")
+TOO_LITTLE_BYTES = 600_000_000  # OpenBLAS stands still with it
+
+
+@pytest.fixture
+def picture(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), np.random.default_rng(1).integers(90, 110, (64, 64)).astype(np.uint16))
+    return path
+
+
+def test_a_small_limit_ends_in_words(picture):
+    done = subprocess.run(
+        [sys.executable, "-m", "startrack.cli.main", "detect", str(picture)],
+        capture_output=True, text=True, timeout=60, check=False, cwd=picture.parent,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (TOO_LITTLE_BYTES, TOO_LITTLE_BYTES)),
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent)},
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (4, "")
+    assert done.stderr.startswith("startrack: out_of_memory: the limit of address space (ulimit -v) is 0.60 GB")
+    assert "Traceback" not in done.stderr and "report" not in done.stderr
+
+
+def test_a_picture_too_large_for_the_limit_is_refused_before_it_is_decoded(monkeypatch):
+    monkeypatch.setattr(memory, "_limit_bytes", lambda: int(1.2e9))
+    decoding.check_size(2000, 2000)
+    with pytest.raises(BadInput, match=r"is 1\.20 GB, .* 1\.38 GB with a picture of 16\.0 Mpx") as caught:
+        decoding.check_size(4000, 4000)
+    assert caught.value.reason == "out_of_memory"
+
+
+def exception_from(cause):
+    try:
+        raise RuntimeError("a library") from cause
+    except RuntimeError as error:
+        return error
+
+
+def opencvs_error():
+    error = cv2.error("Failed to allocate 100 bytes")
+    error.code = -4
+    return error
+
+
+@pytest.mark.parametrize(
+    "cause",
+    [
+        MemoryError(), np._core._exceptions._ArrayMemoryError((10**6, 10**6), np.dtype(float)),
+        OSError(errno.ENOMEM, "no"), opencvs_error(), exception_from(MemoryError()),
+    ],
+)  # fmt: skip
+def test_a_lack_of_memory_is_known_by_its_exception(cause, picture, monkeypatch, capsys):
+    def fail(*_):
+        raise cause
+
+    refusal = memory.memory_refusal(cause)
+    assert refusal is not None and refusal.reason == "out_of_memory" and "memory is short" in str(refusal)
+    monkeypatch.setattr(locate, "_solve_image", fail)
+    assert main(["detect", str(picture), "--json"]) == 4
+    heard = capsys.readouterr()
+    record = json.loads(heard.out)
+    assert record["reason"] == "out_of_memory" and "ulimit" in record["advice"] and "report" not in record["advice"]
+
+
+def test_other_errors_are_a_lack_of_memory_where_no_library_can_be_loaded(monkeypatch):
+    cause = RuntimeError("Could not locate or load CSPICE shared library")
+    assert memory.memory_refusal(cause) is None
+    monkeypatch.setattr(memory, "_has_room", lambda: False)
+    refusal = memory.memory_refusal(cause)
+    assert refusal is not None and "CSPICE" in str(refusal)
+
+
+def test_a_decoder_without_memory_does_not_call_the_picture_damaged(picture, monkeypatch):
+    def fail(_):
+        raise MemoryError
+
+    monkeypatch.setattr("startrack.exposure.png.decode", fail)
+    with pytest.raises(BadInput, match=r"a\.png: memory is short") as caught:
+        decoding.decode_file(picture)
+    assert caught.value.reason == "out_of_memory"

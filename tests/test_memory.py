@@ -44,9 +44,9 @@ def test_a_small_limit_ends_in_words(picture):
 
 
 def test_a_picture_too_large_for_the_limit_is_refused_before_it_is_decoded(monkeypatch):
-    monkeypatch.setattr(memory, "_limit_bytes", lambda: int(1.2e9))
+    monkeypatch.setattr(memory, "_limit_bytes", lambda: int(1.3e9))
     decoding.check_size(2000, 2000)
-    with pytest.raises(BadInput, match=r"is 1\.20 GB, .* 1\.38 GB with a picture of 16\.0 Mpx") as caught:
+    with pytest.raises(BadInput, match=r"is 1\.30 GB, .* 1\.50 GB with a picture of 16\.0 Mpx") as caught:
         decoding.check_size(4000, 4000)
     assert caught.value.reason == "out_of_memory"
 

@@ -10,10 +10,9 @@ from contextlib import contextmanager, suppress
 from startrack.core.errors import BadInput, NoSolution, Reason
 from startrack.core.files import MAX_CAUSE_CHARS
 
-# Address space of a command and of each pixel of its picture (VmPeak of `detect` on two cores: 1.10 GB at 0.26 Mpx,
-# 2.68 GB at 67 Mpx). It works with a tenth less, as arrays are smaller then; below that OpenBLAS blocks or ends the
-# process, and LLVM aborts it.
-COMMAND_BYTES = 1.0e9
+# Address space of a command and of each pixel of its picture (VmPeak of `detect` on two cores: 1.13 GB at 0.26 Mpx,
+# 2.74 GB at 67 Mpx). With less, OpenBLAS blocks (0.6 GB) or ends the process (0.8), and LLVM aborts it (0.9 to 1.13).
+COMMAND_BYTES = 1.12e9
 PIXEL_BYTES = 24
 LIBRARY_BYTES = 2**27  # a library that cannot be loaded, or a thread not started, lacks less (llvmlite has 0.12 GB)
 OPENCV_NO_MEMORY = -4  # cv2.error.code, StsNoMem

@@ -242,7 +242,7 @@ class _Search:
         part = float(np.sqrt(self.field_sr / (2 * np.pi)))
         if self.narrow:
             whole = (s for s in WIDE_STAGES if s.radius_rad == np.pi)
-            return tuple(replace(s, gate_rad=s.gate_rad * part, free=("f",)) for s in whole)
+            return tuple(replace(s, gate_rad=s.gate_rad * part, free=("f", "fy")) for s in whole)
         return tuple(
             replace(s, radius_rad=s.radius_rad * (part if s.radius_rad < np.pi else 1.0), gate_rad=s.gate_rad * part)
             for s in WIDE_STAGES

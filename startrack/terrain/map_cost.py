@@ -23,6 +23,12 @@ ENDS_S = 1.0  # of the ends of the maps, for the table
 FRAME_S, HORIZONS_OF_FRAME = 1.5, 100_000.0
 
 
+def costs_of(ground: TracedMap) -> dict[str, float]:
+    """Times [s] of a `ground`, as `Terrain.costs_s` names them."""
+    table = {} if ground.is_prepared else {"horizons": seconds_of_table(ground)}
+    return table | {"frame": seconds_of_frame(ground)}
+
+
 def seconds_of_table(ground: TracedMap) -> float:
     """Time [s] that the table of horizons of a `ground` takes on all cores, by cells all over it."""
     square, cells = ground.square, ground.square.cells_within_reach

@@ -13,10 +13,10 @@ from startrack.terrain.horizon_table import AZIMUTH_BINS
 if TYPE_CHECKING:
     from startrack.terrain.traced_map import TracedMap
 
-UNKNOWN_FROM, RIM_POINTS = 12, 48  # places across the search area, and on its rim, at which ends are looked up
+UNKNOWN_FROM, RIM_PLACES = 12, 48  # places across the search area, and on its rim, at which ends are looked up
 LEAST_END_M = 1.0  # distance from a camera to the ends of the maps: nearer ones count as at it
 MIDDLES_RAD = (np.arange(AZIMUTH_BINS) + 0.5) * 2 * np.pi / AZIMUTH_BINS
-MOST_STEPS = 1000  # from the origin to the farthest post of the maps
+MOST_DISTANCES = 1000  # from the origin to the farthest post of the maps
 
 
 def unknown_elevations_rad(ground: TracedMap) -> Array:
@@ -26,7 +26,7 @@ def unknown_elevations_rad(ground: TracedMap) -> Array:
     """
     line = np.linspace(-1, 1, UNKNOWN_FROM) * ground.search_radius_m
     places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    around = np.arange(RIM_POINTS) * 2 * np.pi / RIM_POINTS
+    around = np.arange(RIM_PLACES) * 2 * np.pi / RIM_PLACES
     rim = ground.search_radius_m * np.stack([np.sin(around), np.cos(around)], axis=-1)
     places = np.vstack([places[np.hypot(*places.T) < ground.search_radius_m], rim])
     bins = np.repeat((np.arange(AZIMUTH_BINS)[:, None] + [0.02, 0.5, 0.98]).ravel(), len(places))
@@ -45,7 +45,7 @@ def distances_to_end_m(ground: TracedMap) -> Array:
     """(AZIMUTH_BINS,) distance from the origin [m] at which the maps end or have a void, in the middle of each bin."""
     posts_m = np.array([one.post_m for one in ground.maps])
     farthest_m = 1.5 * max(float(np.hypot(*one.heights_m.shape)) * one.post_m for one in ground.maps)
-    s = np.linspace(0.0, farthest_m, int(min(farthest_m / posts_m.min(), MOST_STEPS)) + 1)[1:]
+    s = np.linspace(0.0, farthest_m, int(min(farthest_m / posts_m.min(), MOST_DISTANCES)) + 1)[1:]
     places = latlon_from_enu(ground.site, np.outer(np.sin(MIDDLES_RAD), s), np.outer(np.cos(MIDDLES_RAD), s), 0.0)
     known = np.zeros((AZIMUTH_BINS, len(s)), dtype=bool)
     for one in ground.maps:

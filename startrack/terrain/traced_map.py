@@ -17,7 +17,7 @@ from startrack.terrain.earth_projection import EarthProjection
 from startrack.terrain.ground import Ground, ground_up_m, pack_maps
 from startrack.terrain.horizon_kernel import surfaces
 from startrack.terrain.horizon_table import AZIMUTH_BINS, FIELDS, HorizonTable, Square
-from startrack.terrain.map_cost import seconds_of_frame, seconds_of_table
+from startrack.terrain.map_cost import costs_of
 from startrack.terrain.projection import Projection
 from startrack.terrain.protocol import Progress, Terrain
 from startrack.terrain.raster import Raster
@@ -162,13 +162,11 @@ class TracedMap(Terrain):
 
     def costs_s(self) -> dict[str, float]:
         """See `Terrain`."""
-        table = {} if self.is_prepared else {"horizons": seconds_of_table(self)}
-        return table | {"frame": seconds_of_frame(self)}
+        return costs_of(self)
 
     def without_table(self) -> Self:
         """The same map whose traces begin at the camera; see `Terrain`."""
-        other = copy(self)
-        other.__dict__["_uses_table"] = False
+        (other := copy(self)).__dict__["_uses_table"] = False
         return other
 
     def horizons(self, points_m: Array, azimuths_rad: Array) -> tuple[Array, Array, Array]:

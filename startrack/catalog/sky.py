@@ -92,7 +92,7 @@ def apparent_stars(catalog: StarCatalog, time_utc: datetime | None, site: Site |
 def catalog_rays(apparent_icrs: Array, time_utc: datetime | None, site: Site | None) -> Array:
     """Directions (n, 3) in the catalogue of what appears in `apparent_icrs` (n, 3): no refraction, no aberration.
 
-    The inverse of `apparent_stars` at the same time and site.
+    The inverse of `apparent_stars` at the same `time_utc` and `site`; without a time the directions as they are.
     """
     if time_utc is None:
         return apparent_icrs  # the catalogue was taken without aberration

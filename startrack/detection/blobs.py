@@ -54,7 +54,7 @@ def find_blobs(sources: Detections) -> Blobs:
 
 
 def light_at(sources: Detections, xy_px: Array) -> Array:
-    """Light (n,) above the background in the disc about each of `xy_px` (n, 2), as recorded.
+    """Light (n,) above the background in the disc about each of `xy_px` (n, 2), as the image of `sources` has it.
 
     It grows with a star's brightness, saturated or not.
     """

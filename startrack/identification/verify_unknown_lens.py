@@ -218,7 +218,7 @@ def blend_radius_px(centroids: Centroids) -> float:
 
 
 def coincidence_radius_px(distance_px: Array) -> float:
-    """Distance [px] within which a star coincides with a detection, by the distances (n,) of the matches."""
+    """Distance [px] within which a star coincides with a detection, by those of the matches, `distance_px` (n,)."""
     rms_px = float(np.sqrt(np.mean(np.square(distance_px))))
     return float(np.clip(RADIUS_SIGMAS * rms_px, SMALLEST_COINCIDENCE_PX, INLIER_PX))
 

@@ -20,7 +20,7 @@ OF_A_POSITION = ("position", "modes", "search", "evidence", "sky", "clock")  # s
 
 
 def result_dict(result: Outcome) -> dict[str, Any]:
-    """The fix of one image: its keys are the same whether it is solved or refused.
+    """The fix of one image, of its `result`: the keys are the same whether it is solved or refused.
 
     A section is null where nothing of it is known: `position` unless the status is ok. Lists are then empty. Quantities
     of stages that have not run are null: those in `enu` without terrain and time.

@@ -15,6 +15,7 @@ from startrack.chain.sky_state import stating_sky
 from startrack.chain.source_names import identified_names
 from startrack.chain.stages import Detected, Identified, Inputs, Oriented, Settings, extend
 from startrack.core.compilation import announce_compilation
+from startrack.core.time_limit import stating_work
 from startrack.core.types import (
     Array,
     BadInput,
@@ -24,7 +25,6 @@ from startrack.core.types import (
     Identification,
     NotIdentified,
     Stars,
-    TooFewStars,
 )  # fmt: skip
 from startrack.detection import Detector
 from startrack.estimation.attitude import solve_attitude
@@ -153,22 +153,38 @@ def identify_unknown_lens(
 
 
 def _identify_at_fovs(detected: Detected, fovs_rad: Array, stars: Stars, near_sky: NearSky | None) -> Identified:
+    from startrack.identification import advise_on_fields
     from startrack.identification import identify_unknown_lens as solve
 
     sources, size_px = detected.detections, detected.exposure.size_px
+    tried: list[int] = []  # patterns, of each field done
+    refusal: NotIdentified | None = None
+
+    def done() -> str:
+        return f"{len(tried)} of {len(fovs_rad)} fields done"
+
     for fov_rad in fovs_rad:
         try:
-            found = solve(sources, size_px, float(fov_rad), stars, background=sources.background_e, near_sky=near_sky)
-        except (NotIdentified, TooFewStars):
-            if len(fovs_rad) == 1:
-                raise
+            with stating_work(done):
+                found = solve(
+                    sources, size_px, float(fov_rad), stars, background=sources.background_e, near_sky=near_sky
+                )
+        except NotIdentified as cause:
+            refusal = cause
+            tried += [cause.evidence["tried"]] if "tried" in cause.evidence else []  # else the sources are too few
             continue
         return _identified(detected, found.camera, stars, (), None, found.identification)
+    if refusal is not None and (len(fovs_rad) == 1 or not tried):
+        raise refusal
     step = (fovs_rad[-1] / fovs_rad[0]) ** (1 / (len(fovs_rad) - 1))  # each is the middle of a part of the range
-    low, high = np.degrees([fovs_rad[0], fovs_rad[-1] * step]) * 2 / (1 + step)
+    low_rad, high_rad = fovs_rad[0] * 2 / (1 + step), fovs_rad[-1] * step * 2 / (1 + step)
+    where = "" if near_sky is None else f" within {near_sky}"
     raise NotIdentified(
-        f"no lens of {low:.3g} to {high:.3g} degrees explains the point sources ({len(fovs_rad)} tried)",
-        advice="check the focus",
+        f"no lens of {np.degrees(low_rad):.3g} to {np.degrees(high_rad):.3g} degrees{where} explains the "
+        f"{len(sources)} point sources better than chance ({len(fovs_rad)} fields, {sum(tried)} patterns tried)",
+        advice=advise_on_fields(low_rad, high_rad, near_sky),
+        detected=len(sources),
+        tried=sum(tried),
     )
 
 

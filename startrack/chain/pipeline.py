@@ -25,6 +25,7 @@ from startrack.chain.orientation import (
 from startrack.chain.sky_refinement import measured_skyline, refine_by_sky_light
 from startrack.chain.stages import Detected, Identified, Inputs, Located, Oriented, Refused, Settings
 from startrack.core.errors import Reason
+from startrack.core.time_limit import check_time, limited_time, stating_work
 from startrack.core.types import BadInput, Exposure, NoSolution
 from startrack.detection import find_damage
 from startrack.evidence import check_single_skyline
@@ -51,7 +52,7 @@ def locate(
     run = Run(Inputs(
         exposure=exposure, camera=camera, terrain=terrain, catalog_name=catalog.name,
         localizer_name=localizer_name(settings.localizer), damage=find_damage(exposure, camera),
-    ))  # fmt: skip
+    ), settings.time_limit_s)  # fmt: skip
 
     def stages() -> Located:
         check_inputs(run.reached)
@@ -130,7 +131,7 @@ def identify(
     Earth.
     """
     settings = settings or Settings()
-    run = Run(Inputs(exposure=exposure, camera=camera, catalog_name=catalog.name))
+    run = Run(Inputs(exposure=exposure, camera=camera, catalog_name=catalog.name), settings.time_limit_s)
 
     def stages() -> Oriented:
         check_inputs(run.reached)
@@ -150,8 +151,8 @@ def identify_blind(
     degrees, from there up that of the whole image circle. `catalog` is the list of stars; `settings` has the detector
     and the part of the sky. The lens found is the value's `camera`.
     """
-    run = Run(Inputs(exposure=exposure, catalog_name=catalog.name))
     settings, fovs_rad = settings or Settings(), np.atleast_1d(fov_rad)
+    run = Run(Inputs(exposure=exposure, catalog_name=catalog.name), settings.time_limit_s)
     near_sky = settings.identifier.near_sky
     return run.outcome(lambda: _orient(run, None, settings, identify_unknown_lens, fovs_rad, catalog, near_sky))
 
@@ -172,17 +173,22 @@ def add_timing(outcome: Any, **more_ms: float) -> Any:
 
 
 class Run:
-    """One exposure on its way through the stages: the last complete value, and the wall time of each stage."""
+    """One exposure on its way through the stages: the last complete value, and the wall time of each stage.
 
-    def __init__(self, inputs: Inputs) -> None:
-        self.reached = inputs
+    `limit_s` is that of the processor time of all stages; None: the one of a block around, if any.
+    """
+
+    def __init__(self, inputs: Inputs, limit_s: float | None = None) -> None:
+        self.reached, self.limit_s = inputs, limit_s
         self._timing_ms: dict[str, float] = {}
 
     def time_stage(self, stage: str, function: Callable[..., R], *args: Any) -> R:
         """The result of `function(*args)`, its time added to that of the `stage`."""
         start = clock.perf_counter()
         try:
-            return function(*args)
+            with stating_work(lambda: f"it was at the stage {stage}"):
+                check_time()
+                return function(*args)
         finally:
             self._timing_ms[stage] = self._timing_ms.get(stage, 0.0) + 1e3 * (clock.perf_counter() - start)
 
@@ -198,7 +204,9 @@ class Run:
         Of a damaged image its damage may be the reason.
         """
         try:
-            return replace(stages(), timing_ms=MappingProxyType(self._timing_ms))
+            with limited_time(self.limit_s):
+                value = stages()
+            return replace(value, timing_ms=MappingProxyType(self._timing_ms))
         except (BadInput, NoSolution) as cause:
             damage = self.reached.damage if cause.reason in HIDDEN_BY_DAMAGE else None
             return Refused(

@@ -9,8 +9,9 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.core.errors import Reason
+from startrack.core.time_limit import stating_work
 from startrack.core.types import Array, Centroids, Detections, Exposure, NotIdentified, TooFewStars
-from startrack.detection import ROUNDED, is_rounded, smallest_step
+from startrack.detection import MIN_BINNED_SIGMA_PX, ROUNDED, WIDTH_TOLERANCE, is_rounded, smallest_step
 
 STEP_PX = 16  # of the pixels at which the background is looked up
 VISIBLE_SNR = 5.0
@@ -21,9 +22,11 @@ FEW_PART = 0.25  # of the stars of a clear sky: 14 clear images, half hidden by 
 # Where no zero point tells: an all-sky camera then has 3.7 times the stars of a clear sky on a clear night, 0.98 beside
 # a bright Moon, and 0.16 under clouds.
 ASSUMED_LIMIT_MAG = 5.0
-BRIGHT_SKY = "the sky is bright, by clouds, the Moon or twilight: use a picture of a clear, dark sky"
-BRIGHT_VIEW = "the sky is bright, by the Sun, the Earth or lit ground: use a picture without stray light"
-FEW_STARS = "clouds or poor focus hide the stars: use a picture of a clear sky in focus, or expose longer"
+BRIGHT_SKY = "the background is bright, as clouds, the Moon or twilight make it: try a picture of a clear, dark sky"
+BRIGHT_VIEW = "the background is bright, as the Sun, the Earth or lit ground make it: try a picture without stray light"
+FEW_STARS = "few stars for a clear sky: try a longer exposure, or a picture without clouds if some were in view"
+WIDE_STARS = "if the focus may be off, try a sharper picture"
+GROUND = "if ground, trees or lamps are in view, try --mask"
 OTHER_ROWS = (
     "ROWORDER in its header is {}, and rows are taken in the order of the file: is the camera file of pictures with "
     "the other order? Flip the rows of this one, or make a camera file of such pictures"
@@ -45,11 +48,16 @@ def stating_sky(
     `on_moon`: above ground without air. `more` follows the advice about the lens.
     """
     try:
-        yield
+        with stating_work(lambda: measured_text(exposure, found)):
+            yield
     except (NotIdentified, TooFewStars) as cause:
         if cause.reason in (NotIdentified.reason, TooFewStars.reason):
             clear = None if v_mag is None else count_clear(exposure, found, camera, v_mag, fov_rad)
             lens = (cause.advice or ("" if found else DARK_VIEW if on_moon else DARK_SKY)) + more
+            if found and not (on_moon or exposure.mask is not None or (camera is not None and camera.mask is not None)):
+                lens += f"; {GROUND}"
+            if found and is_wide(found, camera):
+                lens = f"{WIDE_STARS}; {lens}"
             text = sky_text(exposure, found, clear, on_moon, _rounding(exposure, found, camera), lens)
             cause.args = (f"{cause.fact.rstrip('.?')}. {text}",)
         elif cause.reason is Reason.MIRRORED and exposure.row_order:
@@ -65,18 +73,39 @@ def sky_text(
     `found` are the point sources of the `exposure`, `clear` is how many a clear sky would show (None: not known).
     `rounding` is the advice where rounding hides stars, `lens` that where nothing else is the likely cause.
     """
-    count = 0 if found is None else len(found)
-    low, high = np.percentile(exposure.recorded_adu[::STEP_PX, ::STEP_PX], [5, 95])
-    part = high / exposure.saturation_adu if exposure.saturation_adu else 0.0
-    of_range = f" ({100 * part:.0f} % of the range)" if part else ""
-    of_clear = "" if clear is None else f" where a clear sky would show about {float(f'{clear:.2g}'):.0f}"
+    count, part = 0 if found is None else len(found), _bright_part(exposure)
     advice = rounding or lens
     if part >= BRIGHT_PART:
         advice = BRIGHT_VIEW if on_moon else BRIGHT_SKY
     elif not rounding and not on_moon and count and clear is not None and count < FEW_PART * clear:
-        advice = FEW_STARS
-    measured = f"{count} point sources{of_clear}, background from {low:.0f} to {high:.0f} ADU{of_range}"
-    return f"Measured: {measured}" + (f": {advice}" if advice else "")
+        advice = f"{FEW_STARS}; {lens}" if lens else FEW_STARS
+    return measured_text(exposure, found, clear) + (f": {advice}" if advice else "")
+
+
+def measured_text(exposure: Exposure, found: Centroids | None, clear: float | None = None) -> str:
+    """The point sources and the background of an `exposure` as text; the arguments are those of `sky_text`."""
+    sources = f"{0 if found is None else len(found)} point source{'s' * (found is None or len(found) != 1)}"
+    if found:
+        sources += f" (SNR {found.snr.min():.0f} to {found.snr.max():.0f}, sigma of {found.psf_sigma_px:.1f} px)"
+    of_clear = "" if clear is None else f" where a clear sky would show about {float(f'{clear:.2g}'):.0f}"
+    low, high = np.percentile(exposure.recorded_adu[::STEP_PX, ::STEP_PX], [5, 95])
+    part = _bright_part(exposure)
+    of_range = f" ({100 * part:.0f} % of the range)" if part else ""
+    width, height = exposure.size_px
+    background = f"background from {low:.0f} to {high:.0f} ADU{of_range}"
+    return f"Measured: {sources}{of_clear}, in {width} x {height} px, {background}"
+
+
+def is_wide(found: Centroids, camera: Camera | None) -> bool:
+    """Whether the point sources are wider than those of a sharp picture, and than the `camera` file states."""
+    stated = None if camera is None or camera.sensor is None else camera.sensor.psf_sigma_px
+    return found.psf_sigma_px > max(MIN_BINNED_SIGMA_PX, (1 + WIDTH_TOLERANCE) * (stated or 0.0))
+
+
+def _bright_part(exposure: Exposure) -> float:
+    """Part of the range of the pixels below which 95 % of them are; 0 where the range is not known."""
+    high = float(np.percentile(exposure.recorded_adu[::STEP_PX, ::STEP_PX], 95))
+    return high / exposure.saturation_adu if exposure.saturation_adu else 0.0
 
 
 def _rounding(exposure: Exposure, found: Centroids | None, camera: Camera | None) -> str:

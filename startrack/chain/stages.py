@@ -65,12 +65,15 @@ class Settings:
     evidence_sources: str = "both"  # "stars", "sky" (the light of the sky at the skyline) or "both"
     near: PositionPrior | None = None  # of the position; None: anywhere in the search area of the terrain
     near_attitude: NearAttitude | None = None  # tried first: it saves time
+    time_limit_s: float | None = None  # of the processor time of an image (all threads); None: no limit
     deep_stars: bool = True  # use Gaia's stars too, where they are installed and the frame is deeper than Hipparcos
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "localizer", require_localizer(self.localizer))
         if self.evidence_sources not in EVIDENCE_SOURCES:
             raise ValueError(f"evidence_sources {self.evidence_sources!r}: known are {', '.join(EVIDENCE_SOURCES)}")
+        if self.time_limit_s is not None and not self.time_limit_s > 0:
+            raise ValueError(f"time_limit_s={self.time_limit_s}: give seconds of processor time, above 0")
         if self.near is not None and not has_posterior(self.localizer):
             raise ValueError(f"near={self.near}: only the localizer posterior takes a prior of the position")
 

@@ -22,6 +22,7 @@ from startrack.cli.images import approximate_camera, check_one_time, flag_site, 
 from startrack.core.compilation import announce_compilation
 from startrack.core.errors import BadInput, NoSolution
 from startrack.core.files import printable, resolve_named, split_camera
+from startrack.core.time_limit import limited_time
 
 MIN_SIDE, MAX_SIDE = 3, 100  # corners or squares of a board
 SENSOR_FLAGS = {"gain_e_per_adu": "gain", "read_noise_e": "read_noise", "bias_adu": "bias"}  # by keys of camera files
@@ -39,21 +40,22 @@ def run(args: argparse.Namespace) -> int:
     })  # fmt: skip
     flag_site(args)  # wrong usage is reported before the images are read
     out = check_camera_output(args)
-    exposures = read_each_once(args)
-    announce_compilation()
-    start = approximate_camera(args, exposures)
-    with named_steps(
-        args, f"calibrate with {len(exposures)} images", calibration.count_steps(len(exposures))
-    ) as show_step:
-        try:
-            found = calibration.calibrate(
-                exposures, load_catalog(), camera=start, fov_rad=args.fov, site=site_of(args, exposures),
-                known_sensor=known_sensor, name=args.name or out.stem, progress=show_step,
-            )  # fmt: skip
-        except NoSolution as cause:
-            record = calibration.refusal_dict(cause.reason, str(cause))
-            write_record(out, record)
-            return print_outcome(args, record, refusal(cause, printable(out))[1])
+    with limited_time(args.time_limit):
+        exposures = read_each_once(args)
+        announce_compilation()
+        start = approximate_camera(args, exposures)
+        with named_steps(
+            args, f"calibrate with {len(exposures)} images", calibration.count_steps(len(exposures))
+        ) as show_step:
+            try:
+                found = calibration.calibrate(
+                    exposures, load_catalog(), camera=start, fov_rad=args.fov, site=site_of(args, exposures),
+                    known_sensor=known_sensor, name=args.name or out.stem, progress=show_step,
+                )  # fmt: skip
+            except NoSolution as cause:
+                record = calibration.refusal_dict(cause.reason, str(cause))
+                write_record(out, record)
+                return print_outcome(args, record, refusal(cause, printable(out))[1])
     record, line = calibration.calibration_dict(found), calibration.summary(found, printable(out))
     line += f"\n  {record['message']}" if record["message"] else ""
     if found.accepted:

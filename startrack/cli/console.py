@@ -57,7 +57,7 @@ def print_advice(reason: str | None, message: str, args: argparse.Namespace, own
     """
     if reason is None or getattr(args, "quiet", False):
         return
-    advice = errors.next_step(reason, message, by_fov=getattr(args, "fov", None) is not None)
+    advice = errors.next_step(reason, message)
     if advice and own not in ("", errors.Reason(reason).advice):
         advice = own
     printed: set[str] = vars(args).setdefault("printed_advice", set())

@@ -167,6 +167,11 @@ PIXELS = (
 TIME_SIGMA = flag(
     "--time-sigma SECONDS", "standard deviation of the clock's error (1, and more where it is not stated)", time_sigma_s
 )
+TIME_LIMIT = flag(
+    "--time-limit SECONDS",
+    "of processor time, all threads together: what is not found by then is refused as time_limit",
+    positive_number,
+)
 FACTS = (CAMERA, TIME, TIME_SIGMA, EXPOSURE, *PIXELS)  # that images may lack
 SITE = flag("--site LAT,LON[,M]", "where the camera stands on the Earth, in degrees and metres (--site=-30.2,...)")
 SKY = (PHOTOGRAPHS, CAMERA, TIME, EXPOSURE, *PIXELS, SITE, TERRAIN)  # of photographs of the night sky

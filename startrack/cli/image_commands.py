@@ -7,9 +7,8 @@ import argparse
 from startrack.cli import flags
 from startrack.cli.flag_types import cluster_address, count, fields_of_view_rad, geo_formats, seconds
 from startrack.cli.flags import Command, Either, flag, function_at
-from startrack.core import REPORTED_IMAGES
+from startrack.core import NARROWEST_DEG, REPORTED_IMAGES, WIDEST_DEG
 
-NARROWEST_DEG, WIDEST_DEG = 3.0, 280.0  # fields of view of `identify`
 INPUT = (flags.IMAGES, flags.TOPIC, *flags.FACTS)
 SHARED = {"output": flags.OUTPUT, "more": (flags.NO_SEED, *flags.MORE)}
 COMMANDS = (
@@ -20,7 +19,7 @@ COMMANDS = (
         "NAME.stars.ecsv, NAME.skyline.ecsv, NAME.wcs, NAME.corr, NAME.annotated.png and NAME.skyline.png.",
         {
             "input": (*INPUT, flags.TERRAIN, flag("--fov DEG", argparse.SUPPRESS)),  # a flag of identify and calibrate
-            "method": flags.METHOD,
+            "method": (*flags.METHOD, flags.TIME_LIMIT),
             "output": (
                 *flags.OUTPUT,
                 flag(
@@ -55,7 +54,7 @@ COMMANDS = (
                     lambda text: fields_of_view_rad(text, NARROWEST_DEG, WIDEST_DEG),
                 ),
             ),
-            "method": (flags.POINTING,),
+            "method": (flags.POINTING, flags.TIME_LIMIT),
             "output": (
                 *flags.OUTPUT,
                 flag("--catalog-table", "list in NAME.stars.ecsv the stars in the frame that were not identified too"),

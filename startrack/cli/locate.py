@@ -24,6 +24,7 @@ from startrack.cli.report import write_page_of_images
 from startrack.core.errors import INTERNAL_ERROR, BadInput, BadOutput
 from startrack.core.files import make_folder, printable
 from startrack.core.memory import refusing_shortage
+from startrack.core.time_limit import limited_time
 from startrack.core.types import Exposure
 from startrack.exposure import read_mask, split_bag_path
 from startrack.identification import WIDE_FIELD_RAD, Identifier
@@ -41,7 +42,7 @@ def locate(args: argparse.Namespace) -> int:
         )
     check_localizer(args)
     settings = settings_of(args)
-    code = _run_images(args, "fix", lambda exposure, _: chain.locate_exposure(exposure, settings))
+    code = _run_images(args, "fix", lambda exposure, _: chain.locate_exposure(exposure, settings), args.time_limit)
     if args.report:
         write_page_of_images(args.dir, args.images)
     return code
@@ -59,7 +60,7 @@ def identify(args: argparse.Namespace) -> int:
             return chain.identify_blind(exposure, args.fov, load_catalog(), settings)
         return chain.identify(exposure, camera, load_catalog(), settings)
 
-    return _run_images(args, "identification", solve)
+    return _run_images(args, "identification", solve, args.time_limit)
 
 
 def detect(args: argparse.Namespace) -> int:
@@ -67,8 +68,11 @@ def detect(args: argparse.Namespace) -> int:
     return _run_images(args, "detections", chain.detect)
 
 
-def _run_images(args: argparse.Namespace, kind: str, solve: Solve) -> int:
-    """Solve each image, print its outcome, and return the exit code; results are NAME.`kind`.json."""
+def _run_images(args: argparse.Namespace, kind: str, solve: Solve, limit_s: float | None = None) -> int:
+    """Solve each image, print its outcome, and return the exit code; results are NAME.`kind`.json.
+
+    `limit_s` is that of the processor time of each image, from reading it to its solution (None: none).
+    """
     if args.image_topic is not None and not any(split_bag_path(path) for path in args.images):
         args.usage_error("--image-topic is for ROS bags, and none is given")
     needed = NEEDED_LATER[:-1] if args.no_plots else NEEDED_LATER
@@ -78,7 +82,7 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve) -> int:
         name = Path(path).name
         try:
             with refusing_shortage():
-                record, line = _solve_image(args, path, Path(args.dir) / f"{stem}.{kind}.json", solve)
+                record, line = _solve_image(args, path, Path(args.dir) / f"{stem}.{kind}.json", solve, limit_s)
         except BadInput as cause:
             record = output.refused_dict(path, cause.reason, str(cause), kind.removesuffix("s"))
             if isinstance(cause, BadOutput):
@@ -102,27 +106,28 @@ def _import_beside(names: Sequence[str]) -> None:
             importlib.import_module(name)
 
 
-def _solve_image(args: argparse.Namespace, path: str, out: Path, solve: Solve) -> Outcome:
+def _solve_image(args: argparse.Namespace, path: str, out: Path, solve: Solve, limit_s: float | None) -> Outcome:
     """Read and solve the image and write its results with the record `out`; only -O replaces those of another image."""
     start, is_located = time.perf_counter(), args.command == "locate"
-    exposure = read(path, args)
-    camera, terrain = (None, chain.load_named(exposure)[1]) if is_located else (_camera_of(args, exposure), None)
-    if isinstance(exposure.mask, str):
-        read_mask(exposure.mask)  # as the others: an earlier result outlasts a file that cannot be read
-    try:
-        make_folder(out.parent)
-    except BadOutput as cause:
-        args.usage_error(str(cause))
-    remedy = "choose another -D, or replace it with -O"  # before anything is computed
-    output.prepare_folder(out, exposure.sha256, overwrite=args.overwrite, remedy=remedy)
-    read_s = time.perf_counter() - start
-    if terrain is not None and exposure.terrain is not None and exposure.time_utc is not None:
-        prepare(terrain, args)
-        print_warnings(args, terrain.name, terrain.warnings(), of_all=True)
-        compile_beside(exposure.terrain)
-    start = time.perf_counter()
-    with wait_lines(args, f"{args.command} {printable(exposure.name)}"):
-        result = chain.add_timing(solve(exposure, camera), read=1e3 * read_s)
+    with limited_time(limit_s):
+        exposure = read(path, args)
+        camera, terrain = (None, chain.load_named(exposure)[1]) if is_located else (_camera_of(args, exposure), None)
+        if isinstance(exposure.mask, str):
+            read_mask(exposure.mask)  # as the others: an earlier result outlasts a file that cannot be read
+        try:
+            make_folder(out.parent)
+        except BadOutput as cause:
+            args.usage_error(str(cause))
+        remedy = "choose another -D, or replace it with -O"  # before anything is computed
+        output.prepare_folder(out, exposure.sha256, overwrite=args.overwrite, remedy=remedy)
+        read_s = time.perf_counter() - start
+        if terrain is not None and exposure.terrain is not None and exposure.time_utc is not None:
+            prepare(terrain, args)
+            print_warnings(args, terrain.name, terrain.warnings(), of_all=True)
+            compile_beside(exposure.terrain)
+        start = time.perf_counter()
+        with wait_lines(args, f"{args.command} {printable(exposure.name)}"):
+            result = chain.add_timing(solve(exposure, camera), read=1e3 * read_s)
     more = {"explain": output.explain(result)} if is_located and args.explain else {}
     record = output.write_results(
         result, out, plots=not args.no_plots, catalog_table=getattr(args, "catalog_table", False), more=more

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from startrack import __version__
 from startrack.core.files import PACKAGE
+from startrack.core.time_limit import CLOCK
 
 if TYPE_CHECKING:
     from multiprocessing.context import BaseContext
@@ -77,7 +78,8 @@ ANNOUNCEMENT_TURN = Turn()
 def announce_compilation() -> None:
     """From now on, log one line when numba compiles the first kernel of a package of startrack in this process.
 
-    Nothing is logged where all kernels come from the cache. Call this before the first use of a kernel.
+    Compilation does not count towards a limit of time. Nothing is logged where all kernels come from the cache. Call
+    this before the first use of a kernel.
     """
     from numba.core import event
 
@@ -85,6 +87,7 @@ def announce_compilation() -> None:
 
     class Announcement(event.Listener):  # type: ignore[misc]
         def on_start(self, event: Any) -> None:
+            CLOCK.pause()
             root, _, module = event.data["dispatcher"].py_func.__module__.partition(".")
             package = module.partition(".")[0]
             if root == PACKAGE.name and package not in announced and ANNOUNCEMENT_TURN.take():
@@ -92,7 +95,7 @@ def announce_compilation() -> None:
                 LOG.warning("compiling %s, once for this installation: %s", package, _compiled_text(package))
 
         def on_end(self, event: Any) -> None:
-            """Nothing to do."""
+            CLOCK.resume()
 
     event.register("numba:compile", Announcement())
 

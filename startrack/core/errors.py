@@ -76,12 +76,14 @@ class Reason(StrEnum):
     )  # fmt: skip
     NO_STARS = (
         "no_stars", EXIT_REFUSED, "No stars stand out of the noise",
-        "Expose longer, keep stray light out, check the lens cap and the focus.",
+        "Try a longer exposure. Of a dark picture: was the lens cap on? Of a bright one: keep stray light out. Of "
+        "blurred stars: focus.",
     )  # fmt: skip
     NOT_IDENTIFIED = (
         "not_identified", EXIT_REFUSED, "No attitude explains the point sources better than chance (one in 10^9)",
-        "Check that the camera file is that of this lens; expose longer for more stars; where the lens is not known, "
-        "startrack identify --fov finds it.",
+        "Try what fits the picture: startrack identify --fov where the camera file may be another lens's, another "
+        "--fov where the field may be another, --mask where ground or lamps are in view, a longer exposure where "
+        "stars are few.",
     )  # fmt: skip
     MIRRORED = (
         "mirrored", EXIT_REFUSED, "The image is a mirror image, compared with the camera file",
@@ -111,6 +113,11 @@ class Reason(StrEnum):
         "take another picture some way off, expose longer, or narrow [search] in the terrain file to where the rover "
         "can be.",
     )  # fmt: skip
+    TIME_LIMIT = (
+        "time_limit", EXIT_REFUSED, "The time limit came before an answer",
+        "Give more time with --time-limit, or facts that narrow the search: a camera file, a narrower --fov, "
+        "--near-sky, or of a position --near.",
+    )  # fmt: skip
     INTERNAL_ERROR = (
         "internal_error", EXIT_INTERNAL_ERROR, "The program has an error",
         "Please report it with the image; startrack locate IMAGE -v shows where it happened.",
@@ -124,23 +131,16 @@ ADVICE_IN_MESSAGE = re.compile(  # the imperatives of our messages, a flag, or a
 )
 MISSING = "No such file"
 MISSING_ADVICE = "Check the name and the folder of the file."
-OTHER_FOV_ADVICE = (  # in the place of NOT_IDENTIFIED's, where a field of view is given and no camera file
-    "Try another field of view: startrack identify --fov 60..200 IMAGE finds it; check the focus; expose longer for "
-    "more stars."
-)
 BAD_INPUT_REASONS = frozenset(one for one in Reason if one.exit_code == EXIT_BAD_INPUT)  # BadInput in the library
 
 
-def next_step(reason: str, message: str, *, by_fov: bool = False) -> str:
-    """The advice of a `reason` for a terminal; empty where the `message` itself contains what to do, or a question.
-
-    `by_fov`: whether a field of view is given in the place of a camera file.
-    """
+def next_step(reason: str, message: str) -> str:
+    """The advice of a `reason` for a terminal; empty where the `message` itself contains what to do, or a question."""
     if ADVICE_IN_MESSAGE.search(message):
         return ""
     if message.endswith((MISSING, "no such folder", "is a file, not a folder")):
         return MISSING_ADVICE
-    return OTHER_FOV_ADVICE if by_fov and reason == Reason.NOT_IDENTIFIED else Reason(reason).advice
+    return Reason(reason).advice
 
 
 def exit_code_of(reason: str | None) -> int:

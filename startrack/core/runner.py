@@ -11,6 +11,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from contextvars import copy_context
 from dataclasses import dataclass
 from itertools import islice
 from multiprocessing import active_children, get_context, parent_process
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
 
 from startrack.core.compilation import ANNOUNCEMENT_TURN
 from startrack.core.errors import BadInput
+from startrack.core.time_limit import check_time
 
 if TYPE_CHECKING:
     from multiprocessing.synchronize import Semaphore
@@ -51,10 +53,17 @@ def count_cores() -> int:
 def map_in_threads(work: Callable[..., Result], *tasks: Iterable[Any]) -> Iterator[Result]:
     """The results of `work` for the `tasks`, as of `map`, by a thread a core; the first exception is raised.
 
-    For work on arrays, which numpy, OpenCV and the compiled kernels do beside other threads.
+    For work on arrays, which numpy, OpenCV and the compiled kernels do beside other threads. The limit of time of
+    the caller holds in the threads; each task begins with asking for it.
     """
+    here = copy_context()
+
+    def limited(*task: Any) -> Result:
+        check_time()
+        return work(*task)
+
     with ThreadPoolExecutor(count_cores()) as pool:
-        yield from pool.map(work, *tasks)
+        yield from pool.map(lambda *task: here.copy().run(limited, *task), *tasks)
 
 
 class RunStopped(Exception):

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from startrack.core.time_limit import check_time
 from startrack.core.types import Array, Ints
 from startrack.detection.fit import (
     FIT_ROUNDS,
@@ -36,6 +37,7 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = 
     """Fits of all candidates. `known`: earlier fits of the first peaks, refined once; `frame.found` contains them."""
     from scipy.spatial import cKDTree
 
+    check_time()
     radius, centres = radius_for(sigma), peaks.centres
     data, variance = frame.cut_light(centres, radius)
     stamps = Stamps(data, variance, frame.usable_pixels(centres, radius), centres, peaks.surround)
@@ -71,6 +73,7 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = 
     if len(bright):
         fits = fit_again(bright, last[bright])
     for _ in range(CROWDED_ROUNDS):
+        check_time()
         counts = _are_relevant(stamps, fits, star, other, sigma)
         crowded, signal = _changed_signal(stamps, fits, star[counts], other[counts], sigma, last)
         if not len(crowded):

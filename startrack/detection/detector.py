@@ -10,6 +10,7 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.core.smooth_image import Image, SmoothImage
+from startrack.core.time_limit import check_time
 from startrack.core.types import Array, Bools, Detections, Exposure, Mask, TooFewStars
 from startrack.detection.background import background_and_noise, block_side, smallest_step
 from startrack.detection.classify import (
@@ -119,6 +120,7 @@ class Detector:
     def _candidates_at(self, source: FrameSource, sigma: float) -> _Candidates:
         """Candidates and their fits; where the PSF is wide, in the binned frame."""
         side, frame = binning_factor(sigma), source.frame(sigma)
+        check_time()
         small = bin_frame(frame, side)
         peaks = self._find_peaks(frame, small, side, sigma)
         return _Candidates(frame, small, side, sigma, fit_all(small, peaks, sigma / side))
@@ -128,6 +130,7 @@ class Detector:
         side, sigma = candidates.side, candidates.sigma
         frame = source.frame(sigma, paint_sources(stars, sigma, source.image.shape))
         frame = replace(frame, source_noise=candidates.fitted.source_noise)
+        check_time()
         positions = (stars.xy_px - 0.5 * (side - 1)) / side
         peaks = self._find_peaks(frame, bin_frame(frame, side), side, sigma, known=positions)
         if side > 1:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from startrack.core.time_limit import check_time
 from startrack.core.types import Array, Bools, Ints
 from startrack.core.values import Rows, array
 from startrack.detection.background import CLIPPED_SIGMA
@@ -68,6 +69,7 @@ def find_streaks(frame: Frame) -> Streaks | None:
     hundredth of the length is added to its error for variations. Particle tracks have random directions and lengths,
     and are rejected.
     """
+    check_time()
     height, width = frame.shape
     whole = np.empty_like(frame.image)
     fill_residuals(*frame.light_and_noise, whole)
@@ -84,6 +86,7 @@ def find_streaks(frame: Frame) -> Streaks | None:
     signal = (frame.image[rows, columns] - frame.background.at(rows, columns)).astype(np.float64)
     variance = np.square(frame.noise.at(rows, columns).astype(np.float64))
     variance += frame.source_noise.per_unit * np.maximum(signal, 0.0)
+    check_time()
     blobs = _moments(label, np.stack([columns, rows], axis=1).astype(np.float64), signal, variance, count)
     flux, flux_sigma, xy, spread, covariance = blobs
     bright = (area >= MIN_AREA_PX) & (area <= MAX_AREA_PX) & off_border & (flux > BRIGHT_STAR_SNR * flux_sigma)

@@ -15,6 +15,7 @@ import numpy as np
 
 from startrack.camera import Camera, lens_jacobian, with_update
 from startrack.core.statistics import root_between
+from startrack.core.time_limit import check_time
 from startrack.core.types import Array, NotIdentified
 from startrack.estimation.normal_equations import NormalEquations, Observations, Terms
 from startrack.frames import R_from_rotvec
@@ -163,6 +164,7 @@ def adjust(
     inverse = inverse_covariance(points.covariance_px2, extra)
     damping = _Damping(points, free, scheme.loss, inverse, prior) if damped else None
     for k in range(scheme.steps):
+        check_time()
         if scheme.estimates_extra:
             extra = extra_variance_px2(residual, points.covariance_px2, len(free) + 3 * points.images)
             inverse = inverse_covariance(points.covariance_px2, extra)

@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from startrack.camera import Camera
+from startrack.core.time_limit import check_time, stating_work
 from startrack.core.types import Array, Centroids, Ints
 from startrack.estimation.false_alarm import PATTERN_MATCHES, expected_false_alarms
 from startrack.frames import wahba
@@ -119,6 +120,10 @@ class AttitudeSearch:
         then from triangles assembled from catalogue pairs; last from short ones, for rays with errors of `rough_px`:
         over short distances a rough calibration is still accurate.
         """
+        with stating_work(lambda: f"{len(self.rays_cam)} point sources: {self.tried} matching triangles tried"):
+            yield from self._hypotheses(tolerance_px, rough_px)
+
+    def _hypotheses(self, tolerance_px: float, rough_px: float) -> Iterator[AttitudeHypothesis]:
         n, tolerance = len(self.rays_cam), tolerance_px * self.scale.axis_rad_per_px
         for windows in (BRIGHTEST, BEYOND):
             for deep in (False, True):
@@ -151,6 +156,7 @@ class AttitudeSearch:
         self, index: PatternIndex, first: int, fresh: int, end: int, tolerance: float
     ) -> Iterator[AttitudeHypothesis]:
         """From triangles of the detections `first` to `end` that have a vertex from the `fresh`-th of them on."""
+        check_time()
         some = self.rays_cam[first:end]
         vertices, sides = sides_of_few(some, fresh, index.longest_chord)
         left, right = index.candidates(sides, tolerance, self._matches_each(MATCHES_EACH))
@@ -161,6 +167,7 @@ class AttitudeSearch:
     def _attitudes_from_pairs(self, tolerance: float) -> Iterator[AttitudeHypothesis]:
         index, few = self.patterns.pairs, self.rays_cam[:PIVOTS]
         for pivot in range(len(few) - 2):
+            check_time()
             image, catalogue = index.triangles(few[pivot:], tolerance)
             if len(image):
                 yield from self._test_triangles(few[image + pivot], index.rays_icrs[catalogue], 0, tolerance)
@@ -200,6 +207,7 @@ class AttitudeSearch:
         """The `attitudes` at which more detections hit a star within the `radius` than chance makes likely."""
         rays = len(self.rays_cam[: first + VERIFIED_DETECTIONS])
         for R in attitudes:
+            check_time()
             near = self._neighbours(R, first)
             hits = min(int(np.count_nonzero(near.chord < radius)), rays)
             if hits < self.sources.min_matches:
@@ -235,6 +243,7 @@ class AttitudeSearch:
         if len(cam):
             yield rotation_between(cam[0], icrs[0], np.ones(len(cam[0])))
         for start in range(1, len(cam), PRETESTED):
+            check_time()
             R = wahba(cam[start : start + PRETESTED], icrs[start : start + PRETESTED])
             near = self.patterns.neighbours((some @ R).reshape(-1, 3), 2 * np.arcsin(radius / 2), depth)
             hit = near.ray[np.diff(near.ray, prepend=-1) > 0]  # each once

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from startrack.camera import Camera
 from startrack.core import STAR_COUNT_SLOPE
+from startrack.core.errors import Reason
 from startrack.core.types import Array, Attitude, Centroids, Identification, Ints, NotIdentified, Stars
 from startrack.estimation.attitude import AttitudeFit, solve_attitude
 from startrack.identification.lost_in_space import Identifier
@@ -100,18 +103,19 @@ def identify_centroids(
 
         stars = load_catalog().at(None, None)
     sources, order = sorted_centroids(xy_px, flux, sigma_px, saturated, psf_sigma_px)
-    if camera is not None:
-        if fov_rad is not None or size_px is not None:
-            raise ValueError("with camera= neither a field of view nor size_px= is given: the camera has its own")
-        _require_in_frame(sources.xy_px, camera.size_px)
-        found = (identifier or Identifier())(sources, camera, stars, near_R_cam_icrs)
-    elif fov_rad is not None and size_px is not None:
-        _require_in_frame(sources.xy_px, size_px)
-        near_sky = None if identifier is None else identifier.near_sky
-        solution = identify_unknown_lens(sources, size_px, fov_rad, stars, near_sky=near_sky)
-        camera, found = solution.camera, solution.identification
-    else:
-        raise ValueError("give a camera, or fov_rad= with size_px=")
+    with _stating_order(flux is None):
+        if camera is not None:
+            if fov_rad is not None or size_px is not None:
+                raise ValueError("with camera= neither a field of view nor size_px= is given: the camera has its own")
+            _require_in_frame(sources.xy_px, camera.size_px)
+            found = (identifier or Identifier())(sources, camera, stars, near_R_cam_icrs)
+        elif fov_rad is not None and size_px is not None:
+            _require_in_frame(sources.xy_px, size_px)
+            near_sky = None if identifier is None else identifier.near_sky
+            solution = identify_unknown_lens(sources, size_px, fov_rad, stars, near_sky=near_sky)
+            camera, found = solution.camera, solution.identification
+        else:
+            raise ValueError("give a camera, or fov_rad= with size_px=")
     fit = solve_attitude(
         camera, sources.xy_px[found.detection], sources.covariance_px2[found.detection], stars.rays_icrs[found.star],
         found.R_cam_icrs,
@@ -121,6 +125,18 @@ def identify_centroids(
         false_alarm_probability=found.false_alarm_probability, unexplained=found.unexplained,
     )  # fmt: skip
     return IdentifiedCentroids(identification=found, stars=stars, camera=camera, attitude_fit=fit, has_time=has_time)
+
+
+@contextmanager
+def _stating_order(is_assumed: bool) -> Iterator[None]:
+    """In the block a refusal also states that the order of the centroids is assumed, if it is."""
+    try:
+        yield
+    except NotIdentified as cause:
+        if is_assumed and cause.reason != Reason.MIRRORED:
+            order = "no fluxes are given, and the list counts as sorted, brightest first: if it is not, sort it"
+            cause.args = (f"{cause}; {order}, or give flux=",)
+        raise
 
 
 def sorted_centroids(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.camera import Camera
+from startrack.core.time_limit import check_time
 from startrack.core.types import Array, Bools, Ints
 from startrack.estimation.false_alarm import PATTERN_MATCHES, log_trials
 from startrack.identification.lens_guesses import LensGuess, RadialFamily, family_angle, unknown_camera
@@ -75,6 +76,7 @@ class HypothesisSearch:
         xy = self.xy_px[window.first :]
         found: list[LensHypothesis] = []
         for part in np.array_split(np.arange(len(left)), len(left) // CANDIDATES_AT_ONCE + 1) if len(left) else ():
+            check_time()
             pairs = image.take(left[part]), patterns.triangles.triangles.take(right[part])
             found += self._rank_by_stars(patterns, guess, xy, *pairs)
         return sorted(found, key=lambda hypothesis: hypothesis.log_p)[:MAX_HYPOTHESES]
@@ -113,6 +115,7 @@ class HypothesisSearch:
         self, patterns: ShapePatterns, guess: LensGuess, window: Window
     ) -> tuple[Triangles, Ints, Ints]:
         """Triangles of the window, and the pairs (image triangle, catalogue triangle) of similar ones."""
+        check_time()
         rays = family_rays(self.xy_px[window.first : window.end], guess, guess.focal_px)
         image = triangles(rays, patterns.longest_side_rad)
         image = image.take(image.vertices.max(axis=1, initial=0) >= window.done - window.first)

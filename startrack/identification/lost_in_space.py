@@ -97,13 +97,16 @@ class Identifier:
                 advice="is the array transposed? Else flip the image, or set mirrored = "
                 f"{str(not camera.mirrored).lower()} in the camera file",
             )
-        where, advice = ("", "") if self.near_sky is None else (f" within {self.near_sky}", " and where it points")
-        is_known = camera.name != UNKNOWN_LENS
-        lens = "the camera file is that of this lens" if is_known else "its lens is that of the others"
+        where, advice = "", ""
+        if self.near_sky is not None:
+            where, advice = f" within {self.near_sky}", "; if the axis may point elsewhere, leave out near_sky"
+        lens = "if its lens may differ from that of the others, try it alone"
+        if camera.name != UNKNOWN_LENS:
+            lens = f"if {camera.name} may be another lens's, try startrack identify --fov, which needs no camera file"
         raise NotIdentified(
             f"no attitude{where} explains the {len(inside)} point "
             f"sources better than chance ({search.tried} tried; {refusal})",
-            advice=f"check that {lens}{advice}",
+            advice=lens + advice,
             detected=len(inside),
             tried=search.tried,
         )
@@ -180,7 +183,9 @@ def _describe_few(inside: int, given: int, camera: Camera, needed: int) -> tuple
     With the advice.
     """
     if given < needed:
-        return f"{given} point sources are too few to identify", "expose longer"
+        return f"{given} point source{'s' * (given != 1)}: too few to identify, which takes {needed}", (
+            "try a longer exposure"
+        )
     return (
         f"only {inside} of {given} point sources lie in the image circle of camera {camera.name!r} "
         f"({np.degrees(camera.max_angle_rad):.4g} degrees from its axis, in {camera.size_px[0]} x "

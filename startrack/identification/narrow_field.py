@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from startrack.core.time_limit import check_time
 from startrack.core.types import Array, Centroids, Ints, Stars
 from startrack.estimation.false_alarm import (
     PATTERN_MATCHES,
@@ -64,6 +65,7 @@ def narrow_lenses(
             if any(np.trace(other.T @ R) > 3.0 - SAME_VIEW_RAD**2 for other in seen):
                 continue
             seen.append(R)
+            check_time()
             view = PinholeView(R, camera.focal_px[0], camera.mirrored, camera.size_px, 0.0)
             lens = _grow_view(view, centroids, stars, search.log_trials)
             if lens is not None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.time_limit import check_time
 from startrack.core.types import Array, Bools, Ints, Stars
 from startrack.estimation.false_alarm import log_p_value
 from startrack.identification.index import keep_last_few
@@ -97,7 +98,7 @@ def proximity_mask(rays_icrs: Array, radius_rad: float) -> ProximityMask:
     columns = 2 * rows
     star_declination = np.arcsin(np.clip(rays_icrs[:, 2], -1, 1))
     star_ascension = np.arctan2(rays_icrs[:, 1], rays_icrs[:, 0])
-    edges = np.zeros((rows, columns + 1), dtype=np.int32)
+    edges = np.zeros((rows, columns + 1), dtype=np.int16)
     middle_row = np.floor((star_declination / np.pi + 0.5) * rows).astype(np.int64)
     for offset in range(-3, 4):
         row = middle_row + offset
@@ -116,7 +117,7 @@ def proximity_mask(rays_icrs: Array, radius_rad: float) -> ProximityMask:
             some = b > a
             np.add.at(edges, (row[some], a[some]), 1)
             np.add.at(edges, (row[some], b[some]), -1)
-    near = np.cumsum(edges[:, :-1], axis=1) > 0
+    near = np.cumsum(edges[:, :-1], axis=1, dtype=np.int16) > 0
     weight = np.cos(((np.arange(rows) + 0.5) / rows - 0.5) * np.pi)
     return ProximityMask(near, float(near.mean(axis=1) @ weight / weight.sum()))
 
@@ -178,7 +179,9 @@ def patterns_for(stars: Stars, sizes: PatternSizes) -> ShapePatterns:
         star = separate_bright_stars(stars, sizes.stars)
         rays = stars.rays_icrs[star]
         found = triangles(rays, sizes.longest_side_rad * (1 + sizes.size_tolerance))
+        check_time()
         index = shape_index(found, sizes.shape_tolerance, sizes.size_tolerance)
+        check_time()
         return ShapePatterns(star, rays, sizes.longest_side_rad, index, proximity_mask(rays, sizes.near_rad))
 
     key = (sizes, len(stars), np.round(stars.rays_icrs[:500], 3).tobytes())

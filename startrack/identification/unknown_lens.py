@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
-from startrack.core import FIELD_TOLERANCE_1
+from startrack.core import FIELD_TOLERANCE_1, NARROWEST_DEG, WIDEST_DEG
+from startrack.core.time_limit import check_time, stating_work
 from startrack.core.types import Array, Centroids, Identification, NotIdentified, Stars
 from startrack.estimation.false_alarm import probability
 from startrack.estimation.normal_equations import observations_of_image
@@ -60,7 +61,6 @@ FIELD_STEPS_PER_E = 4.0  # indexes are made for fields a fourth part of a factor
 ASPECTS = (15 / 16, 16 / 15, 9 / 8, 8 / 9, 27 / 32, 45 / 64)
 LAST_FITS = 4  # of matching and fitting a lens that is found
 SAME_LENS_RAD = 0.05  # between attitudes
-ADVICE = "check the field of view and the focus; with a camera file fewer stars suffice"
 
 
 @dataclass(frozen=True)
@@ -97,15 +97,27 @@ def identify_unknown_lens(
                 false_alarm_probability=probability(lens.log_p),
             )  # fmt: skip
             return UnknownLensSolution(camera, identification)
-    tried = search.hypotheses.tried
     where = "" if near_sky is None else f" within {near_sky}"
     raise NotIdentified(
         f"no lens of {np.degrees(fov_rad):.3g} degrees ({100 * tolerance:.0f} % more or less){where} explains the "
-        f"{len(centroids)} point sources better than chance ({tried} patterns tried)",
-        advice=ADVICE,
+        f"{len(centroids)} point sources better than chance ({search.tried_text})",
+        advice=advise_on_fields(fov_rad * (1 - tolerance), fov_rad * (1 + tolerance), near_sky),
         detected=len(centroids),
-        tried=tried,
+        tried=search.hypotheses.tried,
     )
+
+
+def advise_on_fields(low_rad: float, high_rad: float, near_sky: NearSky | None) -> str:
+    """What may be tried where no lens from `low_rad` to `high_rad` fits with the axis near the sky given, if any."""
+    low, high = np.degrees([low_rad, high_rad])
+    wider = max(low / 2, NARROWEST_DEG), min(2 * high, WIDEST_DEG)
+    words = ["if there is a camera file, give it: fewer stars suffice"]
+    if wider[0] < 0.99 * low or wider[1] > 1.01 * high:
+        range_text = f"{wider[0]:.3g}..{wider[1]:.3g}"
+        words.insert(0, f"if the field of view may be another, try startrack identify --fov {range_text}")
+    if near_sky is not None:
+        words.append("if the axis may point elsewhere, leave out near_sky")
+    return "; ".join(words)
 
 
 class _Search:
@@ -126,10 +138,11 @@ class _Search:
             self.xy_px = self.xy_px[off < CIRCLE_EDGE * self.circle.radius_px]
         chosen = remove_clumps(self.xy_px, CLUMP_FRACTION * min(size_px), MAX_DETECTIONS)
         if len(chosen) < self.min_matches:
+            apart = "" if len(chosen) == len(centroids) else f" of {len(centroids)} that stand apart"
             raise NotIdentified(
-                f"{len(chosen)} point sources are too few to identify without a camera file, which takes "
-                f"{self.min_matches}",
-                advice=f"expose longer, or {ADVICE}",
+                f"{len(chosen)} point source{'s' * (len(chosen) != 1)}{apart}: too few to identify without a camera "
+                f"file, which takes {self.min_matches}",
+                advice="try a longer exposure, or a camera file, with which fewer suffice",
                 detected=len(centroids),
             )
         self.hypotheses = HypothesisSearch(self.xy_px[chosen], size_px, near_sky, 0.5 * fov_rad * tolerance)
@@ -146,8 +159,18 @@ class _Search:
         # Rounded, one index serves many fields.
         self.rounded_sr = float(np.exp(np.round(FIELD_STEPS_PER_E * np.log(self.field_sr)) / FIELD_STEPS_PER_E))
 
+    @property
+    def tried_text(self) -> str:
+        """The work done."""
+        return f"{self.hypotheses.tried} patterns of the {len(self.hypotheses.xy_px)} brightest that stand apart tried"
+
     def lenses(self) -> Iterator[VerifiedLens]:
         """Verified lenses, whatever their p-value."""
+        field = f"{np.degrees(self.fov_rad):.3g} degrees, {len(self.centroids)} point sources"
+        with stating_work(lambda: f"{field}: {self.tried_text}"):
+            yield from self._lenses()
+
+    def _lenses(self) -> Iterator[VerifiedLens]:
         if self.narrow:
             yield from narrow_lenses(self.centroids, self.hypotheses, self.fov_rad, self.rounded_sr, self.stars)
         if not self.wide:
@@ -216,6 +239,7 @@ class _Search:
                     if any(np.trace(other.T @ R) > 1 + 2 * np.cos(SAME_LENS_RAD) for other in seen):
                         continue
                     seen.append(R)
+                    check_time()
                     around = None if self.wide else np.flatnonzero(self.stars.rays_icrs @ R[2] > nearest_1)
                     stars = self.stars if around is None else self.stars.take(around)
                     grown = grow(hypothesis, self.xy_px, stars.rays_icrs, stages)

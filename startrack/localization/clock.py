@@ -8,6 +8,7 @@ from math import hypot
 
 import numpy as np
 
+from startrack.core.time_limit import check_time
 from startrack.core.types import Array, Clock, Evidence, NotLocated
 from startrack.frames import Air, R_from_rotvec, Site, sky_rotvec_rad, turn_sky, ut1_sigma_s
 from startrack.localization import search
@@ -209,6 +210,7 @@ def explore_times(
 
 def turned_model(model: SkylineModel, later_s: float, is_rough: bool = False) -> SkylineModel:
     """The model with its rows turned to a later time; see `SectorRows.is_rough`."""
+    check_time()
     return model.with_rows(turn_evidence(model.seen.rows, later_s, model.terrain.air), is_rough)
 
 

@@ -16,6 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from startrack.core.statistics import shares
+from startrack.core.time_limit import check_time
 from startrack.core.types import Array
 
 DEGREES, FAR_DEGREES = 5.0, 3.0  # of freedom of the t distributions
@@ -191,6 +192,7 @@ def sample(
     modes = list(modes)
     more = 1.0 + MORE_POINTS * (d - 2)
     for number, count in enumerate(rounds):
+        check_time()
         new = [*_parts(modes, round(more * count)), *(first if number == 0 else ())]
         drawn = _draw(new, len(points))
         drawn_by = np.logaddexp(drawn_by, _log_mixture(new, points)) if number else drawn_by

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from startrack.core.time_limit import check_time
 from startrack.core.types import Array, NotLocated
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.terrain import Terrain
@@ -107,6 +108,7 @@ def last_boxes(likelihood: PositionLikelihood, width: int, traced: bool) -> tupl
     terrain, (east_m, north_m, half) = likelihood.terrain, likelihood.terrain.searched
     centres = np.array([[east_m, north_m]])
     while half > LAST_HALF_M[traced] and len(centres):
+        check_time()
         centres, half = split_boxes(centres, half, terrain), half / 2
         score = likelihood.average.score(terrain, centres, half, traced=traced and half < TRACED_BELOW_M)
         centres = centres[np.argsort(-score, kind="stable")[:width]]
@@ -121,11 +123,13 @@ def refine_boxes(likelihood: PositionLikelihood, centres_m: Array, half_m: float
     """
     terrain, near, half = likelihood.terrain, centres_m[:CLOSER], half_m
     while half > LAST_STEP_M and len(near):
+        check_time()
         near, half = split_boxes(near, half, terrain), half / 2
         near = near[np.argsort(-likelihood.average.score(terrain, near, half), kind="stable")[:CLOSER]]
     found, score = np.zeros((0, 2)), np.zeros(0)
     new, step_m, gained = np.vstack([centres_m[:SCORED], near]), half_m, np.inf
     while len(new) and (step_m > LAST_STEP_M or gained > CLIMB_NATS):
+        check_time()
         new = new[np.asarray(terrain.allowed(new))]
         before = float(score.max(initial=-np.inf))
         found, score = np.vstack([found, new]), np.append(score, likelihood.exact_scores(new))
@@ -162,6 +166,7 @@ def local_posterior(likelihood: PositionLikelihood, guess: Guess, log_open: floa
     terrain, reach_m = likelihood.terrain, FIRST_REACH_M
     modes = guess.points_m[guess.log_likelihood > guess.best - NATS]
     while True:
+        check_time()
         centres = (modes[:, None] + square_grid(reach_m, BOXES_ACROSS)).reshape(-1, 2)
         score = np.where(terrain.allowed(centres), likelihood.exact_scores(centres), -np.inf)
         off = np.abs(centres[:, None] - modes).max(axis=2).min(axis=1)
@@ -232,6 +237,7 @@ class Search:
         lk, kept = self.likelihood, []
         nats = self.prune_nats + max(0.0, 2.0 * float(np.log(half / FINEST_M)))
         for start in range(0, len(centres), BOXES_AT_ONCE):
+            check_time()
             some = centres[start : start + BOXES_AT_ONCE]
             first, last = lk.sums.open_rays(lk.terrain, some, half)
             visible, least, most = lk.sums.sums(first, last)

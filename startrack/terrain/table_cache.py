@@ -19,6 +19,7 @@ from startrack.core.errors import BadInput
 from startrack.core.files import hold_lock
 from startrack.core.runner import count_cores
 from startrack.core.stored import read_sealed, write_sealed
+from startrack.core.time_limit import uncounted_time
 from startrack.core.types import Ints
 from startrack.terrain.horizon_table import (
     AZIMUTH_BINS,
@@ -111,7 +112,8 @@ def load_or_build_table(ground: TracedMap, progress: Progress | None = None) -> 
             about_s = seconds_of_table(ground)
             LOG.info("horizons of %s: computed now, once; this takes about %.2g s", ground.name, about_s)
             start = clock.perf_counter()
-            table = build_table(ground, progress)
+            with uncounted_time():
+                table = build_table(ground, progress)
             is_kept, path = keep_table(key, table), path_of_table(key)
             where = f"kept in {path}" if is_kept else f"not kept: {path.parent} cannot be written"
             LOG.debug("horizons of %s: done in %.0f s, %s", ground.name, clock.perf_counter() - start, where)

@@ -24,6 +24,7 @@ from startrack.camera import REFRACTION_CONTAINED, REFRACTION_REMOVED, Camera
 from startrack.catalog import StarCatalog
 from startrack.chain import stating_sky
 from startrack.core.runner import map_in_threads
+from startrack.core.time_limit import TimeLimitReached, check_time, stating_work
 from startrack.core.types import Array, BadInput, Bools, Exposure, Identification, NoSolution, NotIdentified
 from startrack.detection import Detector
 from startrack.estimation.fixed_camera import find_disagreeing
@@ -77,7 +78,9 @@ class _Run:
         return max(self.identified, key=lambda one: len(one.found))
 
     def refuse(self, image: str, cause: NoSolution) -> None:
-        """Leave an image out."""
+        """Leave an image out; a limit of time ends the calibration."""
+        if isinstance(cause, TimeLimitReached):
+            raise cause
         self.refused.append(RefusedImage(name=image, reason=cause.reason, message=str(cause)))
 
 
@@ -114,20 +117,23 @@ def calibrate(
     """
     run = _Run(catalog, camera, field_of_view_rad(camera, fov_rad), site, progress)
     frames = _frames(run, exposures)
-    _identify_all(run, frames)
-    joint, same = _fit_jointly(run)
-    joint = widen_covariance(joint)
+    with stating_work(lambda: f"the stars of {len(run.identified)} of {len(exposures)} images were identified"):
+        _identify_all(run, frames)
+        joint, same = _fit_jointly(run)
+        joint = widen_covariance(joint)
     fitted = replace(
         joint.fit.camera, name=name, max_angle_rad=largest_angle_rad(joint.fit.camera, camera, fov_rad),
         refraction=REFRACTION_CONTAINED if site is None else "" if site.air is None else REFRACTION_REMOVED,
     )  # fmt: skip
     joint = replace(joint, fit=replace(joint.fit, camera=fitted))
     progress("measuring throughput and sensor")
+    check_time()
     photometry = measure_photometry(joint, known_sensor or KnownSensor())
     mask = None if camera is None else camera.mask
     level_adu = photometry.properties.bias_adu
     if known_sensor is not None and known_sensor.bias_adu is not None:
         level_adu = known_sensor.bias_adu
+    check_time()
     obstructed, no_mask_because = find_obstructions(joint, same, level_adu) if mask is None else (None, "")
     return Calibration(
         camera=replace(fitted, sensor=photometry.sensor, mask=mask),
@@ -195,6 +201,8 @@ def _identify_all(run: _Run, frames: list[Frame]) -> None:
             run.identified.append(_identify_first(run, frame))
             break
         except NoSolution as cause:
+            if isinstance(cause, TimeLimitReached):
+                raise
             waiting.append((frame, cause))
     if not run.identified:
         for frame, refusal in waiting:

@@ -13,6 +13,7 @@ import numpy as np
 
 from startrack.camera import MIN_THROUGHPUT_1, Sensor
 from startrack.core.statistics import robust_sigma
+from startrack.core.time_limit import check_time
 from startrack.core.types import Array, Ints, Rows, array
 from startrack.estimation.joint_fit import JointFit
 from startrack.frames import airmass
@@ -171,6 +172,7 @@ def _star_fluxes(joint: JointFit) -> StarFluxes:
     parts = [StarFluxes(gain_mag=none, sigma_mag=none, angle_rad=none, b_v=none, airmass=none, image=no_image)]
     calibrated = joint.fit.camera.calibrated_angle_rad
     for i, (frame, matched) in enumerate(zip(joint.frames, joint.matches, strict=True)):
+        check_time()
         exposure_s = frame.exposure.exposure_s
         if exposure_s is None:
             continue

@@ -19,6 +19,7 @@ from startrack.catalog import (
 from startrack.chain import NearAttitude, Oriented, Refused, Settings, identify, identify_blind
 from startrack.core.errors import BadInput, Reason
 from startrack.core.runner import map_in_threads
+from startrack.core.time_limit import TimeLimitReached
 from startrack.core.types import Array, Body, Detections, Exposure, Ints
 from startrack.estimation.false_alarm import log_p_value_poisson
 from startrack.estimation.fixed_camera import find_disagreeing
@@ -104,6 +105,8 @@ def orient_frames(
             identified.append(outcome)
         elif outcome.reason.exit_code == Reason.BAD_IMAGE.exit_code:
             raise BadInput(outcome.reason, f"{exposure.name}: {outcome.message}")
+        elif outcome.reason is Reason.TIME_LIMIT:
+            raise TimeLimitReached(f"{exposure.name}: {outcome.message}")
         else:
             left_out.append(LeftOut(name=exposure.name, reason=outcome.reason, message=outcome.message))
 

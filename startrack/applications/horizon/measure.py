@@ -24,6 +24,7 @@ from startrack.camera import Camera
 from startrack.catalog import StarCatalog
 from startrack.core.errors import NoSolution
 from startrack.core.runner import map_in_threads
+from startrack.core.time_limit import check_time
 from startrack.core.types import Array, Bools, Exposure, Ints, MeasuredSkyline
 from startrack.frames import Site, off_axis_rad, rays_from_azel
 
@@ -112,7 +113,9 @@ def skyline_of_frames(measured: Sequence[MeasuredFrame], site: Site) -> Measured
 
 def measure_frame(frame: SkyFrame, site: Site) -> MeasuredFrame:
     """What one `frame` shows of the skyline at a `site`."""
+    check_time()
     stars = measure_stars(frame)
+    check_time()
     steps, by_stars = find_steps(frame, stars), star_log_likelihood(stars.rays, stars.missing)
     by_steps = np.zeros_like(by_stars)
     for found, (_, weight) in zip(steps, WIDTHS, strict=True):
@@ -125,6 +128,7 @@ def _skyline_of(
     frames: Sequence[SkyFrame], lights: Sequence[Light], log_likelihood: Array, site: Site
 ) -> MeasuredSkyline:  # fmt: skip
     """The skyline by the `log_likelihood` (AZIMUTH_COLUMNS, n) of the `lights` of `frames`."""
+    check_time()
     stars, steps = zip(*lights, strict=True)
     mean, sigma = combine_columns(column_log_prior() + log_likelihood)
     # The columns' posterior as bins of one degree; the errors that the frames share are added once.

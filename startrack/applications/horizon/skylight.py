@@ -25,6 +25,7 @@ from startrack.applications.horizon.columns import (
 )
 from startrack.applications.horizon.frames import SkyFrame
 from startrack.applications.horizon.starlight import StarLight
+from startrack.core.time_limit import check_time
 from startrack.core.types import Array, Bools, Ints
 
 BEYOND_CIRCLE_RAD = np.radians(4.5)  # the edge of the image circle is stated to some degrees; light is followed so far
@@ -73,6 +74,7 @@ def _steps_of(columns: Columns, width: int) -> Steps:
     """The steps of columns that are means over `width`."""
     from scipy.ndimage import maximum_filter1d
 
+    check_time()
     width_px = width * 2 * np.pi / AZIMUTH_COLUMNS / columns.px_rad
     dark = float(np.nanpercentile(columns.light_e, DARKEST_PERCENT))
     at_ground = _level_above(columns, CLEAR_GAP_PX, 2 * CLEAR_GAP_PX + GROUND_PX / 2, dark)

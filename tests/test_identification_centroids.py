@@ -100,7 +100,7 @@ def test_the_message_about_a_wrong_list_says_what_to_give(case) -> None:
 
 @pytest.mark.parametrize("empty", [[], np.zeros((0, 2))], ids=["list", "array"])
 def test_an_empty_list_has_too_few_stars(empty) -> None:
-    with pytest.raises(NotIdentified, match="0 point sources are too few"):
+    with pytest.raises(NotIdentified, match="0 point sources: too few"):
         identify_centroids(empty, camera=FISHEYE, stars=sky())
 
 

@@ -24,8 +24,17 @@ from startrack.camera import REFRACTION_CONTAINED, REFRACTION_REMOVED, Camera
 from startrack.catalog import StarCatalog
 from startrack.chain import stating_sky
 from startrack.core.runner import map_in_threads
-from startrack.core.time_limit import TimeLimitReached, check_time, stating_work
-from startrack.core.types import Array, BadInput, Bools, Exposure, Identification, NoSolution, NotIdentified
+from startrack.core.time_limit import stating_work
+from startrack.core.types import (
+    Array,
+    BadInput,
+    Bools,
+    Exposure,
+    Identification,
+    NoSolution,
+    NotIdentified,
+    TooFewStars,
+)
 from startrack.detection import Detector
 from startrack.estimation.fixed_camera import find_disagreeing
 from startrack.estimation.frame_matching import Frame, frame_of, require_body, require_time
@@ -78,9 +87,7 @@ class _Run:
         return max(self.identified, key=lambda one: len(one.found))
 
     def refuse(self, image: str, cause: NoSolution) -> None:
-        """Leave an image out; a limit of time ends the calibration."""
-        if isinstance(cause, TimeLimitReached):
-            raise cause
+        """Leave an image out."""
         self.refused.append(RefusedImage(name=image, reason=cause.reason, message=str(cause)))
 
 
@@ -116,9 +123,8 @@ def calibrate(
         NotIdentified: the stars of no image are identified, or no majority agrees about the times and the site.
     """
     run = _Run(catalog, camera, field_of_view_rad(camera, fov_rad), site, progress)
-    frames = _frames(run, exposures)
     with stating_work(lambda: f"the stars of {len(run.identified)} of {len(exposures)} images were identified"):
-        _identify_all(run, frames)
+        _identify_all(run, _frames(run, exposures))
         joint, same = _fit_jointly(run)
         joint = widen_covariance(joint)
     fitted = replace(
@@ -127,13 +133,10 @@ def calibrate(
     )  # fmt: skip
     joint = replace(joint, fit=replace(joint.fit, camera=fitted))
     progress("measuring throughput and sensor")
-    check_time()
     photometry = measure_photometry(joint, known_sensor or KnownSensor())
     mask = None if camera is None else camera.mask
-    level_adu = photometry.properties.bias_adu
-    if known_sensor is not None and known_sensor.bias_adu is not None:
-        level_adu = known_sensor.bias_adu
-    check_time()
+    stated_adu = None if known_sensor is None else known_sensor.bias_adu
+    level_adu = photometry.properties.bias_adu if stated_adu is None else stated_adu
     obstructed, no_mask_because = find_obstructions(joint, same, level_adu) if mask is None else (None, "")
     return Calibration(
         camera=replace(fitted, sensor=photometry.sensor, mask=mask),
@@ -177,7 +180,7 @@ def _frames(run: _Run, exposures: Sequence[Exposure]) -> list[Frame]:
             )
         try:
             return load_frame(exposure, run.catalog, run.site, camera=run.start)
-        except NoSolution as cause:
+        except TooFewStars as cause:
             return cause
 
     frames: list[Frame] = []
@@ -200,16 +203,14 @@ def _identify_all(run: _Run, frames: list[Frame]) -> None:
         try:
             run.identified.append(_identify_first(run, frame))
             break
-        except NoSolution as cause:
-            if isinstance(cause, TimeLimitReached):
-                raise
+        except NotIdentified as cause:
             waiting.append((frame, cause))
     if not run.identified:
         for frame, refusal in waiting:
             run.refuse(frame.exposure.name, refusal)
         raise NotIdentified(
-            f"the stars of no image could be identified ({run.refused[0].message}). Take pictures of the clear, dark "
-            "night sky, in focus, with the camera still and at least a hundred stars in view",
+            f"the stars of no image could be identified ({run.refused[0].message}). A calibration takes pictures of "
+            "the clear, dark night sky, in focus, with the camera still and at least a hundred stars in view",
             reason=run.refused[0].reason,
         )
 
@@ -217,7 +218,7 @@ def _identify_all(run: _Run, frames: list[Frame]) -> None:
         try:
             with _stating_sky_of(frame, run, run.identified[0].camera):
                 camera, found = identify_with_camera(run.identified[0].camera, frame)
-        except NoSolution as cause:
+        except NotIdentified as cause:
             return cause
         return _IdentifiedFrame(frame, camera, found.R_cam_icrs, found)
 

@@ -48,7 +48,7 @@ def stating_sky(
     `on_moon`: above ground without air. `more` follows the advice about the lens.
     """
     try:
-        with stating_work(lambda: measured_text(exposure, found)):
+        with stating_work(lambda: "the sources were sought" if found is None else measured_text(exposure, found)):
             yield
     except (NotIdentified, TooFewStars) as cause:
         if cause.reason in (NotIdentified.reason, TooFewStars.reason):

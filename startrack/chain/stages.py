@@ -72,8 +72,6 @@ class Settings:
         object.__setattr__(self, "localizer", require_localizer(self.localizer))
         if self.evidence_sources not in EVIDENCE_SOURCES:
             raise ValueError(f"evidence_sources {self.evidence_sources!r}: known are {', '.join(EVIDENCE_SOURCES)}")
-        if self.time_limit_s is not None and not self.time_limit_s > 0:
-            raise ValueError(f"time_limit_s={self.time_limit_s}: give seconds of processor time, above 0")
         if self.near is not None and not has_posterior(self.localizer):
             raise ValueError(f"near={self.near}: only the localizer posterior takes a prior of the position")
 

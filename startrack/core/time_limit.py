@@ -61,7 +61,12 @@ _LIMIT: ContextVar[_Limit | None] = ContextVar("time limit", default=None)
 
 @contextmanager
 def limited_time(seconds: float | None) -> Iterator[None]:
-    """In the block `check_time` raises once so much processor time [s] was used; None: as outside of the block."""
+    """In the block `check_time` raises once so much processor time [s] was used; None: as outside of the block.
+
+    Raises ValueError for a limit that is not above 0.
+    """
+    if seconds is not None and not seconds > 0:
+        raise ValueError(f"the time limit is {seconds} s: give seconds of processor time, above 0")
     if seconds is None:
         yield
         return

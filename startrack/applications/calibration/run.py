@@ -25,16 +25,7 @@ from startrack.catalog import StarCatalog
 from startrack.chain import stating_sky
 from startrack.core.runner import map_in_threads
 from startrack.core.time_limit import stating_work
-from startrack.core.types import (
-    Array,
-    BadInput,
-    Bools,
-    Exposure,
-    Identification,
-    NoSolution,
-    NotIdentified,
-    TooFewStars,
-)
+from startrack.core.types import Array, BadInput, Bools, Exposure, Identification, NotIdentified, TooFewStars
 from startrack.detection import Detector
 from startrack.estimation.fixed_camera import find_disagreeing
 from startrack.estimation.frame_matching import Frame, frame_of, require_body, require_time
@@ -86,7 +77,7 @@ class _Run:
         """The frame with the most identified stars."""
         return max(self.identified, key=lambda one: len(one.found))
 
-    def refuse(self, image: str, cause: NoSolution) -> None:
+    def refuse(self, image: str, cause: TooFewStars | NotIdentified) -> None:
         """Leave an image out."""
         self.refused.append(RefusedImage(name=image, reason=cause.reason, message=str(cause)))
 
@@ -170,7 +161,7 @@ def load_frame(exposure: Exposure, catalog: StarCatalog, site: Site | None, came
 
 
 def _frames(run: _Run, exposures: Sequence[Exposure]) -> list[Frame]:
-    def load(exposure: Exposure) -> Frame | NoSolution:
+    def load(exposure: Exposure) -> Frame | TooFewStars:
         wanted = (run.start or exposures[0]).size_px
         if exposure.size_px != wanted:
             raise BadInput(
@@ -186,7 +177,7 @@ def _frames(run: _Run, exposures: Sequence[Exposure]) -> list[Frame]:
     frames: list[Frame] = []
     for exposure, found in zip(exposures, map_in_threads(load, exposures), strict=True):
         run.progress(f"detecting stars in {exposure.name}")
-        if isinstance(found, NoSolution):
+        if isinstance(found, TooFewStars):
             run.refuse(exposure.name, found)
         else:
             frames.append(found)
@@ -197,7 +188,7 @@ def _frames(run: _Run, exposures: Sequence[Exposure]) -> list[Frame]:
 
 def _identify_all(run: _Run, frames: list[Frame]) -> None:
     """Identify the stars of every frame: the lens of the first that can be is the start for all others."""
-    waiting: list[tuple[Frame, NoSolution]] = []
+    waiting: list[tuple[Frame, NotIdentified]] = []
     coming = iter(frames)
     for frame in coming:
         try:
@@ -214,7 +205,7 @@ def _identify_all(run: _Run, frames: list[Frame]) -> None:
             reason=run.refused[0].reason,
         )
 
-    def identify(frame: Frame) -> _IdentifiedFrame | NoSolution:
+    def identify(frame: Frame) -> _IdentifiedFrame | NotIdentified:
         try:
             with _stating_sky_of(frame, run, run.identified[0].camera):
                 camera, found = identify_with_camera(run.identified[0].camera, frame)
@@ -225,7 +216,7 @@ def _identify_all(run: _Run, frames: list[Frame]) -> None:
     others = [*coming, *(frame for frame, _ in waiting)]
     for frame, outcome in zip(others, map_in_threads(identify, others), strict=True):
         run.progress(f"identifying the stars of {frame.exposure.name}")
-        if isinstance(outcome, NoSolution):
+        if isinstance(outcome, NotIdentified):
             run.refuse(frame.exposure.name, outcome)
         else:
             run.identified.append(outcome)

@@ -54,8 +54,7 @@ T = TypeVar("T")
 class Settings:
     """The stages and their settings; each can be replaced by another one with the same call.
 
-    `localizer` may be given by its name in `startrack.localization.LOCALIZERS`. Raises TypeError for a class instead of
-    an object, ValueError for another name, also of `evidence_sources`.
+    `localizer` may be a name in `startrack.localization.LOCALIZERS`. Raises TypeError for a class, ValueError for others.
     """
 
     detector: Detector = field(default_factory=Detector)

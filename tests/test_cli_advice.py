@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from startrack.chain import detect, stating_sky
 from startrack.cli.console import print_outcome
 from startrack.cli.main import main
-from startrack.core.errors import Reason, next_step
+from startrack.core.errors import NotIdentified, Reason, next_step
+from startrack.exposure import read_exposure
+from startrack.identification import NearSky, advise_on_fields
 
 ACTIONS = {"calibrate": ("board", "verify", "show", "convert"), "terrain": ("show", "import", "build")}
 LOWELL = str(Path(__file__).parents[1] / "sample_images/lowell-2018-08-06.fits.bz2")  # 180 degrees, on the Earth
@@ -134,3 +139,45 @@ def test_the_advice_of_a_command_comes_before_that_of_the_reason(capsys: pytest.
         record = {"status": "refused", "reason": str(reason), "message": "they differ", "advice": own}
         assert print_outcome(argparse.Namespace(json=False, quiet=False), record, "a  refused") == 3
         assert capsys.readouterr() == ("a  refused\n", f"  next: {shown}\n")
+
+
+@pytest.mark.parametrize(
+    ("flag", "file", "text"),
+    [
+        ("-c", "terrain/shackleton.toml", "give it with -t (a terrain file)"),
+        ("-t", "calib/fisheye-2048.toml", "give it with -c (a camera file)"),
+        ("-c", "sample_images/near-wall.png", "it is no text: is it a picture"),
+        ("-t", "sample_images/near-wall.png", "it is no text: is it a picture"),
+    ],
+)
+def test_a_file_of_another_kind_is_said_to_be_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], flag: str, file: str, text: str
+) -> None:
+    path = str(Path(__file__).parents[1] / file)
+    assert main(["locate", SAMPLE, flag, path, "-D", str(tmp_path), "--no-plots"]) == 4
+    heard = capsys.readouterr()
+    assert text in heard.out and "next:" not in heard.err
+
+
+def test_only_wide_sources_lead_to_the_focus() -> None:
+    """And only ground in view, another field and another file are advised, each where it was not excluded."""
+    exposure = read_exposure(SAMPLE)
+    sharp = detect(exposure, None).detections
+    for psf_sigma_px, is_advised in ((1.0, False), (4.0, True)):
+        found = replace(sharp, psf_sigma_px=psf_sigma_px)
+        with pytest.raises(NotIdentified) as refused, stating_sky(exposure, found):
+            raise NotIdentified("no lens fits", advice="if the field of view may be another, try --fov 4..50")
+        text = str(refused.value)
+        assert ("focus" in text) == is_advised and "try --fov 4..50" in text and "if ground" in text
+        assert f"{len(sharp)} point sources (SNR " in text and f"sigma of {psf_sigma_px} px" in text
+        assert "in 2048 x 2048 px" in text
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "text"), [(8.0, 25.0, "--fov 4..50"), (3.0, 280.0, ""), (2.0, 200.0, "--fov 3..280")]
+)
+def test_fields_that_were_tried_are_not_advised(low: float, high: float, text: str) -> None:
+    advice = advise_on_fields(*np.radians([low, high]), None)
+    assert text in advice and ("--fov" in advice) == bool(text)
+    assert "near_sky" not in advice
+    assert "leave out near_sky" in advise_on_fields(0.1, 0.4, NearSky.from_degrees([10.0, 20.0, 5.0]))

@@ -127,3 +127,11 @@ def test_an_impossible_field_or_frame_is_named() -> None:
         identify_centroids(xy_px, fov_rad=3.0, size_px=(1024, 0), stars=sky())
     with pytest.raises(ValueError, match="size_px= is 1024: give width and height"):
         identify_centroids(xy_px, fov_rad=3.0, size_px=1024, stars=sky())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("flux", [None, np.linspace(9.0, 1.0, 40)], ids=["none", "given"])
+def test_a_refused_list_without_fluxes_is_said_to_count_as_sorted(flux) -> None:
+    xy_px = random_positions(FISHEYE, 40, np.random.default_rng(8))
+    with pytest.raises(NotIdentified) as refused:
+        identify_centroids(xy_px, camera=FISHEYE, stars=sky(), flux=flux)
+    assert ("counts as sorted, brightest first" in str(refused.value)) == (flux is None)

@@ -54,7 +54,7 @@ T = TypeVar("T")
 class Settings:
     """The stages and their settings; each can be replaced by another one with the same call.
 
-    `localizer` may be a name in `startrack.localization.LOCALIZERS`. Raises TypeError for a class, ValueError for others.
+    `localizer` may be a name in `startrack.localization.LOCALIZERS`. Raises TypeError, ValueError for values of no use.
     """
 
     detector: Detector = field(default_factory=Detector)

@@ -23,6 +23,10 @@ MAX_STEM_BYTES = 200  # file systems take names of 255, and a suffix follows
 FULL_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}  # errors of writing that are not the path's
 MAX_KEY_PARTS = 16  # of a TOML key such as origin.latitude_deg
 _KEY_PART = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
+KINDS = {  # of TOML files, by the reason of a faulty one: the flag that takes it, and keys that it has
+    "bad_calibration": ("-c (a camera file)", {"size_px", "focal_px"}),
+    "bad_terrain": ("-t (a terrain file)", {"body", "origin"}),
+}
 LONG_KEY = re.compile(rf"(?<![\w.-])(?:{_KEY_PART}[ \t]*+\.[ \t]*+){{{MAX_KEY_PARTS}}}")
 FOREIGN_CAMERA_SUFFIXES = ".yaml", ".yml", ".xml", ".txt", ".cal"  # of other programs' camera files
 FilePath = str | os.PathLike[str]
@@ -120,6 +124,8 @@ def read_text(path: FilePath, reason: str, *, max_bytes: int = MAX_TEXT_BYTES) -
             raise ValueError("no such file")
         with open(path, "rb") as file:
             raw = file.read(max_bytes + 1)
+        if b"\0" in raw:
+            raise ValueError("it is no text: is it a picture or a map?")
         if len(raw) > max_bytes:
             raise ValueError(f"it has more than {max_bytes // 2**20} MiB")
         return raw.decode("utf-8")
@@ -129,13 +135,17 @@ def read_text(path: FilePath, reason: str, *, max_bytes: int = MAX_TEXT_BYTES) -
 
 
 def parse_toml(text: str, reason: str) -> dict[str, Any]:
-    """The keys of a TOML text. Raises BadInput `reason` with one line of cause."""
+    """The keys of a TOML text. Raises BadInput `reason` with one line of cause, also for a file of another kind."""
     if LONG_KEY.search(text):  # tomllib takes seconds for a key of thousands of parts
         raise BadInput(reason, f"not a TOML file: a key of more than {MAX_KEY_PARTS} parts")
     try:
-        return tomllib.loads(text)
+        values = tomllib.loads(text)
     except (ValueError, RecursionError) as cause:  # TOMLDecodeError, huge integers, deeply nested lists
         raise BadInput(reason, " ".join(f"not a TOML file: {str(cause)[:MAX_CAUSE_CHARS]}".split())) from cause
+    for kind, (flag, keys) in KINDS.items():
+        if reason in KINDS and kind != reason and keys <= values.keys():
+            raise BadInput(reason, f"it is a file of another kind: give it with {flag}, and the right one here")
+    return values
 
 
 def existing_folder(folder: FilePath, content: str = "") -> Path:

@@ -264,7 +264,10 @@ def compile_beside(reference: str) -> subprocess.Popen[bytes] | None:
     if is_compiled() or count_cores() == 1:
         return None
     nothing = subprocess.DEVNULL
-    return subprocess.Popen([sys.executable, "-c", COMPILE, reference], stdin=nothing, stdout=nothing, stderr=nothing)
+    command = [sys.executable, "-c", COMPILE, reference]
+    with suppress(OSError):  # without it the fix waits for its kernels: no memory, no right to run another process
+        return subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing)
+    return None
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack import __version__
+from startrack.core.cache import cache_folder
 from startrack.core.files import PACKAGE
 from startrack.core.time_limit import CLOCK
 
@@ -33,23 +34,27 @@ CACHED = "@njit(cache=True"  # of a kernel that is kept on disk
 ABOVE_KERNELS = {"api", "applications", "chain", "cli", "output", "rendering"}  # no kernel uses them
 
 
-def choose_cache_folder() -> None:
+def choose_cache_folder() -> bool:
     """Set NUMBA_CACHE_DIR unless numba can write beside the package, or the variable is set. Called before numba loads.
 
-    Without any folder to write to, the cache is temporary: without one numba would refuse to load the kernels.
+    Without a folder that stays, the cache is temporary. False where no folder at all can be written to: numba would
+    then refuse to load kernels that are to be kept.
     """
     if VARIABLE in os.environ or os.access(PACKAGE, os.W_OK):
-        return
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "startrack" / "numba"
+        return True
+    folder = cache_folder("numba")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError:
-        # A fresh folder that only this user can write to: numba unpickles the files in its cache.
-        folder = Path(tempfile.mkdtemp(prefix="startrack-numba-"))
+        try:  # a fresh folder that only this user can write to: numba unpickles the files in its cache
+            folder = Path(tempfile.mkdtemp(prefix="startrack-numba-"))
+        except OSError:
+            return False
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
     os.environ[VARIABLE] = str(folder)
+    return True
 
 
 class Turn:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from startrack.core.compilation import choose_cache_folder, discard_stale_kernels
 from startrack.core.stored import read_sealed, with_seal
 
-choose_cache_folder()
+KEPT = {} if choose_cache_folder() else {"cache": False}  # options of each kernel
 discard_stale_kernels()
 
 import numba  # noqa: E402 - it reads where its cache lies when it loads
@@ -164,11 +164,11 @@ def njit(*, inner: bool = False, **options: Any) -> Callable[[Callable[..., Any]
     All kernels release the GIL, and divide by zero as numpy does. numba compiles the functions of its own that a
     kernel uses, as np.empty, once for all kernels of equal options.
     """
-    common = {"no_cfunc_wrapper": True, "no_cpython_wrapper": inner, "nogil": True, "error_model": "numpy"} | options
+    common = {"no_cfunc_wrapper": True, "no_cpython_wrapper": inner, "nogil": True, "error_model": "numpy"} | options | KEPT
 
     def decorate(function: Callable[..., Any]) -> Any:
         kernel = numba.njit(**common)(function)  # type: ignore[call-overload]
-        if options.get("cache"):
+        if common.get("cache"):
             kernel._cache = KernelCache(function)
         if inner:
             kernel.__class__ = InnerKernel

@@ -15,6 +15,7 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
+from startrack.core.cache import cache_folder
 from startrack.core.errors import BadInput
 from startrack.core.files import hold_lock
 from startrack.core.runner import count_cores
@@ -45,12 +46,6 @@ VERSION = 7  # of the tracing and of the table's format
 TABLES_IN_MEMORY: WeakValueDictionary[str, HorizonTable] = WeakValueDictionary()
 
 
-def cache_dir() -> Path:
-    """Folder of the tables: $XDG_CACHE_HOME/startrack/horizons, or ~/.cache/startrack/horizons."""
-    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "startrack" / "horizons"
-
-
 def key_of_table(ground: TracedMap) -> str:
     """SHA-256 over the maps' posts and geometry, the origin, the square, the camera's height and the format."""
     digest = hashlib.sha256(f"startrack horizons {VERSION} {AZIMUTH_BINS}".encode())
@@ -68,7 +63,7 @@ def key_of_table(ground: TracedMap) -> str:
 
 def path_of_table(key: str) -> Path:
     """File of the table with this key."""
-    return cache_dir() / f"{key[:40]}.table"
+    return cache_folder("horizons") / f"{key[:40]}.table"
 
 
 def load_table(key: str, square: Square) -> HorizonTable | None:

@@ -264,3 +264,41 @@ def test_the_zoneless_time_of_a_tiff_is_not_used(tmp_path):
     path = tmp_path / "frame.tif"
     tifffile.imwrite(path, FRAME, datetime=datetime(2020, 1, 1))
     assert read_exposure(path).time_utc is None
+
+
+@pytest.mark.parametrize(
+    "place",
+    ["/etc/passwd#a.yaml", "{here}/camera.toml", "../camera.toml", "sub/../../camera.toml",
+     "\\\\server\\x\\camera.toml",
+     "//server/x/camera.toml", "C:camera.toml", "c:/camera.toml", "..\\camera.toml", "C:name"],
+)  # fmt: skip
+@pytest.mark.parametrize("key", ["STCAMERA", "STTERRAI"])
+def test_a_header_names_no_file_elsewhere(tmp_path, key, place):
+    """Not even one that is there: whether it is would be told to the picture's author."""
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for one in (tmp_path, folder):
+        (one / "camera.toml").write_text("")
+    text = PngImagePlugin.PngInfo()
+    text.add_text(key, place.format(here=folder))
+    Image.fromarray(FRAME).save(folder / "frame.png", pnginfo=text)
+    exposure = read_exposure(folder / "frame.png")
+    assert (exposure.camera, exposure.terrain) == (None, None)
+    (warning,) = exposure.warnings
+    assert warning.startswith(f"{key} '") and warning.endswith("a flag or a sidecar; not used")
+
+
+def test_a_sidecar_names_files_anywhere(image, sidecar):
+    sidecar({"camera": "../camera.toml", "terrain": "/maps/t.toml"})
+    exposure = read_exposure(image)
+    assert exposure.camera == str(image.parent / "../camera.toml")
+    assert exposure.terrain == "/maps/t.toml"
+
+
+def test_a_header_names_files_beside_and_below_the_image(tmp_path):
+    for name in ("camera.toml", "./a b.toml", "calib/c.toml", "..x.toml"):
+        text = PngImagePlugin.PngInfo()
+        text.add_text("STCAMERA", name)
+        Image.fromarray(FRAME).save(tmp_path / "frame.png", pnginfo=text)
+        exposure = read_exposure(tmp_path / "frame.png")
+        assert (exposure.camera, exposure.warnings) == (str(tmp_path / name).replace("/a b", "/./a b"), ())

@@ -36,12 +36,22 @@ def exposure(tmp_path):
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_round_trip(tmp_path, exposure, suffix):
-    path = write_exposure(tmp_path / "deep" / "er" / f"frame 1.0{suffix}", exposure)
+    path = write_exposure(tmp_path / f"frame 1.0{suffix}", exposure)
     back = read_exposure(path)
     np.testing.assert_array_equal(back.pixels_adu, FRAME)
     assert [getattr(back, f) for f in FACTS] == [getattr(exposure, f) for f in FACTS]
     assert os.path.realpath(back.camera) == os.path.realpath(exposure.camera)
     assert (back.terrain, back.name, back.warnings) == ("shackleton", "frame 1.0", ())
+
+
+def test_a_camera_elsewhere_is_in_the_sidecar_alone(tmp_path, exposure):
+    path = write_exposure(tmp_path / "deep" / "er" / "frame.png", exposure)
+    assert "STCAMERA" not in Image.open(path).text
+    assert (read_exposure(path).camera, read_exposure(path).warnings) == (None, ())
+    write_sidecar(path, exposure)
+    back = read_exposure(path)
+    assert os.path.realpath(back.camera) == os.path.realpath(exposure.camera)
+    assert back.terrain == "shackleton"
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".fits"])
@@ -157,7 +167,7 @@ def test_a_path_without_suffix_stays_a_path(tmp_path):
 def test_relative_paths_hold_through_a_symbolic_link(tmp_path, exposure):
     (tmp_path / "elsewhere" / "out").mkdir(parents=True)
     (tmp_path / "link").symlink_to(tmp_path / "elsewhere" / "out")
-    write_exposure(tmp_path / "link" / "f.png", exposure)
+    write_sidecar(write_exposure(tmp_path / "link" / "f.png", exposure), exposure)
     for folder in ("link", "elsewhere/out"):
         camera = read_exposure(tmp_path / folder / "f.png").camera
         assert os.path.realpath(camera) == os.path.realpath(exposure.camera)

@@ -87,7 +87,8 @@ def test_the_page_is_whole_in_itself(text):
     metas = [attrs for tag, attrs in page.tags if tag == "meta"]
     assert {"name": "viewport", "content": "width=device-width,initial-scale=1"} in metas
     (policy,) = [one["content"] for one in metas if one.get("http-equiv") == "Content-Security-Policy"]
-    assert "default-src 'none'" in policy and "http" not in policy
+    assert {"default-src 'none'", "base-uri 'none'", "form-action 'none'"} <= set(policy.split("; "))
+    assert "http" not in policy
 
 
 def test_texts_of_results_are_escaped(text, results):

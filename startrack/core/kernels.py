@@ -164,7 +164,9 @@ def njit(*, inner: bool = False, **options: Any) -> Callable[[Callable[..., Any]
     All kernels release the GIL, and divide by zero as numpy does. numba compiles the functions of its own that a
     kernel uses, as np.empty, once for all kernels of equal options.
     """
-    common = {"no_cfunc_wrapper": True, "no_cpython_wrapper": inner, "nogil": True, "error_model": "numpy"} | options | KEPT
+    common = (
+        {"no_cfunc_wrapper": True, "no_cpython_wrapper": inner, "nogil": True, "error_model": "numpy"} | options | KEPT
+    )
 
     def decorate(function: Callable[..., Any]) -> Any:
         kernel = numba.njit(**common)(function)  # type: ignore[call-overload]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -31,6 +32,7 @@ HEADER_OF = {  # the sidecar's key of a fact and its name in a header: FITS keyw
 # The names of the sidecar's keys are valid in a header too, except in FITS, where a card called CAMERA is common and
 # names the hardware.
 SITE_NAMES = (("OBSLAT", "OBSLONG"), ("SITELAT", "SITELONG"), ("LAT-OBS", "LONG-OBS"), ("OBSGEO-B", "OBSGEO-L"))
+ELSEWHERE = re.compile(r"^/|\\|^[A-Za-z]:|(^|/)\.\.(/|$)")  # of paths: absolute, of Windows, through a folder above
 ROW_ORDERS = ("TOP-DOWN", "BOTTOM-UP")
 _NAMES = (*TIME_NAMES, "ROWORDER", *HEADER_OF.values(), *(name for pair in SITE_NAMES for name in pair))
 HEADER_KEYS = {name: name for name in _NAMES} | HEADER_OF
@@ -115,7 +117,7 @@ def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts
         elif value is None and key in HEADER_OF:
             value = _header_text(header, key, notes)
             if value is not None and key in NAMED_FILES:
-                value = resolve_path(image, value)
+                value = _file_beside(image, HEADER_OF[key], value, notes)
         found[key] = as_utc(value) if key == "time_utc" and value is not None else value
     if given.time_utc is not None:
         other = _other_time_notes(found["time_utc"], sidecar, header, found["exposure_s"])
@@ -181,6 +183,17 @@ def header_number(header: Mapping[str, Any], key: str, notes: list[str]) -> floa
     except (TypeError, ValueError, OverflowError):
         notes.append(f"{name} {value_text(value)} is not a number of seconds {declared.limits}; not used")
         return None
+
+
+def _file_beside(image: Path, name: str, value: str, notes: list[str]) -> str | None:
+    """A header's name of a shipped file, or the path of one beside or below the `image`; None for a file elsewhere.
+
+    A header comes from others: it may not tell them which files exist here, nor open a connection to a server.
+    """
+    if ELSEWHERE.search(value):
+        notes.append(f"{name} {value[:SHOWN_CHARS]!r} names a file elsewhere: give it by a flag or a sidecar; not used")
+        return None
+    return resolve_path(image, value)
 
 
 def _header_text(header: Mapping[str, Any], key: str, notes: list[str]) -> str | None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from startrack.core.files import check_free, is_path, printable, relative_path, write_atomically
 from startrack.core.types import BadInput, Exposure
-from startrack.exposure.facts import HEADER_OF, Facts
+from startrack.exposure.facts import ELSEWHERE, HEADER_OF, Facts
 from startrack.exposure.sidecar import IMAGE_KEYS, NAMED_FILES, SIDECAR, sidecars
 from startrack.frames import format_utc
 
@@ -28,8 +28,9 @@ def write_exposure(path: str | os.PathLike[str], exposure: Exposure, *, overwrit
     """Write the image by suffix (.png, .tif, .tiff, .fits, .fits.gz, .fits.bz2) with its metadata; return its path.
 
     PNG holds 16-bit counts (8-bit ones if the exposure was read from such a file), rounded; TIFF and FITS too, or
-    float32 if the pixels are not such counts. Camera and terrain paths are written relative to the file. The same
-    exposure gives the same bytes.
+    float32 if the pixels are not such counts. Camera and terrain paths are written relative to the file; those beside
+    or below it alone, as no others are read from a header (`write_sidecar` writes all). The same exposure gives the
+    same bytes.
 
     Raises:
         BadInput: bad_image if the file exists and not `overwrite`, the suffix is not known, the pixels do not fit the
@@ -70,7 +71,7 @@ def header_entries(exposure: Exposure, folder: Path) -> dict[str, str | float]:
         if exposure.exposure_s is not None:
             entries["DATE-OBS"] = format_utc(exposure.time_utc - timedelta(seconds=exposure.exposure_s / 2))
     for key, name in HEADER_OF.items():
-        if key in stated:
+        if key in stated and not (key in NAMED_FILES and ELSEWHERE.search(stated[key])):
             entries[name] = stated[key] if isinstance(stated[key], str) else float(stated[key])
     dates = {name: str(entries[name]).removesuffix("Z") for name in ("DATE-OBS", "DATE-AVG") if name in entries}
     return entries | dates  # FITS has no zone letter

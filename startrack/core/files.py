@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 from startrack.core.declaration import similar_name
 from startrack.core.errors import MISSING, BadInput, BadOutput, Reason, one_line
+from startrack.core.replacement import replace_file
 
 PACKAGE = Path(__file__).resolve().parents[1]
 MAX_TEXT_BYTES = 2**20  # camera and terrain files have a few kilobytes
@@ -211,18 +211,11 @@ def write_atomically(path: FilePath, data: bytes, *, overwrite: bool, reason: st
     disk is full.
     """
     check_free(path, overwrite=overwrite, reason=reason)
-    # In the same folder, because a rename does not cross file systems; tempfile would make the file private.
-    target, temporary = Path(path), Path(path).parent / f".{uuid4().hex}.part"
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("xb") as file:
-            file.write(data)
-        os.replace(temporary, target)
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        replace_file(Path(path), data)
     except (OSError, ValueError) as cause:  # ValueError: a name with a null character
         raise _write_error(cause, reason, path, "cannot be written") from cause
-    finally:
-        with suppress(OSError, ValueError):  # renamed already; and a failed clean-up must not hide the cause
-            temporary.unlink()
 
 
 def _write_error(cause: Exception, reason: str, path: FilePath, text: str, advice: str = "") -> BadInput:

@@ -80,7 +80,7 @@ def test_a_list_of_centroids_is_identified_in_one_call():
     assert np.isin(again.hip, named.hip).mean() > 0.95
     with pytest.raises(ValueError, match="give a camera, or fov= with size_px="):
         startrack.identify(found.xy_px[:200])
-    with pytest.raises(startrack.core.errors.NoSolution, match="0 point sources are too few"):
+    with pytest.raises(startrack.core.errors.NoSolution, match="0 point sources: too few"):
         startrack.identify([], camera="fisheye-2048")
     with pytest.raises(ValueError, match=r"shape \(2, 3\): give \(n, 2\)"):
         startrack.identify([[1, 2, 3], [4, 5, 6]], camera="fisheye-2048")

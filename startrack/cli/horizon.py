@@ -14,7 +14,7 @@ from startrack.catalog import load_catalog
 from startrack.cli.console import Outcome, named_steps, print_left_out, print_outcome, refusal
 from startrack.cli.images import approximate_camera, check_fov, check_one_time, read_each_once, site_of
 from startrack.core.errors import BadInput, BadOutput, NoSolution, Reason, one_line
-from startrack.core.time_limit import limited_time
+from startrack.core.time_limit import limited_time, stating_work
 
 FORMAT = "startrack.horizon/1"
 UNTESTED = "time and site are not tested by one image: an hour turns the skyline by 15 degrees"
@@ -39,7 +39,8 @@ def run(args: argparse.Namespace) -> int:
 def _measure(args: argparse.Namespace) -> Outcome:
     """The record and the line of a skyline that was measured and written."""
     horizon.check_output(args.output, overwrite=args.overwrite)
-    with limited_time(args.time_limit):
+    done: list[str] = []
+    with stating_work(lambda: done[-1] if done else "no image was identified"), limited_time(args.time_limit):
         exposures = read_each_once(args)
         site = site_of(args, exposures)
         if site is None:
@@ -51,11 +52,16 @@ def _measure(args: argparse.Namespace) -> Outcome:
         camera = approximate_camera(args, exposures)
         steps = 2 * len(exposures) + 1
         with named_steps(args, f"horizon from {_count_text(len(exposures))}", steps) as show_step:
+
+            def begin(text: str) -> None:
+                done.append(text)
+                show_step(text)
+
             frames, left_out = horizon.orient_frames(
-                exposures, load_catalog(), site, camera=camera, fov_rad=args.fov, progress=show_step
+                exposures, load_catalog(), site, camera=camera, fov_rad=args.fov, progress=begin
             )
             print_left_out(left_out if frames else ())  # else the refusal names them
-            found = horizon.measure_frames(frames, left_out, site, show_step)
+            found = horizon.measure_frames(frames, left_out, site, begin)
     horizon.write_skyline(args.output, found.skyline, site, found.frames, overwrite=args.overwrite)
     unknown = int((~found.skyline.known).sum())
     varying = int((found.skyline.source == "varies").sum())

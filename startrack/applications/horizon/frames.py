@@ -99,14 +99,14 @@ def orient_frames(
         return identify(exposure, camera, catalog)
 
     def take(exposure: Exposure, outcome: Oriented | Refused) -> None:
+        if outcome.reason is Reason.TIME_LIMIT:
+            raise TimeLimitReached(f"{exposure.name}: {outcome.message}")
         progress(f"identified the stars of {exposure.name}")
         if isinstance(outcome, Oriented):
             _require_above_horizon(outcome, site)
             identified.append(outcome)
         elif outcome.reason.exit_code == Reason.BAD_IMAGE.exit_code:
             raise BadInput(outcome.reason, f"{exposure.name}: {outcome.message}")
-        elif outcome.reason is Reason.TIME_LIMIT:
-            raise TimeLimitReached(f"{exposure.name}: {outcome.message}")
         else:
             left_out.append(LeftOut(name=exposure.name, reason=outcome.reason, message=outcome.message))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -9,7 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from startrack.cli.main import main
 from startrack.core import cache, compilation
+from startrack.core.files import hold_lock
+from startrack.core.types import BadInput
 
 ROOT = Path(__file__).parent.parent
 # Python as for a user of whom the system knows nothing, and after it a machine that takes no file.
@@ -106,3 +110,70 @@ def test_kernels_are_not_kept_where_no_folder_takes_a_file(monkeypatch):
     monkeypatch.setattr(compilation.tempfile, "mkdtemp", none)
     assert compilation.choose_cache_folder() is False
     assert "NUMBA_CACHE_DIR" not in os.environ
+
+
+@pytest.fixture
+def full_cache(monkeypatch, tmp_path):
+    """A cache of three tables and two files of compiled code, and the locks of a process that lives and a killed one.
+
+    The first table was used last.
+    """
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "named"))
+    folder = tmp_path / "startrack"
+    (folder / "numba" / "core_1").mkdir(parents=True)
+    for name in ("core_1/kernel.nbi", "startrack-1.key"):
+        (folder / "numba" / name).write_bytes(b"12345")
+    tables = folder / "horizons"
+    tables.mkdir()
+    for age_s, name in ((10, "a"), (30, "b"), (20, "c")):
+        (tables / f"{name}.table").write_bytes(bytes(1000))
+        os.utime(tables / f"{name}.table", (1e9 - age_s, 1e9 - age_s))
+    (tables / "killed.lock").write_text("1")
+    with hold_lock(tables / "a.lock"):
+        yield tables
+
+
+def test_cache_shows_what_it_keeps(full_cache, capsys):
+    assert main(["cache", "show", "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["limit_bytes"] == 2e9
+    assert [(one["kind"], one["files"], one["bytes"]) for one in record["folders"]] == [
+        ("tables of horizons", 3, 3000), ("compiled code", 2, 10), ("compiled code", 0, 0),
+    ]  # fmt: skip
+    assert main(["cache", "show"]) == 0
+    assert str(full_cache) in capsys.readouterr().out
+
+
+def test_cache_clear_removes_all_but_the_lock_in_use(full_cache, capsys):
+    assert main(["cache", "clear"]) == 0
+    assert capsys.readouterr().out == "removed 5 files, 0.0 MB\n"
+    left = [path.name for path in full_cache.parent.rglob("*") if path.is_file()]
+    assert left == ["a.lock"]
+    assert main(["cache", "clear", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["removed_bytes"] == 0
+
+
+def test_the_tables_that_were_not_used_for_longest_leave_above_the_limit(full_cache, monkeypatch):
+    for size_gb, left in (("3e-6", "abc"), ("2.5e-6", "ac"), ("1e-6", "a"), ("0", "a")):
+        monkeypatch.setenv("STARTRACK_CACHE_GB", size_gb)
+        cache.remove_oldest(full_cache, "*.table", full_cache / "a.table")
+        assert sorted(path.stem for path in full_cache.glob("*.table")) == [*left], size_gb
+
+
+@pytest.mark.parametrize("text", ["much", "-1", "nan"])
+def test_a_limit_that_is_no_size_is_refused(monkeypatch, text):
+    monkeypatch.setenv("STARTRACK_CACHE_GB", text)
+    with pytest.raises(BadInput, match=f"STARTRACK_CACHE_GB={text}: is no size in GB"):
+        cache.limit_bytes()
+
+
+def test_compiled_code_of_an_installed_package_lies_in_the_users_cache(monkeypatch, tmp_path):
+    """So that nothing of it stays in site-packages when the package is removed; that of a checkout lies beside it."""
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert compilation.choose_cache_folder() is True
+    assert "NUMBA_CACHE_DIR" not in os.environ
+    monkeypatch.setattr(compilation, "data_dir", lambda kind: compilation.PACKAGE / "data" / kind)
+    assert compilation.choose_cache_folder() is True
+    assert os.environ.pop("NUMBA_CACHE_DIR") == str(tmp_path / "startrack" / "numba")

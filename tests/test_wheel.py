@@ -41,7 +41,7 @@ def run_elsewhere(unpacked, folder, *words):
     """`python words` with the wheel's content alone, in another folder."""
     done = subprocess.run(
         [sys.executable, *words], cwd=folder, capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": str(unpacked)},
+        env={**os.environ, "PYTHONPATH": str(unpacked), "XDG_CACHE_HOME": str(unpacked.parent / "cache")},
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -75,6 +75,8 @@ def test_it_works_away_from_the_checkout(unpacked_wheel, tmp_path):
     position = json.loads(out)["position"]
     assert abs(position["east_m"] + 6900) < 40
     assert abs(position["north_m"] - 4700) < 40
+    kept = {path.suffix for path in unpacked_wheel.rglob("*") if path.is_file() and "__pycache__" in path.parts}
+    assert kept == {".pyc"}, "compiled code lies in the user's cache"
 
 
 def test_every_shipped_file_is_read_from_it(unpacked_wheel, tmp_path):

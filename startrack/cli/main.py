@@ -32,7 +32,7 @@ COMMANDS = {  # name to the module of startrack.cli that declares it
     "locate": "image_commands", "batch": "image_commands", "track": "image_commands", "identify": "image_commands",
     "detect": "image_commands", "render": "study_commands", "calibrate": "input_commands",
     "horizon": "input_commands", "predict": "study_commands", "report": "image_commands",
-    "reproduce": "study_commands", "terrain": "input_commands", "doctor": "study_commands",
+    "reproduce": "study_commands", "terrain": "input_commands", "doctor": "study_commands", "cache": "study_commands",
     "schema": "study_commands", "demo": "image_commands",
 }  # fmt: skip
 USAGE, INTERRUPTED = 2, 130

@@ -25,6 +25,10 @@ DRIVE_FLAGS = (
         types.amount,
     ),
 )
+CACHE = """usage: startrack cache ACTION
+
+look             startrack cache show     tables of horizons and compiled code: folders, files, sizes
+remove           startrack cache clear    the next commands compute and compile again"""
 COMMANDS = (
     Command(
         "render", function_at("render.run"), "make synthetic exposures and files with their truth",
@@ -165,6 +169,23 @@ COMMANDS = (
             "more": (flags.JSON, *flags.MORE),
         },
         "startrack doctor",
+    ),
+    Command(
+        "cache", None, "size and removal of tables of horizons and compiled code", None,
+        start=CACHE,
+        actions=(
+            Command(
+                "show", function_at("cache.show"), "folders, files and sizes",
+                "Tables of horizons take at most 2 GB, or STARTRACK_CACHE_GB: above that those leave that were not "
+                "used for longest.",
+                {"more": (flags.JSON, *flags.MORE)}, "startrack cache show",
+            ),
+            Command(
+                "clear", function_at("cache.clear"), "remove all of it",
+                "The next commands compute and compile again.",
+                {"more": (flags.JSON, *flags.MORE)}, "startrack cache clear",
+            ),
+        ),
     ),
     Command(
         "schema", function_at("doctor.run_schema"), "JSON schemas of the files",

@@ -1,7 +1,8 @@
 """numba's cache of compiled kernels: where it lies, and whether this machine has compiled them already.
 
-The kernels are compiled at their first use after an installation and then loaded from the cache. numba writes the
-cache beside the package; where that folder is read-only, NUMBA_CACHE_DIR is set to a folder of the user's.
+The kernels are compiled at their first use after an installation and then loaded from the cache. It lies in a folder
+of the user's, as numba's NUMBA_CACHE_DIR is set, so that nothing stays of a package that is removed; of a checkout that
+can be written to beside the sources.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from startrack import __version__
 from startrack.core.cache import cache_folder
-from startrack.core.files import PACKAGE
+from startrack.core.files import PACKAGE, data_dir
 from startrack.core.time_limit import CLOCK
 
 if TYPE_CHECKING:
@@ -29,20 +30,22 @@ if TYPE_CHECKING:
     from multiprocessing.synchronize import Semaphore
 
 LOG = logging.getLogger(__name__)
+FOLDER = "numba"  # in the user's cache
 VARIABLE = "NUMBA_CACHE_DIR"
 CACHED = "@njit(cache=True"  # of a kernel that is kept on disk
 ABOVE_KERNELS = {"api", "applications", "chain", "cli", "output", "rendering"}  # no kernel uses them
 
 
 def choose_cache_folder() -> bool:
-    """Set NUMBA_CACHE_DIR unless numba can write beside the package, or the variable is set. Called before numba loads.
+    """Set NUMBA_CACHE_DIR unless the package is a checkout, or the variable is set. Called before numba loads.
 
     Without a folder that stays, the cache is temporary. False where no folder at all can be written to: numba would
     then refuse to load kernels that are to be kept.
     """
-    if VARIABLE in os.environ or os.access(PACKAGE, os.W_OK):
+    is_checkout = data_dir("calib").parent == PACKAGE.parent
+    if VARIABLE in os.environ or (is_checkout and os.access(PACKAGE, os.W_OK)):
         return True
-    folder = cache_folder("numba")
+    folder = cache_folder(FOLDER)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -116,9 +119,7 @@ def discard_stale_kernels() -> None:
     for source in sources:
         status = source.stat()
         key.update(f"{source.name} {status.st_size} {status.st_mtime_ns}".encode())
-    folder = os.environ.get(VARIABLE)
-    name = f"startrack-{hashlib.sha256(str(PACKAGE).encode()).hexdigest()[:12]}.key"
-    file = Path(folder or PACKAGE / "__pycache__") / name
+    file = _key_file()
     with suppress(OSError):  # another process may be doing the same
         if file.is_file() and file.read_text() == key.hexdigest():
             return
@@ -137,6 +138,18 @@ def is_compiled() -> bool:
     return any(True for source in (PACKAGE / "localization").glob("*.py") for _ in _indices_of(source))
 
 
+def compiled_files() -> dict[Path, list[Path]]:
+    """Files of compiled code by folder: in the user's cache those of all installations, elsewhere those of this one."""
+    own, named = cache_folder(FOLDER), os.environ.get(VARIABLE)
+    found = {own: [path for path in own.rglob("*") if path.is_file()]}
+    place = Path(named) if named else PACKAGE
+    if place != own:
+        folders = {_cache_of(source.parent) for source in PACKAGE.rglob("*.py")}
+        kernels = [path for folder in folders for path in folder.glob("*.nb[ic]")]
+        found[place] = sorted([*kernels, *([_key_file()] if _key_file().is_file() else [])])
+    return found
+
+
 def _compiled_text(package: str) -> str:
     """How many of the kernels of a `package` of startrack are compiled."""
     sources = [*(PACKAGE / package).rglob("*.py")]
@@ -148,8 +161,19 @@ def _compiled_text(package: str) -> str:
 def _indices_of(source: Path) -> Iterator[Path]:
     """numba's index files of a source: MODULE.FUNCTION-LINE.pyXY.nbi, in __pycache__ or below NUMBA_CACHE_DIR."""
     name = f"{source.stem}.*.py{sys.version_info.major}{sys.version_info.minor}.nbi"
-    folder = os.environ.get(VARIABLE)
-    if not folder:
-        return (source.parent / "__pycache__").glob(name)
-    of_parent = hashlib.sha1(str(source.parent).encode(), usedforsecurity=False).hexdigest()
-    return (Path(folder) / f"{source.parent.name}_{of_parent}").glob(name)
+    return _cache_of(source.parent).glob(name)
+
+
+def _cache_of(folder: Path) -> Path:
+    """Where numba keeps the compiled code of the sources in a `folder`."""
+    named = os.environ.get(VARIABLE)
+    if not named:
+        return folder / "__pycache__"
+    of_folder = hashlib.sha1(str(folder).encode(), usedforsecurity=False).hexdigest()
+    return Path(named) / f"{folder.name}_{of_folder}"
+
+
+def _key_file() -> Path:
+    """The file with the key of the sources that the compiled code is of."""
+    name = f"startrack-{hashlib.sha256(str(PACKAGE).encode()).hexdigest()[:12]}.key"
+    return Path(os.environ.get(VARIABLE) or PACKAGE / "__pycache__") / name

@@ -15,7 +15,7 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-from startrack.core.cache import cache_folder
+from startrack.core.cache import cache_folder, limit_bytes, remove_oldest
 from startrack.core.errors import BadInput
 from startrack.core.files import hold_lock
 from startrack.core.runner import count_cores
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from startrack.terrain.traced_map import TracedMap
 
 LOG = logging.getLogger(__name__)
+FOLDER, SUFFIX = "horizons", ".table"  # of the tables in the cache
 VERSION = 7  # of the tracing and of the table's format
 
 # Terrains that need the same table share one in memory, for as long as one of them lives.
@@ -63,7 +64,7 @@ def key_of_table(ground: TracedMap) -> str:
 
 def path_of_table(key: str) -> Path:
     """File of the table with this key."""
-    return cache_folder("horizons") / f"{key[:40]}.table"
+    return cache_folder(FOLDER) / f"{key[:40]}{SUFFIX}"
 
 
 def load_table(key: str, square: Square) -> HorizonTable | None:
@@ -73,6 +74,8 @@ def load_table(key: str, square: Square) -> HorizonTable | None:
         unknown_rad = np.frombuffer(data, np.float64, AZIMUTH_BINS)
         values = np.frombuffer(data, np.uint16, offset=unknown_rad.nbytes).reshape(-1, AZIMUTH_BINS, FIELDS)
         TABLES_IN_MEMORY[key] = table = HorizonTable(square, values, unknown_rad)
+        with suppress(OSError):  # the time of its last use, by which the oldest leave
+            os.utime(path_of_table(key))
     return table
 
 
@@ -83,6 +86,7 @@ def keep_table(key: str, table: HorizonTable) -> bool:
         write_sealed(path_of_table(key), table.unknown_rad.tobytes() + table.values.tobytes())
     except BadInput:
         return False
+    remove_oldest(path_of_table(key).parent, f"*{SUFFIX}", path_of_table(key))
     return True
 
 
@@ -104,6 +108,7 @@ def load_or_build_table(ground: TracedMap, progress: Progress | None = None) -> 
         if table is None:
             if os.path.lexists(path_of_table(key)):
                 LOG.warning("the table of horizons %s is damaged: made anew", path_of_table(key))
+            limit_bytes()  # a wrong one is refused before the work
             about_s = seconds_of_table(ground)
             LOG.info("horizons of %s: computed now, once; this takes about %.2g s", ground.name, about_s)
             start = clock.perf_counter()

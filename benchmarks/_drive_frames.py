@@ -12,11 +12,13 @@ from _cameras import EXPOSURE_S, camera_for_share
 
 from startrack.applications.tracking import ObservedFrame, TrackErrors, observe_frame
 from startrack.applications.tracking.frame_estimate import estimate_frame
+from startrack.applications.tracking.observed_frame import image_fixes, observe_again
 from startrack.catalog import apparent_stars, load_catalog
 from startrack.chain import Located, Settings, locate
-from startrack.core.types import Array, Evidence
+from startrack.core.types import Array, Evidence, NotLocated
 from startrack.evidence.star_evidence import visibility_llr
 from startrack.frames import R_enu_icrs, azel_from_rays
+from startrack.localization import ExactPosterior
 from startrack.rendering import Series, render
 from startrack.terrain import HeightMap, Terrain
 
@@ -54,6 +56,18 @@ def frames_by_evidence(course: Course, rng: np.random.Generator) -> Iterator[Obs
         at = position + FIRST_ERROR_M * rng.normal(size=2)
         estimate = estimate_frame(evidence, course.stated, course.shared, at, FIRST_SIGMA_M**2 * np.eye(2))
         yield ObservedFrame(f"frame-{number:03d}", when, None, (estimate,), evidence)
+
+
+def frames_by_fixes(course: Course, rng: np.random.Generator) -> Iterator[ObservedFrame]:
+    """As `frames_by_evidence`, each located in the whole search area: an image that is refused has no position."""
+    for frame in frames_by_evidence(course, rng):
+        assert frame.evidence is not None
+        try:
+            fixes = image_fixes(ExactPosterior()(frame.evidence, course.stated), course.stated)
+        except NotLocated as refusal:
+            yield replace(frame, modes=(), evidence=None, reason=str(refusal.reason), message=str(refusal))
+            continue
+        yield observe_again(replace(frame, fixes=fixes), course.shared, course.stated)
 
 
 def simulate_evidence(

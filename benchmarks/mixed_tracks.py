@@ -9,7 +9,7 @@ wrong if it is off by more than twice its 99.9 % circle from where the rover was
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,29 +51,32 @@ class Draw:
 
 
 Change = Callable[[Draw, np.random.Generator], Draw]
+Observe = Callable[[Course, np.random.Generator], Iterable[ObservedFrame]]
 
 
-def draw_drive(terrain: str, rng: np.random.Generator) -> Draw:
+def draw_drive(
+    terrain: str, rng: np.random.Generator, frames: int = FRAMES, observe: Observe = frames_by_evidence
+) -> Draw:
     """A drive with the usual errors of its odometry."""
     stated = load_terrain(terrain)
-    course = draw_course(stated, stated, 0.0, frames=FRAMES, spacing_m=SPACING_M, every_s=EVERY_S,
+    course = draw_course(stated, stated, 0.0, frames=frames, spacing_m=SPACING_M, every_s=EVERY_S,
                          radius_m=RADIUS_M, slope_rad=SLOPE_RAD, rng=rng)  # fmt: skip
     turn = rng.choice([-1.0, 1.0]) * TURN_RAD
     step = course.position_m[1] - course.position_m[0]
     turned = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]) @ step
-    number = np.arange(-STEPS_BEYOND, FRAMES + STEPS_BEYOND, 1.0 / POSES_A_STEP)
+    number = np.arange(-STEPS_BEYOND, frames + STEPS_BEYOND, 1.0 / POSES_A_STEP)
     path = course.position_m[0] + np.minimum(number, CORNER)[:, None] * step
     path += np.maximum(number - CORNER, 0.0)[:, None] * turned
     heading = np.where(number < CORNER, np.arctan2(*step), np.arctan2(*turned))
     R = np.array([R_body_enu_from_heading_pitch_roll(a, *rng.normal(0.0, TILT_RAD, 2)) for a in heading])
     errors = replace(USUAL_ODOMETRY, sigma_1=USUAL_ODOMETRY.sigma_1 * POSES_A_STEP**0.5)
     position_m, R_own_body = draw_odometry(np.pad(path, ((0, 0), (0, 1))), R, errors=errors, rng=rng)
-    at = np.searchsorted(number, np.arange(FRAMES))
+    at = np.searchsorted(number, np.arange(frames))
     course = replace(course, position_m=path[at])
-    frames = [replace(frame, R_body_enu=r) for frame, r in zip(frames_by_evidence(course, rng), R[at], strict=True)]
+    observed = [replace(frame, R_body_enu=r) for frame, r in zip(observe(course, rng), R[at], strict=True)]
     time_s = course.time_utc[0].timestamp() + EVERY_S * number
     quat = np.array([quat_xyzw_from_R(one) for one in R_own_body])
-    return Draw(course, frames, Odometry(time_s=time_s, position_m=position_m, quat_xyzw=quat))
+    return Draw(course, observed, Odometry(time_s=time_s, position_m=position_m, quat_xyzw=quat))
 
 
 def with_foreign(count: int, *, of_one_drive: bool) -> Change:

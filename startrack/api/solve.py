@@ -71,6 +71,7 @@ def track(
     odometry_sigma: float = ODOMETRY_SIGMA,
     odometry_floor_m: float = ODOMETRY_FLOOR_M,
     max_speed_m_s: float = MAX_SPEED_M_S,
+    odometry_time_sigma_s: float = 0.0,
     at_rest: bool = False,
     settings: Settings | None = None,
 ) -> Track:
@@ -84,6 +85,7 @@ def track(
         odometry_sigma: standard deviation of a move on each horizontal axis, relative to its length.
         odometry_floor_m: the same, beside that.
         max_speed_m_s: of the rover; odometry with a faster move is refused.
+        odometry_time_sigma_s: standard deviation of the offset of the odometry's clock from that of the images.
         at_rest: the camera did not move.
         settings: stages to use instead of the usual ones.
 
@@ -99,11 +101,15 @@ def track(
     settings = chain.settings_input(settings) or Settings()
     session = tracking.TrackSession(
         settings=settings, stated_camera=camera, stated_terrain=terrain,
-        odometry_errors=OdometryErrors(odometry_sigma, odometry_floor_m, max_speed_m_s),
+        odometry_errors=OdometryErrors(odometry_sigma, odometry_floor_m, max_speed_m_s, odometry_time_sigma_s),
     )  # fmt: skip
     for image in images:
         session.add_exposure(chain.exposure_input(image, None))
-    moves = odometry if odometry is None or isinstance(odometry, Odometry) else tracking.read_odometry(odometry)
+    moves = (
+        odometry
+        if odometry is None or isinstance(odometry, Odometry)
+        else tracking.read_odometry(odometry, floor_m=odometry_floor_m)
+    )
     return session.estimate(moves, at_rest=at_rest)
 
 

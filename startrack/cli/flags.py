@@ -211,6 +211,12 @@ ODOMETRY = (
     flag("--odometry-sigma F", "error of a move on each horizontal axis, relative", amount, default=ODOMETRY_SIGMA),
     flag("--odometry-floor M", "the same, beside that in quadrature", amount, default=ODOMETRY_FLOOR_M),
 )
+ODOMETRY_TIME = flag(
+    "--odometry-time-sigma SECONDS",
+    "offset of the odometry's clock from that of the images",
+    amount,
+    default=0.0,
+)
 MAX_SPEED = flag(
     "--max-speed M_PER_S",
     "of the rover: odometry with a faster move is refused",

@@ -106,7 +106,7 @@ COMMANDS = (
             "motion between the images (without: each is alone but for shared errors)": (
                 flag("--odometry FILE", "TUM text, or a ROS bag"),
                 flag("--odometry-topic TOPIC", "of a bag with several"),
-                *flags.ODOMETRY, flags.MAX_SPEED,
+                *flags.ODOMETRY, flags.ODOMETRY_TIME, flags.MAX_SPEED,
                 flag("--at-rest", "the camera did not move"),
             ),
             "live": (

@@ -87,10 +87,13 @@ def maps_left_out(found: Iterable[Image]) -> set[Image]:
     return set(maps)
 
 
+OF_TRACKS = {"max_speed_m_s": "max_speed", "time_sigma_s": "odometry_time_sigma"}  # flags of `track` alone
+
+
 def odometry_errors(args: argparse.Namespace) -> OdometryErrors:
     """The errors of odometry that flags state, the usual ones where they do not."""
     flags = {"sigma_1": args.odometry_sigma, "floor_m": args.odometry_floor}
-    flags["max_speed_m_s"] = getattr(args, "max_speed", None)
+    flags |= {name: getattr(args, flag, None) for name, flag in OF_TRACKS.items()}
     return OdometryErrors(**{name: value for name, value in flags.items() if value is not None})
 
 

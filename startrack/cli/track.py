@@ -13,10 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from startrack.applications import tracking
-from startrack.applications.batch import images_under
+from startrack.applications.batch import image_tree, images_under
 from startrack.applications.tracking import FrameStore, ObservedFrame, Odometry, OdometryFile, Track, TrackSession
 from startrack.catalog import load_catalog
 from startrack.chain import Settings
@@ -57,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     finally:
         if (out / "track.json").exists() and not track.has_written:
             print(f"startrack: the files {printable(out)}/track.* are of an earlier run", file=sys.stderr, flush=True)
-    return worst_code(track.codes)
+    return worst_code(track.all_codes)
 
 
 def _check_flags(args: argparse.Namespace) -> None:
@@ -83,13 +81,21 @@ class TrackRun:
     def __init__(self, args: argparse.Namespace, session: TrackSession) -> None:
         self.args, self.session = args, session
         self.codes: set[int] = set()
+        self._unread: list[tuple[str, int]] = []  # images that could not be read, and the exit code of each
         self._is_old, self._write_s = False, 0.0  # the files; what writing them took
         self._printed = 0  # lines at rest
+        self._warned: set[str] = set()  # what was said of the odometry
+        self._has_ended = False  # no more images come, and no odometry
         self._shown: set[str] = set()  # facts whose gross error an image showed
         self.has_written = False
         self._moves: OdometryFile | None = None
         if args.odometry is not None:
-            self._moves = OdometryFile(args.odometry, args.odometry_topic, bool(args.follow))
+            self._moves = OdometryFile(args.odometry, args.odometry_topic, bool(args.follow), args.odometry_floor)
+
+    @property
+    def all_codes(self) -> set[int]:
+        """Exit codes of what happened, with those of images that could not be read."""
+        return {*self.codes, *(code for _, code in self._unread)}
 
     def take_all(self) -> None:
         """Locate all images, then estimate and write the track."""
@@ -125,15 +131,27 @@ class TrackRun:
     def follow(self) -> None:
         """Take images as they come; Ctrl-C and SIGTERM end it, before the first image with the code of a stop."""
         folder = self.args.frames[0]
+        tree = image_tree(folder, self.args.dir)
         load_catalog()  # before the first image comes
         if (terrain := prepare_reference(self.args.terrain, self.args)) is not None:
             compile_kernels(terrain)
         former = signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+        def forget(path: str) -> str:
+            """Name of an image; that it could not be read before counts no more."""
+            name = printable(os.path.relpath(path, folder))
+            self._unread = [one for one in self._unread if one[0] != name]
+            return name
+
+        def take(path: str) -> None:
+            self._add(path)
+            forget(path)
+
         try:
             for path in tracking.follow_images(
-                lambda: [image.path for image in images_under(folder, self.args.dir)],
-                self._add,
-                lambda path, cause: self._refuse(printable(os.path.relpath(path, folder)), cause),
+                lambda: [os.path.join(folder, name) for name in tree.changes()],
+                take,
+                lambda path, cause: self._refuse(forget(path), cause),
                 until_idle_s=self.args.until_idle,
             ):
                 self._update(path is not None)
@@ -146,12 +164,14 @@ class TrackRun:
             signal.signal(signal.SIGTERM, former)
         if self._moves is not None:
             self._moves.end()
-        self._finish(growing=True)
+            self._has_ended = True
+            self._update(has_come=False)  # images after the last pose wait no longer
+        self._finish(was_live=True)
 
-    def _finish(self, growing: bool = False) -> None:
-        """Write and print the track of all images, `growing` in front of the user; the reasons where there is none."""
+    def _finish(self, was_live: bool = False) -> None:
+        """Write and print the track of all images, with `was_live` without their lines; the reasons where none is."""
         try:
-            track = self._estimate(growing)
+            track = self._estimate()
         except BadInput as cause:
             if exit_code_of(cause.reason) == EXIT_BAD_INPUT:
                 raise
@@ -168,14 +188,25 @@ class TrackRun:
             print(f"the odometry has {track.odometry_fault}: {why}", file=sys.stderr)
         if track.odometry_fault or any(frame.status != "used" for frame in track.frames):
             self.codes.add(EXIT_REFUSED)
-        if not growing:
+        if not was_live:
             self._print(tracking.frame_records(track), "")
         if not (self.args.quiet or self.args.json):
-            counts = tracking.track_record(track)["counts"]
-            print(
-                f"{counts['frames']} frames: {counts['used']} used, {counts['left_out']} left out, {counts['refused']} "
-                f"refused; {counts['slips']} slips of the odometry; files in {printable(self.args.dir)}/track.*"
-            )
+            for text in track.leg_texts:
+                print(printable(text))
+            print(f"{self._summary(track)}; files in {printable(self.args.dir)}/track.*")
+
+    def _summary(self, track: Track) -> str:
+        """What became of all images, also of those that could not be read, and of the odometry."""
+        counts, unread = tracking.track_record(track)["counts"], len(self._unread)
+        of_images = f"{counts['used']} used, {counts['left_out']} left out, {counts['refused'] + unread} refused"
+        parts = [f"{counts['frames'] + unread} images: {of_images}"]
+        if unread:
+            parts[0] += f" ({unread} could not be read)"
+        if counts["slips"]:
+            parts.append(f"{counts['slips']} moves slipped, in {counts['legs']} legs")
+        if counts["outside_odometry"]:
+            parts.append(f"{counts['outside_odometry']} outside the odometry")
+        return "; ".join(parts)
 
     def _update(self, has_come: bool) -> None:
         """A line about each image that the odometry reaches; the files, unless the next image would wait for them."""
@@ -188,7 +219,7 @@ class TrackRun:
             self._is_old |= bool(records)
             if self._is_old and (not has_come or self._write_s < QUICK_S):
                 start = time.monotonic()
-                self._write(self._estimate(growing=True), pictures=False)
+                self._write(self._estimate(), pictures=False)
                 self._write_s, self._is_old = time.monotonic() - start, False
         except BadInput as cause:  # no position yet, or no odometry for the first images
             if has_come:
@@ -201,7 +232,7 @@ class TrackRun:
             before, self._printed = self._printed, len(self.session.frames)
             yield from tracking.frame_records(self._estimate())[before:]
         else:
-            for track in self.session.newest(self._odometry()):
+            for track in self.session.newest(self._odometry(), has_ended=self._has_ended):
                 yield from tracking.frame_records(track)
 
     def _print(self, records: Sequence[dict[str, Any]], prefix: str) -> None:
@@ -215,6 +246,7 @@ class TrackRun:
             place = f"E {east_m:.1f} m  N {north_m:.1f} m  ±{radius_m:.1f} m (95 %)" if is_known else "no position"
             why = f"  {record['reason']}: {record['message']}" if record["reason"] else ""
             slip = "  after a slip" if record["slipped"] else ""
+            slip += "  outside the odometry" if record["outside_odometry"] else ""
             search = "  search: beam" if record["search"] == "beam" else ""
             status = record["status"].replace("_", " ")
             print(f"{printable(record['image'])}  {status}  {place}{search}{slip}{why}", flush=True)
@@ -224,9 +256,6 @@ class TrackRun:
 
     def _add_exposure(self, exposure: Exposure, path: str | None = None) -> None:
         """Locate the image; print the facts that it shows to be grossly wrong, once each."""
-        odometry = None if self.args.follow else self._odometry()
-        if odometry is not None and exposure.time_utc is not None:
-            odometry.require_covers(np.array([exposure.time_utc.timestamp()]))
         if self.session.terrain is None:
             prepare_reference(exposure.terrain, self.args)
         frame: ObservedFrame = self.session.add_exposure(exposure, path)
@@ -239,20 +268,27 @@ class TrackRun:
             self.codes.add(EXIT_REFUSED)
 
     def _refuse(self, name: str, cause: BadInput) -> None:
-        self.codes.add(exit_code_of(cause.reason))
+        self._unread.append((name, exit_code_of(cause.reason)))
         print(f"{name}  refused  {cause.reason}: {cause}", file=sys.stderr, flush=True)
 
-    def _estimate(self, growing: bool = False) -> Track:
-        return self.session.estimate(self._odometry(), at_rest=self.args.at_rest, covered_only=growing)
+    def _estimate(self) -> Track:
+        is_live = bool(self.args.follow) and not self._has_ended
+        return self.session.estimate(self._odometry(), at_rest=self.args.at_rest, covered_only=is_live)
 
     def _odometry(self) -> Odometry | None:
-        return None if self._moves is None else self._moves.read()
+        if self._moves is None:
+            return None
+        odometry = self._moves.read()
+        for text in set(odometry.warnings) - self._warned:
+            self._warned.add(text)
+            print(text, file=sys.stderr, flush=True)
+        return odometry
 
     def _write(self, track: Track, pictures: bool = True) -> None:
         args, odometry, made, moves_m = self.args, None, {}, None
         if args.odometry is not None:
             odometry = {"file": Path(args.odometry).name, "sigma": args.odometry_sigma, "floor_m": args.odometry_floor,
-                        "fault": track.odometry_fault or None}  # fmt: skip
+                        "time_sigma_s": args.odometry_time_sigma, "fault": track.odometry_fault or None}  # fmt: skip
         if pictures and not args.no_plots:
             if odometry is not None and not track.odometry_fault:
                 moves_m = self.session.odometry_positions_m(track, self._odometry())

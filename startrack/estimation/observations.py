@@ -57,12 +57,14 @@ class FrameEstimate:
 class OdometryErrors:
     """Errors of moves, independent on each horizontal axis; by default those of a usual rover's odometry.
 
-    All moves share a further error of their scale and one of their heading, each as large as the relative one.
+    All moves share a further error of their scale and one of their heading, each as large as the relative one, and the
+    offset of the odometry's clock from that of the images.
     """
 
     sigma_1: float = ODOMETRY_SIGMA  # standard deviation, relative to the length of a move
     floor_m: float = ODOMETRY_FLOOR_M  # beside that, in quadrature
     max_speed_m_s: float = MAX_SPEED_M_S  # faster moves are impossible
+    time_sigma_s: float = 0.0  # standard deviation of that offset
 
     def sigma_m(self, move_m: Array) -> Array:
         """Standard deviation (...) [m] of moves (..., 2), or (..., 3), on each axis."""
@@ -81,11 +83,22 @@ def moves_by_scale_and_heading(move_m: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Moves between successive frames, in enu, each with an independent error, and with errors that all share."""
+    """Moves between successive frames, in enu, each with an independent error, and with errors that they share.
+
+    Some are of all moves, some of each leg: moves in a row in which the wheels slip alike.
+    """
 
     move_m: Array  # (n - 1, 2)
     sigma_m: Array  # (n - 1,) on each axis; infinite where the move is not known
     by_shared_m: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))  # (n - 1, 2, f) by one sigma of each
+    leg: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # (n - 1,) number, rising; 0: none
+    by_leg_m: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))  # (n - 1, 2, l) by one sigma of its errors
+
+    @property
+    def by_each_m(self) -> Array:
+        """(n - 1, 2, f + l m) by the errors that all moves share, and those of each of m legs."""
+        of_legs = [np.where((self.leg == k)[:, None, None], self.by_leg_m, 0.0) for k in np.unique(self.leg) if k]
+        return np.concatenate([self.by_shared_m, *of_legs], axis=2)
 
     @classmethod
     def unknown(cls, frames: int) -> Steps:

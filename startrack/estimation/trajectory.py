@@ -8,6 +8,7 @@ observations, the estimates of the errors of the map's posts follow.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,12 +25,12 @@ DIRECTIONS = 256  # over half a turn
 class TrackFilter:
     """Estimates after the frames so far; `predict` and `update` in the order of time.
 
-    The state: the last position, the shared errors, those that all moves share, and posts.
+    The state: the last position, the shared errors, those of all moves and of the last leg, and posts.
     """
 
     shared_count: int
     height_sigma_m: float
-    moves_count: int = 0  # of errors that all moves share
+    moves_count: int = 0  # of errors that all moves share, and then of the last leg
     mean: Array = field(init=False)
     covariance: Array = field(init=False)
     posts: dict[int, int] = field(default_factory=dict)  # number of a post to its place in the state
@@ -61,11 +62,21 @@ class TrackFilter:
             sigma_m = UNKNOWN_M
         elif self.moves_count:
             shared, by = slice(2 + self.shared_count, self._first_post), steps.by_shared_m[number]
+            if len(steps.leg):
+                if steps.leg[number] > steps.leg[:number].max(initial=0):
+                    self._forget(slice(self._first_post - steps.by_leg_m.shape[-1], self._first_post))
+                by = np.hstack([by, steps.by_leg_m[number] * (steps.leg[number] > 0)])
             move_m = move_m + by @ self.mean[shared]
             self.covariance[:2] += by @ self.covariance[shared]
             self.covariance[:, :2] += self.covariance[:, shared] @ by.T
         self.mean[:2] += move_m
         self.covariance[[0, 1], [0, 1]] += sigma_m**2
+
+    def _forget(self, part: slice) -> None:
+        """These errors are those of a new leg."""
+        self.mean[part] = 0.0
+        self.covariance[part], self.covariance[:, part] = 0.0, 0.0
+        self.covariance[part, part] = np.eye(part.stop - part.start)
 
     def update(self, estimate: FrameEstimate) -> None:
         """Take in the observation of one frame."""
@@ -114,11 +125,28 @@ class Smoothed:
     post_sigma_m: Array  # (c,)
 
 
+def mixed_normal(means: Sequence[Array], covariances: Sequence[Array], share: Array) -> tuple[Array, Array]:
+    """Mean (..., d) and covariance (..., d, d) of a mixture of normal distributions with these shares (m,)."""
+    mean = np.einsum("m,m...->...", share, means)
+    off = np.asarray(means) - mean
+    return mean, np.einsum("m,m...->...", share, covariances + off[..., None] * off[..., None, :])
+
+
+def mix_smoothed(parts: Sequence[Smoothed], share: Array) -> Smoothed:
+    """The estimate by several explanations of the same observations, with their shares (m,)."""
+    position = mixed_normal([one.position_m for one in parts], [one.covariance_m2 for one in parts], share)
+    shared = mixed_normal([one.shared for one in parts], [one.shared_covariance for one in parts], share)
+    errors = [one.post_error_m[:, None] for one in parts]
+    post = mixed_normal(errors, [np.square(one.post_sigma_m)[:, None, None] for one in parts], share)
+    return Smoothed(*position, *shared, parts[0].post, post[0][:, 0], np.sqrt(post[1][:, 0, 0]))
+
+
 def smooth(observations: Observations, steps: Steps) -> Smoothed:
     """The best positions and shared errors, with their covariances. Cost: the third power of the number of frames."""
     n, known = observations.count, np.isfinite(steps.sigma_m)
     weight = np.where(known, 1.0 / np.square(np.where(known, steps.sigma_m, 1.0)), 0.0)
-    size, more = len(observations.target), steps.by_shared_m.shape[-1]
+    by_each_m = steps.by_each_m
+    size, more = len(observations.target), by_each_m.shape[-1]
     information, target = np.eye(size + more), np.append(observations.target, np.zeros(more))
     information[:size, :size] = observations.information
     for axis in range(2):
@@ -128,7 +156,7 @@ def smooth(observations: Observations, steps: Steps) -> Smoothed:
         np.subtract.at(target, left, weight * steps.move_m[:, axis])
         np.add.at(target, right, weight * steps.move_m[:, axis])
     if more:
-        by, left = steps.by_shared_m.reshape(-1, more), np.arange(2 * (n - 1))
+        by, left = by_each_m.reshape(-1, more), np.arange(2 * (n - 1))
         weighted = np.repeat(weight, 2)[:, None] * by
         for at, sign in ((left, 1.0), (left + 2, -1.0)):
             information[at, size:] += sign * weighted

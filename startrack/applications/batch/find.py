@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -17,6 +18,8 @@ from startrack.output import PICTURES
 from startrack.terrain import is_geotiff
 
 LOCK = ".startrack-batch.lock"
+COARSE_S = 2.0  # steps of a folder's time on the coarsest file systems (FAT): a later change within one does not show
+RELIST_S = 10.0  # after which a folder is listed again whatever its time: some network file systems do not keep it
 
 
 @dataclass(frozen=True, order=True)
@@ -45,7 +48,7 @@ def images_under(folder: str | os.PathLike[str], excluded: str | os.PathLike[str
     """
     root = existing_folder(folder)
     folders: dict[str, list[str]] = {}
-    for name in _image_names(root, None if excluded is None else os.path.realpath(excluded)):
+    for name in sorted(image_tree(root, excluded).changes()):
         folders.setdefault(str(PurePosixPath(name).parent), []).append(name)
     found = [
         Image(name, (PurePosixPath(parent) / of_results).as_posix(), str(root / name))
@@ -53,6 +56,11 @@ def images_under(folder: str | os.PathLike[str], excluded: str | os.PathLike[str
         for name, of_results in zip(group, result_stems(group), strict=True)
     ]
     return sorted(found)
+
+
+def image_tree(folder: str | os.PathLike[str], excluded: str | os.PathLike[str] | None = None) -> ImageTree:
+    """The tree of a `folder` without the folder `excluded`. Raises BadInput (bad_image) if `folder` is none."""
+    return ImageTree(existing_folder(folder), None if excluded is None else os.path.realpath(excluded))
 
 
 def listed_images(
@@ -134,27 +142,67 @@ def lock_results(out: Path) -> Iterator[None]:
         yield
 
 
-def _image_names(root: Path, excluded: str | None) -> list[str]:
-    """Paths of the tree's images, relative to it. A folder is entered once, by its own name rather than by a link."""
-    top = os.path.realpath(root)
-    entered, found = {top}, []
+@dataclass(eq=False)
+class ImageTree:
+    """The images of the tree of a folder as they come: of its folders those are listed anew that may have changed.
 
-    def is_entered(path: Path) -> bool:
-        real = os.path.realpath(path)
-        inside_by_link = path.is_symlink() and Path(real).is_relative_to(top)
-        if path.name.startswith(".") or real == excluded or real in entered or inside_by_link:
-            return False
-        entered.add(real)
-        return True
+    Links to folders outside the tree are followed, each folder once, by its own name rather than by a link. Hidden
+    files and folders, the folder `excluded` (a real path) and anything but regular files are left out.
+    """
 
-    for parent, folders, files in os.walk(root, followlinks=True):
-        here = Path(parent)
-        folders[:] = [name for name in sorted(folders) if is_entered(here / name)]
-        for path in (here / name for name in files if _is_image(name)):
+    root: Path
+    excluded: str | None = None
+    _listed: dict[str, _Listing] = field(default_factory=dict)
+
+    def changes(self) -> list[str]:
+        """Paths, relative to the tree's folder, of the images in folders that were listed anew: at first of all."""
+        top = os.path.realpath(self.root)
+        entered, found, waiting = {top}, [], [self.root]
+        while waiting:
+            here = waiting.pop()
+            listing, is_new = self._listing(here)
+            if is_new:
+                found += [(here / name).relative_to(self.root).as_posix() for name in listing.images]
+            inside = []
+            for path in (here / name for name in listing.folders):
+                real = os.path.realpath(path)
+                inside_by_link = path.is_symlink() and Path(real).is_relative_to(top)
+                if real != self.excluded and real not in entered and not inside_by_link:
+                    entered.add(real)
+                    inside.append(path)
+            waiting += inside[::-1]
+        return found
+
+    def _listing(self, folder: Path) -> tuple[_Listing, bool]:
+        """What the folder holds, and whether it was listed anew."""
+        now, known = time.monotonic(), self._listed.get(str(folder))
+        try:
+            stamp = os.stat(folder).st_mtime_ns
+            is_same = known is not None and known.stamp == stamp
+            changed_s = known.changed_s if known is not None and is_same else now
+            if known is not None and is_same and now - changed_s > COARSE_S and now - known.listed_s < RELIST_S:
+                return known, False
+            with os.scandir(folder) as entries:
+                held = [one for one in entries if not one.name.startswith(".")]
+            folders = sorted(one.name for one in held if one.is_dir())
             # A pipe would block the reader; a broken link is an image that will be refused.
-            if os.path.isfile(path) or not os.path.exists(path):
-                found.append(path.relative_to(root).as_posix())
-    return sorted(found)
+            files = [one for one in held if _is_image(one.name) and (one.is_file() or not os.path.exists(one.path))]
+            found = _Listing(stamp, now, changed_s, folders, [one.name for one in files])
+        except OSError:  # a folder that may not be read, or is gone
+            found = _Listing(0, now, now, [], [])
+        self._listed[str(folder)] = found
+        return found, True
+
+
+@dataclass(frozen=True)
+class _Listing:
+    """What a folder held."""
+
+    stamp: int  # time of its last change [ns], by the clock of its file system
+    listed_s: float  # by the clock of this process
+    changed_s: float  # when the stamp was seen first
+    folders: list[str]
+    images: list[str]
 
 
 def _is_image(name: str) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 from startrack.applications.tracking.explanations import Explanation, Explanations, Moves
 from startrack.core.types import Array, BadInput, Bools, Ints
 from startrack.estimation.observations import FrameEstimate, Observations, Steps
-from startrack.estimation.trajectory import Smoothed, smooth
+from startrack.estimation.trajectory import Smoothed, mix_smoothed, smooth
 from startrack.localization import AMBIGUOUS_MASS
 
 CHI2_999 = float(-2.0 * np.log(0.001))  # within which a normal error in the plane is with 99.9 %
@@ -23,10 +23,16 @@ class RobustTrack:
 
     smoothed: Smoothed
     mode: Ints  # (n,) which mode of each frame is used; -1: none
-    slipped: Bools  # (n - 1,)
+    steps: Steps  # the moves as they are explained
+    leg: Ints  # (n - 1,) number from 1 of the leg, or of the single move, that slipped; 0: none
     vouched: Bools  # (n,) whether explanations of another position are unlikely together
     attitude_fits: Bools  # (n,) whether the attitude of each frame turns the move after it
     fault: str = ""  # of the odometry as a whole, which is left out then
+
+    @property
+    def slipped(self) -> Bools:
+        """(n - 1,) moves judged wheel slip."""
+        return np.asarray(self.leg > 0)
 
 
 def smooth_robustly(
@@ -69,7 +75,7 @@ def smooth_robustly(
     if (mode != best.mode).any():
         found = _smooth(modes, best, mode, height_sigma_m) or found
     turns = np.append(best.anchor == np.arange(1, len(mode)), True)
-    return RobustTrack(found, mode, best.slipped, vouched, turns, best.moves.fault)
+    return RobustTrack(found, mode, best.steps, best.leg, vouched, turns, best.moves.fault)
 
 
 def disagrees(position_m: Array, covariance_m2: Array, other_m: Array, other_m2: Array) -> Bools:
@@ -104,11 +110,13 @@ def _doubt(
 def _smooth(
     modes: Sequence[Sequence[FrameEstimate]], one: Explanation, mode: Ints, height_sigma_m: float
 ) -> Smoothed | None:
-    """The estimate by the modes (n,) with the moves of an explanation; None where no frame has one."""
+    """The estimate by the modes (n,) with the moves of an explanation and its variants; None where no frame has one."""
     chosen = [of[k] if k >= 0 else None for of, k in zip(modes, mode, strict=True)]
     if all(estimate is None for estimate in chosen):
         return None
-    return smooth(Observations.of(chosen, height_sigma_m), one.steps)
+    observations, others = Observations.of(chosen, height_sigma_m), [each.share for each in one.variants]
+    share = np.array([1.0 - sum(others), *others])
+    return mix_smoothed([smooth(observations, each.steps) for each in (one, *one.variants)], share)
 
 
 def _group(one: Explanation, names: Sequence[str], *, has_odometry: bool) -> str:

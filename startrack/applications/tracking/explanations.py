@@ -1,28 +1,34 @@
 """Which images, moves and odometry of a track belong together: explanations, compared by their evidence.
 
 An explanation states of each image whether it is of this camera, and which of its positions is right; of each move,
-whether the wheels slipped; and of the odometry, whether it is as stated or wrong as a whole. Each has a prior (the
-constants below) and a likelihood: that of a Kalman filter without posts, whose errors count as the image's own. An
-image that is not of the track is anywhere, or near its place with a gross error. The moves are turned by the attitude
-of the last image that an explanation takes as right.
+whether the wheels slipped, in it alone or alike in the moves of a leg; and of the odometry, whether it is as stated or
+wrong as a whole. Each has a prior (the constants below) and a likelihood: that of a Kalman filter without posts, whose
+errors count as the image's own. An image that is not of the track is anywhere, or near its place with a gross error.
+The moves are turned by the attitude of the last image that an explanation takes as right.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 
 import numpy as np
 
 from startrack.core.types import Array, Bools, Ints
-from startrack.estimation.observations import FrameEstimate, Steps
+from startrack.estimation.observations import FrameEstimate, Steps, moves_by_scale_and_heading
 
 SLIP_PROBABILITY, SLIP_SIGMA_M = 0.05, 20.0  # of a move by wheel slip, and its size on each axis
+# Of a leg: that it begins with a move, that a move is its last one, and its error of scale and of heading [rad].
+LEG_PROBABILITY, LEG_END_PROBABILITY, LEG_SIGMA_1 = 0.05, 0.2, 0.15
+STRAIGHT, SLIPS, BEGINS, CONTINUES = range(4)  # what a move is: without slip, with, the first of a leg, another of it
 WRONG_PROBABILITY, WRONG_SIGMA_M = 1e-3, 200.0  # of a frame, and the error of its position on each axis
 FOREIGN_SIGMA_M = 5000.0  # of a position anywhere in a search area, about its middle
 MIXED_PROBABILITY, MIXED_PART = 1e-3, 0.1  # of a set with images from elsewhere, and how many of its images these are
 ODOMETRY_WRONG_PROBABILITY = 0.01  # as a whole
-FREEDOMS = 6  # of odometry as a whole: a linear map from three axes to two
+FREEDOMS = 7  # of odometry as a whole: a linear map from three axes to two, and its clock
+LEG_FREEDOMS = 2
+LEAST_VARIANT = 0.01  # part of an explanation's probability, by other moves, that counts in its positions
 KEPT_NATS, MOST_KEPT = 60.0, 60  # of explanations beside the best, and for each kind of odometry
 
 
@@ -50,7 +56,14 @@ class Moves:
         move = np.einsum("nij,nj->ni", self.turn[anchor], delta)[:, :2]
         known = np.isfinite(move).all(axis=1) & np.isfinite(sigma) & (not self.fault)
         shared = np.where(known[:, None, None], (self.turn[anchor] @ self.freedom_m[: len(anchor)])[:, :2], 0.0)
-        return Steps(np.where(known[:, None], move, 0.0), np.where(known, sigma, np.inf), shared)
+        of_leg = np.where(known[:, None, None], (self.turn[anchor] @ self.leg_m[: len(anchor)])[:, :2], 0.0)
+        straight = np.zeros(len(anchor), dtype=np.int64)
+        return Steps(np.where(known[:, None], move, 0.0), np.where(known, sigma, np.inf), shared, straight, of_leg)
+
+    @cached_property
+    def leg_m(self) -> Array:
+        """(n - 1, 3, LEG_FREEDOMS) of `delta_m`, by errors of a standard normal prior that the moves of a leg share."""
+        return LEG_SIGMA_1 * moves_by_scale_and_heading(self.delta_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,17 +72,25 @@ class Explanation:
 
     share: float  # of the probability
     moves: Moves
+    number: int  # of these moves among the kinds of odometry
     mode: Ints  # (n,) which mode of each frame is right; -1: none
-    slipped: Bools  # (n - 1,)
+    kind: Ints  # (n - 1,) of each move: STRAIGHT to CONTINUES
     anchor: Ints  # (n - 1,) entry of `Moves.turn` for each move
     position_m: Array  # (2,) of the last frame
     covariance_m2: Array  # (2, 2)
+    variants: tuple[Explanation, ...] = ()  # with other moves alone, beside it; their shares are those of this one
+
+    @property
+    def leg(self) -> Ints:
+        """(n - 1,) number from 1 of the leg, or of the single move, that slipped; 0: none."""
+        return np.where(self.kind > STRAIGHT, np.cumsum((self.kind == SLIPS) | (self.kind == BEGINS)), 0)
 
     @property
     def steps(self) -> Steps:
-        """The moves with their errors, those that slipped with a larger one."""
+        """The moves with their errors: those that slipped with a larger one, those of a leg with what they share."""
         steps = self.moves.steps(self.anchor)
-        return replace(steps, sigma_m=np.where(self.slipped, np.hypot(steps.sigma_m, SLIP_SIGMA_M), steps.sigma_m))
+        sigma_m = np.where(self.kind == SLIPS, np.hypot(steps.sigma_m, SLIP_SIGMA_M), steps.sigma_m)
+        return replace(steps, sigma_m=sigma_m, leg=np.where(self.kind >= BEGINS, self.leg, 0))
 
 
 @dataclass(eq=False)
@@ -79,15 +100,26 @@ class Branches:
     log_likelihood: Array  # (b,) with all priors but that of wrong frames
     log_wrong: Array  # (b,) the part of it by wrong frames
     wrong: Ints  # (b,) number of wrong frames
-    mean: Array  # (b, 2 + k + FREEDOMS) of the position, the shared errors and those of the odometry as a whole
-    covariance: Array  # (b, 2 + k + FREEDOMS, 2 + k + FREEDOMS)
+    mean: Array  # (b, p) of the position, the shared errors, and those of the odometry as a whole and of a leg
+    covariance: Array  # (b, p, p) with p = 2 + k + FREEDOMS + LEG_FREEDOMS
     odometry: Ints  # (b,) which moves
     anchor: Ints  # (b,) entry of their turns
-    history: Ints  # (b, frames, 3) mode, slip before it, anchor of the move before it
+    history: Ints  # (b, frames, 3) mode, kind and anchor of the move before it
 
     def take(self, which: Ints | Bools) -> Branches:
         """Those of an index."""
         return Branches(*(getattr(self, f.name)[which] for f in fields(self)))
+
+    def move_by_leg(self, by_leg: Array, *, is_new: bool) -> None:
+        """Move by the errors of a leg, of which a new one has its own: `by_leg` (b, 2, LEG_FREEDOMS) by one sigma."""
+        leg = slice(-LEG_FREEDOMS, None)
+        if is_new:
+            self.mean[:, leg], self.covariance[:, leg], self.covariance[:, :, leg] = 0.0, 0.0, 0.0
+            self.covariance[:, leg, leg] = np.eye(LEG_FREEDOMS)
+        shift = np.tile(np.eye(self.mean.shape[1]), (len(self.mean), 1, 1))
+        shift[:, :2, leg] = by_leg
+        self.mean = np.einsum("bij,bj->bi", shift, self.mean)
+        self.covariance = shift @ self.covariance @ shift.swapaxes(1, 2)
 
     @staticmethod
     def join(parts: Sequence[Branches]) -> Branches:
@@ -149,7 +181,14 @@ class Explanations:
                 best.append(other)
         share = np.exp(np.array(weights) - np.logaddexp.reduce(weights))
         order = np.argsort(-share, kind="stable").tolist()
-        return [self._explanation(best[g], float(share[g]), n) for g in order]
+        likeliest, *others = (self._explanation(best[g], float(share[g]), n) for g in order)
+        group = list(groups.values())[order[0]] if order[0] < len(groups) else []
+        if not likeliest.moves.fault:
+            part = np.exp(total[group] - np.logaddexp.reduce(total[group]))
+            kept = [(b, p) for b, p in zip(group[1:], part[1:].tolist(), strict=True) if p > LEAST_VARIANT]
+            more = tuple(self._explanation(found.take(np.array([b])), p, n) for b, p in kept)
+            likeliest = replace(likeliest, variants=more)
+        return [likeliest, *others]
 
     @property
     def _branches(self) -> Branches:
@@ -158,18 +197,18 @@ class Explanations:
         return self._found
 
     def _explanation(self, one: Branches, share: float, n: int) -> Explanation:
-        mode, slipped, anchor = one.history[0].T
+        mode, kind, anchor = one.history[0].T
         return Explanation(
-            share, self._moves[one.odometry[0]], mode, slipped[1:] > 0, anchor[1:n], one.mean[0, :2],
+            share, self._moves[one.odometry[0]], int(one.odometry[0]), mode, kind[1:], anchor[1:n], one.mean[0, :2],
             one.covariance[0, :2, :2],
         )  # fmt: skip
 
     def _start(self) -> Branches:
-        count, p = len(self._moves), 2 + self.shared_count + FREEDOMS
-        prior = np.diag(np.square(np.append(self._free_sigma, np.ones(FREEDOMS))))
+        count, more = len(self._moves), np.ones(FREEDOMS + LEG_FREEDOMS)
+        prior = np.diag(np.square(np.append(self._free_sigma, more)))
         nothing, none = np.zeros(count), np.zeros(count, dtype=np.int64)
         return Branches(
-            np.array([m.log_prior for m in self._moves]), nothing, none, np.zeros((count, p)),
+            np.array([m.log_prior for m in self._moves]), nothing, none, np.zeros((count, len(prior))),
             np.tile(prior, (count, 1, 1)), np.arange(count), none,
             np.zeros((count, 1, 3), dtype=np.int64),
         )  # fmt: skip
@@ -179,7 +218,10 @@ class Explanations:
         return np.r_[FOREIGN_SIGMA_M, FOREIGN_SIGMA_M, np.ones(self.shared_count)]
 
     def _moved(self, one: Branches, step: int) -> Branches:
-        """After a move, with the entry of the next frame in the history; a known move may be one that slipped."""
+        """After a move, with the entry of the next frame in the history; a known move may be one that slipped.
+
+        A leg may begin, and go on, in odometry without a fault as a whole.
+        """
         turn = np.array([m.turn for m in self._moves])[one.odometry, one.anchor]
         delta = np.array([m.delta_m[step] for m in self._moves])[one.odometry]
         sigma = np.array([m.sigma_m[step] for m in self._moves])[one.odometry]
@@ -187,7 +229,8 @@ class Explanations:
         move = np.einsum("bij,bj->bi", turn, delta)[:, :2]
         lost = ~(np.isfinite(move).all(axis=1) & np.isfinite(sigma))
         shift = np.tile(np.eye(one.mean.shape[1]), (len(lost), 1, 1))
-        shift[:, :2, -FREEDOMS:] = np.where(lost[:, None, None], 0.0, (turn @ freedom)[:, :2])
+        all_moves = slice(-FREEDOMS - LEG_FREEDOMS, -LEG_FREEDOMS)
+        shift[:, :2, all_moves] = np.where(lost[:, None, None], 0.0, (turn @ freedom)[:, :2])
         mean = np.einsum("bij,bj->bi", shift, one.mean)
         covariance = shift @ one.covariance @ shift.swapaxes(1, 2)
         mean[:, :2] = np.where(lost[:, None], 0.0, mean[:, :2] + move)
@@ -195,20 +238,36 @@ class Explanations:
         covariance[:, [0, 1], [0, 1]] += np.square(np.where(lost, FOREIGN_SIGMA_M, sigma))[:, None]
         entry = np.stack([np.zeros_like(one.anchor), np.zeros_like(one.anchor), one.anchor], axis=-1)
         history = np.concatenate([one.history, entry[:, None]], axis=1)
-        may = ~lost & self.may_slip
-        straight = Branches(
-            one.log_likelihood + np.where(may, np.log1p(-SLIP_PROBABILITY), 0.0), one.log_wrong, one.wrong, mean,
-            covariance, one.odometry, one.anchor, history,
-        )  # fmt: skip
-        slipped = straight.take(may)
-        slipped.log_likelihood += np.log(SLIP_PROBABILITY) - np.log1p(-SLIP_PROBABILITY)
-        slipped.covariance[:, [0, 1], [0, 1]] += SLIP_SIGMA_M**2
-        slipped.history[:, -1, 1] = 1
-        return Branches.join([straight, slipped])
+        moved = Branches(
+            one.log_likelihood, one.log_wrong, one.wrong, mean, covariance, one.odometry, one.anchor, history
+        )
+        if not self.may_slip:
+            return moved
+        may_begin = ~lost & np.array([not m.fault for m in self._moves])[one.odometry]
+        in_leg = one.history[:, -1, 1] >= BEGINS
+        ended = np.where(in_leg, np.log(LEG_END_PROBABILITY), 0.0)  # a move that is not known ends a leg too
+        slips = np.where(may_begin, SLIP_PROBABILITY + LEG_PROBABILITY, SLIP_PROBABILITY)
+        by_leg = (turn @ np.array([m.leg_m[step] for m in self._moves])[one.odometry])[:, :2]
+        parts = []
+        for kind, may, log_prior in (
+            (STRAIGHT, np.ones_like(lost), np.where(lost, 0.0, ended + np.log1p(-slips))),
+            (SLIPS, ~lost, ended + np.log(SLIP_PROBABILITY)),
+            (BEGINS, may_begin, ended + np.log(LEG_PROBABILITY)),
+            (CONTINUES, ~lost & in_leg, np.full(len(lost), np.log1p(-LEG_END_PROBABILITY))),
+        ):
+            branches = moved.take(may)
+            branches.log_likelihood += log_prior[may]
+            branches.history[:, -1, 1] = kind
+            if kind == SLIPS:
+                branches.covariance[:, [0, 1], [0, 1]] += SLIP_SIGMA_M**2
+            elif kind != STRAIGHT:
+                branches.move_by_leg(by_leg[may], is_new=kind == BEGINS)
+            parts.append(branches)
+        return Branches.join(parts)
 
     def _used(self, one: Branches, number: int, mode: FrameEstimate, anchor: Ints) -> Branches:
         residual, covariance, noise = self._innovation(one, mode)
-        seen = np.pad(mode.response, ((0, 0), (0, FREEDOMS)))
+        seen = np.pad(mode.response, ((0, 0), (0, FREEDOMS + LEG_FREEDOMS)))
         cross = one.covariance @ seen.T
         gain = np.linalg.solve(covariance, cross.swapaxes(1, 2)).swapaxes(1, 2)
         found = _decided(

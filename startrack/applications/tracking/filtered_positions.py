@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from startrack.applications.tracking.contradictions import RobustTrack, disagrees, smooth_robustly
-from startrack.applications.tracking.explanations import FREEDOMS, Explanations, Moves
+from startrack.applications.tracking.explanations import FREEDOMS, LEG_FREEDOMS, Explanations, Moves
 from startrack.applications.tracking.frame_estimate import (
     FRAME_REACH_SIGMAS,
     LEAST_FRAME_HALF_M,
@@ -25,7 +25,7 @@ from startrack.applications.tracking.observed_frame import ObservedFrame
 from startrack.applications.tracking.track_errors import SIZE_ROUNDS, TrackErrors
 from startrack.core.types import Array, BadInput, Ints
 from startrack.estimation.observations import UNKNOWN_M, FrameEstimate, Observations, Steps
-from startrack.estimation.trajectory import Smoothed, TrackFilter, smooth
+from startrack.estimation.trajectory import Smoothed, TrackFilter, mixed_normal, smooth
 from startrack.localization import AMBIGUOUS_MASS
 from startrack.terrain import Terrain
 
@@ -38,7 +38,7 @@ class OnlineTrack:
     """Positions at the time of each frame; `add` in the order of time. Without contradictions a Kalman filter."""
 
     def __init__(self, shared_count: int, height_sigma_m: float) -> None:
-        self.filter = TrackFilter(shared_count, height_sigma_m, FREEDOMS)
+        self.filter = TrackFilter(shared_count, height_sigma_m, FREEDOMS + LEG_FREEDOMS)
         self.is_vouched = True  # whether explanations of another position of the last frame are unlikely together
         self._explanations = Explanations(shared_count, height_sigma_m)
         self._modes: list[Modes] = []
@@ -48,6 +48,28 @@ class OnlineTrack:
     def mode(self) -> int:
         """Which mode of the last frame is used; -1: none."""
         return int(self._best.mode[-1]) if self.is_vouched else -1
+
+    @property
+    def position_m(self) -> Array:
+        """(2,) of the last frame, by all moves that it may have made."""
+        return self._of_last[0]
+
+    @property
+    def covariance_m2(self) -> Array:
+        """(2, 2) of the last frame, by all moves that it may have made."""
+        return self._of_last[1]
+
+    @property
+    def _of_last(self) -> tuple[Array, Array]:
+        """Where the filter differs from the explanation it follows, by posts, the variants differ alike."""
+        best, others = self._best, [one.share for one in self._best.variants]
+        parts, share = (best, *best.variants), np.array([1.0 - sum(others), *others])
+        position, covariance = mixed_normal(
+            [one.position_m for one in parts], [one.covariance_m2 for one in parts], share
+        )
+        sizes, axes = np.linalg.eigh(covariance - best.covariance_m2)
+        more = (axes * np.maximum(sizes, 0.0)) @ axes.T
+        return self.filter.position_m + position - best.position_m, self.filter.covariance_m2 + more
 
     @property
     def is_first(self) -> bool:
@@ -61,10 +83,10 @@ class OnlineTrack:
         self._best, *others = self._explanations.ranked()
         best, n = self._best, len(self._modes)
         steps = best.steps
-        moved = [(), *zip(best.slipped.tolist(), best.anchor.tolist(), [best.moves.fault] * (n - 1), strict=True)]
+        moved = [(), *zip(best.kind.tolist(), best.anchor.tolist(), [best.number] * (n - 1), strict=True)]
         decided = [(mode, *move) for mode, move in zip(best.mode.tolist(), moved, strict=True)]
         if decided[:-1] != self._decided:  # another explanation of the frames before is likelier now
-            self.filter = TrackFilter(self.filter.shared_count, self.filter.height_sigma_m, FREEDOMS)
+            self.filter = TrackFilter(self.filter.shared_count, self.filter.height_sigma_m, FREEDOMS + LEG_FREEDOMS)
             self._decided = []
         for k in range(len(self._decided), n):
             if k:
@@ -89,8 +111,8 @@ def filter_positions(
     kinds = [Moves.of(moves)] if isinstance(moves, Steps) else moves
     for k, of in enumerate(modes):
         track.add(of, kinds)
-        position.append(track.filter.position_m)
-        covariance.append(track.filter.covariance_m2 if track.is_vouched else UNKNOWN_M**2 * np.eye(2))
+        position.append(track.position_m)
+        covariance.append(track.covariance_m2 if track.is_vouched else UNKNOWN_M**2 * np.eye(2))
         alone += [k] if track.is_first else []
         mode.append(track.mode)
     return np.array(position), np.array(covariance), np.array(mode), alone

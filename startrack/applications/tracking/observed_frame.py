@@ -88,7 +88,7 @@ def observe_frame(outcome: Outcome, errors: TrackErrors | None = None, terrain: 
     missing = facts_of(value, errors) - errors.gross
     if missing:
         raise ValueError(f"{name}: it shows a gross error of {', '.join(missing)}: it must be shared")
-    fixes = _image_fixes(value.fix, terrain)
+    fixes = image_fixes(value.fix, terrain)
     rows = _informative_rows(value, terrain, fixes[0].at_time_m)
     frame = ObservedFrame(
         name, when, R, (), rows, fixes, value.fix.shown, steepness_1=value.terrain.steepness_1, search=value.fix.search
@@ -114,7 +114,7 @@ def observe_again(frame: ObservedFrame, errors: TrackErrors, terrain: Terrain) -
     return replace(frame, modes=tuple(modes))
 
 
-def _image_fixes(fix: Fix, terrain: Terrain) -> tuple[ImageFix, ...]:
+def image_fixes(fix: Fix, terrain: Terrain) -> tuple[ImageFix, ...]:
     """The position of a `fix` by one image, or each of several."""
     if not fix.ambiguous:
         position, at = np.asarray(fix.position_enu_m), np.asarray(fix.at_time_m)

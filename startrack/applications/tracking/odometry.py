@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, NoReturn
 import numpy as np
 from numpy.typing import ArrayLike
 
+from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.errors import BadInput
 from startrack.core.files import MAX_CAUSE_CHARS, FilePath, printable, read_text
-from startrack.core.types import Array, Value, array
+from startrack.core.types import Array, Bools, Value, array
 from startrack.exposure import BAG_SUFFIXES, ODOMETRY_TYPES, is_bag, read_messages
 from startrack.frames import format_utc
 
@@ -27,6 +28,7 @@ TUM_COLUMNS = "time tx ty tz qx qy qz qw"
 LAST_TIME_S = datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC).timestamp()  # larger numbers are milliseconds or less
 QUATERNION_LENGTH_1 = 0.01  # error of a quaternion's length from rounding to two digits; more is another quantity
 SPAN_TOLERANCE_S = 1e-3  # some files round times to 0.1 ms; a rover moves less than 0.1 mm in that time
+GAP_INTERVALS = 10.0  # between poses, by the median one: where poses are farther apart, some are missing
 LARGEST_COORDINATE_M = 1e8  # also of frames that count from the middle of a body
 MAX_ODOMETRY_BYTES = 2**28  # two million poses
 
@@ -42,6 +44,7 @@ class Odometry(Value):
     time_s: Array = array("n")  # Unix seconds, UTC
     position_m: Array = array("n", 3)
     quat_xyzw: Array = array("n", 4)  # from body to the frame
+    warnings: tuple[str, ...] = ()  # of what was read
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -84,6 +87,18 @@ class Odometry(Value):
         position_m = np.stack([np.interp(at_s, self.time_s, axis) for axis in self.position_m.T], axis=-1)
         return position_m, Slerp(self.time_s, Rotation.from_quat(self.quat_xyzw))(at_s)
 
+    def covers(self, time_s: Array, still_m: float = ODOMETRY_FLOOR_M) -> Bools:
+        """Whether the odometry says where the body was at each of `time_s` (m,) [Unix s].
+
+        It does not before its first pose, after its last one, and in a gap in which the body moved by `still_m` [m].
+        """
+        step_s, moved_m = np.diff(self.time_s), np.linalg.norm(np.diff(self.position_m, axis=0), axis=1)
+        k = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, len(step_s) - 1)
+        is_gap = (step_s > GAP_INTERVALS * np.median(step_s)) & (moved_m > still_m)
+        after, before = time_s - self.time_s[k], self.time_s[k + 1] - time_s
+        at_pose = (np.abs(after) <= SPAN_TOLERANCE_S) | (np.abs(before) <= SPAN_TOLERANCE_S)
+        return np.asarray(at_pose | ((after > 0) & (before > 0) & ~is_gap[k]))
+
     def require_covers(self, time_s: Array) -> None:
         """Raises BadInput (bad_odometry) for one of `time_s` (m,) [Unix s] before the first pose or after the last."""
         first, last = self.time_s[[0, -1]]
@@ -106,30 +121,33 @@ class Odometry(Value):
             )
 
 
-def read_odometry(path: FilePath, topic: str | None = None, *, growing: bool = False) -> Odometry:
+def read_odometry(
+    path: FilePath, topic: str | None = None, *, growing: bool = False, floor_m: float = ODOMETRY_FLOOR_M
+) -> Odometry:
     """The odometry in the file `path`: TUM text, or a ROS bag (.bag, .db3, .mcap, a folder with metadata.yaml).
 
     TUM text has one pose a line, `time tx ty tz qx qy qz qw`, with the time in Unix seconds (UTC) and comments after
     `#`. Of a bag, the nav_msgs/Odometry messages of a `topic` are read (None: its only topic of that type), with the
-    times of their headers. `growing`: text that is being written; its last line is left out unless it is complete,
-    with eight numbers and the end of the line.
+    times of their headers. Of poses at one time that agree within `floor_m` [m] the last one counts, with a warning.
+    `growing`: text that is being written; its last line is left out unless it is complete, with eight numbers and the
+    end of the line.
 
     Raises:
         BadInput: bad_odometry with the file and the cause, in one line.
     """
     if is_bag(path) or Path(path).is_dir():
-        return _odometry_of_bag(path, topic)
+        return _odometry_of_bag(path, topic, floor_m)
     if topic is not None:
         _refuse(f"{printable(path)}: is read as text and has no topic {topic}; bags end in {', '.join(BAG_SUFFIXES)}")
-    return _odometry_of_text(path, growing)
+    return _odometry_of_text(path, growing, floor_m)
 
 
 class OdometryFile:
     """A file of odometry that is read again where it has changed."""
 
-    def __init__(self, path: str, topic: str | None, is_followed: bool) -> None:
+    def __init__(self, path: str, topic: str | None, is_followed: bool, floor_m: float = ODOMETRY_FLOOR_M) -> None:
         """Of a `path`, and of a bag the `topic`; `is_followed`: its last line may be incomplete."""
-        self.path, self.topic, self._is_growing = path, topic, is_followed
+        self.path, self.topic, self._is_growing, self.floor_m = path, topic, is_followed, floor_m
         self._has_ended = False
         self._read: tuple[object, Odometry] | None = None  # with the stamp of the file
 
@@ -142,7 +160,7 @@ class OdometryFile:
         """The odometry as it is now. Raises BadInput as `read_odometry`."""
         stamp = self._stamp()
         if self._read is None or self._read[0] != stamp:
-            read = partial(read_odometry, self.path, self.topic)
+            read = partial(read_odometry, self.path, self.topic, floor_m=self.floor_m)
             try:
                 self._read = stamp, read(growing=self._is_growing)
             except BadInput:
@@ -162,7 +180,7 @@ class OdometryFile:
         return None
 
 
-def _odometry_of_text(path: FilePath, growing: bool) -> Odometry:
+def _odometry_of_text(path: FilePath, growing: bool, floor_m: float) -> Odometry:
     values, lines = arrays.array("d"), arrays.array("q")  # lists take 620 bytes a pose, these 72
     text = read_text(path, "bad_odometry", max_bytes=MAX_ODOMETRY_BYTES)
     for number, line in enumerate((_complete_lines(text) if growing else text).splitlines(), start=1):
@@ -177,7 +195,7 @@ def _odometry_of_text(path: FilePath, growing: bool) -> Odometry:
             why = str(cause)[:MAX_CAUSE_CHARS]
             raise BadInput("bad_odometry", f"{printable(path)}: line {number}: {why}") from cause
         lines.append(number)
-    return _odometry_of_rows(path, values, lambda row: f"line {lines[row]}")
+    return _odometry_of_rows(path, values, lambda row: f"line {lines[row]}", floor_m)
 
 
 def _complete_lines(text: str) -> str:
@@ -188,7 +206,7 @@ def _complete_lines(text: str) -> str:
     return whole if not words or len(words) >= len(TUM_COLUMNS.split()) else whole[:last]
 
 
-def _odometry_of_bag(path: FilePath, topic: str | None) -> Odometry:
+def _odometry_of_bag(path: FilePath, topic: str | None, floor_m: float) -> Odometry:
     rows, frames = [], set()
     for message in read_messages(path, ODOMETRY_TYPES, topic, reason="bad_odometry", flag="--odometry-topic"):
         body, pose = message.content, message.content.pose.pose
@@ -199,23 +217,45 @@ def _odometry_of_bag(path: FilePath, topic: str | None) -> Odometry:
         named = "; ".join(f"{child!r} in {frame!r}" for frame, child in sorted(frames))
         _refuse(f"{printable(path)}: the topic has poses of several frames: {named}")
     rows.sort(key=lambda row: row[0])  # a bag is in the order of arrival
-    return _odometry_of_rows(path, rows, lambda row: f"pose {row}")
+    return _odometry_of_rows(path, rows, lambda row: f"pose {row}", floor_m)
 
 
-def _odometry_of_rows(path: FilePath, rows: ArrayLike, name_row: Callable[[int], str]) -> Odometry:
+def _odometry_of_rows(path: FilePath, rows: ArrayLike, name_row: Callable[[int], str], floor_m: float) -> Odometry:
     values = np.asarray(rows, dtype=np.float64).reshape(-1, len(TUM_COLUMNS.split()))
-    fault = _first_fault(values)
+    again = _repeats(values, floor_m)
+    fault = _first_fault(values, again)
     if fault is not None:
         _refuse(f"{printable(path)}: {name_row(fault[0])}: {fault[1]}")
     try:
-        return Odometry(time_s=values[:, 0], position_m=values[:, 1:4], quat_xyzw=values[:, 4:])
+        warnings: tuple[str, ...] = ()
+        if again.any():
+            apart_m = np.linalg.norm(np.diff(values[:, 1:4], axis=0)[again[1:]], axis=1).max()
+            first, values = name_row(int(np.argmax(again))), values[~np.append(again[1:], False)]
+            warnings = (
+                f"{printable(path)}: {np.count_nonzero(again)} second poses at one time, the first in {first}, up to "
+                f"{1e3 * apart_m:.1f} mm apart: the last one counts",
+            )
+        return Odometry(time_s=values[:, 0], position_m=values[:, 1:4], quat_xyzw=values[:, 4:], warnings=warnings)
     except ValueError as cause:
         raise BadInput("bad_odometry", f"{printable(path)}: {cause}") from cause
 
 
-def _first_fault(rows: Array) -> tuple[int, str] | None:
-    """Index and fault of the first pose that cannot be used among `rows` (n, 8) of TUM's columns; None: all can."""
-    time_s = rows[:, 0]
+def _repeats(rows: Array, floor_m: float) -> Bools:
+    """Which of `rows` (n, 8) have the time of the one before, and its pose within `floor_m` and ODOMETRY_SIGMA rad."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        moved_m = np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1)
+        before, after = rows[:-1, 4:], rows[1:, 4:]
+        turned = np.minimum(*(np.linalg.norm(after - sign * before, axis=1) for sign in (1.0, -1.0)))  # half the angle
+        same = (np.diff(rows[:, 0]) == 0) & (moved_m <= floor_m) & (2.0 * turned <= ODOMETRY_SIGMA)
+    return np.append(np.zeros(min(len(rows), 1), dtype=bool), same)
+
+
+def _first_fault(rows: Array, again: Bools | None = None) -> tuple[int, str] | None:
+    """Index and fault of the first pose that cannot be used among `rows` (n, 8) of TUM's columns; None: all can.
+
+    Rows `again` (n,) repeat the one before.
+    """
+    time_s, again = rows[:, 0], np.zeros(len(rows), dtype=bool) if again is None else again
     with np.errstate(over="ignore", invalid="ignore"):
         length, step_s = np.linalg.norm(rows[:, 4:], axis=1), np.diff(time_s, prepend=-np.inf)
         largest_m = np.abs(rows[:, 1:4]).max(axis=1)
@@ -224,7 +264,7 @@ def _first_fault(rows: Array) -> tuple[int, str] | None:
             "the time {now:.6g} is not in Unix seconds": ~((time_s >= 0) & (time_s <= LAST_TIME_S)),
             "the quaternion has the length {length:.3g}, not 1": ~(np.abs(length - 1) <= QUATERNION_LENGTH_1),
             f"a coordinate is larger than {LARGEST_COORDINATE_M:.0e} m": ~(largest_m <= LARGEST_COORDINATE_M),
-            "a second pose at the time {now:.6f}": step_s == 0,
+            "a second pose at the time {now:.6f}, {apart:.4g} m away": (step_s == 0) & ~again,
             "times are not in order: {now:.6f} follows {before:.6f}": step_s < 0,
         }
     faulty = np.array(list(faults.values()))
@@ -232,7 +272,8 @@ def _first_fault(rows: Array) -> tuple[int, str] | None:
         return None
     k = int(np.argmax(faulty.any(axis=0)))
     text = list(faults)[int(np.argmax(faulty[:, k]))]
-    return k, text.format(now=time_s[k], before=time_s[k - 1], length=length[k])
+    apart = np.linalg.norm(rows[k, 1:4] - rows[k - 1, 1:4])
+    return k, text.format(now=time_s[k], before=time_s[k - 1], length=length[k], apart=apart)
 
 
 def _utc_text(time_s: float) -> str:

@@ -26,11 +26,12 @@ def odometry_moves(
 ) -> list[Moves]:
     """Moves between frames by `odometry` as stated, and with each fault that it may have as a whole.
 
-    The attitude that the stars show turns them. Without odometry no move is known. `shows_scale`: whether images show a
+    The attitude that the stars show turns them. Without odometry no move is known, nor is one from or to a frame that
+    it does not cover. `shows_scale`: whether images show a
     wrong scale. In a crater of unknown size they do not: its error is the stated one, and no fault changes lengths.
 
     Raises:
-        BadInput: bad_odometry for odometry that does not cover the frames, or is impossible.
+        BadInput: bad_odometry for odometry that is impossible.
     """
     from scipy.spatial.transform import Rotation
 
@@ -38,7 +39,9 @@ def odometry_moves(
     if odometry is None:
         return [unknown]
     odometry.require_possible(errors.max_speed_m_s)
-    position, attitude = odometry.poses_at(np.array([frame.time_utc.astimezone(UTC).timestamp() for frame in frames]))
+    time_s = times_s(frames)
+    covered = odometry.covers(time_s, errors.floor_m)
+    position, attitude = odometry.poses_at(np.clip(time_s, *odometry.time_s[[0, -1]]))
     Q = attitude.as_matrix()
     back, first = Q.swapaxes(1, 2), Rotation.from_quat(np.roll(attitude.as_quat(), -1, axis=1)).as_matrix()
     down = np.diag([1.0, -1.0, -1.0])
@@ -54,18 +57,29 @@ def odometry_moves(
         **{f"axes in the order {' '.join('xyz'[k] for k in order)}": (position[:, order], Q) for order in axes},
     }
     apart = np.full(len(frames) - 1, APART_SIGMA_M)
-    R = np.array([np.full((3, 3), np.nan) if frame.R_body_enu is None else frame.R_body_enu for frame in frames])
+    nowhere = np.full((3, 3), np.nan)
+    R = np.array([
+        frame.R_body_enu if is_covered and frame.R_body_enu is not None else nowhere
+        for frame, is_covered in zip(frames, covered, strict=True)
+    ])  # fmt: skip
     none = np.full((1, 3, 3), np.nan)
 
     def moves(fault: str, position_m: Array, to_odometry: Array) -> Moves:
         """By poses in a frame of the odometry's own."""
         turn = np.concatenate([none, R.swapaxes(1, 2) @ to_odometry.swapaxes(1, 2)])
         delta = np.diff(position_m, axis=0)
-        return Moves(fault, 0.0, delta, turn, errors.sigma_m(delta), unknown.freedom_m)
+        sigma_m = np.where(covered[:-1] & covered[1:], errors.sigma_m(delta), np.inf)
+        return Moves(fault, 0.0, delta, turn, sigma_m, unknown.freedom_m)
 
     right = moves("", position, Q)
-    east, north = np.eye(FREEDOMS).reshape(2, 3, FREEDOMS)
-    similar, linear = np.zeros_like(unknown.freedom_m), np.zeros_like(unknown.freedom_m)
+    east, north = np.eye(6, FREEDOMS).reshape(2, 3, FREEDOMS)
+    similar, linear, by_clock = (np.zeros_like(unknown.freedom_m) for _ in range(3))
+    if errors.time_sigma_s and len(frames) > 1:
+        late, early = (
+            odometry.increments_body_m(np.clip(time_s + offset_s, *odometry.time_s[[0, -1]]))
+            for offset_s in (errors.time_sigma_s, -errors.time_sigma_s)
+        )
+        by_clock[..., -1] = np.einsum("nij,nj->ni", Q[:-1], 0.5 * (late - early))
     similar[..., :2] = moves_by_scale_and_heading(right.delta_m)
     linear[:, 0], linear[:, 1] = right.delta_m @ east, right.delta_m @ north
     sizes = [(1.0, errors.sigma_1)]  # of the errors that all moves share, with their probabilities before
@@ -80,13 +94,20 @@ def odometry_moves(
     return [
         *(
             replace(
-                right, freedom_m=size_1 * similar, log_prior=float(np.log(part * (1.0 - ODOMETRY_WRONG_PROBABILITY)))
+                right,
+                freedom_m=size_1 * similar + by_clock,
+                log_prior=float(np.log(part * (1.0 - ODOMETRY_WRONG_PROBABILITY))),
             )
             for part, size_1 in sizes
         ),
         *(replace(one, log_prior=float(prior - np.log(len(named)))) for one in named),
         *(replace(one, log_prior=float(prior)) for one in wrong),
     ]
+
+
+def times_s(frames: Sequence[ObservedFrame]) -> Array:
+    """Times (n,) [Unix s] of the frames."""
+    return np.array([frame.time_utc.astimezone(UTC).timestamp() for frame in frames])
 
 
 def odometry_steps(frames: Sequence[ObservedFrame], odometry: Odometry | None, errors: OdometryErrors) -> Steps:

@@ -21,7 +21,7 @@ const radiusText = (k, prefix) => say(frames[`${prefix}radius95_m`][k], 2, "m");
 
 function frameRows(k) {
   return [
-    ["Time", sayTime(frames.time_utc[k])], ["Why", frames.message[k]], ["Odometry", frames.slipped[k] ? "slip before this frame" : null],
+    ["Time", sayTime(frames.time_utc[k])], ["Why", frames.message[k]], ["Odometry", frames.slipped[k] ? "slip before this frame" : frames.outside_odometry[k] ? "does not cover this time" : null],
     ["Search", frames.search[k] === "beam" ? "beam: ended before the proof that no other position fits" : null],
     ["Smoothed", placeText(k, "")], ["95 % within", radiusText(k, "")],
     ["Filtered", placeText(k, "filtered_")], ["95 % within", radiusText(k, "filtered_")],
@@ -223,7 +223,7 @@ function table() {
 function leadText() {
   const of = (status) => frames.status.filter((one) => one === status).length;
   const parts = Object.entries(FRAME_WORDS).map(([status, words]) => [of(status), words]).filter(([n]) => n).map(([n, words]) => `${say(n, 0)} ${words}`);
-  return `${say(count, 0)} ${count === 1 ? "frame" : "frames"} on ${page.terrain}: ${[parts.join(", "), ...page.crater].join("; ")}.`;
+  return `${say(count, 0)} ${count === 1 ? "frame" : "frames"} on ${page.terrain}: ${[parts.join(", "), ...page.crater, ...page.legs].join("; ")}.`;
 }
 
 map.node.append(layers());

@@ -85,9 +85,8 @@ def _facts(track: Track) -> list[str]:
     if len(known) > 1 and not track.at_rest:
         lines.append(f"95 % radius of all, smoothed: median {length_text(float(np.median(radius_m[known])))}")
     lines += track.crater_texts
-    if track.slipped.any():
-        lines.append(f"slips of the odometry: {np.count_nonzero(track.slipped)}")
-    return lines
+    slips = f"slips of the odometry: {np.count_nonzero(track.slipped)} moves in {len(track.legs)} legs"
+    return lines + ([slips] if track.slipped.any() else [])
 
 
 def draw_graph(

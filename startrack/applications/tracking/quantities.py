@@ -16,6 +16,7 @@ from startrack.frames import format_utc, latlon_from_enu
 
 FORMAT = "startrack.track/1"
 STATUSES = ("used", "left_out", "refused")
+COUNTS = ("frames", *STATUSES, "slips", "legs", "outside_odometry")
 SEARCHES = ("proven", "beam")
 Value = Callable[["FrameValues"], Any]
 
@@ -87,6 +88,10 @@ FRAME_QUANTITIES = (
         lambda v: int(v.k > 0 and bool(v.track.slipped[v.k - 1])), {"enum": [0, 1]}, known=True,
     ),
     _frame(
+        "outside_odometry", "", "%d", "1: the odometry does not cover its time, so that it has no move",
+        lambda v: int(v.frame.is_outside), {"enum": [0, 1]}, known=True,
+    ),
+    _frame(
         "search", "", "%s", "proven: the image alone excludes every other position; beam: its search ended before that",
         lambda v: v.frame.search or None, {"enum": [None, *SEARCHES]}, known=True,
     ),
@@ -122,12 +127,17 @@ TRACK = output.file_schema(
         "at_rest": "flag",
         "odometry": output.or_null(
             output.object_schema({
-                "file": "text", "sigma": "positive", "floor_m": "positive",
+                "file": "text", "sigma": "positive", "floor_m": "positive", "time_sigma_s": "number",
                 "fault": output.or_null("text", "for which it is left out as a whole"),
             }),
             "its file and stated errors",
         ),
-        "counts": output.object_schema(dict.fromkeys(("frames", *STATUSES, "slips"), "count")),
+        "counts": output.object_schema(dict.fromkeys(COUNTS, "count")),
+        "legs": output.list_schema(output.object_schema({
+            "first": "text", "last": "text", "moves": "count", "length_m": "positive",
+            "factor": output.or_null("positive", "length by the odometry over that of the track"),
+            "heading_deg": output.or_null("number", "of the odometry, to the right of the track"),
+        })),
         "horizon": output.object_schema(
             {"error_deg": "number", "sigma_deg": "positive"}, "true horizon less the map's"
         ),

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from datetime import UTC
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,22 +21,23 @@ from startrack.applications.tracking.observed_frame import (
     observe_frame,
 )
 from startrack.applications.tracking.odometry import SPAN_TOLERANCE_S, Odometry
-from startrack.applications.tracking.odometry_moves import odometry_moves, odometry_steps
+from startrack.applications.tracking.odometry_moves import odometry_moves, odometry_steps, times_s
 from startrack.applications.tracking.track import Track, estimate_track, smooth_placed, track_of_newest
 from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.catalog import load_catalog
 from startrack.chain import Located, Settings, input_hashes, job_sha256, load_camera_input, locate, terrain_input
 from startrack.core.errors import BadInput
 from startrack.estimation.observations import USUAL_ODOMETRY, OdometryErrors
-from startrack.exposure import NO_TIME
+from startrack.exposure import NO_TIME, sidecar_of
 
 if TYPE_CHECKING:
     from startrack.camera import Camera
     from startrack.core.types import Array, Exposure
     from startrack.terrain import Terrain
 
-STILL_S = 0.1  # since the last change of a file, after which it is complete
-PATIENCE_S = 5.0  # for a file that cannot be read, or whose sidecar is missing
+# Since the last change of a file or its sidecar: it is complete, and one that cannot be read is refused.
+TRIES_S = (0.1, 5.0)
+POLLING_PART = 0.02  # of a core, to look for images while none comes
 
 
 @dataclass
@@ -128,10 +129,11 @@ class TrackSession:
         """Whether frames were not filtered yet."""
         return self._filtered != self.frames
 
-    def newest(self, odometry: Odometry | None) -> Iterator[Track]:
+    def newest(self, odometry: Odometry | None, *, has_ended: bool = False) -> Iterator[Track]:
         """Each frame that was not filtered yet and that the `odometry` reaches, by the frames before it: a track each.
 
-        If a frame comes late, all frames after it are filtered anew. Raises as `estimate`.
+        `has_ended`: also those after its last pose, which no odometry reaches any more. If a frame comes late, all
+        frames after it are filtered anew. Raises as `estimate`.
         """
         terrain, shared = self.terrain, self.shared
         if terrain is None or shared is None:
@@ -139,11 +141,12 @@ class TrackSession:
         if self._filtered != self.frames[: len(self._filtered)]:
             self._filtered, self._online = [], None
         for k in range(len(self._filtered), len(self.frames)):
-            if not _is_reached(self.frames[k], odometry):
+            if not (has_ended or _is_reached(self.frames[k], odometry)):
                 return
             online = self._online = self._filter_to(k, odometry, shared, terrain.height_sigma_m)
             self._filtered.append(self.frames[k])
-            yield track_of_newest(self.frames[k], online, terrain)
+            is_outside = odometry is not None and not odometry.covers(times_s(self.frames[k : k + 1]))[0]
+            yield track_of_newest(self.frames[k], online, terrain, shared, is_outside=is_outside)
 
     def _filter_to(self, k: int, odometry: Odometry | None, shared: TrackErrors, height_sigma_m: float) -> OnlineTrack:
         """The filter with frame k; where positions are not linear in `shared`, of all frames about what they show."""
@@ -192,7 +195,7 @@ class TrackSession:
 def _is_reached(frame: ObservedFrame, odometry: Odometry | None) -> bool:
     """Whether the odometry has come as far as the frame."""
     last_s = np.inf if odometry is None else float(odometry.time_s[-1])
-    return frame.time_utc.astimezone(UTC).timestamp() <= last_s + SPAN_TOLERANCE_S
+    return bool(times_s([frame])[0] <= last_s + SPAN_TOLERANCE_S)
 
 
 def follow_images(
@@ -202,37 +205,59 @@ def follow_images(
     *,
     until_idle_s: float | None,
 ) -> Iterator[str | None]:
-    """Give each path that `list_images` lists to `take`, and yield it after that; None where no image waits.
+    """Give each path that `list_images` has listed to `take`, and yield it after that; None where no image waits.
 
-    Ends when no image came for `until_idle_s` (None: never). An image that `take` refuses with BadInput is tried again
-    for some seconds, since its sidecar may be missing; then `refuse` gets it.
+    An image waits until size and time of its file and of its sidecar stay as they are; these times are compared with
+    each other, not with a clock. One that `take` refuses with BadInput is tried again when one of them changes, and
+    once after some seconds; then `refuse` gets it. Ends when no image came for `until_idle_s` (None: never).
     """
     taken: set[str] = set()
-    refused: set[tuple[str, int]] = set()  # with the time of its last change: a file that grows on is tried anew
-    first_try: dict[str, float] = {}
+    waiting: dict[str, _Waiting] = {}
     idle_since = time.monotonic()
     while until_idle_s is None or time.monotonic() - idle_since < until_idle_s:
-        waiting = False
-        for path in list_images():
-            try:
-                changed_ns = Path(path).stat().st_mtime_ns
-            except OSError:  # removed since it was listed
+        start_s, has_come = time.process_time(), False
+        waiting |= {path: _Waiting() for path in list_images() if path not in taken and path not in waiting}
+        for path, one in sorted(waiting.items()):
+            stamp, now = _stamp(path), time.monotonic()
+            if stamp is None:  # removed since it was listed
+                del waiting[path]
                 continue
-            is_still = time.time_ns() - changed_ns > STILL_S * 1e9
-            if path in taken or (path, changed_ns) in refused or not is_still:
+            if stamp != one.stamp:
+                one.stamp, one.since, one.tries = stamp, now, 0
+            if one.tries < len(TRIES_S):  # neither taken nor refused
+                idle_since = now
+            if one.tries == len(TRIES_S) or now - one.since < TRIES_S[one.tries]:
                 continue
-            idle_since = time.monotonic()
+            one.tries += 1
             try:
                 take(path)
             except BadInput as cause:
-                if time.monotonic() - first_try.setdefault(path, time.monotonic()) >= PATIENCE_S:
+                if one.tries == len(TRIES_S):
                     refuse(path, cause)
-                    refused.add((path, changed_ns))
                 continue
             taken.add(path)
-            waiting = True
+            del waiting[path]
+            has_come = True
             yield path
             idle_since = time.monotonic()
-        if not waiting:
+        if not has_come:
             yield None
-            time.sleep(0.5 * STILL_S)
+            time.sleep(max(0.5 * TRIES_S[0], (time.process_time() - start_s) / POLLING_PART))
+
+
+@dataclass(eq=False)
+class _Waiting:
+    """A file that was not taken yet."""
+
+    stamp: object = None
+    since: float = 0.0  # when that was seen first
+    tries: int = 0
+
+
+def _stamp(path: str) -> object:
+    """Size and time of a file and of its sidecar; None where there is no file."""
+    try:
+        stats = [os.stat(one) for one in (path, sidecar_of(Path(path))) if one is not None]
+    except OSError:
+        return None
+    return [(one.st_size, one.st_mtime_ns) for one in stats]

@@ -14,9 +14,10 @@ import numpy as np
 from startrack.applications.tracking.contradictions import RobustTrack, smooth_robustly
 from startrack.applications.tracking.explanations import Moves
 from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions, positions_at_rest
+from startrack.applications.tracking.legs import SlippedLeg, images_outside, legs_about, slipped_legs
 from startrack.applications.tracking.observed_frame import ImageFix, ObservedFrame
 from startrack.applications.tracking.odometry import Odometry
-from startrack.applications.tracking.odometry_moves import odometry_moves
+from startrack.applications.tracking.odometry_moves import odometry_moves, times_s
 from startrack.applications.tracking.track_errors import BIAS, CLOCK, DEPTH, SIZE_ROUNDS, WIDTH, TrackErrors
 from startrack.core.types import Array, BadInput, Bools, ClockError, Ints
 from startrack.estimation.observations import UNKNOWN_M, USUAL_ODOMETRY, FrameEstimate, OdometryErrors
@@ -58,6 +59,7 @@ class TrackFrame:
     message: str
     quat_xyzw_body_enu: Array | None  # (4,) None: no attitude, or one that contradicts the track
     search: str = ""  # as `Fix.search` of the image alone; empty: refused
+    is_outside: bool = False  # the odometry does not cover its time
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +106,12 @@ class Track:
     at_rest: bool
     terrain: Terrain  # where its size is not known, the crater as estimated
     odometry_fault: str = ""  # of the odometry as a whole, which is left out then
+    legs: tuple[SlippedLeg, ...] = ()  # the slipped steps, each leg of them as one
+
+    @property
+    def leg_texts(self) -> list[str]:
+        """The slipped legs in words."""
+        return [one.text([frame.name for frame in self.frames]) for one in self.legs]
 
     @property
     def crater_texts(self) -> list[str]:
@@ -131,7 +139,7 @@ def estimate_track(
         odometry_errors: of these moves.
         at_rest: the camera did not move: all exposures have one position.
 
-    Raises BadInput: no_time for frames that are not in the order of time, bad_odometry for odometry that does not cover
+    Raises BadInput: no_time for frames that are not in the order of time, bad_odometry for odometry that covers none of
     them or is impossible, inconsistent_evidence where no group of frames is clearly right; ValueError where no frame
     has a position.
     """
@@ -139,6 +147,12 @@ def estimate_track(
     if any(a > b for a, b in pairwise(times)):
         raise BadInput("no_time", "the frames are not in the order of their times")
     n, modes = len(frames), [frame.modes for frame in frames]
+    is_outside = np.zeros(n, dtype=bool)
+    if odometry is not None:
+        is_outside = ~odometry.covers(times_s(frames), odometry_errors.floor_m)
+        if is_outside.all():
+            odometry.require_covers(times_s(frames))
+    by_image: list[int] = []  # whose smoothed positions are those of their images
     if at_rest:
         robust, position_m, covariance_m2 = positions_at_rest(frames, terrain, shared)
         first, second = [*np.flatnonzero(robust.mode >= 0).tolist(), n][:2]
@@ -150,11 +164,18 @@ def estimate_track(
         filtered = filter_positions(placed, moves, len(shared), terrain.height_sigma_m)
         position_m, covariance_m2, used_then, by_one = filtered
         covariance_m2[(used_then >= 0) & (robust.mode < 0)] = UNKNOWN_M**2 * np.eye(2)  # taken back since
+        by_one += images_outside(frames, used_then, position_m, shared)
         alone = {k: frames[k].fixes for k in by_one if robust.mode[k] >= 0}
+        by_image = images_outside(frames, robust.mode, robust.smoothed.position_m, shared)
     found, used = robust.smoothed, np.flatnonzero(robust.mode >= 0).tolist()
     known_m2 = np.where(robust.vouched[:, None, None], found.covariance_m2, UNKNOWN_M**2 * np.eye(2))
-    smoothed = np.broadcast_to(found.position_m, (n, 2)), np.broadcast_to(known_m2, (n, 2, 2))
-    by_one = [] if len(used) > 1 else list(range(n)) if at_rest else used
+    own = {k: frames[k].fixes for k in by_image}
+    if len(used) == 1:
+        own = dict.fromkeys(range(n) if at_rest else used, frames[used[0]].fixes)
+    smoothed = _trajectory(
+        np.broadcast_to(found.position_m, (n, 2)), np.broadcast_to(known_m2, (n, 2, 2)), terrain, own
+    )  # fmt: skip
+    leg = legs_about(robust.leg, by_image, np.isfinite(robust.steps.sigma_m))
     bias, clock = (_shared_error(found, shared, name) for name in (BIAS, CLOCK))
     crater = terrain.with_shape(_shape_values(found, shared, terrain)) if shared.size_sigma_1 else terrain
     depth, width = (_size_error(found, shared, name, crater.facts().get(key, np.nan)) for name, key in SIZES.items())
@@ -163,11 +184,14 @@ def estimate_track(
         places_m = terrain.post_positions_m(found.post)
         crests = CrestHeights(found.post, places_m, found.post_error_m, found.post_sigma_m)
     return Track(
-        tuple(_track_frame(*one) for one in zip(frames, robust.mode, robust.attitude_fits, strict=True)),
-        _trajectory(position_m, covariance_m2, terrain, alone),
-        _trajectory(*smoothed, terrain, dict.fromkeys(by_one, frames[used[0]].fixes)), *(bias or (0.0, 0.0)),
-        clock and ClockError(*clock), depth, width, crests, robust.slipped, at_rest,
+        tuple(
+            _track_frame(*one)
+            for one in zip(frames, robust.mode, robust.attitude_fits, is_outside.tolist(), strict=True)
+        ),
+        _trajectory(position_m, covariance_m2, terrain, alone), smoothed, *(bias or (0.0, 0.0)),
+        clock and ClockError(*clock), depth, width, crests, leg > 0, at_rest,
         crater if shared.bends else terrain, robust.fault,
+        slipped_legs(leg, robust.steps.move_m, smoothed.position_enu_m[:, :2]),
     )  # fmt: skip
 
 
@@ -220,18 +244,36 @@ def _is_possible(found: Smoothed, shared: TrackErrors) -> bool:
     return bool(np.linalg.norm(found.shared[is_size]) < MOST_SIZE_SIGMAS)
 
 
-def track_of_newest(frame: ObservedFrame, online: OnlineTrack, terrain: Terrain) -> Track:
-    """The last `frame` that `online` has, as a track of its own: by all frames up to it."""
-    alone = {0: frame.fixes} if online.is_first else {}
-    covariance_m2 = online.filter.covariance_m2 if online.is_vouched else UNKNOWN_M**2 * np.eye(2)
-    found = _trajectory(online.filter.position_m[None], covariance_m2[None], terrain, alone)
+def track_of_newest(
+    frame: ObservedFrame, online: OnlineTrack, terrain: Terrain, shared: TrackErrors, *, is_outside: bool = False
+) -> Track:
+    """The last `frame` that `online` has, as a track of its own: by all frames up to it.
+
+    `shared` are the errors of the track; `is_outside`: the odometry does not cover the frame.
+    """
+    position_m = online.position_m[None]
+    by_image = images_outside([frame], np.array([online.mode]), position_m, shared)
+    alone = {0: frame.fixes} if online.is_first or by_image else {}
+    covariance_m2 = online.covariance_m2 if online.is_vouched else UNKNOWN_M**2 * np.eye(2)
+    found = _trajectory(position_m, covariance_m2[None], terrain, alone)
     none = np.zeros(0, dtype=bool)
     return Track(
-        (_track_frame(frame, online.mode, True),), found, found, 0.0, 0.0, None, None, None, None, none, False, terrain
+        (_track_frame(frame, online.mode, True, is_outside),),
+        found,
+        found,
+        0.0,
+        0.0,
+        None,
+        None,
+        None,
+        None,
+        none,
+        False,
+        terrain,
     )
 
 
-def _track_frame(frame: ObservedFrame, mode: int, attitude_fits: bool) -> TrackFrame:
+def _track_frame(frame: ObservedFrame, mode: int, attitude_fits: bool, is_outside: bool) -> TrackFrame:
     found, count = ("used", "", ""), len(frame.modes)
     if not frame.modes:
         found = "refused", frame.reason, frame.message
@@ -241,7 +283,7 @@ def _track_frame(frame: ObservedFrame, mode: int, attitude_fits: bool) -> TrackF
         found = "left_out", "inconsistent_evidence", "its position contradicts the other frames"
     R = frame.R_body_enu if attitude_fits and found[0] != "left_out" else None
     quat = None if R is None else quat_xyzw_from_R(R)
-    return TrackFrame(frame.name, frame.time_utc, *found, quat, frame.search)
+    return TrackFrame(frame.name, frame.time_utc, *found, quat, frame.search, is_outside)
 
 
 def _trajectory(

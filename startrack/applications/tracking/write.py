@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from startrack import __version__, output
+from startrack.applications.tracking.legs import SlippedLeg
 from startrack.applications.tracking.quantities import FORMAT, FRAME_QUANTITIES, STATUSES, frame_records
 from startrack.applications.tracking.track import CrestHeights, SizeError, Track, Trajectory
 from startrack.applications.tracking.track_map import known_points, track_extent
@@ -38,14 +39,26 @@ def track_record(track: Track, odometry: dict[str, Any] | None = None) -> dict[s
         "odometry": odometry,
         "counts": {
             "frames": len(statuses), **{name: statuses.count(name) for name in STATUSES},
-            "slips": int(np.count_nonzero(track.slipped)),
+            "slips": int(np.count_nonzero(track.slipped)), "legs": len(track.legs),
+            "outside_odometry": sum(frame.is_outside for frame in track.frames),
         },
+        "legs": [leg_record(track, one) for one in track.legs],
         "horizon": {"error_deg": error_deg, "sigma_deg": sigma_deg},
         "clock": clock,
         "depth": size_record(track.depth, "depth_m"),
         "width": size_record(track.width, "diameter_m"),
         "frames": frame_records(track),
         "provenance": {"version": __version__},
+    }  # fmt: skip
+
+
+def leg_record(track: Track, leg: SlippedLeg) -> dict[str, Any]:
+    """The object of a slipped leg in track.json."""
+    is_known = np.isfinite(leg.factor_1)
+    return {
+        "first": track.frames[leg.first].name, "last": track.frames[leg.last].name, "moves": leg.last - leg.first,
+        "length_m": leg.length_m, "factor": leg.factor_1 if is_known else None,
+        "heading_deg": float(np.degrees(leg.heading_rad)) if is_known else None,
     }  # fmt: skip
 
 
@@ -135,6 +148,7 @@ def track_page(track: Track, picture_png: bytes, *, title: str, odometry_m: Arra
         "columns": [],
         "title": title,
         "at_rest": track.at_rest,
+        "legs": track.leg_texts,
         "frames": {
             q.key: [
                 round(value, 8 if q.key in ACCURATE else PAGE_DECIMALS) if isinstance(value, float) else value

@@ -60,7 +60,8 @@ def truth_m(drive):
 def test_the_track_holds_the_truth_and_is_better_than_single_images(drive, tracked):
     record = json.loads((tracked / "track.json").read_text())
     Draft202012Validator(TRACK).validate(record)
-    assert record["counts"] == {"frames": FRAMES, "used": FRAMES, "left_out": 0, "refused": 0, "slips": 0}
+    none = dict.fromkeys(("left_out", "refused", "slips", "legs", "outside_odometry"), 0)
+    assert record["counts"] == {"frames": FRAMES, "used": FRAMES, **none} and record["legs"] == []
     for prefix in ("", "filtered_"):
         found = np.array([[one[f"{prefix}east_m"], one[f"{prefix}north_m"]] for one in record["frames"]])
         error = found - truth_m(drive)[:, :2]
@@ -237,21 +238,30 @@ def test_wrong_odometry_is_left_out_or_refused(drive, tracked, tmp_path, capsys)
     assert "faster than 0.04 m/s" in err and f"the files {out}/track.* are of an earlier run" in err
 
 
-def test_an_image_outside_the_odometry_is_left_out_by_name(drive, tracked, tmp_path, capsys):
+def test_an_image_outside_the_odometry_is_used_by_itself_and_named(drive, tracked, tmp_path, capsys):
     images, out = tmp_path / "frames", tmp_path / "out"
     shutil.copytree(drive / "frames", images)
     shutil.copytree(tracked, out)
     shutil.copy(drive / "small.toml", tmp_path)
-    image = min(images.glob("*.png"))
-    shutil.copy(image, images / "foreign.png")
-    facts = json.loads(image.with_suffix(".json").read_text())
-    (images / "foreign.json").write_text(json.dumps(facts | {"time_utc": "2001-01-01T00:00:00Z"}))
-    assert run(images, "--odometry", images / "odometry.tum", "-D", out, "-q", "--no-plots") == 4
-    err = capsys.readouterr().err
-    assert "foreign.png  refused  bad_odometry: the frame's time 2001-01-01T00:00:00" in err
-    assert "earlier run" not in err
-    counts = json.loads((out / "track.json").read_text())["counts"]
-    assert counts["frames"] == counts["used"] == FRAMES
+    poses = (images / "odometry.tum").read_text().splitlines(keepends=True)
+    (images / "odometry.tum").write_text("".join(poses[:-1]))  # ends before the last image
+    (images / "unread.png").write_bytes(b"no image")
+    flags = ("-D", out, "--odometry-time-sigma", "5", "--no-plots")
+    assert run(images, "--odometry", images / "odometry.tum", *flags) == 4
+    text, err = capsys.readouterr()
+    last = max(path.stem for path in images.glob("*.png") if path.stem != "unread")
+    assert re.search(rf"^{last}\S*  used  E .* outside the odometry$", text, re.MULTILINE)
+    assert "unread.png  refused  " in err and "earlier run" not in err
+    closing = f"{FRAMES + 1} images: {FRAMES} used, 0 left out, 1 refused (1 could not be read); 1 outside the odometry"
+    assert text.splitlines()[-1].startswith(f"{closing}; files in ")
+    record = json.loads((out / "track.json").read_text())
+    Draft202012Validator(TRACK).validate(record)
+    assert record["counts"]["frames"] == record["counts"]["used"] == FRAMES
+    assert record["odometry"]["time_sigma_s"] == 5.0
+    live = ("--follow", images, "--until-idle", "0.5", "--odometry", images / "odometry.tum")
+    assert run(*live, *flags) == 4
+    shown = capsys.readouterr().out
+    assert "outside the odometry" in shown and closing in shown
 
 
 def test_a_height_map_in_the_folder_is_left_out(tmp_path, capsys):
@@ -373,7 +383,7 @@ def test_followed_odometry_that_ends_within_a_line_waits(drive, tracked, tmp_pat
         assert run("--follow", drive / "frames", "-D", tmp_path / "out", *arguments) == 0
         counts = json.loads((tmp_path / "out" / "track.json").read_text())["counts"]
         whole = torn.startswith(lines[-1][:-3])  # a last digit that is missing does not show
-        assert counts["used"] == (FRAMES if whole else FRAMES - 1), torn
+        assert (counts["used"], counts["outside_odometry"]) == (FRAMES, 0 if whole else 1), torn
         shutil.rmtree(tmp_path / "out")
 
 

@@ -12,7 +12,19 @@ from synthetic_track import CRATER
 from tracking_helpers import SHARED, attitudes, observed, odometry_of
 
 from startrack.applications.tracking import ObservedFrame, Odometry, Track, estimate_track
-from startrack.applications.tracking.explanations import FOREIGN_SIGMA_M, SLIP_PROBABILITY, Explanations, Moves
+from startrack.applications.tracking.explanations import (
+    BEGINS,
+    CONTINUES,
+    FOREIGN_SIGMA_M,
+    LEG_END_PROBABILITY,
+    LEG_PROBABILITY,
+    LEG_SIGMA_1,
+    SLIP_PROBABILITY,
+    SLIPS,
+    STRAIGHT,
+    Explanations,
+    Moves,
+)
 from startrack.applications.tracking.write import tum_text
 from startrack.core.errors import BadInput
 from startrack.core.types import Array
@@ -20,13 +32,14 @@ from startrack.estimation.observations import FrameEstimate, OdometryErrors, Ste
 
 FRAMES, STEP_M, SIGMA_M = 7, 80.0, 5.0
 DRAWS = 20
+STRAIGHT_1 = 1.0 - SLIP_PROBABILITY - LEG_PROBABILITY
 
 
-def estimate_at(place: Array, bias: float, rng: np.random.Generator) -> FrameEstimate:
+def estimate_at(place: Array, bias: float, rng: np.random.Generator, sigma_m: float = SIGMA_M) -> FrameEstimate:
     """The observation of a position; the evidence knows the shared error to half of its prior."""
-    covariance = np.diag([SIGMA_M**2, SIGMA_M**2, 0.2])
+    covariance = np.diag([sigma_m**2, sigma_m**2, 0.2])
     response = np.diag([1.0, 1.0, 0.8])
-    noise = np.diag([SIGMA_M**2, SIGMA_M**2, 0.8 * 0.2])
+    noise = np.diag([sigma_m**2, sigma_m**2, 0.8 * 0.2])
     mean = response @ np.append(place, bias) + rng.multivariate_normal(np.zeros(3), noise)
     return FrameEstimate(mean, covariance, response, noise, np.zeros(0, dtype=np.int64), np.zeros((3, 0)))
 
@@ -170,13 +183,27 @@ def test_the_stated_speed_decides_what_is_impossible():
 
 
 def test_the_likelihood_of_an_explanation_is_that_of_the_joint_normal():
-    """Against SciPy's density of all observations at once: one wrong image apart, a slip or none."""
+    """Against SciPy's density of all observations at once: no slip, one of the second move, or a leg of both."""
     rng = np.random.default_rng(6)
     estimates = [estimate_at(np.array([80.0 * k, 3.0]), 0.5, rng) for k in range(3)]
     steps = Steps(np.array([[80.0, 0.0], [80.0, 0.0]]), np.array([1.6, 1.6]))
-    for slip in (0.0, 1.0):
+    kinds = {
+        (STRAIGHT, STRAIGHT): [STRAIGHT_1, STRAIGHT_1],
+        (STRAIGHT, SLIPS): [STRAIGHT_1, SLIP_PROBABILITY],
+        (BEGINS, CONTINUES): [LEG_PROBABILITY, 1.0 - LEG_END_PROBABILITY],
+        (BEGINS, SLIPS): [LEG_PROBABILITY, LEG_END_PROBABILITY * SLIP_PROBABILITY],
+    }
+    for (first, second), probabilities in kinds.items():
         # Unknowns in order: first position, two errors of moves, shared error.
-        prior = np.diag([*[FOREIGN_SIGMA_M**2] * 2, *[1.6**2] * 2, *[1.6**2 + slip * 400.0] * 2, 1.0])
+        slip_m2 = 400.0 * (second == SLIPS)
+        prior = np.diag([*[FOREIGN_SIGMA_M**2] * 2, *[1.6**2] * 2, *[1.6**2 + slip_m2] * 2, 1.0])
+        # The error of scale moves along a leg to the east, that of heading across it.
+        by_leg = (LEG_SIGMA_1 * 80.0) ** 2 * np.eye(2)
+        if first == BEGINS:
+            prior[2:4, 2:4] += by_leg
+        if second == CONTINUES:
+            prior[4:6, 4:6] += by_leg
+            prior[2:4, 4:6] = prior[4:6, 2:4] = by_leg
         design = np.zeros((9, 7))
         for k in range(3):
             design[3 * k : 3 * k + 2, : 2 * (k + 1)] = np.tile(np.eye(2), k + 1)
@@ -186,11 +213,10 @@ def test_the_likelihood_of_an_explanation_is_that_of_the_joint_normal():
         for k, one in enumerate(estimates):
             covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += one.noise
         log_density = multivariate_normal(mean, covariance).logpdf(np.concatenate([one.mean for one in estimates]))
-        log_density += np.log1p(-SLIP_PROBABILITY) + np.log(SLIP_PROBABILITY if slip else 1.0 - SLIP_PROBABILITY)
+        log_density += np.log(probabilities).sum()
         found = Explanations(1, 0.0)
         for one in estimates:
             found.add((one,), [Moves.of(steps)])
         branches = found._branches
-        same = (branches.history[:, :, 0] == 0).all(axis=1) & (branches.history[:, 2, 1] == slip)
-        same &= branches.history[:, 1, 1] == 0
+        same = (branches.history[:, :, 0] == 0).all(axis=1) & (branches.history[:, 1:, 1] == (first, second)).all(axis=1)
         assert branches.log_likelihood[same] == pytest.approx(log_density, abs=1e-6)

@@ -101,7 +101,8 @@ def test_values_may_be_separated_by_tabs_and_rounded(tmp_path):
     ("lines", "cause"),
     [
         ([GOOD[0], GOOD[2], GOOD[1]], "line 3: times are not in order: 10.000000 follows 20.000000"),
-        ([*GOOD, GOOD[2]], "line 4: a second pose at the time 20.000000"),
+        ([*GOOD, "20 2.06 1 0 0 0 0 1"], "line 4: a second pose at the time 20.000000, 0.06 m away"),
+        ([*GOOD, "20 2 1 0 0 0 0.02 0.9998"], "line 4: a second pose at the time 20.000000"),
         (["# head", GOOD[0], "10 nan 0 0 0 0 0 1", GOOD[2]], "line 3: a number is NaN or infinite"),
         ([GOOD[0], "10 0 0 inf 0 0 0 1"], "line 2: a number is NaN or infinite"),
         ([GOOD[0], "10 1e300 0 0 0 0 0 1"], "line 2: a coordinate is larger than 1e\\+08 m"),
@@ -125,6 +126,30 @@ def test_a_bad_file_is_refused_in_one_line_that_names_it(tmp_path, lines, cause)
     assert (refusal.value.reason, refusal.value.reason.exit_code) == ("bad_odometry", 4)
     assert "o.tum: " in message
     assert "\n" not in message
+
+
+def test_of_poses_at_one_time_that_agree_the_last_one_counts(tmp_path):
+    """The second of three has the opposite sign of the same rotation."""
+    again = ["20 2.03 1 0 0 0 0 -1", "20 2.02 1.03 0 0 0 0.005 1", "30 3 1 0 0 0 0 1"]
+    read = read_odometry(write(tmp_path / "o.tum", [*GOOD, *again]))
+    assert read.time_s.tolist() == [0.0, 10.0, 20.0, 30.0]
+    assert read.position_m[2].tolist() == [2.02, 1.03, 0.0]
+    (warning,) = read.warnings
+    assert "2 second poses at one time, the first in line 4, up to 31.6 mm apart: the last one counts" in warning
+    with pytest.raises(BadInput, match="line 4: a second pose"):
+        read_odometry(tmp_path / "o.tum", floor_m=0.01)
+    assert read_odometry(write(tmp_path / "good.tum", GOOD)).warnings == ()
+
+
+def test_odometry_covers_neither_gaps_nor_what_is_beyond_its_ends():
+    at_s = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 50.0, 51.0, 52.0, 90.0])
+    east_m = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 30.0, 31.0, 32.0, 32.01])  # at rest in the second gap
+    quat = np.tile([0.0, 0.0, 0.0, 1.0], (len(at_s), 1))
+    found = Odometry(time_s=at_s, position_m=east_m[:, None] * [1.0, 0.0, 0.0], quat_xyzw=quat)
+    asked = np.array([-0.01, -0.0005, 0.5, 4.0, 4.5, 49.0, 50.0, 51.5, 70.0, 90.0, 90.1])
+    expected = [False, True, True, True, False, False, True, True, True, True, False]
+    assert found.covers(asked).tolist() == expected
+    assert found.covers(np.array([70.0]), still_m=0.001).tolist() == [False]
 
 
 def test_reading_takes_a_few_hundred_bytes_a_pose(tmp_path, monkeypatch):

@@ -1,6 +1,6 @@
 """The linear estimator of a track: against least squares with every unknown written out, and against the truth."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -67,15 +67,18 @@ def test_the_smoother_is_least_squares_with_all_unknowns(shared_count, by_moves)
 
 
 @pytest.mark.parametrize("by_moves", [False, True])
-def test_the_filter_is_the_smoother_of_the_frames_so_far(by_moves):
+@pytest.mark.parametrize("leg", [[0] * 8, [0, 1, 1, 1, 0, 3, 4, 4]])
+def test_the_filter_is_the_smoother_of_the_frames_so_far(by_moves, leg):
     drive = simulate_drive(np.random.default_rng(2), 9)
     drive = with_shared_moves(drive) if by_moves else drive
-    state = TrackFilter(1, HEIGHT_SIGMA_M, drive.steps.by_shared_m.shape[-1])
+    by_leg_m = 0.2 * np.stack([drive.steps.move_m, drive.steps.move_m[:, ::-1]], axis=-1)
+    drive = replace(drive, steps=replace(drive.steps, leg=np.array(leg), by_leg_m=by_leg_m)) if by_moves else drive
+    state = TrackFilter(1, HEIGHT_SIGMA_M, drive.steps.by_shared_m.shape[-1] + drive.steps.by_leg_m.shape[-1])
     for k, estimate in enumerate(drive.estimates):
         if k:
             state.predict(drive.steps, k - 1)
         state.update(estimate)
-        steps = Steps(drive.steps.move_m[:k], drive.steps.sigma_m[:k], drive.steps.by_shared_m[:k])
+        steps = Steps(*(getattr(drive.steps, one.name)[:k] for one in fields(Steps)))
         batch = smooth(Observations.of(drive.estimates[: k + 1], HEIGHT_SIGMA_M), steps)
         np.testing.assert_allclose(state.position_m, batch.position_m[-1], atol=1e-4)
         np.testing.assert_allclose(state.covariance_m2, batch.covariance_m2[-1], atol=1e-4)

@@ -42,6 +42,7 @@ class Moves:
     turn: Array  # (n + 1, 3, 3) from that frame to enu: before the first attitude, then by each frame's; nan: not known
     sigma_m: Array  # (n - 1,) on each axis; infinite where the move is not known
     freedom_m: Array  # (n - 1, 3, FREEDOMS) of `delta_m`, by errors of a standard normal prior that all moves share
+    has_legs: bool = True  # whether some may slip alike; images must show the scale of moves
 
     @classmethod
     def of(cls, steps: Steps) -> Moves:
@@ -243,7 +244,7 @@ class Explanations:
         )
         if not self.may_slip:
             return moved
-        may_begin = ~lost & np.array([not m.fault for m in self._moves])[one.odometry]
+        may_begin = ~lost & np.array([m.has_legs and not m.fault for m in self._moves])[one.odometry]
         in_leg = one.history[:, -1, 1] >= BEGINS
         ended = np.where(in_leg, np.log(LEG_END_PROBABILITY), 0.0)  # a move that is not known ends a leg too
         slips = np.where(may_begin, SLIP_PROBABILITY + LEG_PROBABILITY, SLIP_PROBABILITY)

@@ -272,7 +272,8 @@ def _first_fault(rows: Array, again: Bools | None = None) -> tuple[int, str] | N
         return None
     k = int(np.argmax(faulty.any(axis=0)))
     text = list(faults)[int(np.argmax(faulty[:, k]))]
-    apart = np.linalg.norm(rows[k, 1:4] - rows[k - 1, 1:4])
+    with np.errstate(over="ignore", invalid="ignore"):
+        apart = np.linalg.norm(rows[k, 1:4] - rows[k - 1, 1:4])
     return k, text.format(now=time_s[k], before=time_s[k - 1], length=length[k], apart=apart)
 
 

@@ -71,7 +71,7 @@ def odometry_moves(
         sigma_m = np.where(covered[:-1] & covered[1:], errors.sigma_m(delta), np.inf)
         return Moves(fault, 0.0, delta, turn, sigma_m, unknown.freedom_m)
 
-    right = moves("", position, Q)
+    right = replace(moves("", position, Q), has_legs=shows_scale)
     east, north = np.eye(6, FREEDOMS).reshape(2, 3, FREEDOMS)
     similar, linear, by_clock = (np.zeros_like(unknown.freedom_m) for _ in range(3))
     if errors.time_sigma_s and len(frames) > 1:

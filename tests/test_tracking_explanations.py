@@ -218,5 +218,7 @@ def test_the_likelihood_of_an_explanation_is_that_of_the_joint_normal():
         for one in estimates:
             found.add((one,), [Moves.of(steps)])
         branches = found._branches
-        same = (branches.history[:, :, 0] == 0).all(axis=1) & (branches.history[:, 1:, 1] == (first, second)).all(axis=1)
+        same = (branches.history[:, :, 0] == 0).all(axis=1) & (branches.history[:, 1:, 1] == (first, second)).all(
+            axis=1
+        )
         assert branches.log_likelihood[same] == pytest.approx(log_density, abs=1e-6)

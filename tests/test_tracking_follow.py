@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from startrack.applications.batch import image_tree
 from startrack.applications.batch import find as finding
+from startrack.applications.batch import image_tree
 from startrack.applications.tracking import follow_images, session
 from startrack.core.types import BadInput
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -44,7 +47,9 @@ def with_fix(frame: ObservedFrame, sigma_m: float = SIGMA_M) -> ObservedFrame:
     """The frame with the fix of its image alone."""
     at, covariance = frame.modes[0].mean[:2], sigma_m**2 * np.eye(2)
     radius95, radius999 = (float(radius_holding(covariance[None], part)[0]) for part in (0.95, 0.999))
-    return replace(frame, fixes=(ImageFix(np.asarray(camera_at(at, CRATER)), covariance, radius95, radius999, at, 1.0),))
+    return replace(
+        frame, fixes=(ImageFix(np.asarray(camera_at(at, CRATER)), covariance, radius95, radius999, at, 1.0),)
+    )
 
 
 def in_circles(found, position_m: Array) -> Array:
@@ -86,7 +91,7 @@ def test_a_position_outside_its_own_circle_is_that_of_its_image(is_ambiguous):
     _, frames, odometry = drive(np.random.default_rng(3))
     odometry = replace(odometry, position_m=np.array(odometry.position_m))
     moved = with_fix(frames[4], 2.0)
-    fix = replace(moved.fixes[0], position_enu_m=moved.fixes[0].position_enu_m + [12.0, 0.0, 0.0])
+    fix = replace(moved.fixes[0], position_enu_m=moved.fixes[0].position_enu_m + np.array([12.0, 0.0, 0.0]))
     frames[4] = replace(moved, fixes=(fix, fix) if is_ambiguous else (fix,))
     track = estimate_track(frames, CRATER, SHARED, odometry=odometry)
     away = np.linalg.norm(track.smoothed.position_enu_m[4] - fix.position_enu_m)
@@ -104,6 +109,25 @@ def test_a_position_outside_its_own_circle_is_that_of_its_image(is_ambiguous):
         online.add(frames[k].modes, odometry_moves(frames[: k + 1], odometry, USUAL_ODOMETRY))
     live = track_of_newest(frames[4], online, CRATER, SHARED)
     np.testing.assert_array_equal(live.filtered.position_enu_m[0], fix.position_enu_m)
+
+
+@pytest.mark.slow
+def test_drives_whose_images_are_located_have_no_pose_beyond_twice_its_circle(monkeypatch):
+    """A few of the drives of benchmarks/slips.py, from simulated stars."""
+    monkeypatch.setattr(sys, "path", [*sys.path, str(Path(__file__).parent.parent / "benchmarks")])
+    slips = importlib.import_module("slips")
+    beyond = []
+    for number, draw in enumerate(slips.draws_of("shackleton-thesis", 4)):
+        for name in ("none", "4 of 9 moves 20 % too long", "4 of 9 moves 20 % too long, 3 others turned by 3 degrees"):
+            slipped = slips.with_slips(draw, slips.CLASSES[name], np.random.default_rng([1, number]))
+            course = slipped.course
+            track = estimate_track(slipped.frames, course.stated, course.shared, odometry=slipped.odometry)
+            beyond.append(slips.score(track, slipped))
+            for frame, at in zip(slipped.frames, track.smoothed.position_enu_m, strict=True):
+                assert np.linalg.norm(at - frame.fixes[0].position_enu_m) <= frame.fixes[0].radius999_m + 1.0
+    for kind in ("smoothed", "filtered"):
+        circles = np.array([one[f"{kind} circles"] for one in beyond])
+        assert circles.max() < 2.0 and np.count_nonzero(circles > 1.0) <= 1
 
 
 def test_a_leg_states_the_similarity_of_its_moves():

@@ -214,7 +214,7 @@ def follow_images(
     taken: set[str] = set()
     waiting: dict[str, _Waiting] = {}
     idle_since = time.monotonic()
-    while until_idle_s is None or time.monotonic() - idle_since < until_idle_s:
+    while True:
         start_s, has_come = time.process_time(), False
         waiting |= {path: _Waiting() for path in list_images() if path not in taken and path not in waiting}
         for path, one in sorted(waiting.items()):
@@ -229,20 +229,27 @@ def follow_images(
             if one.tries == len(TRIES_S) or now - one.since < TRIES_S[one.tries]:
                 continue
             one.tries += 1
+            before_s = time.process_time()
             try:
                 take(path)
             except BadInput as cause:
                 if one.tries == len(TRIES_S):
                     refuse(path, cause)
                 continue
+            finally:  # is no part of looking for images
+                start_s += time.process_time() - before_s
             taken.add(path)
             del waiting[path]
             has_come = True
             yield path
             idle_since = time.monotonic()
-        if not has_come:
-            yield None
-            time.sleep(max(0.5 * TRIES_S[0], (time.process_time() - start_s) / POLLING_PART))
+        if has_come:
+            continue
+        looked_s = time.process_time() - start_s
+        yield None
+        if until_idle_s is not None and time.monotonic() - idle_since > until_idle_s:
+            return
+        time.sleep(max(0.5 * TRIES_S[0], looked_s / POLLING_PART))
 
 
 @dataclass(eq=False)

@@ -18,13 +18,12 @@ from startrack.applications.tracking.explanations import (
     FOREIGN_SIGMA_M,
     LEG_END_PROBABILITY,
     LEG_PROBABILITY,
-    LEG_SIGMA_1,
     SLIP_PROBABILITY,
     SLIPS,
     STRAIGHT,
     Explanations,
-    Moves,
 )
+from startrack.applications.tracking.moves import LEG_SIGMA_1, Moves
 from startrack.applications.tracking.write import tum_text
 from startrack.core.errors import BadInput
 from startrack.core.types import Array

@@ -7,8 +7,8 @@ import pytest
 from tracking_helpers import HEIGHT_SIGMA_M, STEP_SIGMA_M, Drive, mean_nees, shifted, simulate_drive, with_slips
 
 from startrack.applications.tracking.contradictions import smooth_robustly
-from startrack.applications.tracking.explanations import Moves
 from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions
+from startrack.applications.tracking.moves import Moves
 from startrack.estimation import trajectory
 from startrack.estimation.observations import Observations, Steps
 from startrack.estimation.trajectory import TrackFilter, smooth

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.applications.tracking.explanations import Explanation, Explanations, Moves
+from startrack.applications.tracking.explanations import Explanation, Explanations
+from startrack.applications.tracking.moves import Moves
 from startrack.core.types import Array, BadInput, Bools, Ints
 from startrack.estimation.observations import FrameEstimate, Observations, Steps
 from startrack.estimation.trajectory import Smoothed, mix_smoothed, smooth

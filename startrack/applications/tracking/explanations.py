@@ -10,61 +10,24 @@ The moves are turned by the attitude of the last image that an explanation takes
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from startrack.core.types import Array, Bools, Ints
-from startrack.estimation.observations import FrameEstimate, Steps, moves_by_scale_and_heading
+from startrack.applications.tracking.branches import Branches
+from startrack.applications.tracking.moves import FREEDOMS, LEG_FREEDOMS, Moves
+from startrack.core.types import Array, Ints
+from startrack.estimation.observations import FrameEstimate, Steps
 
 SLIP_PROBABILITY, SLIP_SIGMA_M = 0.05, 20.0  # of a move by wheel slip, and its size on each axis
-# Of a leg: that it begins with a move, that a move is its last one, and its error of scale and of heading [rad].
-LEG_PROBABILITY, LEG_END_PROBABILITY, LEG_SIGMA_1 = 0.05, 0.2, 0.15
+LEG_PROBABILITY, LEG_END_PROBABILITY = 0.05, 0.2  # that a leg begins with a move, and that a move of it is its last
 STRAIGHT, SLIPS, BEGINS, CONTINUES = range(4)  # what a move is: without slip, with, the first of a leg, another of it
 WRONG_PROBABILITY, WRONG_SIGMA_M = 1e-3, 200.0  # of a frame, and the error of its position on each axis
 FOREIGN_SIGMA_M = 5000.0  # of a position anywhere in a search area, about its middle
 MIXED_PROBABILITY, MIXED_PART = 1e-3, 0.1  # of a set with images from elsewhere, and how many of its images these are
 ODOMETRY_WRONG_PROBABILITY = 0.01  # as a whole
-FREEDOMS = 7  # of odometry as a whole: a linear map from three axes to two, and its clock
-LEG_FREEDOMS = 2
 LEAST_VARIANT = 0.01  # part of an explanation's probability, by other moves, that counts in its positions
 KEPT_NATS, MOST_KEPT = 60.0, 60  # of explanations beside the best, and for each kind of odometry
-
-
-@dataclass(frozen=True, eq=False)
-class Moves:
-    """The moves between n frames, by odometry with one fault as a whole or none."""
-
-    fault: str  # empty: none
-    log_prior: float
-    delta_m: Array  # (n - 1, 3) in the odometry's frame
-    turn: Array  # (n + 1, 3, 3) from that frame to enu: before the first attitude, then by each frame's; nan: not known
-    sigma_m: Array  # (n - 1,) on each axis; infinite where the move is not known
-    freedom_m: Array  # (n - 1, 3, FREEDOMS) of `delta_m`, by errors of a standard normal prior that all moves share
-    has_legs: bool = True  # whether some may slip alike; images must show the scale of moves
-
-    @classmethod
-    def of(cls, steps: Steps) -> Moves:
-        """Those of `steps`, which need no attitude."""
-        n = len(steps.sigma_m) + 1
-        turn, none = np.tile(np.eye(3), (n + 1, 1, 1)), np.zeros((n - 1, 3, FREEDOMS))
-        return cls("", 0.0, np.pad(steps.move_m, ((0, 0), (0, 1))), turn, steps.sigma_m, none)
-
-    def steps(self, anchor: Ints) -> Steps:
-        """The first moves in enu, turned as by the entries `anchor` (m,) of `turn`; none is known with a fault."""
-        delta, sigma = self.delta_m[: len(anchor)], self.sigma_m[: len(anchor)]
-        move = np.einsum("nij,nj->ni", self.turn[anchor], delta)[:, :2]
-        known = np.isfinite(move).all(axis=1) & np.isfinite(sigma) & (not self.fault)
-        shared = np.where(known[:, None, None], (self.turn[anchor] @ self.freedom_m[: len(anchor)])[:, :2], 0.0)
-        of_leg = np.where(known[:, None, None], (self.turn[anchor] @ self.leg_m[: len(anchor)])[:, :2], 0.0)
-        straight = np.zeros(len(anchor), dtype=np.int64)
-        return Steps(np.where(known[:, None], move, 0.0), np.where(known, sigma, np.inf), shared, straight, of_leg)
-
-    @cached_property
-    def leg_m(self) -> Array:
-        """(n - 1, 3, LEG_FREEDOMS) of `delta_m`, by errors of a standard normal prior that the moves of a leg share."""
-        return LEG_SIGMA_1 * moves_by_scale_and_heading(self.delta_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,40 +55,6 @@ class Explanation:
         steps = self.moves.steps(self.anchor)
         sigma_m = np.where(self.kind == SLIPS, np.hypot(steps.sigma_m, SLIP_SIGMA_M), steps.sigma_m)
         return replace(steps, sigma_m=sigma_m, leg=np.where(self.kind >= BEGINS, self.leg, 0))
-
-
-@dataclass(eq=False)
-class Branches:
-    """Explanations (b,) of the frames so far."""
-
-    log_likelihood: Array  # (b,) with all priors but that of wrong frames
-    log_wrong: Array  # (b,) the part of it by wrong frames
-    wrong: Ints  # (b,) number of wrong frames
-    mean: Array  # (b, p) of the position, the shared errors, and those of the odometry as a whole and of a leg
-    covariance: Array  # (b, p, p) with p = 2 + k + FREEDOMS + LEG_FREEDOMS
-    odometry: Ints  # (b,) which moves
-    anchor: Ints  # (b,) entry of their turns
-    history: Ints  # (b, frames, 3) mode, kind and anchor of the move before it
-
-    def take(self, which: Ints | Bools) -> Branches:
-        """Those of an index."""
-        return Branches(*(getattr(self, f.name)[which] for f in fields(self)))
-
-    def move_by_leg(self, by_leg: Array, *, is_new: bool) -> None:
-        """Move by the errors of a leg, of which a new one has its own: `by_leg` (b, 2, LEG_FREEDOMS) by one sigma."""
-        leg = slice(-LEG_FREEDOMS, None)
-        if is_new:
-            self.mean[:, leg], self.covariance[:, leg], self.covariance[:, :, leg] = 0.0, 0.0, 0.0
-            self.covariance[:, leg, leg] = np.eye(LEG_FREEDOMS)
-        shift = np.tile(np.eye(self.mean.shape[1]), (len(self.mean), 1, 1))
-        shift[:, :2, leg] = by_leg
-        self.mean = np.einsum("bij,bj->bi", shift, self.mean)
-        self.covariance = shift @ self.covariance @ shift.swapaxes(1, 2)
-
-    @staticmethod
-    def join(parts: Sequence[Branches]) -> Branches:
-        """All of several."""
-        return Branches(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Branches)))
 
 
 @dataclass(eq=False)

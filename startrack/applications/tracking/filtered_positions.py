@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from startrack.applications.tracking.contradictions import RobustTrack, disagrees, smooth_robustly
-from startrack.applications.tracking.explanations import FREEDOMS, LEG_FREEDOMS, Explanations, Moves
+from startrack.applications.tracking.explanations import Explanations
 from startrack.applications.tracking.frame_estimate import (
     FRAME_REACH_SIGMAS,
     LEAST_FRAME_HALF_M,
@@ -21,6 +21,7 @@ from startrack.applications.tracking.frame_estimate import (
     observe_together,
     sample_together,
 )
+from startrack.applications.tracking.moves import FREEDOMS, LEG_FREEDOMS, Moves
 from startrack.applications.tracking.observed_frame import ObservedFrame
 from startrack.applications.tracking.track_errors import SIZE_ROUNDS, TrackErrors
 from startrack.core.types import Array, BadInput, Ints

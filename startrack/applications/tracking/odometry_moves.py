@@ -8,7 +8,8 @@ from datetime import UTC
 
 import numpy as np
 
-from startrack.applications.tracking.explanations import FREEDOMS, ODOMETRY_WRONG_PROBABILITY, Moves
+from startrack.applications.tracking.explanations import ODOMETRY_WRONG_PROBABILITY
+from startrack.applications.tracking.moves import FREEDOMS, Moves
 from startrack.applications.tracking.observed_frame import ObservedFrame
 from startrack.applications.tracking.odometry import Odometry
 from startrack.core.types import Array

@@ -22,8 +22,9 @@ from startrack.applications.tracking.observed_frame import (
 )
 from startrack.applications.tracking.odometry import SPAN_TOLERANCE_S, Odometry
 from startrack.applications.tracking.odometry_moves import odometry_moves, odometry_steps, times_s
-from startrack.applications.tracking.track import Track, estimate_track, smooth_placed, track_of_newest
+from startrack.applications.tracking.track import Track, estimate_track, track_of_newest
 from startrack.applications.tracking.track_errors import TrackErrors
+from startrack.applications.tracking.unknown_size import smooth_placed
 from startrack.catalog import load_catalog
 from startrack.chain import Located, Settings, input_hashes, job_sha256, load_camera_input, locate, terrain_input
 from startrack.core.errors import BadInput

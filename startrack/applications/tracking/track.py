@@ -3,32 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
-from startrack.applications.tracking.contradictions import RobustTrack, smooth_robustly
-from startrack.applications.tracking.explanations import Moves
 from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions, positions_at_rest
 from startrack.applications.tracking.legs import SlippedLeg, images_outside, legs_about, slipped_legs
 from startrack.applications.tracking.observed_frame import ImageFix, ObservedFrame
 from startrack.applications.tracking.odometry import Odometry
 from startrack.applications.tracking.odometry_moves import odometry_moves, times_s
-from startrack.applications.tracking.track_errors import BIAS, CLOCK, DEPTH, SIZE_ROUNDS, WIDTH, TrackErrors
+from startrack.applications.tracking.track_errors import BIAS, CLOCK, TrackErrors
+from startrack.applications.tracking.unknown_size import SIZES, smooth_placed
 from startrack.core.types import Array, BadInput, Bools, ClockError, Ints
-from startrack.estimation.observations import UNKNOWN_M, USUAL_ODOMETRY, FrameEstimate, OdometryErrors
+from startrack.estimation.observations import UNKNOWN_M, USUAL_ODOMETRY, OdometryErrors
 from startrack.estimation.trajectory import Smoothed, radius_holding
 from startrack.frames import quat_xyzw_from_R
 from startrack.localization import camera_at
 from startrack.terrain import Terrain
 
-SIZES = {DEPTH: "depth_m", WIDTH: "diameter_m"}  # errors of a crater, and the fact of each
-MOST_SIZE_SIGMAS = 4.0  # of the logarithms of a crater's depth and width: what its file states is wrong beyond
-STILL_MOVES_M = 0.01  # expanded about a crater's size anew, until no position moves by more
 UNKNOWN_SIGMA_M = 1e-3 * UNKNOWN_M  # a position with a larger error is not known
 
 
@@ -193,55 +187,6 @@ def estimate_track(
         crater if shared.bends else terrain, robust.fault,
         slipped_legs(leg, robust.steps.move_m, smoothed.position_enu_m[:, :2]),
     )  # fmt: skip
-
-
-def smooth_placed(
-    modes: Sequence[Sequence[FrameEstimate]],
-    moves: Sequence[Moves],
-    shared: TrackErrors,
-    height_sigma_m: float,
-    names: Sequence[str] = (),
-) -> tuple[list[list[FrameEstimate]], RobustTrack]:
-    """The modes with their positions in the crater of the errors `shared` that all show, and the track by them.
-
-    Where the size of a crater is not known, positions are products of it: they are expanded about the estimate anew,
-    by odometry as it is stated first. What may be wrong with it is compared where the expansion is right. `moves` and
-    `names` are those of `smooth_robustly`, which says what this raises.
-    """
-    placed = [[shared.place(one) for one in of] for of in modes]
-    if not shared.bends:
-        return placed, smooth_robustly(placed, moves, height_sigma_m, names=names)
-
-    def expand(placed: list[list[FrameEstimate]], kinds: Sequence[Moves]) -> tuple[Any, RobustTrack, float]:
-        """The modes and the track by `kinds` of moves, and by how much [m] the last expansion moved it."""
-        robust = smooth_robustly(placed, kinds, height_sigma_m, names=names)
-        rounds, moved_m = 0, np.inf
-        while moved_m > STILL_MOVES_M and rounds < SIZE_ROUNDS:
-            before = robust.smoothed
-            placed = [
-                [shared.place(one, position_m, before.shared) for one in of]
-                for of, position_m in zip(modes, before.position_m, strict=True)
-            ]
-            robust = smooth_robustly(placed, kinds, height_sigma_m, names=names)
-            rounds, moved_m = rounds + 1, float(np.abs(robust.smoothed.position_m - before.position_m).max())
-        return placed, robust, moved_m
-
-    if len(moves) > 1:
-        with suppress(BadInput):  # wrong as stated: its faults are compared about the stated size
-            placed, _, _ = expand(placed, moves[:1])
-    placed, robust, moved_m = expand(placed, moves)
-    if moved_m > STILL_MOVES_M or not _is_possible(robust.smoothed, shared):
-        raise BadInput(
-            "inconsistent_evidence",
-            "the odometry contradicts what the terrain file states of the crater's size: are its lengths in metres?",
-        )
-    return placed, robust
-
-
-def _is_possible(found: Smoothed, shared: TrackErrors) -> bool:
-    """Whether the crater's size is one that its file may mean."""
-    is_size = np.array([name in SIZES for name in shared.names])
-    return bool(np.linalg.norm(found.shared[is_size]) < MOST_SIZE_SIGMAS)
 
 
 def track_of_newest(

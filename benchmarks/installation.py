@@ -42,6 +42,7 @@ def main() -> None:
     args = parser.parse_args()
     rows = []
     with tempfile.TemporaryDirectory() as folder:
+        os.environ["XDG_CACHE_HOME"] = str(Path(folder) / "cache")
         wheel, sdist = build(Path(folder))
         for k, python in enumerate(args.pythons):
             for archive in [wheel, sdist][: 2 if k == 0 else 1]:

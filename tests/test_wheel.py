@@ -5,6 +5,8 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
+import venv
 import zipfile
 from pathlib import Path
 
@@ -90,3 +92,34 @@ def test_the_command_is_declared(wheel):
     with zipfile.ZipFile(wheel) as archive:
         (entry,) = [name for name in archive.namelist() if name.endswith("entry_points.txt")]
         assert "startrack = startrack.cli.main:main" in archive.read(entry).decode()
+
+
+@pytest.mark.skipif(sys.version_info >= (3, 13), reason="the oldest packages have no wheels for this Python")
+def test_the_oldest_packages_that_are_allowed_locate_a_sample(wheel, tmp_path):
+    """The lower bounds of pyproject.toml, all at once, in an environment of their own."""
+
+    def output(*words):
+        clean = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "NUMBA_CACHE_DIR")}
+        clean["XDG_CACHE_HOME"] = str(tmp_path / "cache")
+        return subprocess.run(list(map(str, words)), cwd=tmp_path, capture_output=True, text=True, env=clean)
+
+    venv.create(tmp_path / "venv", with_pip=True)
+    python = tmp_path / "venv/bin/python"
+    bounds = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    lowest = [re.sub(r">=([\w.]+).*", r"==\1", bound) for bound in bounds]
+    (tmp_path / "lowest.txt").write_text("\n".join(lowest))
+    pip = python, "-m", "pip"
+    if output(*pip, "download", "-q", "--no-deps", "-d", tmp_path, "filelock").returncode:
+        pytest.skip("no index of packages is reached")
+    done = output(*pip, "install", "-q", "--only-binary=:all:", "-c", "lowest.txt", wheel)
+    assert done.returncode == 0, done.stderr
+    installed = json.loads(output(*pip, "list", "--format", "json").stdout)
+    versions = {re.sub(r"[-_.]+", "-", one["name"].lower()): one["version"] for one in installed}
+    for name, version in (bound.split("==") for bound in lowest):
+        assert re.fullmatch(rf"{re.escape(version)}(\.0)*", versions[name])
+    image = ROOT / "sample_images/near-wall.png"
+    done = output(python, "-m", "startrack", "locate", image, "--json", "--no-plots")
+    assert done.returncode == 0, done.stderr
+    position = json.loads(done.stdout)["position"]
+    assert abs(position["east_m"] + 6900) < 40
+    assert abs(position["north_m"] - 4700) < 40

@@ -9,7 +9,7 @@ import pytest
 from localization_helpers import WRAPPERS, slow_scores
 
 from startrack.core.types import Array, Clock, Evidence, NotLocated
-from startrack.localization import ExactPosterior, posterior
+from startrack.localization import ExactPosterior, horizon_bias, posterior, search
 from startrack.localization.box_sums import BoxAverage
 from startrack.localization.conclusion import conclude
 from startrack.localization.horizon_bias import lower_evidence
@@ -230,3 +230,19 @@ def test_an_unfinished_proof_with_a_bad_start_climbs_from_the_boxes_that_it_left
     assert explored.search == "beam"
     likeliest = explored.centres_m[np.argmax(explored.log_likelihood)]
     assert np.linalg.norm(likeliest - at) < 20.0
+
+
+def test_a_wrong_position_that_explains_all_sectors_does_not_end_an_unproven_search(shackleton, monkeypatch):
+    """On rough maps a narrow beam may find one: where nothing is proven, the wider beams look elsewhere."""
+    at, wrong = np.array([-60.0, 110.0]), np.array([[1500.0, -900.0]])
+    evidence = simulate_rays(shackleton, at, np.random.default_rng(15), 3000, 0.0005)
+
+    def misled(likelihood, beam):
+        return beam_search(likelihood, beam) if beam[1] else Guess(wrong, likelihood.exact_scores(wrong))
+
+    monkeypatch.setattr(horizon_bias, "beam_search", misled)
+    for module in (horizon_bias, search):
+        monkeypatch.setattr(module, "explains_sectors", lambda *_: True)
+    explored = ExactPosterior(budget_horizons=1.0).explore(evidence, shackleton)
+    assert explored.search == "beam"
+    assert np.linalg.norm(explored.centres_m[np.argmax(explored.log_likelihood)] - at) < 20.0

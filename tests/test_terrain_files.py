@@ -12,12 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 import tomli_w
+from hazard_helpers import catalog_to, small_camera
 from map_helpers import PDS3, polar_stereographic
 
-from startrack.camera import load_camera
+from startrack.camera import load_camera, save_camera
 from startrack.cli.main import main
 from startrack.core.files import data_dir, file_stem
 from startrack.core.types import BadInput
+from startrack.exposure import write_exposure, write_sidecar
+from startrack.rendering import Series, render
 from startrack.terrain import (
     EQUIRECTANGULAR,
     HeightMap,
@@ -246,12 +249,21 @@ def test_import_show_and_build(tmp_path, capsys):
     facts = json.loads(capsys.readouterr().out)
     assert facts["format"] == "startrack.terrain/1"
     assert facts["maps"][0]["posts"] == [53, 53]
+    assert 2600 <= facts["maps_end"].pop("nearest_m") <= 2700  # half of 53 posts, one post on at most
+    assert facts["maps_end"].pop("nearest_azimuth_deg") % 90 in (0, 1, 89)
+    assert facts["maps_end"] == {"highest_beyond_m": 800, "highest_beyond_from": "map", "missing": []}
+    assert min(facts["about_s"]["horizons"], facts["about_s"]["frame"]) > 0
     assert main(["terrain", "import", str(tmp_path / "src.tif"), "-o", str(made), *words]) == 2
     assert "-O" in capsys.readouterr().err
     assert main(["terrain", "build", str(made), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["known_before"] is False
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["known_before"] is False
+    assert facts["maps_end"]["missing"] == []
+    assert set(facts["about_s"]) == {"horizons", "frame"}
     assert main(["terrain", "build", str(made), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["known_before"] is True
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["known_before"] is True
+    assert set(facts["about_s"]) == {"frame"}  # the table is there
     assert main(["terrain", "show", str(made), "--at", "100", "0", "-D", str(tmp_path / "out"), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["horizons_ready"] is True
@@ -391,6 +403,69 @@ def test_show_prints_words_and_units(tmp_path, capsys):
     assert not {"[", "{"} & set(said)
     assert main(["terrain", "show", "shackleton-thesis", "--no-plots"]) == 0
     assert "20000 m across and 2000 m deep" in capsys.readouterr().out
+
+
+def test_the_ends_of_the_maps_and_times_are_told(tmp_path, capsys):
+    """Beyond the ends, 3 km off, ground could stand 5 km high: seen from 800 m off the origin at atan(5 / 2.2)."""
+    write_map(tmp_path / "src.tif", hill())
+    made = str(tmp_path / "mine.toml")
+    words = ["--latitude", "-90", "--longitude", "0", "--radius", "800", "--half", "3000", "--highest-beyond", "5000"]
+    assert main(["terrain", "import", str(tmp_path / "src.tif"), "-o", made, *words]) == 0
+    told = [capsys.readouterr().out]
+    for command in (["show", "--no-plots"], ["build"]):
+        assert main(["terrain", command[0], made, *command[1:]]) == 0
+        told.append(capsys.readouterr().out)
+    for said in told:
+        (end,) = re.findall(r"ends      ([\d.]+) km from the origin.* up to 5000 m high \(highest_beyond_m\)", said)
+        assert float(end) == pytest.approx(3.0, abs=0.11)  # a post more at most
+        (up_to,) = re.findall(r"missing   azimuths 0 to 360: the maps end .* up to ([\d.]+) degrees high", said)
+        assert float(up_to) == pytest.approx(np.degrees(np.arctan2(5000, 2200)), abs=1.0)
+        assert re.search("takes     about .* for the table of horizons, once, about .* for the position", said)
+    assert main(["terrain", "show", made, "--no-plots", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["maps_end"]["highest_beyond_from"] == "stated"
+    assert [(one["from_deg"], one["to_deg"]) for one in facts["maps_end"]["missing"]] == [(0, 360)]
+    assert set(facts["about_s"]) == {"frame"}
+
+
+@pytest.mark.slow
+def test_where_the_maps_end_is_told_once_for_all_frames(tmp_path, capsys):
+    path = terrain_file(tmp_path, dem={"highest_beyond_m": 5000.0}, search={"radius_m": 300.0})
+    camera = replace(small_camera(), size_px=(400, 400), focal_px=(127.0, 127.0), centre_px=(199.5, 199.5))
+    save_camera(camera, tmp_path / "camera.toml")
+    series = Series(
+        camera=camera, terrain=load_terrain(path), catalog=catalog_to(5.0), seed=1, faint_v_mag=5.0,
+        terrain_ref=str(path), camera_ref=str(tmp_path / "camera.toml"),
+    )  # fmt: skip
+    exposure, _ = render(series.scene(0)[0], rng=np.random.default_rng(1))
+    images = [tmp_path / "in" / f"{name}.png" for name in "ab"]
+    images[0].parent.mkdir()
+    for image in images:
+        write_exposure(image, exposure)
+        write_sidecar(image, exposure)
+    out = ["-D", str(tmp_path / "out"), "--no-plots"]
+    folder = str(images[0].parent)
+    for words in (["locate", *map(str, images)], ["batch", folder, "-j", "1", "-v", "-O"]):  # over results that exist
+        main([*words, *out])
+        heard = capsys.readouterr().err
+        assert heard.count("the maps end") == 1
+        assert "hill: azimuths 0 to 360 degrees: the maps end" in heard
+    for name in "ab":
+        record = json.loads((tmp_path / "out" / f"{name}.fix.json").read_text())
+        assert sum("the maps end" in one for one in record["warnings"]) == 1  # in the results of each
+
+
+def test_a_post_between_voids_counts_for_the_highest_ground(tmp_path):
+    """Ground beyond the maps, and beyond voids, is taken to be no higher: it must not be taken for lower."""
+    heights = hill().heights_m.copy()
+    heights[5, 5], heights[4, 4:7], heights[6, 4:7], heights[5, 4], heights[5, 6] = 1234.0, *[np.nan] * 4
+    path = terrain_file(tmp_path)
+    write_map(tmp_path / "hill.tif", replace(hill(), heights_m=heights))
+    terrain = load_terrain(path)
+    assert isinstance(terrain, HeightMap)
+    for one in (terrain, terrain.with_voids()):
+        assert one.ground.highest_m == pytest.approx(1234.0, abs=0.3)
+    assert terrain.facts()["maps_end"]["highest_beyond_m"] == 1234
 
 
 def test_a_folder_that_takes_no_pictures_is_named_before_any_work(tmp_path, capsys):

@@ -84,7 +84,7 @@ def _locate_images(
             "results and tables with -O"
         )
     tasks = _tasks(found, out, facts, args)
-    if args.cluster is None and not all(os.path.exists(task.result) for task in tasks):
+    if args.cluster is None and (args.overwrite or not all(os.path.exists(task.result) for task in tasks)):
         _prepare(tasks[0], args)
     runner: Runner[Task, ImageDone] = Runner(batch.locate_image, jobs=args.jobs or count_cores(), cluster=args.cluster)
     shown = _Shown(args, len(tasks), runner.stop)

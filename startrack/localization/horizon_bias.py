@@ -9,7 +9,14 @@ import numpy as np
 from startrack.core.types import Array, Evidence
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.neighbourhood import Neighbourhood, SectorRows
-from startrack.localization.search import BEAMS, Guess, beam_search, explains_sectors
+from startrack.localization.search import (
+    BEAMS,
+    LAST_STEP_M,
+    Guess,
+    beam_search,
+    choose_apart,
+    explains_sectors,
+)
 from startrack.localization.sector_moments import solve_linear
 from startrack.localization.shared_errors import SharedErrors
 from startrack.terrain import Terrain
@@ -42,18 +49,24 @@ def lower_evidence(evidence: Evidence, bias_rad: float) -> Evidence:
     return replace(evidence, elevation_rad=evidence.elevation_rad - bias_rad) if bias_rad else evidence
 
 
-def find_start(likelihood: PositionLikelihood) -> tuple[PositionLikelihood, Guess]:
+def find_start(likelihood: PositionLikelihood, *, all_beams: bool = False) -> tuple[PositionLikelihood, Guess]:
     """The likelihood at the likeliest error of the horizon, and good positions by it.
 
-    The wider beams follow where narrow ones find no position that explains all sectors.
+    The wider beams follow where narrow ones find no position that explains all sectors. With `all_beams` they follow in
+    any case, and the positions are those of all: a wrong one may explain all sectors too.
     """
-    best, found = likelihood, Guess(np.zeros((0, 2)), np.zeros(0))
+    best, found, points = likelihood, Guess(np.zeros((0, 2)), np.zeros(0)), np.zeros((0, 2))
     for beam in BEAMS:
         at_bias, guess = at_likeliest_bias(likelihood, beam_search(likelihood, beam))
+        points = np.vstack([points, guess.points_m])
         if guess.best > found.best:
             best, found = at_bias, guess
-        if explains_sectors(found, likelihood):
-            break
+        if explains_sectors(found, likelihood) and not all_beams:
+            return best, found
+    if all_beams:
+        score = best.exact_scores(points)
+        apart = choose_apart(points, score, LAST_STEP_M)
+        found = Guess(points[apart], score[apart])
     return best, found
 
 

@@ -73,8 +73,11 @@ class ExactPosterior:
 
     def explore(self, evidence: Evidence, terrain: Terrain) -> Explored:
         """The boxes of the `terrain` that may matter by `evidence`, with the likeliest common error of the horizon."""
-        likelihood, guess = find_start(self.likelihood(evidence, terrain))
-        return Search(likelihood, guess, self.prune_nats, self.budget_horizons).run()
+        likelihood = self.likelihood(evidence, terrain)
+        found = Search(*find_start(likelihood), self.prune_nats, self.budget_horizons).run()
+        if found.search == "proven":
+            return found
+        return Search(*find_start(likelihood, all_beams=True), self.prune_nats, self.budget_horizons).run()
 
     def _explore_near(self, evidence: Evidence, terrain: Terrain, near: PositionPrior) -> Explored:
         """As `explore`, in the neighbourhood of the prior.

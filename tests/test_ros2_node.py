@@ -22,6 +22,7 @@ from ros_stand_in import image_message, install, odometry_message, stamped
 EXAMPLE = ROOT / "docs/examples/ros2_track_node.py"
 REFUSED = 1  # number of the image that shows no star
 CAMERA_IN_BODY_M = [0.4, -0.1, 1.2]
+LASTS_S = 1e4  # of a transform after its image; the images are minutes apart
 TOLERANCE_M = 1e-4  # a time in seconds has 0.2 us as a float: less than 1 um of the sky's turn, or of a rover's move
 
 
@@ -47,6 +48,7 @@ def node(drive, monkeypatch):
     """The example's node, with the drive's camera and the thesis's crater."""
     first = drive[1][0]
     facts = {"exposure_s": first.exposure_s, "time_sigma_s": first.time_sigma_s, "camera_in_body_m": CAMERA_IN_BODY_M}
+    facts["transform_lasts_s"] = LASTS_S
     install(monkeypatch, camera=str(drive[0]), terrain="shackleton-thesis", **facts)
     spec = importlib.util.spec_from_file_location("ros2_track_node", EXAMPLE)
     module = importlib.util.module_from_spec(spec)
@@ -75,10 +77,9 @@ def test_poses_are_those_of_the_track_and_a_refused_image_has_none(drive, node):
     assert counts == [0, 1, 2, 3]  # the first image waits for a second pose, the second one is refused
     used = [k for k in range(len(exposures)) if k != REFUSED]
     assert len(node.transforms) == len(used)  # none of the refused image
+    assert [sent.header.stamp for sent in node.transforms] == [move.header.stamp for move in moves[1:]]
     for sent, message, k in zip(node.transforms, published, used, strict=True):
         assert (sent.header.frame_id, sent.child_frame_id) == ("map", "odom")
-        lasts_ns = sent.header.stamp.sec * 10**9 + sent.header.stamp.nanosec - stamp_ns(exposures[k])
-        assert lasts_ns == 60 * 10**9
         moved, turned = sent.transform.translation, sent.transform.rotation
         R_map_odom = Rotation.from_quat([turned.x, turned.y, turned.z, turned.w])
         R_odom_body = Rotation.from_quat(odometry.quat_xyzw[k])  # the odometry has a pose at each image
@@ -88,6 +89,12 @@ def test_poses_are_those_of_the_track_and_a_refused_image_has_none(drive, node):
         np.testing.assert_allclose(camera_m, [at.x, at.y, at.z], rtol=0, atol=1e-6)
         off = R_map_odom * R_odom_body * Rotation.from_quat([q.x, q.y, q.z, q.w]).inv()
         assert off.magnitude() < 1e-6
+    last_ns = stamp_ns(exposures[-1])
+    for later_s, is_sent in ((LASTS_S - 1.0, True), (LASTS_S + 1.0, False)):
+        count = len(node.transforms)
+        node.callbacks["odom"](stamped(moves[-1], last_ns + round(later_s * 1e9)))
+        assert len(node.transforms) == count + is_sent
+    assert node.transforms[-1].transform == node.transforms[-2].transform
     for message, k in zip(published, used, strict=True):
         stamp = message.header.stamp
         assert message.header.frame_id == "map" and stamp.sec * 10**9 + stamp.nanosec == stamp_ns(exposures[k])

@@ -3,8 +3,8 @@
 Subscriptions: `image` (sensor_msgs/Image; the stamp is the middle of the exposure) and `odom` (nav_msgs/Odometry of the
 rover's body). Publication: `pose` (geometry_msgs/PoseWithCovarianceStamped) in the frame of the parameter `map_frame`:
 x east, y north, z up (REP-103, REP-105) from the terrain's origin; its orientation is that of the body (x forward, y
-left, z up), its position that of the camera. With it the transform from `map_frame` to `odom_frame` is broadcast (tf2).
-An image that is refused, or left out, gives neither.
+left, z up), its position that of the camera. From then on the transform from `map_frame` to `odom_frame` is broadcast
+(tf2) with each odometry message. An image that is refused, or left out, gives neither.
 
     python ros2_track_node.py --ros-args -p camera:=fisheye-2048 -p terrain:=shackleton-thesis \
         -r image:=/camera/image_raw -r odom:=/wheel/odometry
@@ -35,7 +35,7 @@ PARAMETERS = {
     "map_frame": "map",
     "odom_frame": "odom",  # of the odometry's poses; empty: no transform is broadcast
     "camera_in_body_m": [0.0, 0.0, 0.0],  # x, y, z of the camera in the body whose poses the odometry has
-    "transform_lasts_s": 60.0,  # a transform holds so long after its image
+    "transform_lasts_s": 60.0,  # so long after its image a transform is broadcast
     "exposure_s": math.nan,  # that an image message does not have; not a number: not known
     "time_sigma_s": math.nan,  # of the clock, the same
     "odometry_sigma": 0.02,  # of a move's length
@@ -69,6 +69,7 @@ class TrackNode(Node):
         self.stamps: dict[str, object] = {}  # of images that were not filtered yet, by their names
         self.images = 0
         self.broadcaster = TransformBroadcaster(self)
+        self.map_from_odom: tuple[float, np.ndarray, Rotation] | None = None  # time [s] of its image, move [m], turn
         self.publisher = self.create_publisher(PoseWithCovarianceStamped, "pose", 10)
         self.create_subscription(Image, "image", self.on_image, qos_profile_sensor_data)
         self.create_subscription(OdometryMessage, "odom", self.on_odometry, ODOMETRY_QUEUE)
@@ -82,6 +83,7 @@ class TrackNode(Node):
             return
         self.poses.append([time_s, at.x, at.y, at.z, q.x, q.y, q.z, q.w])
         self.publish_newest()
+        self.broadcast(stamp)
 
     def on_image(self, message: Image) -> None:
         """Locate an image and keep its evidence."""
@@ -113,7 +115,7 @@ class TrackNode(Node):
             self.get_logger().error(f"the odometry cannot be used: {cause}")
 
     def publish(self, track: Track, odometry: Odometry) -> None:
-        """Publish the pose of a `track` of one image, and the transform; nothing where it is not used, or not known."""
+        """Publish the pose of a `track` of one image, and keep the transform; neither where it is not used or known."""
         frame, position_m = track.frames[0], track.filtered.position_enu_m[0]
         stamp = self.stamps.pop(frame.name, None)
         if stamp is None or frame.status != "used" or frame.quat_xyzw_body_enu is None:
@@ -131,17 +133,28 @@ class TrackNode(Node):
         self.publisher.publish(message)
         if self.odom_frame and np.trace(track.filtered.covariance_m2[0]) < MAX_VARIANCE_M2:
             R_map_body = Rotation.from_quat(frame.quat_xyzw_body_enu).inv()
-            self.broadcast(stamp, position_m - R_map_body.apply(self.camera_in_body_m), R_map_body, odometry)
+            self.keep_transform(stamp, position_m - R_map_body.apply(self.camera_in_body_m), R_map_body, odometry)
 
-    def broadcast(self, stamp: object, body_m: np.ndarray, R_map_body: Rotation, odometry: Odometry) -> None:
-        """Broadcast map <- odom = (map <- body) (odom <- body)^-1, with the `odometry` at the time of the image."""
-        ((at_m,), (R_odom_body,)) = odometry.poses_at(np.array([stamp.sec + 1e-9 * stamp.nanosec]))
+    def keep_transform(self, stamp: object, body_m: np.ndarray, R_map_body: Rotation, odometry: Odometry) -> None:
+        """Keep map <- odom = (map <- body) (odom <- body)^-1, with the `odometry` at the time of the image."""
+        time_s = stamp.sec + 1e-9 * stamp.nanosec
+        ((at_m,), (R_odom_body,)) = odometry.poses_at(np.array([time_s]))
         R_map_odom = R_map_body * R_odom_body.inv()
-        message, until = TransformStamped(), stamp.sec * 10**9 + stamp.nanosec + round(self.lasts_s * 1e9)
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(until, 10**9)
-        message.header.frame_id, message.child_frame_id = self.map_frame, self.odom_frame
+        self.map_from_odom = time_s, body_m - R_map_odom.apply(at_m), R_map_odom
+
+    def broadcast(self, stamp: object) -> None:
+        """Broadcast the transform that is kept, with the `stamp` of the newest odometry; none long after its image.
+
+        Where odometry and transform have the same stamps, tf2 does not interpolate between two corrections.
+        """
+        if self.map_from_odom is None or stamp.sec + 1e-9 * stamp.nanosec > self.map_from_odom[0] + self.lasts_s:
+            return
+        _, move_m, R_map_odom = self.map_from_odom
+        message = TransformStamped()
+        message.header.stamp, message.header.frame_id = stamp, self.map_frame
+        message.child_frame_id = self.odom_frame
         move, turn = message.transform.translation, message.transform.rotation
-        move.x, move.y, move.z = (body_m - R_map_odom.apply(at_m)).tolist()
+        move.x, move.y, move.z = move_m.tolist()
         turn.x, turn.y, turn.z, turn.w = R_map_odom.as_quat().tolist()
         self.broadcaster.sendTransform(message)
 

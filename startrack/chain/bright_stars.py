@@ -100,12 +100,15 @@ class _BrightSources:
             px, in_view = self.camera.project(self.R_cam_icrs @ body.ray_icrs)
             if not in_view:
                 continue
-            reach_px = self.radius_px + (parallax_rad / scale if body.name in ("Moon", "Earth") else 0.0)
-            touched = np.unique(self.blobs.blob[self.tree.query_ball_point(px, reach_px + HALF_PIXEL_PX)])
-            is_near = (np.hypot(*(self.sources.xy_px - px).T) < reach_px) | np.isin(self.source_blob, touched)
+            moved_px = parallax_rad / scale if body.name in ("Moon", "Earth") else 0.0
+            reach_px = self.radius_px + moved_px + HALF_PIXEL_PX
+            touched = np.unique(self.blobs.blob[self.tree.query_ball_point(px, reach_px)])
+            is_large = self.area_px[touched] > len(disc_px(self.sources))  # the Moon: its glare is no background
+            if moved_px:  # stars may be about its place
+                touched, is_large = touched[is_large], is_large[is_large]
+            is_near = (np.hypot(*(self.sources.xy_px - px).T) < self.radius_px) | np.isin(self.source_blob, touched)
             near = np.flatnonzero(is_near & (star_mag > body.v_mag))
             light_e = [*light_at(self.sources, self.sources.xy_px[near]), *self.blobs.light_e[touched]]
-            is_large = self.area_px[touched] > len(disc_px(self.sources))  # the Moon: its glare is no background
             if is_large.any() or max(light_e, default=0.0) > self.light_bounds(np.array([body.v_mag]))[0][0]:
                 seen.append(body)
                 detection.append(near)

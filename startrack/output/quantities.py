@@ -56,8 +56,9 @@ LIGHT_QUANTITIES: tuple[Quantity, ...] = (
              Show("panel", "Residual", lambda p: f"   false alarm {chance_text(p)}"),
              Show("page", "Chance match", chance_text))),
     Q("bodies", "", Oriented, bodies_record,
-      "list of `name`, `v_mag`, `x_px`, `y_px`: planets, Sun, Moon and Earth in the frame, where they must be; without "
-      "a site those that have a source there, without a time none", list_schema(BODY), before=[]),
+      "list of `name`, `v_mag`, `x_px`, `y_px`: planets, Sun, Moon and Earth in the frame, at their predicted places; "
+      "without a site those that have a source there, the Moon as from the middle of the Earth (up to 1 degree off), "
+      "without a time none", list_schema(BODY), before=[]),
     Q("evidence.blocked", "deg", Located, blocked_deg,
       "list of [from, to]: azimuths in which something on no map more likely hides the map's skyline than not; across "
       "north `to` is the smaller", list_schema(list_schema("number", count=2)), before=[], optional=True,

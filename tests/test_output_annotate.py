@@ -65,6 +65,7 @@ def test_size(picture):
     assert fit_to_canvas((3000, 2000))[1] == (1400, 933)
     assert fit_to_canvas((512, 512))[1] == (900, 900)
     assert fit_to_canvas((1024, 1024))[0] == 1.0
+    assert fit_to_canvas((64, 64)) == (4.0, (256, 256))
 
 
 def test_the_skyline_is_where_the_true_wall_is(picture, view, located):

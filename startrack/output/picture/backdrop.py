@@ -18,6 +18,7 @@ from startrack.output.values import skyline_position_m
 
 Image = NDArray[np.float32]
 LONGEST_SIDE_PX, SHORTEST_SIDE_PX = 1400, 900
+MOST_ENLARGED = 4.0  # beyond it a picture shows no more, and a tiny one takes as long to draw as a large one
 SMOOTHING_PX = (0.5, 3.0)  # of the display, as wide as the PSF within these
 KNEE_SNR, GLARE_SNR = 5.0, 400.0  # where the stretch turns from linear to logarithmic, and where it ends
 CALM_SNR = KNEE_SNR / 2  # fainter light than that is treated as noise and left out
@@ -55,7 +56,7 @@ def fit_to_canvas(size_px: tuple[int, int]) -> tuple[float, tuple[int, int]]:
     """Scale, and size (W, H) of an exposure on the canvas."""
     scale = LONGEST_SIDE_PX / max(size_px)
     if scale > 1:  # small frames grow only until they can be read
-        scale = max(1.0, min(scale, SHORTEST_SIDE_PX / min(size_px)))
+        scale = max(1.0, min(scale, SHORTEST_SIDE_PX / min(size_px), MOST_ENLARGED))
     return scale, (max(1, round(size_px[0] * scale)), max(1, round(size_px[1] * scale)))
 
 

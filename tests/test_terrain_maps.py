@@ -27,7 +27,15 @@ from startrack.terrain import (
     read_map,
     write_map,
 )
-from startrack.terrain.map_heights import FOOT_M, SURVEY_FOOT_M, find_marks, metres_of
+from startrack.terrain.map_heights import (
+    FOOT_M,
+    GROUNDS,
+    SURVEY_FOOT_M,
+    Mark,
+    find_marks,
+    highest_step_m,
+    metres_of,
+)
 from startrack.terrain.map_reading import place_on
 
 pytestmark = pytest.mark.usefixtures("own_cache")
@@ -207,7 +215,8 @@ def test_what_no_ground_has_is_refused_and_may_be_accepted(tmp_path, capsys):
     words += ["-o", str(tmp_path / "t.toml")]
     assert main(words) == 4
     assert "flatter than ground is" in capsys.readouterr().err
-    assert main([*words, "--unusual-heights"]) == 0
+    compare = ["--compare", str(case.write(flat + np.float32(1.0), "finer.tif"))]
+    assert main([*words, *compare, "--unusual-heights"]) == 0
     assert np.abs(load_terrain(tmp_path / "t.toml").maps[0].heights_m - flat).max() < 0.01
     steep = case.heights_m.astype(np.float32)
     steep[20, 20:22] = 1234.5, 4321.0
@@ -235,7 +244,7 @@ def test_the_file_of_an_import_loads_though_its_crop_is_flat(tmp_path):
     assert np.ptp(load_terrain(tmp_path / "t.toml").maps[0].heights_m) < 10.0
 
 
-VOIDS = [-9999.0, -32_768.0, -32_767.0, 0.0, 9999.0, -3.4028234663852886e38]
+VOIDS = [-9999.0, -32_768.0, -32_767.0, 9999.0, 12_000.0, -6_000.0, -3.4028234663852886e38]
 
 
 @pytest.mark.parametrize("void", VOIDS)
@@ -250,6 +259,11 @@ def test_a_void_that_no_tag_states_is_named(tmp_path, crs, place, void):
     assert case.check(case.write(values, nodata=void), voids=True) == ()
 
 
+def marks_of(heights: np.ndarray, post_m: float = 10.0, body: str = "earth") -> tuple[Mark, ...]:
+    """Of values that are heights."""
+    return find_marks(heights, np.ones(heights.shape, dtype=bool), (1.0, 0.0), post_m, GROUNDS[body])
+
+
 def test_ground_is_never_taken_for_a_void():
     """A sea, a clipped valley, a flat floor below a wall, a summit; whole numbers and parts."""
     x, y = np.mgrid[:80, :90]
@@ -257,7 +271,49 @@ def test_ground_is_never_taken_for_a_void():
     sea, floor = np.maximum(hills, 0.0), np.maximum(hills, -100.0)
     bowl = np.clip(40.0 * (np.hypot(x - 40, y - 45) - 15.0), 0.0, 700.0)
     for heights in (hills, sea, floor, np.rint(sea), np.rint(hills / 20), bowl, -bowl, np.rint(bowl)):
-        assert find_marks(heights, np.ones(heights.shape, dtype=bool)) == ()
+        assert marks_of(heights) == ()
+
+
+@pytest.mark.parametrize(
+    ("flat_m", "around_m", "post_m", "body"),
+    [
+        (-1500.0, -200.0, 20.0, "moon"), (65.0, 30.0, 1.0, "earth"), (1650.0, 1250.0, 30.0, "earth"),
+        (1200.0, 1300.0, 5.0, "earth"),
+    ],
+    ids=["crater", "roof", "mesa", "lake"],
+)  # fmt: skip
+def test_flat_ground_behind_a_sharp_edge_is_ground(flat_m, around_m, post_m, body):
+    """Steeper than any other ground of the map, yet not steeper than ground can be."""
+    x, y = np.mgrid[:80, :90]
+    inside = np.hypot(x - 40, y - 45) < 20
+    heights = np.where(inside, flat_m, around_m + np.sin(x + 2.0 * y))
+    assert marks_of(heights, post_m, body) == ()
+    wall_m = highest_step_m(post_m) + 10.0
+    (mark,) = marks_of(np.where(inside, around_m - wall_m, heights), post_m, body)
+    assert mark == (around_m - wall_m, np.count_nonzero(inside), True)
+
+
+def test_posts_of_0_m_under_walls_are_ground_with_a_warning(tmp_path):
+    """A sea below a cliff looks as voids that are filled with 0 do."""
+    case = Case(tmp_path, UTM, HELENS, 60.0)
+    values = case.heights_m.astype(np.float32)
+    values[HOLE] = 0.0
+    path = case.write(values)
+    read = read_map(path)
+    assert np.array_equal(read.heights_m, values)
+    (note,) = read.notes
+    assert note.startswith("90 posts of value 0 are taken as ground, though most steps onto them are steeper")
+    assert read_map(path, unusual_heights=True).notes == ()
+    assert case.check(case.write(values, nodata=0.0), voids=True) == ()
+    x, y = np.mgrid[:80, :90]
+    (mark,) = marks_of(np.where(y < 40, 0.0, 60.0 + np.sin(x + 2.0 * y)))
+    assert mark == (0.0, 3200, False)
+
+
+def test_heights_from_the_centre_are_no_voids(tmp_path):
+    case = Case(tmp_path, POLAR, SOUTH, 60.0)
+    case.heights_m[HOLE] = -2500.0
+    assert case.check(case.write(case.heights_m + 1_737_400.0)) == ()
 
 
 @pytest.mark.parametrize(

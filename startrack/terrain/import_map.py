@@ -125,7 +125,7 @@ def import_maps(
     rims = [one for one in crops if 0.5 * min(one.heights_m.shape) * one.post_m >= RIM_RADII * radius_m]
     rim = (rims or crops[-1:])[0]  # the finest map that may hold the rim, or the last
     if height_sigma_m is None:
-        errors = measure_errors(rim, [*crops, *map(read_map, compare)])
+        errors = measure_errors(rim, [*crops, *(read_map(one, unusual_heights=unusual_heights) for one in compare)])
     else:
         errors = StatedErrors(height_sigma_m=float(height_sigma_m), origin="flag", comment="height_sigma_m: as given")
     body = crops[0].projection.body

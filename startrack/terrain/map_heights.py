@@ -43,11 +43,37 @@ class Ground(NamedTuple):
     highest_m: float  # above its sphere, or above the sea
     radii_km: tuple[float, float]  # from its centre
 
+    def has(self, height_m: float) -> bool:
+        """Whether it has ground at a height [m] above its sphere or the sea, or from its centre."""
+        low_km, high_km = self.radii_km
+        return self.lowest_m <= height_m <= self.highest_m or low_km <= height_m / 1000.0 <= high_km
+
 
 GROUNDS = {
     "moon": Ground(-9_200.0, 10_800.0, (1_700.0, 1_750.0)),
     "earth": Ground(-11_050.0, 9_000.0, (6_345.0, 6_395.0)),  # the deepest sea and the highest mountain, and 100 m
 }
+
+
+class Mark(NamedTuple):
+    """A value of many posts of a map, onto which steps are higher than elsewhere on it."""
+
+    value: float
+    posts: int
+    is_void: bool  # ground cannot be so; else it may be
+
+    def note(self) -> str:
+        """What a user has to know of it."""
+        if self.is_void:
+            return (
+                f"{self.posts} posts of value {self.value:g} are taken as voids: the file does not state it, and no "
+                f"ground leads up to it; {AS_THEY_ARE}"
+            )
+        return (
+            f"{self.posts} posts of value {self.value:g} are taken as ground, though most steps onto them are steeper "
+            f"than elsewhere: is it the value for voids? Then state it (rio edit-info --nodata {self.value:g} FILE); "
+            f"{AS_THEY_ARE}"
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -83,9 +109,10 @@ def heights_of(stored: Stored, name: str, scale: float | None, offset_m: float |
             "bad_terrain", f"{name}: its position, its scale or its offset is not a usable number: {numbers}"
         )
     known = ~stored.missing & np.isfinite(values)
-    marks = () if unusual else find_marks(values, known)
-    for mark, _ in marks:
-        known &= values != mark
+    ground = GROUNDS[raster.projection.body]
+    marks = () if unusual else find_marks(values, known, (scale, offset_m), raster.post_m, ground)
+    for mark in marks:
+        known &= (values != mark.value) | (not mark.is_void)
     with np.errstate(over="ignore", invalid="ignore"):
         heights = values.astype(np.float64) * scale + offset_m
     known &= np.abs(heights) < MAX_LENGTH_M
@@ -97,12 +124,9 @@ def heights_of(stored: Stored, name: str, scale: float | None, offset_m: float |
     if not unusual:
         _require_heights(heights[known], values[known], (scale, offset_m), raster.projection.body, name)
         _require_slopes(heights, raster.post_m, name)
-    notes = [
-        f"{count} posts of value {mark:g} are taken as voids: the file does not state it, and no ground leads up to "
-        f"it; {AS_THEY_ARE}"
-        for mark, count in marks
-    ]
-    return replace(raster, heights_m=heights.astype(np.float32), notes=(*stored.notes, *notes))
+    return replace(
+        raster, heights_m=heights.astype(np.float32), notes=(*stored.notes, *(mark.note() for mark in marks))
+    )
 
 
 def _scale_and_offset(
@@ -161,34 +185,47 @@ def _units_m() -> dict[str, float]:
     return found | {SURVEY_FOOT_WORD: SURVEY_FOOT_M}
 
 
-def find_marks(values: NDArray[np.generic], known: Bools) -> tuple[tuple[float, int], ...]:
-    """Values (and how many posts have each) that mark voids among the `known` posts of `values` (rows, columns).
+def find_marks(
+    values: NDArray[np.generic], known: Bools, scaling: tuple[float, float], post_m: float, ground: Ground
+) -> tuple[Mark, ...]:  # fmt: skip
+    """Values that are voids among the `known` posts of `values` (rows, columns), and 0 m where it may be one.
 
-    The lowest, the highest, or 0, where many posts share it and most steps to a neighbour are higher than the steps
-    between other neighbours.
+    scaling: metres of a step of the values, and height of value 0. post_m: spacing of the posts.
+    The lowest value, the highest, or 0, which many posts share, is a void where most steps onto it are higher than
+    those between other neighbours, and it is one of MARKS, or the `ground` has no such height or step.
     """
     known = known.copy()
-    found: list[tuple[float, int]] = []
+    found: list[Mark] = []
     while known.any():
         inside = values[known]
-        ends = dict.fromkeys((float(inside.min()), float(inside.max()), 0.0))
-        for value in ends:
+        doubtful: list[Mark] = []
+        for value in dict.fromkeys((float(inside.min()), float(inside.max()), 0.0)):
             count = int(np.count_nonzero(inside == value))
-            if count >= (1 if value in MARKS else FEWEST_SHARED) and _is_cut_off(values, known, value):
-                found.append((value, count))
+            if count < (1 if value in MARKS else FEWEST_SHARED):
+                continue
+            step_m, height_m = abs(scaling[0]) * _step_onto(values, known, value), scaling[0] * value + scaling[1]
+            if step_m > 0 and (value in MARKS or not ground.has(height_m) or step_m > highest_step_m(post_m)):
+                found.append(Mark(value, count, True))
                 known &= values != value
                 break
+            if height_m == 0.0 and step_m > CLIFF_SLOPE * post_m:
+                doubtful.append(Mark(value, count, False))
         else:
-            break
+            return (*found, *doubtful)
     return tuple(found)
 
 
-def _is_cut_off(values: NDArray[np.generic], known: Bools, value: float) -> bool:
-    """Whether posts of a `value` stand off their neighbours as no other neighbours do."""
+def highest_step_m(post_m: float) -> float:
+    """The most that heights of ground differ between posts so far apart [m]."""
+    return CLIFF_M + CLIFF_SLOPE * post_m
+
+
+def _step_onto(values: NDArray[np.generic], known: Bools, value: float) -> float:
+    """The median step from neighbours onto posts of a `value`; 0 unless it is higher than steps between others."""
     here = known & (values == value)
     others = known & ~here
     if not others.any() or np.ptp(values[others]) == 0:
-        return False
+        return 0.0
     onto: list[Array] = []
     between: list[Array] = []
     stride = max(1, values.size // MAX_STEPS)
@@ -203,7 +240,8 @@ def _is_cut_off(values: NDArray[np.generic], known: Bools, value: float) -> bool
     if not len(steps):  # surrounded by posts that are voids anyway
         steps = np.abs(values[others].astype(np.float64) - value).min(keepdims=True)
     rest = np.concatenate(between)
-    return bool(np.median(steps) > (np.quantile(rest, STEEPEST_SHARE) if len(rest) else 0.0))
+    step = float(np.median(steps))
+    return step if step > (np.quantile(rest, STEEPEST_SHARE) if len(rest) else 0.0) else 0.0
 
 
 def _require_heights(
@@ -253,7 +291,7 @@ def _advice_to_scale(scaling: tuple[float, float], metres: float) -> str:
 def _require_slopes(h: Array, post_m: float, name: str) -> None:
     """Raise BadInput bad_terrain for steps of heights `h` between neighbours that no ground has: voids of any value."""
     most = max(float(np.nanmax(np.abs(np.diff(h, axis=axis)), initial=0.0)) for axis in (0, 1))
-    if most > CLIFF_M + CLIFF_SLOPE * post_m:
+    if most > highest_step_m(post_m):
         raise BadInput(
             "bad_terrain",
             f"{name}: neighbouring posts, {post_m:.3g} m apart, differ by up to {most:.0f} m, and heights are "

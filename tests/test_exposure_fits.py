@@ -12,6 +12,8 @@ from astropy.time import Time
 
 from startrack.core.types import BadInput
 from startrack.exposure import read_exposure
+from startrack.exposure.header_times import middle_of_exposure
+from startrack.frames import format_utc
 
 FRAME = np.random.default_rng(5).integers(0, 65536, (31, 47)).astype(np.uint16)
 SIGNED = FRAME.view(np.int16)
@@ -208,6 +210,10 @@ MJD = 58336.0 + (5 * 3600 + 17 * 60) / 86400  # 2018-08-06T05:17:00, of which th
         {"DATE_END": "2018-08-06T05:18:00", "EXPTIME": 60.0},
         {"DATE_OBS": "2018-08-06T05:17:00", "EXPTIME": 60.0, "MJD_OBS": MJD},
         {"MJD_OBS": MJD, "EXPTIME": 60.0},
+        {"MJD_OBS": 0.0, "DATE_END": "2018-08-06T05:18:00", "EXPTIME": 60.0},
+        {"DATE_OBS": "2018-08-06T05:17:00", "DATE_END": "2018-08-06T05:18:00", "MJD_AVG": 0},
+        {"DATE_OBS": "2018-08-06", "TIME_OBS": "05:17:00", "DATE_END": "2018-08-06T05:18:00"},
+        {"MJD_OBS": MJD, "MJD_END": MJD + 60 / 86400},
         {"MJD_AVG": MJD + 30 / 86400},
         {"MJD_BEG": MJD, "MJD_END": MJD + 60 / 86400},
         {"MJD_BEG": MJD, "EXPTIME": 60.0},
@@ -241,7 +247,11 @@ def test_the_middle_by_the_other_times_of_the_standard(read, cards):
         ),
         ({**BEGIN, "DATE_END": "2018-08-06T05:16:00", "MJD_AVG": MJD - 0.5 / 86400}, "05:16:59.5", []),
         ({"DATE_OBS": "2018-08-06", "MJD_OBS": MJD, "EXPTIME": 60.0}, "05:17:30", ["DATE-OBS not used"]),
-        ({"MJD_OBS": 0.0, "DATE_END": "2018-08-06T05:17:30", "EXPTIME": 60.0}, "05:17:00", ["MJD-OBS not used"]),
+        (
+            {"DATE_OBS": "2018-08-06T05:17:00", "DATE_END": "2018-08-06T05:17:10", "EXPTIME": 1.0},
+            "05:17:00.5", ["by DATE-END it is 0:00:09 (h:mm:ss) after"],
+        ),
+        ({**BEGIN, "DATE_OBS": "2018-08-06T07:17:30"}, "05:17:30", ["by DATE-OBS it is 2:00:30 (h:mm:ss) after"]),
     ],
 )  # fmt: skip
 def test_a_choice_among_times_that_disagree_is_stated(read, cards, time, words):
@@ -250,6 +260,16 @@ def test_a_choice_among_times_that_disagree_is_stated(read, cards, time, words):
     assert len(exposure.warnings) == bool(words)
     for text in words:
         assert text in exposure.warnings[0]
+
+
+@pytest.mark.parametrize("nothing", [None, 0, 0.0, "0", "0.0", "", " "])
+def test_what_fills_the_place_of_a_time_is_no_time(nothing):
+    """As in JSON of a TIFF description, and as many programs write it."""
+    notes = []
+    assert middle_of_exposure({"MJD-OBS": nothing, "MJD-AVG": nothing, "TIMESYS": "TT"}, 60.0, notes) is None
+    header = {"MJD-AVG": nothing, "DATE-BEG": None, "DATE-AVG": "2018-08-06T05:17:30"}
+    assert format_utc(middle_of_exposure(header, None, notes)).startswith("2018-08-06T05:17:30")
+    assert notes == []
 
 
 def test_a_card_that_names_the_hardware_is_not_the_camera_file(read):
@@ -262,6 +282,7 @@ def test_facts_of_the_primary_header_hold_for_an_extension(read):
     primary.header["DATE-AVG"] = "2018-08-06T05:18:00"
     image = fits.ImageHDU(FRAME)
     image.header["EXPTIME"] = 5
+    image.header["DATE-AVG"] = None  # a card without a value
     exposure = read(fits_bytes(primary, image))
     assert exposure.exposure_s == 5.0
     assert exposure.time_utc is not None
@@ -279,7 +300,16 @@ def test_facts_of_the_primary_header_hold_for_an_extension(read):
         ({"MJD_OBS": MJD}, "MJD-OBS is when the exposure starts, and without EXPTIME its middle is not known"),
         ({"DATE_END": "2018-08-06T05:17:04"}, "DATE-END is when the exposure ends"),
         ({**BEGIN, "DATE_END": "2018-08-06T05:16:00"}, "DATE-BEG and DATE-END not used: the end is before the start"),
+        (
+            {"DATE_OBS": "2018-08-06T05:17:00", "DATE_END": "2018-08-06T05:16:00"},
+            "DATE-OBS and DATE-END not used: the end is before the start",
+        ),
         ({"MJD_AVG": "today"}, "MJD-AVG not used"),
+        (
+            {"MJD_OBS": 2460310.5, "EXPTIME": 60.0},
+            "8594 is outside 1900 to 2050, the ephemeris's years (2460310.5: a Julian date?)",
+        ),
+        ({"MJD_AVG": 6.5e4 + 365 * 100}, "the ephemeris's years"),
         ({"MJD_AVG": 1e9}, "MJD-AVG not used"),
         ({"DATE_OBS": "9999-12-31T23:59:59", "EXPTIME": 60.0}, "DATE-OBS not used"),
         ({"DATE_OBS": "2018-08-06T05:17:04", "EXPTIME": 0.0}, "EXPTIME 0.0"),

@@ -191,8 +191,11 @@ def _check_complete(units: Any, raw: bytes) -> None:
 def _metadata(units: Any, unit: Any) -> dict[str, Any]:
     """The metadata in the image's own header, else in the primary one."""
     headers = (unit.header, units[0].header)
-    found = {key: next((h[key] for h in headers if key in h), None) for key in sorted({*HEADER_KEYS.values()})}
-    return {key: value for key, value in found.items() if isinstance(value, str | int | float)}  # not Undefined
+    stated = str | int | float  # not Undefined
+    found = {
+        key: [h[key] for h in headers if isinstance(h.get(key), stated)] for key in sorted({*HEADER_KEYS.values()})
+    }
+    return {key: values[0] for key, values in found.items() if values}
 
 
 def _saturation(header: Any) -> float | None:

@@ -34,7 +34,7 @@ from startrack.frames.directions import (
     turn_azel,
     wahba,
 )
-from startrack.frames.orientation import R_mcmf_icrs, barycentric_state, et_s, ut1_sigma_s
+from startrack.frames.orientation import EPHEMERIS_YEARS, R_mcmf_icrs, barycentric_state, et_s, ut1_sigma_s
 from startrack.frames.site import (
     MOON_RADIUS_M,
     R_enu_fixed,
@@ -51,8 +51,8 @@ from startrack.frames.site import (
 from startrack.frames.time import as_utc, format_utc, parse_utc, seconds_since_2000
 
 __all__ = [
-    "AIR_KEYS", "AIR_TABLE", "EARTH_RADIUS_M", "EXTINCTION_SIGMA_MAG", "LOWEST_PREDICTED_RAD", "MOON_RADIUS_M",
-    "ORTHONORMAL_1", "SPEED_OF_LIGHT_M_S", "USUAL_EXTINCTION_MAG", "USUAL_SIGMA_1", "Air",
+    "AIR_KEYS", "AIR_TABLE", "EARTH_RADIUS_M", "EPHEMERIS_YEARS", "EXTINCTION_SIGMA_MAG", "LOWEST_PREDICTED_RAD",
+    "MOON_RADIUS_M", "ORTHONORMAL_1", "SPEED_OF_LIGHT_M_S", "USUAL_EXTINCTION_MAG", "USUAL_SIGMA_1", "Air",
     "R_body_enu_from_heading_pitch_roll", "R_enu_fixed", "R_enu_icrs", "R_from_quat_xyzw", "R_from_rotvec",
     "R_mcmf_icrs", "Site", "aberrate", "airmass", "angle_between_rad", "as_utc", "azel_from_rays", "barycentric_state",
     "enu_from_latlon", "et_s", "format_utc", "heading_pitch_roll_from_R_body_enu", "latlon_from_enu", "length_xy",

@@ -34,6 +34,7 @@ _KERNELS = (
     ("lunarsky", "lunarsky", "data/pck/moon_pa_de421_1900-2050.bpc"),
     ("skyfield-data", "skyfield_data", "data/de421.bsp"),
 )
+EPHEMERIS_YEARS = 1900, 2050  # first and last with a time that all kernels cover
 NAIF = {"moon": 301, "earth": 399}
 
 _lock = Lock()

@@ -6,12 +6,13 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
 from startrack.core.files import write_atomically
-from startrack.core.replacement import _remove_parts
+from startrack.core.replacement import PART_LIVES_S, _remove_parts
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no lock shows there that a process lives")
 # Stops between write and rename, as a run that is killed there.
@@ -49,6 +50,7 @@ def parts(folder: Path) -> list[Path]:
 def test_the_next_run_removes_the_part_of_a_killed_one_and_none_in_use(writer, tmp_path):
     (part,) = parts(tmp_path)
     assert part.stat().st_size == 1000
+    let_age(part, 2 * PART_LIVES_S)
     write_atomically(tmp_path / "b.json", b"1", overwrite=True)
     assert parts(tmp_path) == [part]
     writer.send_signal(signal.SIGKILL)
@@ -59,10 +61,28 @@ def test_the_next_run_removes_the_part_of_a_killed_one_and_none_in_use(writer, t
     assert sorted(one.name for one in tmp_path.iterdir()) == ["b.json", "c.json"]
 
 
+def let_age(path: Path, seconds: float) -> None:
+    written = time.time() - seconds
+    os.utime(path, (written, written))
+
+
+def test_a_young_part_stays_though_its_lock_is_free(tmp_path):
+    """A file system with locks within one host gives the lock of a part that another host is writing."""
+    part = tmp_path / f".{'3' * 32}.part"
+    part.write_bytes(b"x")
+    for age_s, stays in ((0.9 * PART_LIVES_S, True), (1.1 * PART_LIVES_S, False)):
+        let_age(part, age_s)
+        _remove_parts.cache_clear()
+        write_atomically(tmp_path / "a.json", b"1", overwrite=True)
+        assert part.exists() == stays
+
+
 def test_files_of_others_stay(tmp_path):
     mine = [tmp_path / name for name in ("x.part", ".x.part", f".{'0' * 31}g.part", f".{'1' * 32}.part.json")]
     for path in mine:
         path.write_text("mine")
     (tmp_path / f".{'2' * 32}.part").symlink_to(mine[0])
+    for path in mine:
+        let_age(path, 2 * PART_LIVES_S)
     write_atomically(tmp_path / "a.json", b"1", overwrite=True)
     assert len(list(tmp_path.iterdir())) == 6

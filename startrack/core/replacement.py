@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import time
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -15,6 +16,7 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 PART = re.compile(r"\.[0-9a-f]{32}\.part")  # name of a file that is being written
+PART_LIVES_S = 86_400.0  # since the last byte: longer than any writing, on file systems whose locks hold on one host
 
 
 def replace_file(target: Path, data: bytes) -> None:
@@ -45,6 +47,7 @@ def _remove_parts(folder: Path) -> None:
     """Remove what killed processes left half-written in a `folder`, once a process: it is listed once.
 
     A process holds the lock of its part up to the renaming, and writes once it has it: an empty part may be in use.
+    Another host may not see the lock, so that a part also has to be old.
     On Windows, where no lock shows that a process lives, parts stay.
     """
     if fcntl is None:
@@ -54,5 +57,6 @@ def _remove_parts(folder: Path) -> None:
             if PART.fullmatch(path.name) and not path.is_symlink():
                 with suppress(OSError), path.open("r+b") as file:  # in use, or another user's
                     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    if os.fstat(file.fileno()).st_size:
+                    status = os.fstat(file.fileno())
+                    if status.st_size and time.time() - status.st_mtime > PART_LIVES_S:
                         path.unlink()

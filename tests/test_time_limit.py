@@ -99,6 +99,13 @@ def test_the_work_done_is_stated() -> None:
         search()
 
 
+def test_an_exception_that_is_caught_inside_keeps_its_message() -> None:
+    first = TimeLimitReached("it came")
+    with pytest.raises(TimeLimitReached, match=r"^it came; 3 tried$") as caught, stating_work(lambda: "3 tried"):
+        raise first
+    assert str(first) == "it came" and caught.value.__cause__ is first
+
+
 @pytest.mark.parametrize("asked", [3, 20])
 def test_a_refused_search_states_what_it_saw_and_tried(questions: StepClock, asked: int) -> None:
     """In detection, and among the patterns."""

@@ -96,9 +96,8 @@ def check_time() -> None:
 
 @contextmanager
 def stating_work(text: Callable[[], str]) -> Iterator[None]:
-    """In the block TimeLimitReached also states the `text`: what was done by then."""
+    """In the block TimeLimitReached becomes another one, which also states the `text`: what was done by then."""
     try:
         yield
     except TimeLimitReached as cause:
-        cause.args = (f"{cause}; {text()}",)
-        raise
+        raise TimeLimitReached(f"{cause}; {text()}") from cause

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from startrack.chain import detect, stating_sky
-from startrack.cli.console import print_outcome
+from startrack.cli.console import print_outcome, print_warnings
 from startrack.cli.main import main
 from startrack.core.errors import NotIdentified, Reason, next_step
 from startrack.exposure import read_exposure
@@ -20,6 +20,15 @@ from startrack.identification import NearSky, advise_on_fields
 ACTIONS = {"calibrate": ("board", "verify", "show", "convert"), "terrain": ("show", "import", "build")}
 LOWELL = str(Path(__file__).parents[1] / "sample_images/lowell-2018-08-06.fits.bz2")  # 180 degrees, on the Earth
 SAMPLE = str(Path(__file__).parents[1] / "sample_images/near-wall.png")
+
+
+def test_a_warning_of_all_images_is_printed_once_for_each_terrain(capsys: pytest.CaptureFixture[str]) -> None:
+    args = argparse.Namespace(quiet=False)
+    for image, terrain in (("1.png", "A"), ("2.png", "A"), ("3.png", "B")):
+        print_warnings(args, terrain, ["its error is not stated"], of_all=True)
+        print_warnings(args, image, ["its error is not stated", "no clock"])
+    lines = ["A: its error is not stated", "1.png: no clock", "2.png: no clock", "B: its error is not stated"]
+    assert capsys.readouterr().err.splitlines() == [*lines, "3.png: no clock"]
 
 
 def test_startrack_alone_shows_where_to_start(capsys: pytest.CaptureFixture[str]) -> None:

@@ -68,12 +68,12 @@ def print_advice(reason: str | None, message: str, args: argparse.Namespace, own
 
 def print_warnings(args: argparse.Namespace, name: str, warnings: Iterable[str], *, of_all: bool = False) -> None:
     """A line on stderr for each of the `warnings` about `name`; those `of_all` images once, under that name."""
-    printed: set[str] = vars(args).setdefault("printed_of_all", set())
+    printed: set[tuple[str, str]] = vars(args).setdefault("printed_of_all", set())
     for warning in () if args.quiet else warnings:
-        if warning not in printed:
+        if (name if of_all else "", warning) not in printed:
             print(f"{errors.one_line(name)}: {warning}", file=sys.stderr, flush=True)
         if of_all:
-            printed.add(warning)
+            printed |= {(name, warning), ("", warning)}
 
 
 def print_left_out(images: Any) -> None:

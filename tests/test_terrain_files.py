@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import re
 import socket
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import rasterio
 import tomli_w
 from hazard_helpers import catalog_to, small_camera
 from map_helpers import PDS3, polar_stereographic
@@ -26,6 +28,7 @@ from startrack.terrain import (
     HeightMap,
     Projection,
     Raster,
+    files_of_terrain,
     load_terrain,
     read_map,
     require_place,
@@ -163,7 +166,6 @@ def test_maps_survive_the_file_and_rasterio_reads_the_same(projection, tmp_path)
     assert np.array(read.xy(at)) == pytest.approx(np.array(written.xy(at)))
     place = written.projection.latlon_from_xy(*written.xy(at))
     assert read.row_column(*place) == pytest.approx(at, abs=1e-9)
-    rasterio = pytest.importorskip("rasterio")
     with rasterio.open(tmp_path / "a.tif") as file:
         values = file.read(1) * file.scales[0] + file.offsets[0]
         assert np.abs(values - read.heights_m).max() < 1e-3
@@ -173,7 +175,6 @@ def test_maps_survive_the_file_and_rasterio_reads_the_same(projection, tmp_path)
 
 
 def test_rasterio_reads_projections_that_the_tags_lack(tmp_path):
-    rasterio = pytest.importorskip("rasterio")
     wkt = rasterio.crs.CRS.from_proj4("+proj=stere +lat_0=-90 +lon_0=0 +R=1737400 +units=m")
     m = hill()
     move = rasterio.transform.from_origin(m.x0_m - 50, m.y0_m + 50, 100, 100)
@@ -189,7 +190,6 @@ def test_rasterio_reads_projections_that_the_tags_lack(tmp_path):
 
 def test_a_cloud_optimised_geotiff_is_read(tmp_path):
     """Tiled, compressed, with overviews, integers with scale, offset and no-data, as published by agencies."""
-    rasterio = pytest.importorskip("rasterio")
     from rasterio.enums import Resampling
     from rasterio.shutil import copy
 
@@ -239,6 +239,51 @@ def test_a_pds3_map_is_read_by_its_detached_label(body, radius, tmp_path):
     assert np.degrees(latitude[0]) == pytest.approx(-90.0, abs=1e-4)
     assert np.degrees(longitude[1:]) == pytest.approx([90.0, 0.0], abs=0.3)  # east to the right, 0 degrees up
     assert (90 + np.degrees(latitude[1:])) * 30_323 == pytest.approx([1000.0, 1000.0], rel=1e-3)
+
+
+def test_what_stands_beside_a_map_is_of_its_files(tmp_path):
+    """A mask that appears, and the data of a detached label: the terrain is read again."""
+    path = terrain_file(tmp_path)
+    assert files_of_terrain(path) == (tmp_path / "hill.tif",)
+    assert not np.isnan(load_terrain(path).maps[0].heights_m).any()
+    mask = np.full((61, 61), 255, dtype=np.uint8)
+    mask[0, :5] = 0
+    facts = {"driver": "GTiff", "height": 61, "width": 61, "count": 1, "dtype": "uint8"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it has no position
+        with rasterio.open(tmp_path / "hill.tif.msk", "w", **facts) as file:
+            file.write(mask, 1)
+            file.update_tags(INTERNAL_MASK_FLAGS_1="2")
+    (tmp_path / "hill.tif.aux.xml").write_text("<PAMDataset></PAMDataset>")
+    beside = [tmp_path / f"hill.tif{end}" for end in ("", ".aux.xml", ".msk")]
+    assert sorted(files_of_terrain(path)) == sorted(beside)
+    assert np.count_nonzero(np.isnan(load_terrain(path).maps[0].heights_m)) == 5
+    (tmp_path / "hill.tif.msk").unlink()
+    assert not np.isnan(load_terrain(path).maps[0].heights_m).any()
+    (tmp_path / "HILL.IMG").write_bytes(np.full((61, 61), 7, dtype="<i2").tobytes())
+    (tmp_path / "HILL.LBL").write_text(PDS3.format(body="MOON", radius="1737.4"))
+    path.write_text(tomli_w.dumps({**HILL, "dem": {"file": "HILL.LBL", "unusual_heights": True}}))
+    assert sorted(files_of_terrain(path)) == [tmp_path / "HILL.IMG", tmp_path / "HILL.LBL"]
+    (tmp_path / "HILL.LBL").unlink()
+    assert files_of_terrain(path) == (tmp_path / "HILL.LBL",)
+
+
+def test_an_import_that_is_refused_leaves_the_former_terrain(tmp_path, capsys):
+    """Also where that shows only as the crops are read again: the search area is wider than the map, or has a void."""
+    write_map(tmp_path / "src.tif", hill())
+    holed = hill().heights_m.copy()
+    holed[28:33, 28:33] = np.nan
+    write_map(tmp_path / "holed.tif", replace(hill(), heights_m=holed))
+    words = ["--latitude", "-90", "--longitude", "0", "--half", "2500", "-o", str(tmp_path / "mine.toml"), "-O"]
+    assert main(["terrain", "import", str(tmp_path / "src.tif"), "--radius", "500", *words]) == 0
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    for source, radius in (("src.tif", "4000"), ("holed.tif", "500")):
+        assert main(["terrain", "import", str(tmp_path / source), "--radius", radius, *words]) == 4
+        assert "do not cover the search area" in capsys.readouterr().err
+        assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert main(["terrain", "import", str(tmp_path / "src.tif"), "--radius", "600", *words]) == 0
+    assert load_terrain(tmp_path / "mine.toml").search_radius_m == 600.0
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(before)
 
 
 def test_import_show_and_build(tmp_path, capsys):
@@ -294,7 +339,6 @@ IMPORT = ["--latitude", "-90", "--longitude", "0", "--radius", "500", "--half", 
 
 def whole_numbers(path: Path, unit: str | None = None) -> None:
     """The hill in half metres, as a map that has lost its scale."""
-    rasterio = pytest.importorskip("rasterio")
     m = hill()
     wkt = rasterio.crs.CRS.from_proj4("+proj=stere +lat_0=-90 +lon_0=0 +R=1737400 +units=m")
     move = rasterio.transform.from_origin(m.x0_m - 50, m.y0_m + 50, 100, 100)

@@ -6,6 +6,7 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 import numpy as np
@@ -170,22 +171,20 @@ def _geoid_values(grid: str, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, crops: dict[Path, Raster]) -> HeightMap:
-    """The terrain, whose maps and file are written. After an exception no file is left.
+    """The terrain, whose maps and file are written. They replace former ones only once the terrain is known to load.
 
     The horizon's sigma, where it was measured, follows from the distance of the crests on the terrain.
     """
     import tomli_w
 
-    output.parent.mkdir(parents=True, exist_ok=True)
-    written: list[Path] = []
-    try:
+    with TemporaryDirectory(prefix=".", suffix=".part", dir=output.parent) as name:
+        folder = Path(name)
         for path, crop in crops.items():
-            written.append(path)
-            write_map(path, crop)
-            if not _is_usual(path):
+            write_map(folder / path.name, crop)
+            if not _is_usual(folder / path.name, crop):
                 values["dem"]["unusual_heights"] = True
         try:
-            terrain = cast(HeightMap, terrain_from_dict(values, folder=output.parent))
+            terrain = cast(HeightMap, terrain_from_dict(values, folder=folder))
         except BadInput as cause:
             notes = [f"{crop.source}: {note}" for crop in crops.values() for note in crop.notes]
             raise BadInput(cause.reason, "; ".join([str(cause), *notes])) from cause
@@ -193,18 +192,19 @@ def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, c
             angle_rad = errors.common_crest_sigma_m * crest_angle_rad_per_m(terrain)
             values["dem"]["horizon_sigma_deg"] = float(f"{np.degrees(angle_rad):.2g}")
         text = errors.comment_lines(values["body"]) + tomli_w.dumps(values)
-        write_atomically(output, text.encode("utf-8"), overwrite=True, reason="bad_terrain")
-    except BaseException:
-        for path in written:
-            path.unlink(missing_ok=True)
-        raise
+        write_atomically(folder / output.name, text.encode("utf-8"), overwrite=True, reason="bad_terrain")
+        try:
+            for path in (*crops, output):
+                (folder / path.name).replace(path)
+        except OSError as cause:
+            raise BadOutput("bad_terrain", f"{printable(path)}: cannot be written ({cause.strerror})") from cause
     return terrain
 
 
-def _is_usual(path: Path) -> bool:
-    """Whether a crop that was written is read again without `unusual_heights` as it is: a small one may be flat."""
+def _is_usual(path: Path, crop: Raster) -> bool:
+    """Whether a `crop` is read from `path` without `unusual_heights` with no more voids: a small one may be flat."""
     try:
-        return not read_map(path).notes
+        return np.array_equal(np.isnan(read_map(path).heights_m), np.isnan(crop.heights_m))
     except BadInput:
         return False
 

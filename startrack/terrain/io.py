@@ -113,7 +113,7 @@ def files_of_terrain(path: str | Path) -> tuple[Path, ...]:
         return load_terrain(path).files
     except BadInput:  # refused when it is used; a map that is missing may come
         with suppress(BadInput):
-            return tuple(_map_files(read_keys(read_text(path, "bad_terrain")), Path(path).parent))
+            return _files_of_maps(read_keys(read_text(path, "bad_terrain")), Path(path).parent)
         return ()
 
 
@@ -149,18 +149,28 @@ def _load_cached(path: Path, text: str, stamps: tuple[Any, ...]) -> Terrain:
 
 
 def _map_files(keys: dict[str, Any], folder: Path) -> list[Path]:
-    """Paths of the files that the ground of the keys is read from: those of its key `file`, if it has one."""
+    """Paths of the maps of the keys: those of its ground's key `file`, if it has one."""
     files = next((keys[ground].get("file", ()) for ground in MAKERS if ground in keys), ())
     return [folder / file for file in ((files,) if isinstance(files, str) else files)]
 
 
+def _files_of_maps(keys: dict[str, Any], folder: Path) -> tuple[Path, ...]:
+    """Paths of the files that the maps of the keys are read from: masks and labels of some stand beside them."""
+    maps = _map_files(keys, folder)
+    if not maps:
+        return ()
+    from startrack.terrain.map_reading import files_of_map
+
+    return tuple(dict.fromkeys(file for path in maps for file in files_of_map(path)))
+
+
 def _map_stamps(folder: Path, keys: dict[str, Any]) -> tuple[Any, ...]:
     """Values that change when one of the maps does."""
-    stamps = []
-    for path in _map_files(keys, folder):
+    stamps: list[tuple[Any, ...]] = []
+    for path in _files_of_maps(keys, folder):
         with suppress(OSError, ValueError):  # `read_map` reports it
             status = path.stat()
-            stamps.append((status.st_ino, status.st_size, status.st_mtime_ns))
+            stamps.append((path.name, status.st_ino, status.st_size, status.st_mtime_ns))
     return tuple(stamps)
 
 
@@ -243,7 +253,7 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
         site=site,
         camera_height_m=rover["camera_height_m"],
         maps=maps,
-        files=(*files, *more_files),
+        files=(*_files_of_maps(keys, folder), *more_files),
         obstacles=obstacles,
         search_radius_m=search.get("radius_m", Terrain.search_radius_m),
         height_sigma_m=dem.get("height_sigma_m", 0.0),

@@ -7,6 +7,7 @@ import math
 import os
 import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -64,7 +65,7 @@ def read_map(
     path = Path(path)
     if not os.path.isfile(path):  # False also for names that the system cannot take
         raise BadInput("bad_terrain", f"{path}: no such file")
-    if path.suffix == ".tif" and path.resolve().parent == data_dir("terrain").resolve():
+    if _is_shipped(path):
         whole = read_shipped(path)
         if scale is not None or offset_m is not None:
             raise BadInput("bad_terrain", f"{path}: it states its scale; leave --scale and --offset out")
@@ -107,20 +108,46 @@ def _not_on(name: str, whole: Raster) -> BadInput:
 
 def _read_with_rasterio(path: Path, near: tuple[float, float] | None) -> Stored:
     """The content, cut to a window about `near`. Raises BadInput bad_terrain."""
-    hint = HINTS.get(path.suffix.lower(), "").format(stem=path.stem)
+    from rasterio.io import DatasetReader
+
+    hint = _hint_of(path)
+    with _opened(path) as file:
+        parts = file.subdatasets if file.crs is None else []
+        if not parts:
+            return _content_of(file, path, near, hint)
+        with DatasetReader(_heights_among(parts, path), driver=DRIVERS) as part:
+            return _content_of(part, path, near, hint)
+
+
+def _hint_of(path: Path) -> str:
+    return HINTS.get(path.suffix.lower(), "").format(stem=path.stem)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The open rasterio file `path`. Raises BadInput bad_terrain."""
     require_extra(str(path))
     import rasterio
     from rasterio.io import DatasetReader  # in place of rasterio.open, which takes one driver
 
-    refusal = one_line_refusal(f"{path}: not a map that can be read{hint}")
+    refusal = one_line_refusal(f"{path}: not a map that can be read{_hint_of(path)}")
     with refusal, rasterio.Env(**WITHOUT_NETWORK), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about files without a position, which have their own message
         with DatasetReader(os.fspath(path), driver=DRIVERS) as file:
-            parts = file.subdatasets if file.crs is None else []
-            if not parts:
-                return _content_of(file, path, near, hint)
-        with DatasetReader(_heights_among(parts, path), driver=DRIVERS) as file:
-            return _content_of(file, path, near, hint)
+            yield file
+
+
+def files_of_map(path: Path) -> tuple[Path, ...]:
+    """The files that the map `path` is read from: itself, and those that it names or that stand beside it."""
+    found = {path: None}
+    if not _is_shipped(path):
+        with suppress(BadInput), _opened(path) as file:  # `read_map` reports it
+            found |= dict.fromkeys(Path(one) for one in (*file.files, f"{path}.msk") if os.path.isfile(one))
+    return tuple(found)
+
+
+def _is_shipped(path: Path) -> bool:
+    return path.suffix == ".tif" and path.resolve().parent == data_dir("terrain").resolve()
 
 
 def _heights_among(parts: Sequence[str], path: Path) -> str:

@@ -409,7 +409,7 @@ def test_an_array_becomes_a_terrain(tmp_path, capsys):
     words = ["terrain", "import", str(tmp_path / "h.npy"), "-o", str(tmp_path / "t.toml"), "--latitude", "8.12"]
     words += ["--longitude", "-38.01", "--radius", "300"]
     assert main(words) == 4
-    assert "an array has no place; give terrain import --post M" in capsys.readouterr().err
+    assert "how far apart its posts are: give terrain import --post M" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main([*words, "--corner", "0", "0"])
     assert main([*words, "--post", "60"]) == 0

@@ -96,10 +96,13 @@ def fields_of_view_rad(text: str, narrowest_deg: float, widest_deg: float) -> tu
     The identifier allows for FIELD_TOLERANCE_1 to both sides of an angle: geometric steps as wide leave no gap.
     """
     first, between, last = text.partition("..")
-    low = field_of_view_rad(first, narrowest_deg, widest_deg)
+    try:
+        low = field_of_view_rad(first, narrowest_deg, widest_deg)
+        high = field_of_view_rad(last, narrowest_deg, widest_deg) if between else low
+    except argparse.ArgumentTypeError as cause:
+        raise argparse.ArgumentTypeError(f"{cause}: give DEG or MIN..MAX") from cause
     if not between:
         return (low,)
-    high = field_of_view_rad(last, narrowest_deg, widest_deg)
     if high < low:
         raise argparse.ArgumentTypeError(f"{text}: the first field of view is wider than the last")
     step = (1 + FIELD_TOLERANCE_1) / (1 - FIELD_TOLERANCE_1)

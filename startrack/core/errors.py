@@ -55,7 +55,8 @@ class Reason(StrEnum):
     )  # fmt: skip
     BAD_TERRAIN = (
         "bad_terrain", EXIT_BAD_INPUT, "No terrain file is known, or it cannot be used",
-        "Correct what the message names; a terrain file is given with -t or in NAME.json.",
+        "Correct what the message names; a terrain file is given with -t or in NAME.json, and startrack terrain import "
+        "makes one of a map.",
     )  # fmt: skip
     BAD_ODOMETRY = (
         "bad_odometry", EXIT_BAD_INPUT, "The odometry, or the path of a drive, cannot be used",

@@ -17,7 +17,7 @@ def require_inside(points_m: Array, weight: Array, terrain: Terrain) -> Bools:
     if outside.any() and weight[outside].sum() > 0.5 * weight.sum():
         raise NotLocated(
             f"the stars place the camera outside the search area of {terrain.search_radius_m:.0f} m: "
-            "is this the terrain of the image? Else widen [search] radius_m in its file",
+            "is this the terrain of the image, and are its heights in metres? Else widen [search] radius_m in its file",
             reason="outside_search_area",
         )
     return np.asarray(~outside)

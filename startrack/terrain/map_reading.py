@@ -42,10 +42,12 @@ WITHOUT_NETWORK = {
 HINTS = {  # by suffix
     ".img": " (of a PDS map give the label, {stem}.LBL)",
     ".vrt": ": a mosaic names other files; make one file of it (gdal_translate)",
-    ".npy": ": an array has no place; give terrain import --post M",
-    ".npz": ": an archive of arrays; give one of them, written by numpy.save, to terrain import --post M",
-    ".toml": ": give a map to terrain import, and a terrain file with -t",
-    ".zip": ": an archive; give the map in it",
+}
+NO_MAPS = {  # by suffix
+    ".npy": "an array does not state how far apart its posts are: give terrain import --post M (metres)",
+    ".npz": "an archive of arrays: give one of them, written by numpy.save, to terrain import --post M",
+    ".toml": "no map: give a map to terrain import, and a terrain file with -t",
+    ".zip": "an archive: give the map in it",
 }
 HEIGHT_NAMES = "altitude", "dem", "elevation", "height", "topo", "z"  # of the grid of heights among others of a file
 
@@ -126,6 +128,8 @@ def _hint_of(path: Path) -> str:
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     """The open rasterio file `path`. Raises BadInput bad_terrain."""
+    if path.suffix.lower() in NO_MAPS:
+        raise BadInput("bad_terrain", f"{path}: {NO_MAPS[path.suffix.lower()]}")
     require_extra(str(path))
     import rasterio
     from rasterio.io import DatasetReader  # in place of rasterio.open, which takes one driver

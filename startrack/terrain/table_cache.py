@@ -110,7 +110,8 @@ def load_or_build_table(ground: TracedMap, progress: Progress | None = None) -> 
                 LOG.warning("the table of horizons %s is damaged: made anew", path_of_table(key))
             limit_bytes()  # a wrong one is refused before the work
             about_s = seconds_of_table(ground)
-            LOG.info("horizons of %s: computed now, once; this takes about %.2g s", ground.name, about_s)
+            about = f"{float(f'{about_s:.2g}'):g}"  # no power of ten
+            LOG.info("horizons of %s: computed now, once; this takes about %s s", ground.name, about)
             start = clock.perf_counter()
             with uncounted_time():
                 table = build_table(ground, progress)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from map_helpers import polar_stereographic
+from map_helpers import SITE, polar_stereographic
 
 from startrack.core.errors import NotLocated
 from startrack.core.types import SECTORS, Evidence
@@ -29,6 +29,7 @@ from startrack.terrain import (
 from startrack.terrain import table_cache as cache
 from startrack.terrain.derived_maps import DeformedMap, HorizonInterpolator
 from startrack.terrain.ground import ground_up_m
+from startrack.terrain.map_ends import facts_of_ends
 from startrack.terrain.projection import ORTHOGRAPHIC
 
 DATA = Path(__file__).parent / "data"
@@ -354,6 +355,23 @@ def test_glare_removes_the_evidence_of_its_azimuths(shackleton):
     assert why.tolist() == ["", "glare of a lit rim"]
     (line,) = lit.masked_sectors()
     assert line.startswith("azimuths 350 to 20 degrees: no evidence")
+
+
+@pytest.mark.parametrize("first_m", [3120.0, 3600.0, 4080.0, 9840.0])
+def test_a_void_near_the_search_area_is_the_nearest_end_of_wide_maps(first_m):
+    """One of 720 m on a map of 290 km; the ground between posts of which one is a void is not known."""
+    post_m, half = 240.0, 600
+    heights = np.zeros((2 * half + 1, 2 * half + 1), dtype=np.float32)
+    column = half + round(first_m / post_m)
+    heights[half - 2 : half + 3, column : column + 3] = np.nan
+    projection = Projection(kind=STEREOGRAPHIC, latitude_rad=SITE.latitude_rad, longitude_rad=SITE.longitude_rad)
+    raster = Raster(
+        heights_m=heights, dx_m=post_m, dy_m=-post_m, projection=projection, x0_m=-half * post_m, y0_m=half * post_m
+    )
+    wide = HeightMap(name="wide", site=SITE, maps=(raster,), search_radius_m=2800.0)
+    facts = facts_of_ends(wide, np.full(360, -np.pi / 2))
+    assert abs(facts["nearest_azimuth_deg"] - 90) < 20  # one of those that see it
+    assert -1.0 <= facts["nearest_m"] - (first_m - post_m) <= post_m + 1.0
 
 
 def test_azimuths_where_the_maps_end_are_listed_as_ranges(shackleton):

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 UNKNOWN_FROM, RIM_PLACES = 12, 48  # places across the search area, and on its rim, at which ends are looked up
 LEAST_END_M = 1.0  # distance from a camera to the ends of the maps: nearer ones count as at it
 MIDDLES_RAD = (np.arange(AZIMUTH_BINS) + 0.5) * 2 * np.pi / AZIMUTH_BINS
-MOST_DISTANCES = 1000  # from the origin to the farthest post of the maps
+STEPS_A_BIN = 4  # from place to place along an azimuth, in the width of a bin there; at least the spacing of posts
 
 
 def unknown_elevations_rad(ground: TracedMap) -> Array:
@@ -42,10 +42,17 @@ def unknown_elevations_rad(ground: TracedMap) -> Array:
 
 
 def distances_to_end_m(ground: TracedMap) -> Array:
-    """(AZIMUTH_BINS,) distance from the origin [m] at which the maps end or have a void, in the middle of each bin."""
-    posts_m = np.array([one.post_m for one in ground.maps])
+    """(AZIMUTH_BINS,) distance from the origin [m] at which the maps end or have a void, in the middle of each bin.
+
+    It is too far by less than the spacing of the finest posts, or 0.5 % of it. A void that is narrower than a bin, and
+    than two steps between the places that are looked up, may be missed.
+    """
+    post_m = min(one.post_m for one in ground.maps)
     farthest_m = 1.5 * max(float(np.hypot(*one.heights_m.shape)) * one.post_m for one in ground.maps)
-    s = np.linspace(0.0, farthest_m, int(min(farthest_m / posts_m.min(), MOST_DISTANCES)) + 1)[1:]
+    growth = 2 * np.pi / (AZIMUTH_BINS * STEPS_A_BIN)
+    near = np.arange(post_m, min(post_m / growth, farthest_m), post_m)
+    more = int(np.log(max(farthest_m / near[-1], 1.0)) / np.log1p(growth)) + 1
+    s = np.concatenate([near, np.geomspace(near[-1], farthest_m, more + 1)[1:]])
     places = latlon_from_enu(ground.site, np.outer(np.sin(MIDDLES_RAD), s), np.outer(np.cos(MIDDLES_RAD), s), 0.0)
     known = np.zeros((AZIMUTH_BINS, len(s)), dtype=bool)
     for one in ground.maps:

@@ -449,7 +449,7 @@ def test_files_of_other_kinds_are_named(tmp_path):
         ("a.zip", "archive"),
     ):  # fmt: skip
         (tmp_path / name).write_bytes(b"PK\3\4")
-        with pytest.raises(BadInput, match=f"{name}: not a map that can be read.*{named}"):
+        with pytest.raises(BadInput, match=f"{name}: .*{named}"):
             read_map(tmp_path / name)
     np.save(tmp_path / "o.npy", np.array([{}]), allow_pickle=True)
     at = {"latitude_rad": 0.0, "longitude_rad": 0.0, "half_m": [1e4], "radius_m": 100.0}

@@ -65,7 +65,8 @@ class Command:
     """One command: its name, the function that runs it, its texts, and its flags by the titles of their groups.
 
     `summary` stands in the list of commands, which lacks the command without one. `example` is the end of its help.
-    `start` is printed in place of an error where nothing follows the command's name.
+    `start` is printed in place of an error where nothing follows the command's name. `memory_later`: whether it needs
+    the memory for kernels is known in its work (of each image, or never), so that this is checked there.
     """
 
     name: str
@@ -75,6 +76,7 @@ class Command:
     groups: dict[str, Group] = field(default_factory=dict)
     example: str = ""
     start: str = ""
+    memory_later: bool = False
     actions: Sequence[Command] = ()
 
     def add_to(self, subparsers: Any) -> None:
@@ -93,7 +95,7 @@ class Command:
             for action in self.actions:
                 action.add_to(nested)
         else:
-            parser.set_defaults(run=self.run, usage_error=parser.error)
+            parser.set_defaults(run=self.run, usage_error=parser.error, memory_later=self.memory_later)
 
 
 class _Formatter(argparse.HelpFormatter):

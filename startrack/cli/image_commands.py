@@ -35,7 +35,7 @@ COMMANDS = (
             ),
             "more": SHARED["more"],
         },
-        example="startrack locate sample_images/near-centre.png",
+        example="startrack locate sample_images/near-centre.png", memory_later=True,
     ),
     Command(
         "identify", function_at("locate.identify"), "stars and attitude only",
@@ -61,14 +61,14 @@ COMMANDS = (
             ),
             "more": SHARED["more"],
         },
-        example="startrack identify sky.png --fov 60",
+        example="startrack identify sky.png --fov 60", memory_later=True,
     ),
     Command(
         "detect", function_at("locate.detect"), "centroids only",
         "Find the point sources of each image. With a camera file fluxes are in electrons, without one in ADU and the "
         "PSF is measured from the image. Writes NAME.detections.json and NAME.annotated.png.",
         {"input": INPUT, **SHARED},
-        example="startrack detect sky.png -c camera.toml",
+        example="startrack detect sky.png -c camera.toml", memory_later=True,
     ),
     Command(
         "batch", function_at("batch.run"), "every image of a folder",
@@ -134,7 +134,7 @@ COMMANDS = (
             ),
             "more": flags.MORE,
         },
-        "startrack report startrack-out",
+        "startrack report startrack-out", memory_later=True,
     ),
     Command(
         "demo", function_at("report.run_demo"), "make a picture, locate it and open the report",

@@ -71,7 +71,7 @@ COMMANDS = (
             "input": (flag("cameras CAMERA", "camera file, or the name of a shipped one", nargs="+"),),
             "more": (flags.JSON, *flags.MORE),
         },
-        "startrack calibrate show fisheye-2048",
+        "startrack calibrate show fisheye-2048", memory_later=True,
     ),
     Command(
         "calibrate convert", function_at("camera_files.convert"), None,
@@ -103,7 +103,7 @@ COMMANDS = (
             "output": (flags.FILE, NAME, flags.DIR, flags.OVERWRITE),
             "more": (flags.JSON, *flags.MORE),
         },
-        "startrack calibrate convert camera.toml --to ros",
+        "startrack calibrate convert camera.toml --to ros", memory_later=True,
     ),
     Command(
         "calibrate board", function_at("calibrate.run_board"), None,
@@ -158,7 +158,7 @@ COMMANDS = (
                     "output": (flags.DIR, flags.JSON, flags.NO_PLOTS),
                     "more": flags.MORE,
                 },
-                "startrack terrain show shackleton --at 0 0",
+                "startrack terrain show shackleton --at 0 0", memory_later=True,
             ),
             Command(
                 "build", function_at("terrain.build"), "compute the horizons now; otherwise the first fix does", None,

@@ -26,7 +26,7 @@ from startrack.cli.flags import Command
 from startrack.core import errors
 from startrack.core.errors import BadInput, BadOutput, NoSolution
 from startrack.core.files import FULL_DISK
-from startrack.core.memory import check_memory, refusing_shortage
+from startrack.core.memory import COMMAND_BYTES, START_BYTES, check_memory, refusing_shortage
 
 COMMANDS = {  # name to the module of startrack.cli that declares it
     "locate": "image_commands", "batch": "image_commands", "track": "image_commands", "identify": "image_commands",
@@ -104,7 +104,7 @@ def _run(args: argparse.Namespace) -> int:
     logging.getLogger("startrack").setLevel(logging.ERROR if getattr(args, "quiet", False) else logging.NOTSET)
     try:
         with refusing_shortage():
-            check_memory()
+            check_memory(base_bytes=START_BYTES if args.memory_later else COMMAND_BYTES)
             return int(args.run(args))
     except BadOutput as cause:
         print(f"startrack {args.command}: error: {cause.command_message}", file=sys.stderr)

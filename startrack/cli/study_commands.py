@@ -178,12 +178,12 @@ COMMANDS = (
                 "show", function_at("cache.show"), "folders, files and sizes",
                 "Tables of horizons take at most 2 GB, or STARTRACK_CACHE_GB: above that those leave that were not "
                 "used for longest.",
-                {"more": (flags.JSON, *flags.MORE)}, "startrack cache show",
+                {"more": (flags.JSON, *flags.MORE)}, "startrack cache show", memory_later=True,
             ),
             Command(
                 "clear", function_at("cache.clear"), "remove all of it",
                 "The next commands compute and compile again.",
-                {"more": (flags.JSON, *flags.MORE)}, "startrack cache clear",
+                {"more": (flags.JSON, *flags.MORE)}, "startrack cache clear", memory_later=True,
             ),
         ),
     ),
@@ -191,6 +191,6 @@ COMMANDS = (
         "schema", function_at("doctor.run_schema"), "JSON schemas of the files",
         "Print the JSON schema of one kind of file, or without a name the list of kinds.",
         {"input": (flag("name KIND", "such as fix, identification, camera, terrain", nargs="?"),)},
-        "startrack schema fix",
+        "startrack schema fix", memory_later=True,
     ),
 )  # fmt: skip

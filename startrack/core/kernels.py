@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.compilation import choose_cache_folder, discard_stale_kernels
+from startrack.core.memory import check_memory
 from startrack.core.stored import read_sealed, with_seal
 
 KEPT = {} if choose_cache_folder() else {"cache": False}  # options of each kernel
@@ -83,7 +84,11 @@ class KernelLibrary(JITCodeLibrary):  # type: ignore[misc]
 
 @cache
 def prepare_loading(codegen: Any) -> None:
-    """Have a `codegen` make and load libraries of kernels, and tell LLVM where the functions of numba's runtime are."""
+    """Have a `codegen` make and load libraries of kernels, and tell LLVM where the functions of numba's runtime are.
+
+    Raises BadInput (out_of_memory) where the limit of address space is too small for it.
+    """
+    check_memory()
     codegen._library_class = KernelLibrary
     for name, address in c_helpers.items():
         add_symbol(name if name.startswith("_") else f"NRT_{name}", address)

@@ -13,14 +13,15 @@ from startrack.core.files import MAX_CAUSE_CHARS
 # Address space of a command and of each pixel of its picture (VmPeak of `detect` on two cores: 1.13 GB at 0.26 Mpx,
 # 2.74 GB at 67 Mpx). With less, OpenBLAS blocks (0.6 GB) or ends the process (0.8), and LLVM aborts it (0.9 to 1.13).
 COMMAND_BYTES = 1.12e9
+START_BYTES = 0.6e9  # of a command that loads libraries but no kernel (VmPeak of `schema` 0.58 GB, `terrain show` 0.60)
 PIXEL_BYTES = 24
 LIBRARY_BYTES = 2**27  # a library that cannot be loaded, or a thread not started, lacks less (llvmlite has 0.12 GB)
 OPENCV_NO_MEMORY = -4  # cv2.error.code, StsNoMem
 
 
-def check_memory(pixels: int = 0) -> None:
-    """Raise BadInput (out_of_memory) where the limit of address space is too small for a picture of so many pixels."""
-    limit_bytes, needed_bytes = _limit_bytes(), COMMAND_BYTES + PIXEL_BYTES * pixels
+def check_memory(pixels: int = 0, base_bytes: float = COMMAND_BYTES) -> None:
+    """Raise BadInput (out_of_memory) where the limit of address space is below `base_bytes` and a picture's pixels."""
+    limit_bytes, needed_bytes = _limit_bytes(), base_bytes + PIXEL_BYTES * pixels
     if limit_bytes is not None and limit_bytes < needed_bytes:
         picture = f" with a picture of {pixels / 1e6:.1f} Mpx" if pixels else ""
         raise BadInput(

@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 
 from startrack.core.declaration import Choice, Either, Flag, List, Number, Table, Text
+from startrack.core.errors import Reason
 from startrack.core.files import parse_toml, printable, read_text, resolve_named
+from startrack.core.memory import check_memory
 from startrack.core.obstacles import Obstacles, read_obstacles
 from startrack.core.types import BadInput
 from startrack.frames import AIR_TABLE, Site
@@ -97,14 +99,15 @@ KEYS = Table(
 def load_terrain(name_or_path: str | Path) -> Terrain:
     """The terrain of a file `name_or_path`: a path if it ends in .toml or contains a separator, else a shipped name.
 
-    Raises BadInput bad_terrain with the file and the cause.
+    Raises BadInput bad_terrain with the file and the cause, out_of_memory for lack of memory.
     """
     path = resolve_named(name_or_path, "terrain", "bad_terrain")
     text = read_text(path, "bad_terrain")
     try:
         return _load_cached(path.absolute(), text, _map_stamps(path.parent, read_keys(text)))
     except BadInput as cause:
-        raise BadInput("bad_terrain", f"{printable(path)}: {cause}") from cause
+        reason = cause.reason if cause.reason is Reason.OUT_OF_MEMORY else "bad_terrain"
+        raise BadInput(reason, f"{printable(path)}: {cause}") from cause
 
 
 def files_of_terrain(path: str | Path) -> tuple[Path, ...]:
@@ -230,6 +233,7 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
     from startrack.terrain.height_map import HeightMap
     from startrack.terrain.map_reading import read_map, require_origin
 
+    check_memory()  # its kernels come later: OpenBLAS ends the process before them
     dem, rover, search = keys["dem"], keys["rover"], keys["search"]
     near, files = (site.latitude_rad, site.longitude_rad), _map_files(keys, folder)
     obstacles, more_files = _obstacles(keys, folder)

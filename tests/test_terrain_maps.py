@@ -27,14 +27,13 @@ from startrack.terrain import (
     read_map,
     write_map,
 )
+from startrack.terrain.height_units import SURVEY_FOOT_M, metres_of
 from startrack.terrain.map_heights import (
     FOOT_M,
     GROUNDS,
-    SURVEY_FOOT_M,
     Mark,
     find_marks,
     highest_step_m,
-    metres_of,
 )
 from startrack.terrain.map_reading import place_on
 

@@ -24,6 +24,7 @@ from startrack.core.files import (
     parse_toml,
     printable,
     read_text,
+    require_reference,
     resolve_named,
     split_camera,
 )
@@ -47,6 +48,7 @@ def load_camera(name_or_path: str | Path) -> Camera:
 
 def read_camera(name_or_path: str | Path) -> Camera:
     """The camera of `name_or_path` as by `load_camera`, but nothing is logged."""
+    require_reference(name_or_path, "no_calibration")
     file, wanted = split_camera(name_or_path)
     path = resolve_named(file, "calib", "no_calibration")
     text = read_text(path, "bad_calibration")

@@ -74,6 +74,13 @@ def split_camera(reference: FilePath) -> tuple[str, str | None]:
     return text, None
 
 
+def require_reference(given: object, reason: str) -> None:
+    """Raise BadInput `reason` where what is `given` for a file is neither a text nor a path."""
+    if not isinstance(given, str | os.PathLike):
+        what = type(given).__name__
+        raise BadInput(reason, f"{what} is neither a name nor a path: give the name of a shipped file, or a path")
+
+
 def relative_path(file: FilePath, folder: FilePath) -> str:
     """The path of a `file` as seen from `folder`, with forward slashes.
 
@@ -88,9 +95,7 @@ def relative_path(file: FilePath, folder: FilePath) -> str:
 
 def resolve_named(name_or_path: str | Path, kind: str, reason: str) -> Path:
     """Path of a user's file or of a shipped one. Raises BadInput `reason` if there is none, or if it is no name."""
-    if not isinstance(name_or_path, str | os.PathLike):
-        what = type(name_or_path).__name__
-        raise BadInput(reason, f"{what} is neither a name nor a path: give the name of a shipped file, or a path")
+    require_reference(name_or_path, reason)
     if is_path(name_or_path):
         path = Path(name_or_path)
         if not os.path.isfile(path):  # False also for names too long for the file system
@@ -125,7 +130,7 @@ def read_text(path: FilePath, reason: str, *, max_bytes: int = MAX_TEXT_BYTES) -
         with open(path, "rb") as file:
             raw = file.read(max_bytes + 1)
         if b"\0" in raw:
-            raise ValueError("no text: is it a picture, or a map, of which startrack terrain import makes a terrain?")
+            raise ValueError("it is no text: is it a picture or a map (terrain import makes a terrain of one)?")
         if len(raw) > max_bytes:
             raise ValueError(f"it has more than {max_bytes // 2**20} MiB")
         return raw.decode("utf-8")

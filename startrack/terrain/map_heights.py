@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -13,17 +12,11 @@ from numpy.typing import NDArray
 from startrack.core.types import Array, BadInput, Bools
 from startrack.frames import MOON_RADIUS_M
 from startrack.terrain.earth_projection import FOOT_M
+from startrack.terrain.height_units import metres_of
 from startrack.terrain.projection import MAX_NUMBER
 from startrack.terrain.raster import Raster
 from startrack.terrain.shape import MAX_LENGTH_M
 
-SURVEY_FOOT_M = 1200 / 3937
-PREFIXES = {"": 1.0, "k": 1e3, "d": 0.1, "c": 0.01, "m": 1e-3, "kilo": 1e3, "deci": 0.1, "centi": 0.01, "milli": 1e-3}
-METRES = {"": ("m",), "long": ("metre", "meter")}  # after a short and after a long prefix
-FEET = "ft", "foot", "feet"
-SURVEY_WORDS = "us survey {}", "survey {}", "us {}", "{} us", "{}us", "us{}", "{} us survey", "u.s. survey {}"
-INTERNATIONAL_WORDS = "{}", "international {}", "intl {}", "{} international", "{} i"
-SURVEY_FOOT_WORD = "sft"  # of BT files
 MARKS = -9999.0, -99_999.0, -32_768.0, -32_767.0, 32_767.0, 9999.0, 99_999.0, -(2.0**31)  # usual values for voids
 FEWEST_SHARED = 3  # posts of one value that may be a void, where the value is not one of MARKS
 STEEPEST_SHARE = 0.999  # of the steps between neighbours on the ground: most steps onto a void are higher
@@ -162,27 +155,6 @@ def _scale_and_offset(
         own_scale * unit_m if scale is None else scale,
         stored.offset * unit_m if offset_m is None else offset_m,
     )
-
-
-def metres_of(unit: str) -> float | None:
-    """The length [m] of a `unit` as map files spell it; None for one that is not known."""
-    word = " ".join(unit.lower().strip(" \t\n\0'\"<>[]").replace("_", " ").replace("-", " ").split())
-    word = word.replace("(", "").replace(")", "")
-    return _units_m().get(word)
-
-
-@cache
-def _units_m() -> dict[str, float]:
-    """Lengths [m] by their lower-case names: those of PROJ, and common spellings."""
-    from pyproj.database import get_units_map
-
-    found = {name.lower(): float(unit.conv_factor) for name, unit in get_units_map(category="linear").items()}
-    for prefix, factor in PREFIXES.items():
-        names = METRES["" if len(prefix) == 1 else "long"] + (METRES[""] if not prefix else ())
-        found |= {f"{prefix}{name}{plural}": factor for name in names for plural in ("", "s") if name + plural != "ms"}
-    found |= {form.format(foot): SURVEY_FOOT_M for form in SURVEY_WORDS for foot in FEET}
-    found |= {form.format(foot): FOOT_M for form in INTERNATIONAL_WORDS for foot in FEET}
-    return found | {SURVEY_FOOT_WORD: SURVEY_FOOT_M}
 
 
 def find_marks(

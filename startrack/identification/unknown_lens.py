@@ -108,7 +108,7 @@ def identify_unknown_lens(
 
 
 def advise_on_fields(low_rad: float, high_rad: float, near_sky: NearSky | None) -> str:
-    """What may be tried where no lens from `low_rad` to `high_rad` fits with the axis near the sky given, if any."""
+    """What may be tried where no lens from `low_rad` to `high_rad` fits with the axis in `near_sky`, if it is given."""
     low, high = np.degrees([low_rad, high_rad])
     wider = max(low / 2, NARROWEST_DEG), min(2 * high, WIDEST_DEG)
     words = ["if there is a camera file, give it: fewer stars suffice"]

@@ -57,16 +57,11 @@ class Mark(NamedTuple):
 
     def note(self) -> str:
         """What a user has to know of it."""
-        if self.is_void:
-            return (
-                f"{self.posts} posts of value {self.value:g} are taken as voids: the file does not state it, and no "
-                f"ground leads up to it; {AS_THEY_ARE}"
-            )
-        return (
-            f"{self.posts} posts of value {self.value:g} are taken as ground, though most steps onto them are steeper "
-            f"than elsewhere: is it the value for voids? Then state it (rio edit-info --nodata {self.value:g} FILE); "
-            f"{AS_THEY_ARE}"
-        )
+        kind = "voids: the file does not state it, and no ground leads up to it" if self.is_void else (
+            "ground, though most steps onto them are steeper than elsewhere: is it the value for voids? Then state it "
+            f"(rio edit-info --nodata {self.value:g} FILE)"
+        )  # fmt: skip
+        return f"{self.posts} posts of value {self.value:g} are taken as {kind}; {AS_THEY_ARE}"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -151,10 +146,7 @@ def _scale_and_offset(
             "metres), with --scale of terrain import or as scale in [dem]",
         )
     own_scale = 1.0 if stored.scale is None else stored.scale
-    return (
-        own_scale * unit_m if scale is None else scale,
-        stored.offset * unit_m if offset_m is None else offset_m,
-    )
+    return own_scale * unit_m if scale is None else scale, stored.offset * unit_m if offset_m is None else offset_m
 
 
 def find_marks(

@@ -155,8 +155,8 @@ def test_the_advice_of_a_command_comes_before_that_of_the_reason(capsys: pytest.
     [
         ("-c", "terrain/shackleton.toml", "give it with -t (a terrain file)"),
         ("-t", "calib/fisheye-2048.toml", "give it with -c (a camera file)"),
-        ("-c", "sample_images/near-wall.png", "it is no text: a picture, a map or another binary file"),
-        ("-t", "sample_images/near-wall.png", "it is no text: a picture, a map or another binary file"),
+        ("-c", "sample_images/near-wall.png", "it is no text: is it a picture, or a map (see terrain import)?"),
+        ("-t", "sample_images/near-wall.png", "it is no text: is it a picture, or a map (see terrain import)?"),
     ],
 )
 def test_a_file_of_another_kind_is_said_to_be_one(

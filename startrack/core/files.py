@@ -130,7 +130,7 @@ def read_text(path: FilePath, reason: str, *, max_bytes: int = MAX_TEXT_BYTES) -
         with open(path, "rb") as file:
             raw = file.read(max_bytes + 1)
         if b"\0" in raw:
-            raise ValueError("it is no text: a picture, a map or another binary file")
+            raise ValueError("it is no text: is it a picture, or a map (see terrain import)?")
         if len(raw) > max_bytes:
             raise ValueError(f"it has more than {max_bytes // 2**20} MiB")
         return raw.decode("utf-8")

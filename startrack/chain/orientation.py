@@ -27,8 +27,8 @@ from startrack.core.types import (
     Stars,
 )  # fmt: skip
 from startrack.detection import Detector
-from startrack.estimation.attitude import solve_attitude
 from startrack.estimation.lens_correction import correct_lens
+from startrack.estimation.misfit import solve_with_misfit
 from startrack.exposure import NO_TIME, are_fractions
 from startrack.frames import Site
 from startrack.identification import NearSky, check_single_field
@@ -199,7 +199,7 @@ def solve_orientation(identified: Identified, has_file: bool = True) -> Oriented
         identified.camera, detections.xy_px[found.detection], detections.covariance_px2[found.detection],
         identified.stars.rays_icrs[found.star], found.R_cam_icrs,
     )  # fmt: skip
-    camera, fit, change_px = correct_lens(*matches) if has_file else (matches[0], solve_attitude(*matches), 0.0)
+    camera, fit, change_px = correct_lens(*matches) if has_file else (*solve_with_misfit(*matches), 0.0)
     names = name_bright_sources(
         detections, camera, identified.stars, found, fit.attitude.R_cam_icrs, identified.bodies,
         identified.exposure.time_utc,

@@ -16,18 +16,28 @@ UNKNOWN_TIME_SIGMA_RAD = np.radians(60 / 3600)  # aberration and proper motion l
 SCHEME = Scheme(loss=HUBER_WITH_CUT, steps=12, estimates_extra=True)
 
 
+@dataclass(frozen=True)
+class Misfit:
+    """Errors by a smooth displacement that a lens model does not hold, as j columns of roots: root @ root.T."""
+
+    displacement_px: Array  # (2 k, j) of the coefficients of `misfit.smooth_shifts`
+    lens: Array  # (m, j) of the parameters of the camera's covariance
+    turn_rad: Array  # (3, j) of the attitude
+
+
 @dataclass(frozen=True, kw_only=True)
 class AttitudeFit:
     """Result of `solve_attitude`."""
 
     attitude: Attitude
     centroid_covariance_rad2: Array  # (3, 3) part of the attitude's covariance that is not the lens's
-    turn_by_lens: Array  # (3, m) rotation [rad] per step of the m parameters of the camera's covariance
+    covariance_with_lens: Array  # (3, m) of the rotation [rad] and the m parameters of the camera's covariance
     residual_px: Array  # (n, 2) measured minus predicted
     used: Bools  # (n,) not rejected as outliers
     rms_px: float  # of the used stars, per axis
     extra_sigma_px: float  # error per axis beyond the stated centroid errors (lens, blends, catalogue)
     weight: Array  # (m, 2, 2) inverse covariances of the used stars, times the factor of the robust loss
+    misfit: Misfit | None = None  # in the covariances, where the residuals of a lens fitted to these stars show it
 
     def attitude_of(self, *, has_time: bool) -> Attitude:
         """The attitude; unless it `has_time`, with the error of stars at J2000.0 and without aberration."""
@@ -54,7 +64,7 @@ def solve_attitude(
     used = found.chi2 < STAR_OUTLIER_CHI2
     pose, weight, residual = found.terms.pose[used], found.weight[used], found.residual_px[used]
     by_stars = _covariance_by_stars(pose, found.inverse[used], weight, residual)
-    response = np.zeros((3, len(camera.covariance_order)))
+    with_lens = np.zeros((3, len(camera.covariance_order)))
     by_lens = np.zeros((3, 3))
     if camera.covariance is not None:
         # For a lens fitted to these very stars the sum of both covariances is the marginal of the joint fit, provided
@@ -62,11 +72,12 @@ def solve_attitude(
         lens = lens_jacobian(camera, found.state.rays_cam(points)[used], camera.covariance_order)
         terms = Terms(lens, pose, np.zeros(len(pose), dtype=np.int64), 1)
         (response,) = terms.normal_equations(weight, residual).pose_by_lens
-        by_lens = response @ camera.covariance @ response.T
+        with_lens = response @ camera.covariance
+        by_lens = with_lens @ response.T
     return AttitudeFit(
         attitude=Attitude(R_cam_icrs=found.state.R_cam_icrs[0], covariance_rad2=by_stars + by_lens),
         centroid_covariance_rad2=by_stars,
-        turn_by_lens=response,
+        covariance_with_lens=with_lens,
         residual_px=found.residual_px,
         used=used,
         rms_px=float(np.sqrt(np.mean(residual**2))),

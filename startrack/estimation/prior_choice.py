@@ -32,14 +32,23 @@ def solve_with_best_prior(normal: Array, right: Array, roots: Sequence[Array]) -
     """
     best, most = PriorChoice(0, np.zeros(len(right)), np.zeros_like(normal)), -np.inf
     for number, root in enumerate(roots):
-        inner, pull = np.eye(root.shape[1]) + root.T @ normal @ root, root.T @ right
-        step = np.linalg.solve(inner, pull)
-        log_weight = 0.5 * float(pull @ step) - 0.5 * float(np.linalg.slogdet(inner)[1])  # but for a constant
+        log_weight, step, covariance = solve_with_prior(normal, right, root)
         if number > 0:
             log_weight += float(np.log((1.0 - FILE_PROBABILITY) / FILE_PROBABILITY / (len(roots) - 1)))
         if log_weight > most:
-            most, best = log_weight, PriorChoice(number, root @ step, root @ np.linalg.solve(inner, root.T))
+            most, best = log_weight, PriorChoice(number, step, covariance)
     return best
+
+
+def solve_with_prior(normal: Array, right: Array, root: Array) -> tuple[float, Array, Array]:
+    """Log of the data's probability (but for a constant of all priors), mean (k,) and covariance (k, k) with a prior.
+
+    The arguments are those of `solve_with_best_prior`, the prior's `root` (k, j) one of its roots.
+    """
+    inner, pull = np.eye(root.shape[1]) + root.T @ normal @ root, root.T @ right
+    step = np.linalg.solve(inner, pull)
+    log_probability = 0.5 * float(pull @ step) - 0.5 * float(np.linalg.slogdet(inner)[1])
+    return log_probability, root @ step, root @ np.linalg.solve(inner, root.T)
 
 
 def root_of(covariance: Array) -> Array:

@@ -15,6 +15,7 @@ from startrack.core import STAR_COUNT_SLOPE
 from startrack.core.errors import Reason
 from startrack.core.types import Array, Attitude, Centroids, Identification, Ints, NotIdentified, Stars
 from startrack.estimation.attitude import AttitudeFit, solve_attitude
+from startrack.estimation.misfit import solve_with_misfit
 from startrack.identification.lost_in_space import Identifier
 from startrack.identification.unknown_lens import identify_unknown_lens
 
@@ -102,6 +103,7 @@ def identify_centroids(
         from startrack.catalog import load_catalog
 
         stars = load_catalog().at(None, None)
+    has_file = camera is not None
     sources, order = sorted_centroids(xy_px, flux, sigma_px, saturated, psf_sigma_px)
     with _stating_order(flux is None):
         if camera is not None:
@@ -116,10 +118,11 @@ def identify_centroids(
             camera, found = solution.camera, solution.identification
         else:
             raise ValueError("give a camera, or fov_rad= with size_px=")
-    fit = solve_attitude(
+    matches = (
         camera, sources.xy_px[found.detection], sources.covariance_px2[found.detection], stars.rays_icrs[found.star],
         found.R_cam_icrs,
     )  # fmt: skip
+    camera, fit = (camera, solve_attitude(*matches)) if has_file else solve_with_misfit(*matches)
     found = Identification(
         detection=order[found.detection], star=found.star, R_cam_icrs=fit.attitude.R_cam_icrs,
         false_alarm_probability=found.false_alarm_probability, unexplained=found.unexplained,

@@ -16,6 +16,7 @@ from startrack.camera import lens_jacobian
 from startrack.catalog import catalog_rays
 from startrack.chain import Oriented
 from startrack.core.types import Array
+from startrack.estimation.misfit import smooth_shifts
 from startrack.output.values import turn_rad
 
 HALF_STEP_PX = 0.5  # of the numerical derivative of the sky by pixels
@@ -83,8 +84,12 @@ def covariance_px2(value: Oriented, ray_cam: Array) -> Array:
     covariance = by_turn @ value.attitude.covariance_rad2 @ by_turn.T
     if camera.covariance is not None:
         by_lens = lens_jacobian(camera, ray_cam, camera.covariance_order)
-        mixed = by_turn @ fit.turn_by_lens @ camera.covariance @ by_lens.T
+        mixed = by_turn @ fit.covariance_with_lens @ by_lens.T
         covariance = covariance + by_lens @ camera.covariance @ by_lens.T + mixed + mixed.T
+        if fit.misfit is not None:  # what attitude and lens do not follow
+            here = smooth_shifts(camera, camera.project_unlimited(ray_cam[None]))[0] @ fit.misfit.displacement_px
+            follows = by_turn @ fit.misfit.turn_rad + by_lens @ fit.misfit.lens
+            covariance = covariance + here @ here.T - here @ follows.T - follows @ here.T
     return np.asarray(covariance)
 
 

@@ -29,7 +29,8 @@ CONSTANTS = rows_of("table of constants")
 @pytest.mark.parametrize(("name", "shown", "unit"), [row[:3] for row in CONSTANTS], ids=[row[0] for row in CONSTANTS])
 def test_a_constant_has_the_value_of_the_code(name: str, shown: str, unit: str) -> None:
     module, _, constant = name.strip("`").rpartition(".")
-    value = np.atleast_1d(getattr(importlib.import_module(f"startrack.{module}"), constant)).astype(float)
+    found = getattr(importlib.import_module(f"startrack.{module}"), constant)
+    value = np.atleast_1d(list(found.values()) if isinstance(found, dict) else found).astype(float)
     if constant.endswith("_RAD"):
         assert unit == "deg"
         value = np.degrees(value)

@@ -18,10 +18,12 @@ from startrack.camera import Camera, Decentring, KannalaBrandt, Pinhole
 from startrack.catalog import load_catalog
 from startrack.chain import Oriented, identify_blind
 from startrack.chain.stages import extend
-from startrack.core.types import Exposure
+from startrack.core.types import Exposure, NotIdentified
 from startrack.estimation.attitude import solve_attitude
+from startrack.estimation.misfit import solve_with_misfit
 from startrack.estimation.normal_equations import observations_of_image
 from startrack.exposure import read_exposure
+from startrack.identification import identify_centroids, unknown_lens
 from startrack.identification.found_lens import fit_found_lens
 from startrack.identification.unknown_lens import identify_unknown_lens
 from startrack.output import identification_dict
@@ -118,6 +120,49 @@ def test_the_sigmas_of_a_narrow_lens_hold(fov: float, aspect: float) -> None:
     assert np.sqrt(np.mean(np.square(ratio))) < 1.25
 
 
+def bent(size_px: float, rng: np.random.Generator) -> tuple[float, float]:
+    """Distance of the middle of a bent picture in sigmas, and these sigmas over those by independent errors alone.
+
+    A pinhole of 11 degrees displaces 130 stars by waves of half the frame and longer; its true middle is moved, too.
+    """
+    true, n = lens_camera(Pinhole(), 11.0, 700), 130
+    waves, phase = rng.normal(0, 0.4, (40, 2)) * 2 * np.pi / SIZE, rng.uniform(0, 2 * np.pi, 40)
+    by_wave = size_px * rng.normal(0, 1, (40, 2)) / np.sqrt(20)
+    R = Rotation.random(random_state=rng).as_matrix()
+    px = rng.uniform(0, 1, (n, 2)) * SIZE
+    rays, covariance = true.unproject(px) @ R, np.tile(0.04 * np.eye(2), (n, 1, 1))
+    xy = px + np.sin(px @ waves.T + phase) @ by_wave + rng.normal(0, 0.2, (n, 2))
+    camera, R_found = fit_found_lens(true, R, observations_of_image(xy, covariance, rays), CENTRE_PX)
+    before = oriented(camera, xy, rays, R_found)
+    camera, fit = solve_with_misfit(camera, xy, covariance, rays, R_found)
+    value = SimpleNamespace(
+        camera=camera, attitude_fit=fit, attitude=fit.attitude, exposure=before.exposure, site=None
+    )  # fmt: skip
+    shift = np.sin(MIDDLE_PX @ waves.T + phase) @ by_wave
+    moved = replace(true, centre_px=(true.centre_px[0] + shift[0], true.centre_px[1] + shift[1]))
+    return off_sigmas(value, moved, R), sky_at_middle(value).sigma_rad / sky_at_middle(before).sigma_rad
+
+
+def test_a_bent_picture_has_a_wider_sigma_and_a_straight_one_has_not() -> None:
+    rng = np.random.default_rng(8)
+    straight, crooked = (np.array([bent(size_px, rng) for _ in range(6)]) for size_px in (0.0, 0.3))
+    assert np.all((straight[:, 1] >= 1.0) & (straight[:, 1] < 1.2))
+    assert np.median(crooked[:, 1]) > 1.3
+    assert np.all(crooked[:, 0] < 4.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size_px", [0.0, 0.1, 0.2, 0.3])
+def test_the_sigma_of_the_middle_holds_what_the_lens_does_not(size_px: float) -> None:
+    rng = np.random.default_rng([int(100 * size_px), 1])
+    off, wider = np.array([bent(size_px, rng) for _ in range(60)]).T
+    assert np.mean(off < 3.0) >= 0.95
+    assert np.sqrt(np.mean(off**2) / 2) < 1.3
+    if size_px == 0.0:
+        assert np.median(wider) < 1.05
+        assert np.quantile(wider, 0.9) < 1.2
+
+
 def test_a_centre_that_does_not_show_stays_in_the_middle() -> None:
     rng = np.random.default_rng(5)
     lenses = {fov: [fitted(fov, np.array([15.0, -10.0]), 1.0, rng)[1] for _ in range(10)] for fov in (8.0, 60.0)}
@@ -191,3 +236,13 @@ def test_a_frame_and_its_jpeg_agree_within_their_sigmas(tmp_path) -> None:
     axes = [value.attitude.R_cam_icrs[2] for value in found]
     sigma = np.sqrt(sum(np.trace(value.attitude.covariance_rad2[:2, :2]) / 2 for value in found))
     assert np.linalg.norm(np.cross(*axes)) < 3.0 * sigma
+
+
+@pytest.mark.parametrize("fov", [12.0, 60.0])
+def test_a_refusal_states_the_ratios_that_were_tried(fov: float, monkeypatch) -> None:
+    monkeypatch.setattr(unknown_lens, "MAX_TRIED", 100)
+    xy_px = np.random.default_rng(1).uniform(0, 1, (40, 2)) * SIZE
+    with pytest.raises(NotIdentified) as refused:
+        identify_centroids(xy_px, fov_rad=np.radians(fov), size_px=SIZE)
+    ratios = ", ".join(f"{aspect:.3g}" for aspect in unknown_lens.ASPECTS)
+    assert (f" with square pixels and with fx / fy = {ratios} tried" in str(refused.value)) == (fov < 40.0)

@@ -18,9 +18,9 @@ from startrack.chain.stages import Detected, Inputs, Measured, Oriented, Refused
 from startrack.core.types import Mode
 from startrack.localization.rim_plane import point_fix
 from startrack.output import write_annotated
-from startrack.output.picture.annotate import PANEL_WIDTH, STATUS, _legend, annotate
+from startrack.output.picture.annotate import PANEL_WIDTH, STATUS, _facts, _legend, annotate
 from startrack.output.picture.backdrop import View, fit_to_canvas, remove_hot_pixels
-from startrack.output.picture.canvas import TEXT_PX, Canvas, Ink, text_box
+from startrack.output.picture.canvas import LARGE_PX, TEXT_PX, TITLE_PX, Canvas, Ink, text_box, text_width
 from startrack.output.picture.marks import draw_marks, overlay_of
 from startrack.output.tables import status_of
 
@@ -182,6 +182,13 @@ def test_truth_is_drawn_only_when_given(picture, located):
     assert count_pixels(picture, Ink.TRUTH) == 0
     given = annotate(located.result, tuple(located.truth.position_enu_m[:2]))
     assert count_pixels(given[:, -PANEL_WIDTH:], Ink.TRUTH) > 20
+
+
+def test_the_facts_of_a_sky_without_a_terrain_fit_in_the_panel(located):
+    facts = dict(_facts(extend(located.result, Oriented, terrain=None, bodies=())))
+    assert "Middle" in facts
+    room_px = PANEL_WIDTH - 2 * TITLE_PX - 7.5 * LARGE_PX
+    assert all(text_width(fact, LARGE_PX) < room_px for fact in facts.values())
 
 
 def test_every_kind_of_result_can_be_drawn(located):

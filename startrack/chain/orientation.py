@@ -153,7 +153,7 @@ def identify_unknown_lens(
 
 
 def _identify_at_fovs(detected: Detected, fovs_rad: Array, stars: Stars, near_sky: NearSky | None) -> Identified:
-    from startrack.identification import advise_on_fields
+    from startrack.identification import ASPECTS, NARROW_FIELD_RAD, advise_on_fields, pixels_text
     from startrack.identification import identify_unknown_lens as solve
 
     sources, size_px = detected.detections, detected.exposure.size_px
@@ -179,9 +179,13 @@ def _identify_at_fovs(detected: Detected, fovs_rad: Array, stars: Stars, near_sk
     step = (fovs_rad[-1] / fovs_rad[0]) ** (1 / (len(fovs_rad) - 1))  # each is the middle of a part of the range
     low_rad, high_rad = fovs_rad[0] * 2 / (1 + step), fovs_rad[-1] * step * 2 / (1 + step)
     where = "" if near_sky is None else f" within {near_sky}"
+    narrow = fovs_rad <= NARROW_FIELD_RAD
+    pixels = pixels_text(ASPECTS) if np.any(narrow) else ""
+    pixels += f" (up to {np.degrees(NARROW_FIELD_RAD):g} degrees)" if pixels and not np.all(narrow) else ""
     raise NotIdentified(
         f"no lens of {np.degrees(low_rad):.3g} to {np.degrees(high_rad):.3g} degrees{where} explains the "
-        f"{len(sources)} point sources better than chance ({len(fovs_rad)} fields, {sum(tried)} patterns tried)",
+        f"{len(sources)} point sources better than chance ({len(fovs_rad)} fields, "
+        f"{sum(tried)} patterns{pixels} tried)",
         advice=advise_on_fields(low_rad, high_rad, near_sky),
         detected=len(sources),
         tried=sum(tried),

@@ -37,7 +37,7 @@ class AttitudeFit:
     rms_px: float  # of the used stars, per axis
     extra_sigma_px: float  # error per axis beyond the stated centroid errors (lens, blends, catalogue)
     weight: Array  # (m, 2, 2) inverse covariances of the used stars, times the factor of the robust loss
-    misfit: Misfit | None = None  # in the covariances, where the residuals of a lens fitted to these stars show it
+    misfit: Misfit | None = None  # in the covariances, of a lens fitted to these stars
 
     def attitude_of(self, *, has_time: bool) -> Attitude:
         """The attitude; unless it `has_time`, with the error of stars at J2000.0 and without aberration."""

@@ -1,8 +1,8 @@
 """What a lens model does not hold of one image: a smooth displacement, by the residuals that its stars have in common.
 
 Residuals of neighbouring stars that agree are no independent errors: their means do not become small with many stars,
-and they move the attitude and the lens. The displacement has two polynomials over the frame, whose size is the one that
-makes the residuals most probable; it is zero where independent errors explain them.
+and they move the attitude and the lens. The displacement is a normal process over the frame. Its sizes and lengths, and
+none at all, are weighted by how probable they make the residuals.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ def solve_with_misfit(
 ) -> tuple[Camera, AttitudeFit]:
     """The camera, fitted to these very stars, and their attitude, with the covariances of its misfit added.
 
-    The rest is that of `solve_attitude`. The camera is as it was where the residuals show no misfit, or are those of
-    fewer than 30 stars.
+    The rest is that of `solve_attitude`, which also has the arguments and errors. With fewer than 30 stars, or a camera
+    without covariance, nothing is added.
     """
     fit = solve_attitude(camera, xy_px, covariance_px2, rays_icrs, R_cam_icrs)
     if camera.covariance is None or np.count_nonzero(fit.used) < MIN_FOR_SCATTER:
@@ -83,7 +83,7 @@ def solve_with_misfit(
         solve_with_prior(0.5 * (left + left.T), right[m:] - lens.T @ right[:m], _prior_root(length, size_px))
         for length, size_px in product(LENGTHS, SIZES_PX)
     ]
-    # About the lens that is stated, without the displacement; the mean over none, and all.
+    # About the lens that is stated, without the displacement. Before the residuals none is as probable as all others.
     odds = np.array([np.log(len(found)), *(one[0] for one in found)])
     weight = np.exp(odds - odds.max())
     weight /= weight.sum()

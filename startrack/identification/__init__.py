@@ -5,14 +5,18 @@ from startrack.identification.lost_in_space import MAX_FALSE_ALARM, Identifier
 from startrack.identification.near_sky import NearSky
 from startrack.identification.second_field import check_single_field
 from startrack.identification.unknown_lens import (
+    ASPECTS,
+    NARROW_FIELD_RAD,
     WIDE_FIELD_RAD,
     UnknownLensSolution,
     advise_on_fields,
     identify_unknown_lens,
+    pixels_text,
 )
 from startrack.identification.verify_unknown_lens import coincidence_radius_px
 
 __all__ = [
-    "MAX_FALSE_ALARM", "WIDE_FIELD_RAD", "IdentifiedCentroids", "Identifier", "NearSky", "UnknownLensSolution",
-    "advise_on_fields", "check_single_field", "coincidence_radius_px", "identify_centroids", "identify_unknown_lens",
+    "ASPECTS", "MAX_FALSE_ALARM", "NARROW_FIELD_RAD", "WIDE_FIELD_RAD", "IdentifiedCentroids", "Identifier", "NearSky",
+    "UnknownLensSolution", "advise_on_fields", "check_single_field", "coincidence_radius_px", "identify_centroids",
+    "identify_unknown_lens", "pixels_text",
 ]  # fmt: skip

@@ -107,6 +107,12 @@ def identify_unknown_lens(
     )
 
 
+def pixels_text(aspects: tuple[float, ...]) -> str:
+    """The shapes of pixels tried, to be added to the patterns: square, and with the ratios `aspects`, if any."""
+    ratios = ", ".join(f"{aspect:.3g}" for aspect in aspects)
+    return f" with square pixels and with fx / fy = {ratios}" if aspects else ""
+
+
 def advise_on_fields(low_rad: float, high_rad: float, near_sky: NearSky | None) -> str:
     """What may be tried where no lens from `low_rad` to `high_rad` fits with the axis in `near_sky`, if it is given."""
     low, high = np.degrees([low_rad, high_rad])
@@ -145,6 +151,7 @@ class _Search:
                 advice="try a longer exposure, or a camera file, with which fewer suffice",
                 detected=len(centroids),
             )
+        self.aspects: tuple[float, ...] = ()  # tried beside square pixels
         self.hypotheses = HypothesisSearch(self.xy_px[chosen], size_px, near_sky, 0.5 * fov_rad * tolerance)
         middle = (size_px[0] - 1) / 2, (size_px[1] - 1) / 2
         self.centre_px = middle if self.circle is None else self.circle.centre_px  # expected one of the lens
@@ -162,7 +169,8 @@ class _Search:
     @property
     def tried_text(self) -> str:
         """The work done."""
-        return f"{self.hypotheses.tried} patterns of the {len(self.hypotheses.xy_px)} brightest that stand apart tried"
+        points = f"the {len(self.hypotheses.xy_px)} brightest that stand apart"
+        return f"{self.hypotheses.tried} patterns of {points}{pixels_text(self.aspects)} tried"
 
     def lenses(self) -> Iterator[VerifiedLens]:
         """Verified lenses, whatever their p-value."""
@@ -187,7 +195,7 @@ class _Search:
 
     def _stretched_lenses(self) -> Iterator[VerifiedLens]:
         """Lenses of a narrow field whose pixels are not square, from detections stretched to square ones."""
-        for aspect in ASPECTS:
+        for number, aspect in enumerate(ASPECTS, 1):
             by_px = np.array([1.0 / aspect, 1.0])
             shift_px = 0.5 * (by_px - 1.0)  # pixel centres are at integers
             size_px = round(self.size_px[0] / aspect), self.size_px[1]
@@ -205,7 +213,7 @@ class _Search:
                 yield replace(
                     lens, camera=replace(lens.camera, size_px=self.size_px, focal_px=focal_px, centre_px=(x, y))
                 )
-            self.hypotheses.tried = search.tried
+            self.hypotheses.tried, self.aspects = search.tried, ASPECTS[:number]
 
     def settle(self, lens: VerifiedLens) -> tuple[VerifiedLens, Camera, Array]:
         """The `lens` with the stars of its last fit, the camera and attitude of that fit.

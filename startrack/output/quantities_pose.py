@@ -214,6 +214,6 @@ MIDDLE_QUANTITIES: tuple[Quantity, ...] = (
       "position angle of image up there, from north through east", "turn", form="%.6f",
       columns={"middle_rotation_deg": ()},
       shown=(Show("summary", "up", "up {:.2f}°", _HEADING), Show("text", "middle", ", up at {:.3f}°"),
-             Show("panel", "Middle", "   up {:.2f}°", _HEADING),
+             Show("panel", "Image up", "{:.2f}°", _HEADING),
              Show("notebook page", "up in the middle", "{:.3f}° from north through east"))),
 )  # fmt: skip

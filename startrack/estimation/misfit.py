@@ -19,7 +19,7 @@ from startrack.estimation.normal_equations import Terms
 from startrack.estimation.prior_choice import root_of, solve_with_prior
 
 LENGTHS = (0.25, 0.5, 1.0)  # over which the displacement changes, in halves of the frame's longer side
-SIZES_PX = (0.03, 0.1, 0.3, 1.0)  # of the displacement, RMS per axis
+MISFITS_PX = (0.03, 0.1, 0.3, 1.0)  # of the displacement, RMS per axis
 HALF_BOX, WAVES = 2.0, 14  # of the box of the waves, in the same halves; most half waves in it: numerical
 FREQUENCY = np.pi / (2.0 * HALF_BOX)  # of one half wave
 SMALLEST_PART = 1e-3  # of the largest sigma of a wave: numerical
@@ -81,7 +81,7 @@ def solve_with_misfit(
     left = normal[m:, m:] - normal[m:, :m] @ lens
     found = [
         solve_with_prior(0.5 * (left + left.T), right[m:] - lens.T @ right[:m], _prior_root(length, size_px))
-        for length, size_px in product(LENGTHS, SIZES_PX)
+        for length, size_px in product(LENGTHS, MISFITS_PX)
     ]
     # About the lens that is stated, without the displacement. Before the residuals none is as probable as all others.
     odds = np.array([np.log(len(found)), *(one[0] for one in found)])

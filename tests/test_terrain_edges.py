@@ -55,7 +55,7 @@ def test_an_image_on_a_map_with_edges_has_an_answer_or_a_reason(seed: int, chang
 @pytest.mark.slow
 @pytest.mark.parametrize("change", CHANGES)
 def test_many_images_on_maps_with_edges_have_an_answer_or_a_reason(change: str) -> None:
-    for seed in (9, 19, *range(100, 112)):
+    for seed in (9, 19, 100, 101):
         answer_is_honest(seed, change)
 
 

@@ -78,7 +78,7 @@ def test_it_works_away_from_the_checkout(unpacked_wheel, tmp_path):
     assert abs(position["east_m"] + 6900) < 40
     assert abs(position["north_m"] - 4700) < 40
     kept = {path.suffix for path in unpacked_wheel.rglob("*") if path.is_file() and "__pycache__" in path.parts}
-    assert kept == {".pyc"}, "compiled code lies in the user's cache"
+    assert kept <= {".pyc"}, "compiled code lies in the user's cache"
 
 
 def test_every_shipped_file_is_read_from_it(unpacked_wheel, tmp_path):

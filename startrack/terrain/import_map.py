@@ -180,7 +180,12 @@ def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, c
     with TemporaryDirectory(prefix=".", suffix=".part", dir=output.parent) as name:
         folder = Path(name)
         for path, crop in crops.items():
-            write_map(folder / path.name, crop)
+            try:
+                write_map(folder / path.name, crop)
+            except BadInput as cause:  # the folder is hidden: a user knows the place of the terrain
+                if cause.reason != "disk_full":
+                    raise
+                raise BadInput(cause.reason, str(cause).replace(str(folder), str(output.parent))) from cause
             if not _is_usual(folder / path.name, crop):
                 values["dem"]["unusual_heights"] = True
         try:

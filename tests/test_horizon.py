@@ -14,6 +14,7 @@ from horizon_helpers import CAMERA, LOWELL, SITE, TIME, painted_frame, skyline_d
 from jsonschema import Draft202012Validator
 
 import startrack
+from startrack.applications.horizon import frames as horizon_frames
 from startrack.applications.horizon import measure_skyline, predicted_visible
 from startrack.applications.horizon.frames import orient_frames
 from startrack.applications.horizon.measure import PLACE_SIGMA_RAD, join_skylines, measure_frames
@@ -24,6 +25,7 @@ from startrack.cli.horizon import UNTESTED
 from startrack.cli.main import main
 from startrack.core.errors import BadInput, NoSolution
 from startrack.core.types import MeasuredSkyline
+from startrack.estimation.joint_fit import fit_frames
 from startrack.exposure import read_exposure
 from startrack.frames import Site
 from startrack.output import SCHEMAS
@@ -223,9 +225,13 @@ def test_more_pictures_never_know_fewer_azimuths():
         np.testing.assert_array_equal(found.elevation_rad, some.elevation_rad)
 
 
-def test_the_command_writes_the_file_and_the_record(tmp_path, capsys):
-    out = tmp_path / "a.hrz"
-    assert main(["horizon", str(PHOTO), "-o", str(out), LOWELL_FLAG, "-c", "lowell-ldt", "--json"]) == 0
+def test_the_command_writes_files_of_one_computation_and_the_record(tmp_path, capsys, monkeypatch):
+    fitted = []
+    monkeypatch.setattr(horizon_frames, "fit_frames", lambda *args: fitted.append(args) or fit_frames(*args))
+    names = "a.hrz", "a.csv", "garden/"
+    outputs = [word for name in names for word in ("-o", f"{tmp_path}/{name}")]
+    assert main(["horizon", str(PHOTO), *outputs, LOWELL_FLAG, "-c", "lowell-ldt", "--json"]) == 0
+    assert len(fitted) == 1
     record = json.loads(capsys.readouterr().out)
     assert record["format"] == "startrack.horizon/1"
     assert record["status"] == "ok"
@@ -233,8 +239,14 @@ def test_the_command_writes_the_file_and_the_record(tmp_path, capsys):
     assert "of the 360 interpolated" in record["message"] and record["message"].endswith(UNTESTED)
     Draft202012Validator(SCHEMAS["horizon"]).validate(record)
     assert set(record) <= set(SCHEMAS["horizon"]["properties"])
-    assert out.exists()
-    assert main(["horizon", str(PHOTO), "-o", str(out), LOWELL_FLAG, "-c", "lowell-ldt"]) == 2
+    files = {tmp_path / name for name in ("a.hrz", "a.csv", "garden/landscape.ini", "garden/horizon.txt")}
+    assert {*map(Path, record["files"])} == files == {path for path in tmp_path.rglob("*") if path.is_file()}
+    measured = np.genfromtxt(tmp_path / "a.csv", delimiter=",", skip_header=1)[:, 1]
+    known = np.isfinite(measured)
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "a.hrz")[:360, 1][known], measured[known], atol=6e-4)
+    # Each is checked before the work.
+    assert main(["horizon", str(PHOTO), "-o", f"{tmp_path}/b.csv", *outputs, LOWELL_FLAG, "-c", "lowell-ldt"]) == 2
+    assert len(fitted) == 1 and not (tmp_path / "b.csv").exists()
 
 
 def test_the_advice_of_a_wrong_site_is_about_the_site(tmp_path, capsys):

@@ -12,13 +12,13 @@ from astropy.table import Table
 from horizon_helpers import LOWELL, small_skyline
 
 from startrack.applications.horizon.landscape import interpolate_unknown
-from startrack.applications.horizon.write import check_output, csv_text, nina_text, write_skyline
-from startrack.core.errors import BadInput
+from startrack.applications.horizon.write import check_outputs, csv_text, nina_text, write_skyline
+from startrack.core.errors import BadInput, BadOutput
 from startrack.output import Ink, skyline_picture, skyline_table_text
 
 
 def test_the_csv_has_a_row_a_degree(tmp_path):
-    write_skyline(str(tmp_path / "a.csv"), small_skyline(), LOWELL, (), overwrite=False)
+    write_skyline(small_skyline(), LOWELL, (), str(tmp_path / "a.csv"), overwrite=False)
     lines = (tmp_path / "a.csv").read_text().splitlines()
     assert lines[0] == "azimuth_deg,elevation_deg,sigma_deg,is_measured,source,cloud_probability"
     assert len(lines) == 361
@@ -55,7 +55,7 @@ def test_azimuths_that_are_interpolated_or_differ_are_marked():
 
 
 def test_the_stellarium_landscape_is_polygonal(tmp_path):
-    write_skyline(f"{tmp_path}/garden/", small_skyline(), LOWELL, (), overwrite=False)
+    write_skyline(small_skyline(), LOWELL, (), f"{tmp_path}/garden/", overwrite=False)
     settings = configparser.ConfigParser()
     settings.read(tmp_path / "garden/landscape.ini")
     assert settings["landscape"]["type"] == "polygonal"
@@ -67,7 +67,7 @@ def test_the_stellarium_landscape_is_polygonal(tmp_path):
 
 
 def test_the_panorama_is_a_picture(tmp_path):
-    write_skyline(str(tmp_path / "a.png"), small_skyline(), LOWELL, (), overwrite=False)
+    write_skyline(small_skyline(), LOWELL, (), str(tmp_path / "a.png"), overwrite=False)
     picture = cv2.imread(str(tmp_path / "a.png"))
     assert picture.shape[1] > 1000
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
@@ -94,11 +94,31 @@ def crosses_in(picture: np.ndarray) -> np.ndarray:
 
 def test_unknown_suffixes_and_existing_files_are_refused(tmp_path):
     with pytest.raises(BadInput, match="suffix"):
-        check_output(str(tmp_path / "a.txt"), overwrite=False)
+        check_outputs(str(tmp_path / "a.txt"), overwrite=False)
     (tmp_path / "a.csv").write_text("mine")
     with pytest.raises(BadInput, match="replace it with overwrite=True, or"):
-        check_output(str(tmp_path / "a.csv"), overwrite=False)
-    check_output(str(tmp_path / "a.csv"), overwrite=True)
+        check_outputs(str(tmp_path / "a.csv"), overwrite=False)
+    check_outputs(str(tmp_path / "a.csv"), overwrite=True)
+
+
+@pytest.mark.parametrize(
+    "outputs", ["a.csv a.csv", "a.csv below/../a.csv", "link.csv a.csv", "garden garden/", "b.csv b.csv/"]
+)
+def test_two_outputs_with_one_path_are_refused(tmp_path, monkeypatch, outputs):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "below").mkdir()
+    (tmp_path / "link.csv").symlink_to("a.csv")
+    (tmp_path / "a.csv").write_text("mine")
+    with pytest.raises(BadOutput, match="two outputs have this path"):
+        check_outputs(*outputs.split(), overwrite=True)
+    check_outputs("a.csv", "a.hrz", "a", "below", overwrite=True)
+
+
+def test_no_output_is_written_where_one_cannot_hold_the_skyline(tmp_path):
+    nothing = replace(small_skyline(), elevation_rad=np.full(360, np.nan))
+    with pytest.raises(BadInput, match="unknown at all azimuths"):
+        write_skyline(nothing, LOWELL, (), str(tmp_path / "a.csv"), str(tmp_path / "a.hrz"), overwrite=False)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_skyline_without_any_azimuth_cannot_be_interpolated():

@@ -38,9 +38,9 @@ def photographed():
 def files(photographed, tmp_path_factory):
     """The files in the archive by their names."""
     path = tmp_path_factory.mktemp("landscape") / "garden.zip"
-    write_skyline(str(path), photographed.skyline, SITE, photographed.frames, overwrite=False)
+    write_skyline(photographed.skyline, SITE, photographed.frames, str(path), overwrite=False)
     first = path.read_bytes()
-    write_skyline(str(path), photographed.skyline, SITE, photographed.frames, overwrite=True)
+    write_skyline(photographed.skyline, SITE, photographed.frames, str(path), overwrite=True)
     assert path.read_bytes() == first
     with zipfile.ZipFile(path) as archive:
         return {name: archive.read(name) for name in archive.namelist()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     except BadOutput:
         raise
     except (BadInput, NoSolution) as cause:
-        record, line = refusal(cause, Path(args.output).name, format=FORMAT)
+        record, line = refusal(cause, _names(args), format=FORMAT)
         if cause.reason == Reason.INCONSISTENT_EVIDENCE:
             record["advice"] = ADVICE
         return print_outcome(args, record, line)
@@ -38,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _measure(args: argparse.Namespace) -> Outcome:
     """The record and the line of a skyline that was measured and written."""
-    horizon.check_output(args.output, overwrite=args.overwrite)
+    horizon.check_outputs(*args.output, overwrite=args.overwrite)
     done: list[str] = []
     with stating_work(lambda: done[-1] if done else "no image was identified"), limited_time(args.time_limit):
         exposures = read_each_once(args)
@@ -62,20 +63,20 @@ def _measure(args: argparse.Namespace) -> Outcome:
             )
             print_left_out(left_out if frames else ())  # else the refusal names them
             found = horizon.measure_frames(frames, left_out, site, begin)
-    horizon.write_skyline(args.output, found.skyline, site, found.frames, overwrite=args.overwrite)
+    files = horizon.write_skyline(found.skyline, site, found.frames, *args.output, overwrite=args.overwrite)
     unknown = int((~found.skyline.known).sum())
     varying = int((found.skyline.source == "varies").sum())
-    interpolates = unknown and horizon.needs_all_azimuths(args.output)
+    interpolates = unknown and any(map(horizon.needs_all_azimuths, args.output))
     notes = [f"{unknown} of the {len(found.skyline)} interpolated"] if interpolates else []
     notes += [f"{varying} differ between the images: the highest edge is taken"] if varying else []
     notes += [UNTESTED] if len(found.frames) == 1 else []
     note = "; ".join(notes)
-    record, skyline = _record(args, found, note), found.skyline
+    record, skyline = _record(args, found, files, note), found.skyline
     words = [f"{record['azimuths']['known']} of {len(skyline)} azimuths"]
     if record["median_sigma_deg"] is not None:
         words.append(f"median sigma {record['median_sigma_deg']:.2f}°")
     words.append(_count_text(len(found.frames)))
-    line = "  ".join([one_line(Path(args.output).name), "ok", *words, *([note] if note else [])])
+    line = "  ".join([one_line(_names(args)), "ok", *words, *([note] if note else [])])
     if args.verbose:
         line += "".join(f"\n  {one_line(one.name)}: {len(one.matched_star)} stars fit the lens" for one in found.frames)
     return record, line
@@ -85,14 +86,21 @@ def _count_text(images: int) -> str:
     return f"{images} image{'s' if images > 1 else ''}"
 
 
-def _record(args: argparse.Namespace, found: horizon.SkylineResult, note: str) -> dict[str, Any]:
+def _names(args: argparse.Namespace) -> str:
+    return ", ".join(Path(output).name for output in args.output)
+
+
+def _record(
+    args: argparse.Namespace, found: horizon.SkylineResult, files: Sequence[Path], note: str
+) -> dict[str, Any]:  # fmt: skip
     skyline, known = found.skyline, found.skyline.known
     return {
         "format": FORMAT,
         "status": "ok",
         "reason": None,
         "message": note,
-        "output": Path(args.output).name,
+        "output": _names(args),
+        "files": list(map(str, files)),
         "images": [frame.name for frame in found.frames],
         "left_out": [{"image": one.name, "reason": one.reason, "message": one.message} for one in found.left_out],
         "azimuths": {

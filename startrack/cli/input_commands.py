@@ -137,7 +137,10 @@ COMMANDS = (
                     field_of_view_rad,
                 ),
             ),
-            "output": (flag("-o --output FILE", "the skyline", required=True), *flags.OUTPUT),
+            "output": (
+                flag("-o --output FILE", "the skyline; several -o: in several formats", action="append", required=True),
+                *flags.OUTPUT,
+            ),
             "more": (flags.TIME_LIMIT, flags.NO_SEED, *flags.MORE),
         },
         "startrack horizon NIGHT.jpg... --fov 180 --site 34.74,-111.42 -o horizon.csv",

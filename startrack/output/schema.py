@@ -96,6 +96,7 @@ HORIZON = object_schema(
     optional={
         "advice": schema_of_kind("text", ADVICE),
         "output": "text",
+        "files": list_schema("text"),
         "images": list_schema("text"),
         "left_out": list_schema(object_schema({"image": "text", "reason": {"enum": REFUSALS}, "message": "text"})),
         "azimuths": object_schema(dict.fromkeys(("known", "stars", "sky_light", "both", "varies"), "count")),
@@ -105,7 +106,9 @@ HORIZON = object_schema(
     },
 )
 _HORIZON_RULES = [
-    _if_status("ok", {"properties": {"reason": {"const": None}}, "required": ["output", "images", "azimuths"]}),
+    _if_status(
+        "ok", {"properties": {"reason": {"const": None}}, "required": ["output", "files", "images", "azimuths"]}
+    ),
     _if_status("refused", {"properties": {"reason": {"enum": REFUSALS}}}),
 ]
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +22,7 @@ from startrack.applications.horizon.landscape import (
 )
 from startrack.core.errors import BadOutput
 from startrack.core.files import check_output as check_file
-from startrack.core.files import write_atomically
+from startrack.core.files import printable, write_atomically
 from startrack.core.types import Array, MeasuredSkyline
 from startrack.frames import Site
 from startrack.output import (
@@ -45,15 +47,22 @@ def kind_of(output: str) -> str:
 
 
 def output_files(output: str) -> tuple[Path, ...]:
-    """The files that `write_skyline` writes for an output path."""
+    """The files that `write_skyline` writes for one of its outputs."""
     path = Path(output)
     return (path,) if kind_of(output) else (path / LANDSCAPE, path / HORIZON_LIST)
 
 
-def check_output(output: str, *, overwrite: bool) -> None:
-    """Raise BadOutput if `output` has an unknown suffix, takes no files, or exists and `overwrite` is False."""
-    for path in output_files(output):
+def check_outputs(*outputs: str, overwrite: bool) -> None:
+    """Raise BadOutput for an output of an unknown suffix, that takes no files, or has the path of another one.
+
+    And for one that exists, if `overwrite` is False.
+    """
+    files = [path for output in outputs for path in output_files(output)]
+    for path in files:
         check_file(path, overwrite=overwrite)
+    for one, other in permutations([Path(os.path.realpath(path)) for path in files], 2):
+        if one == other or one in other.parents:
+            raise BadOutput("bad_image", f"{printable(one)}: two outputs have this path")
 
 
 def needs_all_azimuths(output: str) -> bool:
@@ -62,14 +71,24 @@ def needs_all_azimuths(output: str) -> bool:
 
 
 def write_skyline(
-    output: str, skyline: MeasuredSkyline, site: Site, frames: Sequence[SkyFrame], *, overwrite: bool
+    skyline: MeasuredSkyline, site: Site, frames: Sequence[SkyFrame], *outputs: str, overwrite: bool
 ) -> tuple[Path, ...]:
-    """Write the `skyline` of a `site` in the format of the suffix of `output`; the files.
+    """Write the `skyline` of a `site` to each of the `outputs` in the format of its suffix; the files.
 
     `frames` are the photographs, from which the landscape of a `.zip` is drawn. Existing files are replaced with
-    `overwrite` only. Raises BadInput if the format cannot hold the skyline.
+    `overwrite` only. Raises BadInput, and writes nothing, if one of the formats cannot hold the skyline.
     """
-    files, kind, name = output_files(output), kind_of(output), Path(output).stem
+    made = {path: data for output in outputs for path, data in _encoded(output, skyline, site, frames)}
+    for path, data in made.items():
+        write_atomically(path, data, overwrite=overwrite)
+    return tuple(made)
+
+
+def _encoded(
+    output: str, skyline: MeasuredSkyline, site: Site, frames: Sequence[SkyFrame]
+) -> Iterator[tuple[Path, bytes]]:  # fmt: skip
+    """The files of one output with their content."""
+    kind, name = kind_of(output), Path(output).stem
     if kind == ".png":
         data = [png_bytes(skyline_picture(skyline))]
     elif kind == ".zip":
@@ -79,9 +98,7 @@ def write_skyline(
         data = [text_of(skyline).encode("utf-8")]
     else:
         data = list(_landscape_files(Path(output).name, skyline, site).values())
-    for path, content in zip(files, data, strict=True):
-        write_atomically(path, content, overwrite=overwrite)
-    return files
+    return zip(output_files(output), data, strict=True)
 
 
 def _landscape_files(

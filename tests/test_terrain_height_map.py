@@ -7,6 +7,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -275,6 +276,46 @@ def test_of_two_that_need_a_table_one_makes_it(shackleton, monkeypatch):
     assert len(made) == 1
     assert all(np.array_equal(table.values, tables[0].values) for table in tables)
     assert [p.suffix for p in path.parent.iterdir() if p.stem == path.stem] == [".table"]
+
+
+@pytest.fixture
+def tracer(monkeypatch):
+    """The middles of the cells that are traced; `stop_after` so many parts, Ctrl-C follows."""
+    traced, fill = SimpleNamespace(cells=[], stop_after=np.inf), cache.fill_cells
+
+    def count(ground, centres, *more):
+        if len(traced.cells) >= traced.stop_after:
+            raise KeyboardInterrupt
+        fill(ground, centres, *more)
+        traced.cells.append({tuple(centre) for centre in centres})
+
+    monkeypatch.setattr(cache, "fill_cells", count)
+    monkeypatch.setattr(cache, "PART_CELLS", 2)
+    monkeypatch.setattr(cache, "count_cores", lambda: 1)
+    return traced
+
+
+def test_a_stopped_build_goes_on_where_it_was(shackleton, tracer):
+    terrain = replace(shackleton, camera_height_m=1.9, search_radius_m=200.0)
+    terrain.prepare()
+    calm, whole = terrain.table_path.read_bytes(), set().union(*tracer.cells)
+    terrain.discard_table()
+    tracer.cells, tracer.stop_after = [], 3
+    with pytest.raises(KeyboardInterrupt):
+        replace(terrain).prepare()
+    before, tracer.cells, tracer.stop_after = tracer.cells, [], 1
+    with pytest.raises(KeyboardInterrupt):
+        replace(terrain, camera_height_m=1.91).prepare()
+    assert tracer.cells == before[:1]  # nothing is taken from another table
+    kept = sorted(terrain.table_path.parent.glob(f"{terrain.table_path.stem}-*"))
+    assert len(kept) == 3
+    kept[0].write_bytes(kept[0].read_bytes()[:-1])  # damaged
+    tracer.cells, tracer.stop_after = [], np.inf
+    replace(terrain).prepare()
+    assert terrain.table_path.read_bytes() == calm
+    assert sum(cells in before for cells in tracer.cells) == 1
+    assert set().union(*before, *tracer.cells) == whole
+    assert list(terrain.table_path.parent.glob(f"{terrain.table_path.stem}-*")) == []
 
 
 @pytest.mark.slow

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 LOG = logging.getLogger(__name__)
 FOLDER, SUFFIX = "horizons", ".table"  # of the tables in the cache
 VERSION = 7  # of the tracing and of the table's format
+PART_CELLS = 64  # at least, of a part that is traced and kept by itself: 0.5 MB
 
 # Terrains that need the same table share one in memory, for as long as one of them lives.
 TABLES_IN_MEMORY: WeakValueDictionary[str, HorizonTable] = WeakValueDictionary()
@@ -93,8 +94,23 @@ def keep_table(key: str, table: HorizonTable) -> bool:
 def discard_table(key: str) -> None:
     """Remove the table from memory and disk."""
     TABLES_IN_MEMORY.pop(key, None)
+    discard_parts(key)
     with suppress(OSError):
         path_of_table(key).unlink()
+
+
+def path_of_part(key: str, cells: Ints) -> Path:
+    """File of the part with these cells (k,), in order, of the table with this key; the name of a table, too."""
+    path = path_of_table(key)
+    return path.with_stem(f"{path.stem}-{cells[0]}-{cells[-1]}")
+
+
+def discard_parts(key: str) -> None:
+    """Remove the parts of the table with this key."""
+    path = path_of_table(key)
+    for part in path.parent.glob(f"{path.stem}-*{SUFFIX}"):
+        with suppress(OSError):
+            part.unlink()
 
 
 def load_or_build_table(ground: TracedMap, progress: Progress | None = None) -> HorizonTable:
@@ -116,6 +132,8 @@ def load_or_build_table(ground: TracedMap, progress: Progress | None = None) -> 
             with uncounted_time():
                 table = build_table(ground, progress)
             is_kept, path = keep_table(key, table), path_of_table(key)
+            discard_parts(key)
+            is_kept = is_kept or keep_table(key, table)  # with the room on the disk that the parts had
             where = f"kept in {path}" if is_kept else f"not kept: {path.parent} cannot be written"
             LOG.debug("horizons of %s: done in %.0f s, %s", ground.name, clock.perf_counter() - start, where)
         return table
@@ -138,7 +156,8 @@ def _single_builder(path: Path, name: str) -> Iterator[None]:
 def build_table(ground: TracedMap, progress: Progress | None = None) -> HorizonTable:
     """The table of the ground, traced on all cores: the kernels release Python's lock.
 
-    Cells that contain no position within reach have bounds of -+ pi/2.
+    Cells that contain no position within reach have bounds of -+ pi/2. Parts of it that are traced lie on disk, if that
+    takes them, so that a build that was stopped goes on where it was.
     """
     square, packed, height_m = ground.square, ground.ground, ground.camera_height_m
     values = np.zeros((square.across**2, AZIMUTH_BINS, FIELDS), dtype=np.uint16)
@@ -150,16 +169,23 @@ def build_table(ground: TracedMap, progress: Progress | None = None) -> HorizonT
     cells = square.cells_within_reach
     done = 0
 
-    def trace_cells(part: Ints) -> int:
-        """Trace cells (k,) and write their fields to `values`; how many they are."""
+    def fill_part(part: Ints) -> int:
+        """Write the fields of cells (k,) to `values`, traced or from disk; how many cells they are."""
+        path = path_of_part(ground.table_key, part)
+        kept = read_sealed(path)
+        if kept is not None:
+            values[part] = np.frombuffer(kept, np.uint16).reshape(-1, AZIMUTH_BINS, FIELDS)
+            return len(part)
         found = np.empty((len(part), AZIMUTH_BINS, FIELDS))
         fill_cells(packed, centres[part], square.half_m, height_m, sines, cosines, half_turn, found)
         values[part] = quantize_fields(found)
+        with suppress(BadInput):
+            write_sealed(path, values[part].tobytes())
         return len(part)
 
     pool = ThreadPoolExecutor(count_cores())
     try:
-        for count in pool.map(trace_cells, np.array_split(cells, max(1, len(cells) // 64))):
+        for count in pool.map(fill_part, np.array_split(cells, max(1, len(cells) // PART_CELLS))):
             done += count
             if progress is not None:
                 progress(done, len(cells))

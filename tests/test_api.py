@@ -18,10 +18,11 @@ from astropy import units as u
 from astropy.time import Time
 from astropy.utils.masked import Masked
 from jsonschema import Draft202012Validator
+from stage_helpers import as_stage
 
 import startrack
 from startrack.chain import exposure_input, time_input
-from startrack.chain.stages import Oriented, Refused, Settings, extend, last_value
+from startrack.chain.stages import Oriented, Refused, Settings, last_value
 from startrack.core.errors import BadInput
 from startrack.exposure import read_exposure
 from startrack.localization import Hull
@@ -140,7 +141,7 @@ def test_writing_replaces_what_an_earlier_result_left(solution, tmp_path):
     assert (tmp_path / "near-wall-2.wcs").read_text() == "of another image"
     solution.write(tmp_path, plots=False)  # of the same image: replaced
     refused = startrack.locate(read_exposure(IMAGE), time="2030-01-01T00:00:00Z")
-    result = Refused(reason="no_stars", message="", reached=extend(last_value(refused.result), Oriented))
+    result = Refused(reason="no_stars", message="", reached=as_stage(last_value(refused.result), Oriented))
     refused = replace(refused, result=result)
     refused.write(tmp_path, plots=False)
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["near-wall-2.wcs", "near-wall.fix.json"]

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from stage_helpers import as_stage
 
-from startrack.chain.stages import Detected, Measured, Refused, extend
+from startrack.chain.stages import Detected, Measured, Refused
 from startrack.cli.main import main
 from startrack.core.errors import Reason
 from startrack.core.types import Blocked, Mode, UnstatedFact
@@ -25,7 +26,7 @@ def with_fix(located: Any, **changes: Any) -> Any:
 
 
 def refused(located: Any, to: type, reason: Reason, **changes: Any) -> Refused:
-    reached: Any = replace(extend(located.result, to), **changes)
+    reached: Any = replace(as_stage(located.result, to), **changes)
     return Refused(reason=reason, message="why", reached=reached)
 
 

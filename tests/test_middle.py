@@ -11,13 +11,13 @@ import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
 from scipy.spatial.transform import Rotation
+from stage_helpers import as_stage
 from star_painter import paint
 from test_unknown_lens import SIZE, lens_camera, picture, sky
 
 from startrack.camera import Camera, Decentring, KannalaBrandt, Pinhole
 from startrack.catalog import load_catalog
 from startrack.chain import Oriented, identify_blind
-from startrack.chain.stages import extend
 from startrack.core.types import Exposure, NotIdentified
 from startrack.estimation.attitude import solve_attitude
 from startrack.estimation.misfit import solve_with_misfit
@@ -66,7 +66,7 @@ def fitted(fov: float, off: np.ndarray, aspect: float, rng: np.random.Generator)
 
 
 def test_the_middle_is_that_of_the_world_coordinates_by_astropy(located) -> None:
-    value = extend(located.result, Oriented, terrain=None, bodies=())
+    value = as_stage(located.result, Oriented, terrain=None, bodies=())
     header = fits.Header.fromstring(wcs_bytes(value).decode("ascii"))
     world = WCS(header)
     found = identification_dict(value)["middle"]
@@ -83,7 +83,7 @@ def test_the_middle_is_that_of_the_world_coordinates_by_astropy(located) -> None
 
 
 def test_a_middle_beyond_the_lens_is_null(located) -> None:
-    value = extend(located.result, Oriented, terrain=None, bodies=())
+    value = as_stage(located.result, Oriented, terrain=None, bodies=())
     camera = replace(value.camera, centre_px=(0.0, 0.0), max_angle_rad=0.2)
     away = replace(value, camera=camera)
     assert not has_middle(away)
@@ -92,7 +92,7 @@ def test_a_middle_beyond_the_lens_is_null(located) -> None:
 
 
 def test_without_a_time_the_middle_is_a_minute_of_arc_wider(located) -> None:
-    value = extend(located.result, Oriented, terrain=None, bodies=())
+    value = as_stage(located.result, Oriented, terrain=None, bodies=())
     timeless = replace(value, exposure=replace(value.exposure, time_utc=None))
     sigma = [sky_at_middle(one).sigma_rad for one in (value, timeless)]
     assert np.sqrt(sigma[1] ** 2 - sigma[0] ** 2) == pytest.approx(np.radians(1 / 60), rel=0.01)

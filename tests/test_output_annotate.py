@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy.special import ndtr
+from stage_helpers import as_stage
 
 from startrack.camera import Camera, Pinhole
 from startrack.chain import pipeline
-from startrack.chain.stages import Detected, Inputs, Measured, Oriented, Refused, extend
+from startrack.chain.stages import Detected, Inputs, Measured, Oriented, Refused
 from startrack.core.types import Mode
 from startrack.localization.rim_plane import point_fix
 from startrack.output import write_annotated
@@ -169,7 +170,7 @@ def test_the_most_significant_of_many_sources_without_a_name_are_drawn(located):
     )
     assert len(overlay["others"]) == np.count_nonzero(nameless & (result.detections.snr > 10.0))
     assert len(overlay["others"]) + overlay["undrawn"] == np.count_nonzero(nameless)
-    detected = extend(result, Detected)
+    detected = as_stage(result, Detected)
     assert len(overlay_of(detected)["others"]) == 300
     assert overlay_of(detected)["undrawn"] > 0
     assert any(
@@ -185,7 +186,7 @@ def test_truth_is_drawn_only_when_given(picture, located):
 
 
 def test_the_facts_of_a_sky_without_a_terrain_fit_in_the_panel(located):
-    facts = dict(_facts(extend(located.result, Oriented, terrain=None, bodies=())))
+    facts = dict(_facts(as_stage(located.result, Oriented, terrain=None, bodies=())))
     assert "Middle" in facts
     room_px = PANEL_WIDTH - 2 * TITLE_PX - 7.5 * LARGE_PX
     assert all(text_width(fact, LARGE_PX) < room_px for fact in facts.values())
@@ -196,7 +197,7 @@ def test_every_kind_of_result_can_be_drawn(located):
     modes = (Mode(east_m=6000.0, north_m=-2500.0, weight=0.7), Mode(east_m=-3000.0, north_m=4000.0, weight=0.3))
 
     def make_refusal(reason, message, stage):
-        return Refused(reason=reason, message=message, reached=extend(result, stage))
+        return Refused(reason=reason, message=message, reached=as_stage(result, stage))
 
     badge = np.s_[20:70, -200:]
     cases = {
@@ -204,8 +205,8 @@ def test_every_kind_of_result_can_be_drawn(located):
         "inconsistent": make_refusal("inconsistent_evidence", "m " * 400, Measured),
         "not identified": make_refusal("not_identified", "why", Detected),
         "no stars": make_refusal("no_stars", "", Inputs),
-        "identified": extend(result, Oriented, terrain=None, bodies=()),
-        "detected": extend(result, Detected, camera=None, terrain=None),
+        "identified": as_stage(result, Oriented, terrain=None, bodies=()),
+        "detected": as_stage(result, Detected, camera=None, terrain=None),
     }
     for name, one in cases.items():
         drawn = annotate(one)

@@ -8,10 +8,11 @@ from dataclasses import replace
 import pytest
 from astropy import units as u
 from jsonschema import Draft202012Validator, ValidationError
+from stage_helpers import as_stage
 
 from startrack.api.solution import Solution
 from startrack.applications.batch.tables import COLUMNS, column_values, table_values
-from startrack.chain.stages import Measured, Refused, extend
+from startrack.chain.stages import Measured, Refused
 from startrack.core.types import ClockError, Mode
 from startrack.output import SCHEMAS, detection_dict, identification_dict, result_dict, verbose_text
 from startrack.output.html.rows import facts_of
@@ -60,7 +61,7 @@ def test_records_of_earlier_versions_fit_the_schema(located):
 
 def test_only_a_fix_has_a_clock(located):
     result = with_clock(located, CLOCK)
-    refused = Refused(reason="inconsistent_evidence", message="no", reached=extend(result, Measured))
+    refused = Refused(reason="inconsistent_evidence", message="no", reached=as_stage(result, Measured))
     assert result_dict(refused)["clock"] is None
     for record in (identification_dict(result), detection_dict(result)):
         assert "clock" not in record

@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from stage_helpers import as_stage
 
 from startrack.catalog import load_catalog
 from startrack.chain import pipeline
-from startrack.chain.stages import Oriented, extend
+from startrack.chain.stages import Oriented
 from startrack.core.types import BadInput, Mode
 from startrack.localization.rim_plane import point_fix
 from startrack.output import (
@@ -49,7 +50,7 @@ def fix(located):
 
 
 def remove_terrain(result):
-    return extend(result, Oriented, terrain=None, bodies=())
+    return as_stage(result, Oriented, terrain=None, bodies=())
 
 
 def make_ambiguous(result):

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator, ValidationError
 from schema_helpers import unknown_keys
+from stage_helpers import as_stage
 
 from startrack.camera import camera_to_dict
 from startrack.chain import detect
-from startrack.chain.stages import Measured, Oriented, Refused, extend
+from startrack.chain.stages import Measured, Oriented, Refused
 from startrack.cli.main import main
 from startrack.core.files import data_dir
 from startrack.core.types import Mode
@@ -30,9 +31,9 @@ def fits_schema(kind, value):
 def results(result):
     two = (Mode(east_m=1.0, north_m=2.0, weight=0.6), Mode(east_m=3.0, north_m=4.0, weight=0.4))
     ambiguous = replace(result, fix=replace(result.fix, modes=two, ambiguous=True))
-    refused = Refused(reason="inconsistent_evidence", message="no", reached=extend(result, Measured))
+    refused = Refused(reason="inconsistent_evidence", message="no", reached=as_stage(result, Measured))
     yield from (("fix", result_dict(r)) for r in (result, ambiguous, refused))
-    yield "identification", identification_dict(extend(result, Oriented, terrain=None))
+    yield "identification", identification_dict(as_stage(result, Oriented, terrain=None))
     yield "detection", detection_dict(result)
     yield from (
         (kind, refused_dict("a.png", "bad_image", "no", kind)) for kind in ("fix", "identification", "detection")
@@ -47,7 +48,7 @@ def test_solved_and_refused_records_have_the_same_keys(located, kind):
     solved = make(located.result)
     others = [
         make(detect(flat, located.result.camera)),
-        make(Refused(reason="no_time", message="no", reached=extend(located.result, Oriented, terrain=None))),
+        make(Refused(reason="no_time", message="no", reached=as_stage(located.result, Oriented, terrain=None))),
         *(refused_dict("a.png", reason, "no", kind) for reason in ("bad_image", "internal_error")),
     ]
     for other in others:

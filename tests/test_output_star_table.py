@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from astropy import units
 from astropy.table import Table
+from stage_helpers import as_stage
 
-from startrack.chain.stages import Identified, Oriented, extend
+from startrack.chain.stages import Identified, Oriented
 from startrack.output import Column, ecsv_text, write_star_table
 from startrack.output.tables import star_table_text, status_of
 
@@ -80,7 +81,7 @@ def replace_row(light, llr, cause):
 
 
 def test_without_a_terrain_there_are_matches_and_predictions(located, tmp_path):
-    result = extend(located.result, Oriented, terrain=None)
+    result = as_stage(located.result, Oriented, terrain=None)
     write_star_table(tmp_path / "t.ecsv", result, catalog=True)
     table = Table.read(tmp_path / "t.ecsv", format="ascii.ecsv")
     assert table.colnames == [*COLUMNS.split()[:4], *COLUMNS.split()[6:11], "status"]
@@ -93,7 +94,7 @@ def test_without_a_terrain_there_are_matches_and_predictions(located, tmp_path):
     assert named.colnames == table.colnames
     assert [tuple(row) for row in named] == [tuple(row) for row in table[matched]]
     with pytest.raises(ValueError, match="identified"):
-        star_table_text(extend(result, Identified))
+        star_table_text(as_stage(result, Identified))
 
 
 def test_a_full_table_has_a_line_for_each_star(located):

@@ -6,8 +6,9 @@ import re
 from dataclasses import replace
 
 import pytest
+from stage_helpers import as_stage
 
-from startrack.chain.stages import Detected, Oriented, Refused, extend
+from startrack.chain.stages import Detected, Oriented, Refused
 from startrack.core.types import Mode
 from startrack.localization.rim_plane import point_fix
 from startrack.output import refusal_line, summary_line, verbose_text
@@ -67,12 +68,12 @@ def test_other_results(located):
     places = "E 6000.0 m N -2500.0 m ±3.5 m (95 %), probability 70 %; E -3000.4 m N 4000.0 m, probability 30 %"
     assert f"ambiguous  2 positions fit: {places}" in summary_line(ambiguous)
     assert f"  places     {places}; search {result.fix.search}\n" in verbose_text(ambiguous)
-    identified = extend(result, Oriented, terrain=None)
+    identified = as_stage(result, Oriented, terrain=None)
     assert re.search(
         r"small  ok  RA \d+\.\d{4}°  Dec [+-]\d+\.\d{4}° ± 0\.0\d+°  [\d.]+\"/px  up \d+\.\d{2}°  \d+ stars",
         summary_line(identified),
     )
-    detected = extend(result, Detected)
+    detected = as_stage(result, Detected)
     assert summary_line(detected, seconds=0.2) == f"small  ok  {len(result.detections)} point sources  0.2 s with files"
 
 

@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from stage_helpers import as_stage
 from star_painter import paint
 from test_evidence import without_sources
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.chain import Settings, locate, locate_rays
-from startrack.chain.stages import StarRays, extend
+from startrack.chain.stages import StarRays
 from startrack.core.types import BadInput
 from startrack.evidence.photometry import Sources, half_width, measure
 from startrack.rendering import Series
@@ -120,7 +121,7 @@ def test_the_stars_of_an_image_are_located_as_the_pipeline_locates_them(located:
     known, settings = located.result, Settings(evidence_sources="stars")
     catalog = load_catalog().brighter_than(7.0)
     by_stars = locate(known.exposure, known.camera, known.terrain, catalog, settings)
-    again = locate_rays(extend(by_stars, StarRays))
+    again = locate_rays(as_stage(by_stars, StarRays))
     assert again.fix.position_enu_m == pytest.approx(by_stars.fix.position_enu_m, abs=1e-9)
     assert again.fix.integrity.protection_level_m == by_stars.fix.integrity.protection_level_m
 

@@ -17,7 +17,8 @@ from startrack.chain.inputs import (
 )
 from startrack.chain.measurement import CERTAIN_PROBABILITY, COMPLETE_V_MAG, locate_rays, mask_unpredictable
 from startrack.chain.near_attitude import NearAttitude, read_near_attitude
-from startrack.chain.pipeline import add_timing, detect, identify, identify_blind, load_named, locate, locate_exposure
+from startrack.chain.pipeline import detect, identify, identify_blind, load_named, locate, locate_exposure
+from startrack.chain.run import add_timing
 from startrack.chain.sky_refinement import EDGE_SIGMA_PX
 from startrack.chain.sky_state import stating_sky
 from startrack.chain.stages import (

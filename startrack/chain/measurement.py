@@ -16,8 +16,8 @@ from startrack.catalog import (
     load_deep_catalog,
 )
 from startrack.chain.orientation import require_time_and_site
-from startrack.chain.stages import Located, Measured, Oriented, Settings, StarFix, StarRays, extend
-from startrack.core.types import Array, Detections, Evidence, Ints, Stars
+from startrack.chain.stages import Located, Measured, Oriented, Settings, StarFix, StarRays
+from startrack.core.types import Array, Detections, Evidence, Fix, Ints, Stars
 from startrack.evidence import (
     BAND_PX,
     SURE_SIGMAS,
@@ -55,7 +55,7 @@ OPEN_SKY_RAD = np.radians(45.0)  # no skyline is as high, except beside a wall
 DEEP_PART = 0.5  # of the light of the stars that only the deep catalogue has
 NO_DEEP_STARS = "the image does not show the faint stars of {}: only Hipparcos is used"
 COMPLETE_V_MAG = 6.5  # frames with 5 sigma at this magnitude show many stars that Hipparcos lacks
-F = TypeVar("F", bound=StarFix)
+R = TypeVar("R", bound=StarRays)
 
 
 def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -> Measured:
@@ -84,10 +84,10 @@ def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -
         response = measure_response(light)
         light = response.correct(light)
     clock = clock_at(site, when, oriented.exposure.time_sigma_s, oriented.exposure.time_sigma_is_stated)
-    return extend(
-        oriented, Measured, terrain=terrain, site=site, R_enu_icrs=R, clock=clock, light=light, response=response,
-        near=settings.near,
-    )  # fmt: skip
+    above = {"terrain": terrain, "site": site}
+    return Measured(
+        **vars(oriented) | above, R_enu_icrs=R, clock=clock, light=light, response=response, near=settings.near
+    )
 
 
 def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
@@ -211,18 +211,18 @@ def locate_rays(rays: StarRays, localizer: Localizer | None = None) -> StarFix:
 
     Raises NotLocated (or another NoSolution of the `localizer`) where the pipeline refuses an image with these `rays`.
     """
-    return fix_position(rays, StarFix, localizer or require_localizer(DEFAULT_LOCALIZER))
+    seen, fix = fix_position(rays, localizer or require_localizer(DEFAULT_LOCALIZER), rays.evidence())
+    return StarFix(**vars(seen), fix=fix)
 
 
-def fix_position(rays: StarRays, to: type[F], localizer: Localizer, evidence: Evidence | None = None) -> F:
-    """`rays` under the sky of the time that they show, with the position, as a value of the class `to`.
+def fix_position(rays: R, localizer: Localizer, evidence: Evidence) -> tuple[R, Fix]:
+    """The position by `evidence`, and the `rays` under the sky of the time that it shows, on ground of its steepness.
 
-    `evidence` None: that of the stars.
+    `rays` are those of the image that the evidence is from. Raises NotLocated as the `localizer` does.
     """
-    rows = rays.evidence() if evidence is None else evidence
-    rays = replace(rays, terrain=settle_steepness(rows, rays.terrain))
-    fix = localizer(rows, rays.terrain)
+    rays = replace(rays, terrain=settle_steepness(evidence, rays.terrain))
+    fix = localizer(evidence, rays.terrain)
     if fix.clock is not None and not rays.terrain.axisymmetric and clock_matters(rays.clock, rays.terrain):
         later_s = fix.clock.offset_s - rays.clock.offset_s
         rays = rays.later(later_s, SURE_SIGMAS * fix.clock.sigma_s) if later_s else rays
-    return extend(rays, to, fix=fix)
+    return rays, fix

@@ -13,7 +13,7 @@ from startrack.catalog import StarCatalog, apparent_bodies, apparent_stars
 from startrack.chain.bright_stars import name_bright_sources
 from startrack.chain.sky_state import stating_sky
 from startrack.chain.source_names import identified_names
-from startrack.chain.stages import Detected, Identified, Inputs, Oriented, Settings, extend
+from startrack.chain.stages import Detected, Identified, Inputs, Oriented, Settings
 from startrack.core.compilation import announce_compilation
 from startrack.core.time_limit import stating_work
 from startrack.core.types import (
@@ -101,7 +101,7 @@ def detect_sources(inputs: Inputs, camera: Camera | None, detector: Detector) ->
             f"the detector returned {type(detections).__name__}, not Detections: put a function that returns (xy_px, "
             "flux_adu) into startrack.detection.PositionDetector(...)"
         )
-    return extend(inputs, Detected, detections=detections)
+    return Detected(**vars(inputs), detections=detections)
 
 
 def _on_moon(inputs: Inputs) -> bool:
@@ -131,8 +131,8 @@ def _identified(
     found: Identification,
 ) -> Identified:  # fmt: skip
     """The next value, with the names of the stars that were `found`."""
-    return extend(
-        detected, Identified, camera=camera, stars=stars, bodies=bodies, site=site, identification=found,
+    return Identified(
+        **vars(detected) | {"camera": camera}, stars=stars, bodies=bodies, site=site, identification=found,
         names=identified_names(detected.detections, found, bodies),
     )  # fmt: skip
 
@@ -208,10 +208,8 @@ def solve_orientation(identified: Identified, has_file: bool = True) -> Oriented
         detections, camera, identified.stars, found, fit.attitude.R_cam_icrs, identified.bodies,
         identified.exposure.time_utc,
     )  # fmt: skip
-    return extend(
-        identified, Oriented, camera=camera, attitude_fit=fit, lens_change_px=change_px, names=names,
-        bodies=names.bodies,
-    )  # fmt: skip
+    corrected = {"camera": camera, "names": names, "bodies": names.bodies}
+    return Oriented(**vars(identified) | corrected, attitude_fit=fit, lens_change_px=change_px)
 
 
 def check_one_attitude(oriented: Oriented) -> None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import time as clock
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Sequence
 from dataclasses import replace
-from types import MappingProxyType
-from typing import Any, TypeVar
 
 import numpy as np
 
@@ -22,22 +20,15 @@ from startrack.chain.orientation import (
     site_on_earth,
     solve_orientation,
 )  # fmt: skip
+from startrack.chain.run import Run, add_timing
 from startrack.chain.sky_refinement import measured_skyline, refine_by_sky_light
-from startrack.chain.stages import Detected, Identified, Inputs, Located, Oriented, Refused, Settings
-from startrack.core.errors import Reason
-from startrack.core.time_limit import check_time, limited_time, stating_work
-from startrack.core.types import BadInput, Exposure, NoSolution
+from startrack.chain.stages import Detected, Inputs, Located, Oriented, Refused, Settings
+from startrack.core.types import BadInput, Exposure
 from startrack.detection import find_damage
 from startrack.evidence import check_single_skyline
 from startrack.frames import Site
 from startrack.localization import localizer_name
 from startrack.terrain import Terrain, load_terrain
-
-HIDDEN_BY_DAMAGE = {  # reasons that damage of the image causes too
-    Reason.NOT_IDENTIFIED, Reason.INCONSISTENT_EVIDENCE, Reason.INSUFFICIENT_GEOMETRY, Reason.DAMAGED_IMAGE,
-}  # fmt: skip
-T = TypeVar("T", bound=Inputs)
-R = TypeVar("R")
 
 
 def locate(
@@ -49,41 +40,40 @@ def locate(
     `settings` exchanges stages. Bad input of an image makes a refusal too: no image raises an exception.
     """
     settings = settings or Settings()
-    run = Run(Inputs(
+    inputs = Inputs(
         exposure=exposure, camera=camera, terrain=terrain, catalog_name=catalog.name,
         localizer_name=localizer_name(settings.localizer), damage=find_damage(exposure, camera),
-    ), settings.time_limit_s)  # fmt: skip
-
-    def stages() -> Located:
-        check_inputs(run.reached)
+    )  # fmt: skip
+    with Run(inputs, settings.time_limit_s) as run:
+        check_inputs(inputs)
         ground = terrain.with_air(exposure.air)
-        run.reached = replace(run.reached, terrain=ground)
-        oriented = _orient(run, camera, settings, identify_stars, camera, catalog, settings, ground.site)
-        run.time_stage("attitude", check_one_attitude, oriented)
-        measured = run.run_stage("evidence", measure_evidence, oriented, ground, settings)
-        first = replace(measured.evidence(), is_first_look=settings.evidence_sources != "stars")
-        located = run.time_stage("locate", fix_position, measured, Located, settings.localizer, first)
-        step = run.time_stage("evidence", sky_step_at, located)
-        is_bright = step is not None and step.exceeds_noise
-        if is_bright:
-            located = run.time_stage("evidence", remeasure_near_skyline, located, step, settings.evidence)
-        if located.damage is None:  # which changes the light of stars in part
-            run.time_stage("locate", check_single_skyline, located.light, located.terrain, located.position_at_time_m)
-        located = run.time_stage("locate", _refine, located, is_bright, settings)
-        sky_mag = None if step is None else step.brightness_mag_arcsec2(camera, exposure.exposure_s)
-        skyline = run.time_stage("locate", measured_skyline, located)
-        return replace(located, sky_brightness_mag_arcsec2=sky_mag, skyline=skyline)
-
-    return run.outcome(stages)
-
-
-def _orient(
-    run: Run, camera: Camera | None, settings: Settings, identify: Callable[..., Identified], *args: Any
-) -> Oriented:  # fmt: skip
-    """The stages up to the attitude; `identify` gets the sources and `args`."""
-    detected = run.run_stage("detect", detect_sources, run.reached, camera, settings.detector)
-    identified = run.run_stage("identify", identify, detected, *args)
-    return run.run_stage("attitude", solve_orientation, identified, camera is not None)
+        inputs = run.reached = replace(inputs, terrain=ground)
+        with run.stage("detect"):
+            detected = run.reached = detect_sources(inputs, camera, settings.detector)
+        with run.stage("identify"):
+            identified = run.reached = identify_stars(detected, camera, catalog, settings, ground.site)
+        with run.stage("attitude"):
+            oriented = run.reached = solve_orientation(identified)
+            check_one_attitude(oriented)
+        with run.stage("evidence"):
+            measured = run.reached = measure_evidence(oriented, ground, settings)
+        with run.stage("locate"):
+            first = replace(measured.evidence(), is_first_look=settings.evidence_sources != "stars")
+            measured, fix = fix_position(measured, settings.localizer, first)
+            located = Located(**vars(measured), fix=fix)
+        with run.stage("evidence"):
+            step = sky_step_at(located)
+            is_bright = step is not None and step.exceeds_noise
+            if step is not None and is_bright:
+                located = remeasure_near_skyline(located, step, settings.evidence)
+        with run.stage("locate"):
+            if located.damage is None:  # which changes the light of stars in part
+                check_single_skyline(located.light, located.terrain, located.position_at_time_m)
+            located = _refine(located, is_bright, settings)
+            sky_mag = None if step is None else step.brightness_mag_arcsec2(camera, exposure.exposure_s)
+            skyline = measured_skyline(located)
+        return run.finish(replace(located, sky_brightness_mag_arcsec2=sky_mag, skyline=skyline))
+    return run.refusal
 
 
 def _refine(located: Located, is_newer: bool, settings: Settings) -> Located:
@@ -94,7 +84,9 @@ def _refine(located: Located, is_newer: bool, settings: Settings) -> Located:
     if located.sky is None and (is_newer or not by_stars):
         is_traced = not located.terrain.axisymmetric  # a round crater is searched again in no time
         support = located.fix.samples if is_traced and not located.fix.ambiguous else None
-        return fix_position(located, Located, settings.localizer, replace(located.evidence(), support=support))
+        rows = replace(located.evidence(), support=support)
+        located, fix = fix_position(located, settings.localizer, rows)
+        return replace(located, fix=fix)
     return located
 
 
@@ -103,9 +95,9 @@ def locate_exposure(exposure: Exposure, settings: Settings | None = None) -> Loc
 
     Raises BadInput (no_calibration, bad_calibration, bad_terrain) where one is not named or cannot be used.
     """
-    start = clock.perf_counter()
+    start = time.perf_counter()
     camera, terrain = load_named(exposure)
-    read_ms = 1e3 * (clock.perf_counter() - start)
+    read_ms = 1e3 * (time.perf_counter() - start)
     return add_timing(locate(exposure, camera, terrain, load_catalog(), settings), read=read_ms)
 
 
@@ -131,15 +123,19 @@ def identify(
     Earth.
     """
     settings = settings or Settings()
-    run = Run(Inputs(exposure=exposure, camera=camera, catalog_name=catalog.name), settings.time_limit_s)
-
-    def stages() -> Oriented:
-        check_inputs(run.reached)
+    inputs = Inputs(exposure=exposure, camera=camera, catalog_name=catalog.name)
+    with Run(inputs, settings.time_limit_s) as run:
+        check_inputs(inputs)
         known = site or site_on_earth(exposure)
         where = known if known is None else known.with_air(exposure.air)
-        return _orient(run, camera, settings, identify_stars, camera, catalog, settings, where)
-
-    return run.outcome(stages)
+        with run.stage("detect"):
+            detected = run.reached = detect_sources(inputs, camera, settings.detector)
+        with run.stage("identify"):
+            identified = run.reached = identify_stars(detected, camera, catalog, settings, where)
+        with run.stage("attitude"):
+            oriented = solve_orientation(identified)
+        return run.finish(oriented)
+    return run.refusal
 
 
 def identify_blind(
@@ -151,67 +147,25 @@ def identify_blind(
     degrees, from there up that of the whole image circle. `catalog` is the list of stars; `settings` has the detector
     and the part of the sky. The lens found is the value's `camera`.
     """
-    settings, fovs_rad = settings or Settings(), np.atleast_1d(fov_rad)
-    run = Run(Inputs(exposure=exposure, catalog_name=catalog.name), settings.time_limit_s)
-    near_sky = settings.identifier.near_sky
-    return run.outcome(lambda: _orient(run, None, settings, identify_unknown_lens, fovs_rad, catalog, near_sky))
+    settings = settings or Settings()
+    inputs = Inputs(exposure=exposure, catalog_name=catalog.name)
+    with Run(inputs, settings.time_limit_s) as run:
+        with run.stage("detect"):
+            detected = run.reached = detect_sources(inputs, None, settings.detector)
+        with run.stage("identify"):
+            fovs_rad, near_sky = np.atleast_1d(fov_rad), settings.identifier.near_sky
+            identified = run.reached = identify_unknown_lens(detected, fovs_rad, catalog, near_sky)
+        with run.stage("attitude"):
+            oriented = solve_orientation(identified, has_file=False)
+        return run.finish(oriented)
+    return run.refusal
 
 
 def detect(exposure: Exposure, camera: Camera | None, settings: Settings | None = None) -> Detected | Refused:
     """Point sources of an `exposure`; `camera` (None: not known) gives fluxes in electrons, `settings` the detector."""
-    run = Run(Inputs(exposure=exposure, camera=camera))
-    detector = (settings or Settings()).detector
-    return run.outcome(lambda: run.run_stage("detect", detect_sources, run.reached, camera, detector))
-
-
-def add_timing(outcome: Any, **more_ms: float) -> Any:
-    """The same `outcome` with `more_ms`, wall times [ms] by stage, added to its stages' times."""
-    times = dict(outcome.timing_ms)
-    for stage, ms in more_ms.items():
-        times[stage] = times.get(stage, 0.0) + ms
-    return replace(outcome, timing_ms=MappingProxyType(times))
-
-
-class Run:
-    """One exposure on its way through the stages: the last complete value, and the wall time of each stage.
-
-    `limit_s` is that of the processor time of all stages; None: the one of a block around, if any.
-    """
-
-    def __init__(self, inputs: Inputs, limit_s: float | None = None) -> None:
-        self.reached, self.limit_s = inputs, limit_s
-        self._timing_ms: dict[str, float] = {}
-
-    def time_stage(self, stage: str, function: Callable[..., R], *args: Any) -> R:
-        """The result of `function(*args)`, its time added to that of the `stage`."""
-        start = clock.perf_counter()
-        try:
-            with stating_work(lambda: f"it was at the stage {stage}"):
-                check_time()
-                return function(*args)
-        finally:
-            self._timing_ms[stage] = self._timing_ms.get(stage, 0.0) + 1e3 * (clock.perf_counter() - start)
-
-    def run_stage(self, stage: str, function: Callable[..., T], *args: Any) -> T:
-        """The same as `time_stage`, for a function that returns the next complete value."""
-        value = self.time_stage(stage, function, *args)
-        self.reached = value
-        return value
-
-    def outcome(self, stages: Callable[[], T]) -> T | Refused:
-        """The value that `stages` return, with their times, or the refusal with the last complete value.
-
-        Of a damaged image its damage may be the reason.
-        """
-        try:
-            with limited_time(self.limit_s):
-                value = stages()
-            return replace(value, timing_ms=MappingProxyType(self._timing_ms))
-        except (BadInput, NoSolution) as cause:
-            damage = self.reached.damage if cause.reason in HIDDEN_BY_DAMAGE else None
-            return Refused(
-                reason=cause.reason if damage is None else Reason.DAMAGED_IMAGE,
-                message=str(cause) if damage is None else f"{damage.message} ({cause})",
-                reached=self.reached,
-                timing_ms=MappingProxyType(self._timing_ms),
-            )
+    inputs = Inputs(exposure=exposure, camera=camera)
+    with Run(inputs) as run:
+        with run.stage("detect"):
+            detected = detect_sources(inputs, camera, (settings or Settings()).detector)
+        return run.finish(detected)
+    return run.refusal

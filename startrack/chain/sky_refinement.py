@@ -65,7 +65,8 @@ def refine_by_sky_light(located: Located, localizer: Localizer, stars: bool = Tr
                 Evidence.concatenate(*parts), image_errors=sky.errors, support=located.fix.samples, clock=located.clock,
                 near=located.near,
             )  # fmt: skip
-            located = replace(fix_position(located, Located, localizer, evidence), sky=sky, by_stars=stars)
+            located, fix = fix_position(located, localizer, evidence)
+            located = replace(located, fix=fix, sky=sky, by_stars=stars)
             moved_rad = predicted_skyline(located)(MIDDLES_RAD) - predicted_skyline(before)(MIDDLES_RAD)
             if np.quantile(np.abs(moved_rad) * sky.light.px_per_rad, 0.9) < MOVED_PX:
                 return located

@@ -9,9 +9,9 @@ returns states which stages have run; no field is filled in later.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Any, NamedTuple, Self, TypeAlias, TypeVar, cast
+from typing import NamedTuple, Self, TypeAlias
 
 import numpy as np
 
@@ -47,7 +47,6 @@ from startrack.terrain import Terrain
 EVIDENCE_SOURCES = ("both", "stars", "sky")  # of a position; "sky" begins with a fix by the stars
 SHOWN_CHANGE_PX = 0.1  # of the lens, from which a warning states it
 STAGES = ("read", "detect", "identify", "attitude", "evidence", "locate")  # keys of `timing_ms`
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -292,9 +291,3 @@ Outcome: TypeAlias = Inputs | Refused  # of a command: Detected, Oriented or Loc
 def last_value(outcome: Outcome) -> Inputs:
     """The last complete value of an outcome: itself, or the value reached before a refusal."""
     return outcome.reached if isinstance(outcome, Refused) else outcome
-
-
-def extend(value: Any, to: type[T], **more: Any) -> T:
-    """The fields of a value and the results of one more stage as the next value of the chain."""
-    known = {f.name: getattr(value, f.name) for f in fields(cast(Any, to)) if hasattr(value, f.name)}
-    return to(**known | more)

@@ -6,7 +6,7 @@ The position has its errors, what was left out of it, and what nobody stated.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -59,9 +59,9 @@ class Clock(Value):
     gross_probability: float = 0.0  # above 0 where `sigma_s` is not stated
     gross_sigma_s: float = 0.0
 
-    def log_prior(self, later_s: Any) -> Any:
+    def log_prior(self, later_s: float) -> float:
         """Logarithm of the prior density, less its maximum and its gross part, `later_s` than the directions' time."""
-        return -0.5 * np.square((self.offset_s + later_s) / self.sigma_s)
+        return -0.5 * ((self.offset_s + later_s) / self.sigma_s) ** 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,6 +161,18 @@ class Integrity:
         return [int(group) for group in order[:count] if self.part[group] > 0.0]
 
 
+class Explored(NamedTuple):
+    """Positions that rows allow, as the posterior on equal squares: of a search, or the likeliest ones of a fix."""
+
+    centres_m: Array  # (n, 2) east and north
+    half_m: float  # of the side of a square
+    log_likelihood: Array  # (n,) at the centres
+    log_dropped: float  # logarithm of a bound of the mass [m2] that was dropped
+    search: str  # "proven" or "beam"
+    dropped_probability: float | None = None  # of an earlier fix with these points; None: by `log_dropped`
+    has_tried_times: bool = False  # whether an earlier fix with these points tried other times
+
+
 UNPROVEN = (
     "search: beam: the search ended before the proof that no other position fits; the stated one is the best that was "
     "found. --near EAST,NORTH,SIGMA narrows the search"
@@ -176,7 +188,7 @@ class Fix(Value):
     radius95_m: float  # circle about the position that holds 95 % of the posterior
     radius999_m: float
     modes: tuple[Mode, ...]  # heaviest first; weights sum to 1
-    at_time_m: Any = None  # (2,) position if the stated time is right; None: that of `position_enu_m`
+    at_time_m: Array = array(2, default=np.nan, may_be_nan=True)  # if the stated time is right; nan: at the position
     ambiguous: bool  # modes outside the main mode's 99.9 % circle hold more than 1 %
     dropped_probability: float | None = None  # bound on what the search left out of the posterior; None: none below 1
     search: str = "proven"  # no other position fits; "beam": not proven to the end; "approximate": no posterior
@@ -184,14 +196,14 @@ class Fix(Value):
     clock: ClockError | None = None  # as the evidence shows it; None: not estimated
     blocked: Blocked | None = None  # parts of the view; None: nothing is blocked
     integrity: Integrity | None = None  # None: not assessed, of several positions or without a posterior
-    raised_rad: Any = None  # (sectors,) by the shared errors, how much the skyline stands above the map's; None: 0
+    raised_rad: Array | None = None  # (sectors,) rise of the skyline above the map's by the shared errors
     unstated: tuple[UnstatedFact, ...] = ()  # the one that widens the circle most first
     shown: tuple[ShownError, ...] = ()  # errors beyond the defaults
-    samples: Any = None  # of the posterior, for a later call with more rows of the same image; None: there are none
+    samples: Explored | None = None  # of the posterior, for a later fix by more rows of the image; None: there are none
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.at_time_m is None:
+        if np.isnan(self.at_time_m).any():
             object.__setattr__(self, "at_time_m", self.position_enu_m[:2])
 
     @property

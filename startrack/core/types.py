@@ -16,16 +16,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.errors import BadInput, NoSolution, NotIdentified, NotLocated, TooFewStars
-from startrack.core.fix import Blocked, Clock, ClockError, Fix, Integrity, Mode, PositionPrior, ShownError, UnstatedFact
+from startrack.core.fix import (
+    Blocked,
+    Clock,
+    ClockError,
+    Explored,
+    Fix,
+    Integrity,
+    Mode,
+    PositionPrior,
+    ShownError,
+    UnstatedFact,
+)
 from startrack.core.obstacles import Obstacles
 from startrack.core.smooth_image import Image, SmoothImage
 from startrack.core.values import Array, Bools, Ints, Rows, Value, array, rotation, vector
 
 __all__ = [
     "Array", "Attitude", "BadInput", "Blocked", "Body", "Bools", "Centroids", "Clock", "ClockError", "Correction",
-    "Detections", "Evidence", "Exposure", "Fix", "Identification", "ImageErrors", "Integrity", "Ints", "Mask",
-    "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified", "NotLocated", "PositionPrior", "Rows", "ShownError",
-    "Stars", "TooFewStars", "UnstatedFact", "Value", "array", "rotation", "vector",
+    "Detections", "Evidence", "Explored", "Exposure", "Fix", "Identification", "ImageErrors", "Integrity", "Ints",
+    "Mask", "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified", "NotLocated", "PositionPrior", "Rows",
+    "ShownError", "Stars", "TooFewStars", "UnstatedFact", "Value", "array", "rotation", "vector",
 ]  # fmt: skip
 
 # Beyond the zenith: the search for an error of the horizon shifts the rows, by three sigma at most.
@@ -84,7 +95,7 @@ class Exposure(Value):
     exposure_s: float | None = None
     camera: str | None = None  # resolved path or shipped name of the camera file
     terrain: str | None = None  # resolved path or shipped name of the terrain file
-    air: Mapping[str, Any] | None = None  # what is stated of the air over the site, by key of `frames.AIR_KEYS`
+    air: Mapping[str, object] | None = None  # what is stated of the air over the site, by key of `frames.AIR_KEYS`
     mask: str | Mask | None = None  # resolved path of the mask's file, or the mask; None: every pixel counts
     obstacles: str | Obstacles | None = None  # resolved path of their file, or themselves: what hides the ground
     saturation_adu: float | None = None  # largest value the file's type can hold, None for float images
@@ -223,7 +234,7 @@ class Evidence(Rows):
     clock: Clock | None = None  # one for all rows; None: the time is exact
     near: PositionPrior | None = None  # of the camera's position; None: anywhere in the search area
     image_errors: ImageErrors | None = None  # of the rows of extended light; None: these are exact
-    support: Any = None  # samples of an earlier fix from much the same rows; None: the whole area is searched
+    support: Explored | None = None  # points of an earlier fix from much the same rows; None: the area is searched
     is_first_look: bool = False  # a fix by more rows of the image follows: this one is sampled roughly and not checked
 
     def __post_init__(self) -> None:

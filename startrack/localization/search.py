@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import ceil, log2
-from typing import NamedTuple
 
 import numpy as np
 
 from startrack.core.time_limit import check_time
-from startrack.core.types import Array, NotLocated
+from startrack.core.types import Array, Explored, NotLocated
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.terrain import Terrain
 
@@ -36,18 +35,6 @@ BOXES_AT_ONCE = 2000  # so that memory stays flat
 FORESEEN_PART, FORESEEN_BUDGETS = 1 / 30, 2.0
 LOOK_UP_COST = 0.08  # of a bound, in horizons traced
 LAST_MOST_BOXES = 16_000  # of a level: it is the last one; from a sixteenth of it on a better position is sought
-
-
-class Explored(NamedTuple):
-    """The posterior on equal boxes."""
-
-    centres_m: Array  # (n, 2)
-    half_m: float
-    log_likelihood: Array  # (n,) at the centres
-    log_dropped: float  # logarithm of a bound of the mass [m2] that was dropped
-    search: str  # "proven" or "beam"
-    dropped_probability: float | None = None  # of an earlier fix with these points; None: by `log_dropped`
-    has_tried_times: bool = False  # whether an earlier fix with these points tried other times
 
 
 def log_sum(values: Array) -> float:

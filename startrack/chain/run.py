@@ -1,0 +1,77 @@
+"""One exposure on its way through the stages: the last complete value, the times of the stages, and the refusal."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from types import MappingProxyType, TracebackType
+from typing import Self, TypeVar
+
+from startrack.chain.stages import Inputs, Outcome, Refused
+from startrack.core.errors import Reason
+from startrack.core.time_limit import check_time, limited_time, stating_work
+from startrack.core.types import BadInput, NoSolution
+
+HIDDEN_BY_DAMAGE = {  # reasons that damage of the image causes too
+    Reason.NOT_IDENTIFIED, Reason.INCONSISTENT_EVIDENCE, Reason.INSUFFICIENT_GEOMETRY, Reason.DAMAGED_IMAGE,
+}  # fmt: skip
+T = TypeVar("T", bound=Inputs)
+AnyOutcome = TypeVar("AnyOutcome", bound=Outcome)
+
+
+class Run:
+    """A block of stages that ends where one of them refuses; `refusal` is then the outcome.
+
+    `limit_s` is that of the processor time of all stages; None: the one of a block around, if any.
+    """
+
+    refusal: Refused
+
+    def __init__(self, inputs: Inputs, limit_s: float | None = None) -> None:
+        self.reached, self.limit_s = inputs, limit_s
+        self._times = dict[str, float]()
+        self._limit = ExitStack()
+
+    def __enter__(self) -> Self:
+        self._limit.enter_context(limited_time(self.limit_s))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, cause: BaseException | None, trace: TracebackType | None
+    ) -> bool:
+        self._limit.close()
+        if not isinstance(cause, BadInput | NoSolution):
+            return False
+        damage = self.reached.damage if cause.reason in HIDDEN_BY_DAMAGE else None  # of which it may be the result
+        self.refusal = Refused(
+            reason=cause.reason if damage is None else Reason.DAMAGED_IMAGE,
+            message=str(cause) if damage is None else f"{damage.message} ({cause})",
+            reached=self.reached,
+            timing_ms=MappingProxyType(self._times),
+        )
+        return True
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """In the block the time counts as that of the stage."""
+        start = time.perf_counter()
+        try:
+            with stating_work(lambda: f"it was at the stage {name}"):
+                check_time()
+                yield
+        finally:
+            self._times[name] = self._times.get(name, 0.0) + 1e3 * (time.perf_counter() - start)
+
+    def finish(self, value: T) -> T:
+        """The last `value` with the times of the stages."""
+        return replace(value, timing_ms=MappingProxyType(self._times))
+
+
+def add_timing(outcome: AnyOutcome, **more_ms: float) -> AnyOutcome:
+    """The same `outcome` with `more_ms`, wall times [ms] by stage, added to its stages' times."""
+    times = dict(outcome.timing_ms)
+    for stage, ms in more_ms.items():
+        times[stage] = times.get(stage, 0.0) + ms
+    return replace(outcome, timing_ms=MappingProxyType(times))

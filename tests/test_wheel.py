@@ -3,10 +3,10 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
-import venv
 import zipfile
 from pathlib import Path
 
@@ -14,6 +14,19 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 BUILD = "from hatchling.build import build_wheel; import sys; print(build_wheel(sys.argv[1]))"
+MODULES_OF_EXTRAS = (  # that the tests below do not load
+    "matplotlib.pyplot", "playwright.sync_api", "axe_playwright_python.sync_playwright", "sphinx", "furo",
+    "myst_parser", "photutils.psf", "sep",
+)  # fmt: skip
+TESTS_OF_EXTRAS = (
+    "test_exposure_read.py", "test_terrain_maps.py", "test_catalog_gaia.py", "test_site.py",
+    "test_exposure_mosaic.py::test_a_tiff_mosaic_and_a_camera_raw_file_give_the_sensors_counts",
+    "test_bag_images.py::test_each_image_is_read_alone_as_it_is_read_in_turn",
+    "test_bag_images.py::test_no_room_is_made_for_more_than_a_bag_holds",
+    "test_batch.py::test_parquet_is_written_with_the_extra_only",
+    "test_batch.py::test_dask_with_a_killed_worker_equals_the_local_run",
+    "test_cli.py::test_shell_completion_knows_the_commands",
+)  # fmt: skip
 
 pytestmark = pytest.mark.slow
 
@@ -94,32 +107,76 @@ def test_the_command_is_declared(wheel):
         assert "startrack = startrack.cli.main:main" in archive.read(entry).decode()
 
 
-@pytest.mark.skipif(sys.version_info >= (3, 13), reason="the oldest packages have no wheels for this Python")
-def test_the_oldest_packages_that_are_allowed_locate_a_sample(wheel, tmp_path):
-    """The lower bounds of pyproject.toml, all at once, in an environment of their own."""
+class Environment:
+    """A new virtual environment of a Python, whose commands see nothing of the checkout. Skips without an index."""
 
-    def output(*words):
+    def __init__(self, base, folder):
+        self.folder = folder
+        self.run(base, "-m", "venv", "venv")
+        self.python = folder / "venv/bin/python"
+        if self.finish(self.python, "-m", "pip", "download", "-q", "--no-deps", "filelock").returncode:
+            pytest.skip("no index of packages is reached")
+
+    def finish(self, *words):
         clean = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "NUMBA_CACHE_DIR")}
-        clean["XDG_CACHE_HOME"] = str(tmp_path / "cache")
-        return subprocess.run(list(map(str, words)), cwd=tmp_path, capture_output=True, text=True, env=clean)
+        clean["XDG_CACHE_HOME"] = str(self.folder / "cache")
+        return subprocess.run(list(map(str, words)), cwd=self.folder, capture_output=True, text=True, env=clean)
 
-    venv.create(tmp_path / "venv", with_pip=True)
-    python = tmp_path / "venv/bin/python"
-    bounds = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
-    lowest = [re.sub(r">=([\w.]+).*", r"==\1", bound) for bound in bounds]
-    (tmp_path / "lowest.txt").write_text("\n".join(lowest))
-    pip = python, "-m", "pip"
-    if output(*pip, "download", "-q", "--no-deps", "-d", tmp_path, "filelock").returncode:
-        pytest.skip("no index of packages is reached")
-    done = output(*pip, "install", "-q", "--only-binary=:all:", "-c", "lowest.txt", wheel)
-    assert done.returncode == 0, done.stderr
-    installed = json.loads(output(*pip, "list", "--format", "json").stdout)
+    def run(self, *words):
+        """The output of a command that succeeds."""
+        done = self.finish(*words)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    def pip(self, *words):
+        return self.run(self.python, "-m", "pip", *words)
+
+    def locate_sample(self):
+        image = ROOT / "sample_images/near-wall.png"
+        position = json.loads(self.run(self.python, "-m", "startrack", "locate", image, "--json", "--no-plots"))[
+            "position"
+        ]
+        assert abs(position["east_m"] + 6900) < 40
+        assert abs(position["north_m"] - 4700) < 40
+
+
+def newest_python(minor):
+    """A Python 3.`minor` of pyenv or on the path; None without one."""
+    pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
+    return next(iter(pyenv.glob(f"3.{minor}.*/bin/python3")), None) or shutil.which(f"python3.{minor}")
+
+
+@pytest.mark.parametrize("minor", [11, 13])
+def test_the_newest_packages_locate_a_sample_and_removal_leaves_nothing(wheel, tmp_path, minor):
+    base = newest_python(minor)
+    if base is None:
+        pytest.skip(f"there is no Python 3.{minor} on this machine")
+    own = Environment(base, tmp_path)
+    own.pip("install", "-q", "--only-binary=:all:", wheel)
+    own.locate_sample()
+    assert len(list(own.folder.glob("venv/lib/python*/site-packages/startrack*"))) == 2
+    own.pip("uninstall", "-q", "-y", "startrack")
+    assert [path for path in own.folder.glob("venv/**/*") if path.name.startswith("startrack")] == []
+
+
+@pytest.mark.skipif(sys.version_info >= (3, 13), reason="the oldest packages have no wheels for this Python")
+def test_the_oldest_packages_that_are_allowed_locate_a_sample_and_pass_the_tests_of_the_extras(wheel, tmp_path):
+    """The lower bounds of pyproject.toml, all at once, in an environment of their own."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    bounds = [*project["dependencies"], *(bound for name in extras if name != "bench" for bound in extras[name])]
+    found = [re.match(r"([\w.-]+)(?:\[\w+\])?>=([\w.]+)", bound) for bound in bounds]
+    lowest = dict(one.groups() for one in found if one)
+    own = Environment(sys.executable, tmp_path)
+    (tmp_path / "lowest.txt").write_text("\n".join(map("==".join, lowest.items())))
+    own.pip("install", "-q", "--only-binary=:all:", "-c", "lowest.txt", f"{wheel}[test,dev]")
+    installed = json.loads(own.pip("list", "--format", "json"))
     versions = {re.sub(r"[-_.]+", "-", one["name"].lower()): one["version"] for one in installed}
-    for name, version in (bound.split("==") for bound in lowest):
-        assert re.fullmatch(rf"{re.escape(version)}(\.0)*", versions[name])
-    image = ROOT / "sample_images/near-wall.png"
-    done = output(python, "-m", "startrack", "locate", image, "--json", "--no-plots")
-    assert done.returncode == 0, done.stderr
-    position = json.loads(done.stdout)["position"]
-    assert abs(position["east_m"] + 6900) < 40
-    assert abs(position["north_m"] - 4700) < 40
+    assert lowest.keys() - versions.keys() <= {"embreex"}  # which other processors do not get
+    for name in lowest.keys() & versions.keys():
+        assert re.fullmatch(rf"{re.escape(lowest[name])}(\.0)*", versions[name])
+    own.locate_sample()
+    own.run(own.python, "-c", f"import {', '.join(MODULES_OF_EXTRAS)}")
+    own.run(
+        own.python, "-m", "pytest", "-q", "-p", "no:cacheprovider", *(ROOT / "tests" / one for one in TESTS_OF_EXTRAS)
+    )

@@ -30,12 +30,14 @@ from startrack.applications.prediction import (
     times_between,
 )
 from startrack.camera import load_camera
+from startrack.catalog import load_catalog
+from startrack.chain import locate
 from startrack.cli.main import main
 from startrack.core.types import BadInput
 from startrack.frames import Site, latlon_from_enu
 from startrack.output import comparison_picture, path_picture
 from startrack.output.picture.prediction import class_bounds_m, prediction_picture
-from startrack.rendering import Drive, exposure_for_snr, limiting_v_mag
+from startrack.rendering import Drive, Series, exposure_for_snr, limiting_v_mag, load_sky_catalog, render
 from startrack.terrain import Cylinder, load_terrain, write_bands
 
 OK, AMBIGUOUS, REFUSED = Status
@@ -102,8 +104,8 @@ def test_a_draw_has_the_protection_level_of_its_position(monkeypatch):
     from startrack.applications.prediction import draws
 
     fixes = []
-    real = draws.locate_rays
-    monkeypatch.setattr(draws, "locate_rays", lambda *given: fixes.append(real(*given)) or fixes[-1])
+    real = draws.locate_measured
+    monkeypatch.setattr(draws, "locate_measured", lambda *given: fixes.append(real(*given)) or fixes[-1])
     conditions = Conditions("fisheye-2048", "shackleton-thesis", (WHEN,), 22.0, 3, "posterior", exposure_s=0.2)
     predictor = Predictor(load_camera("fisheye-2048"), load_terrain("shackleton-thesis"), conditions)
     found = predictor.draw(Place(0, 6000.0, 2000.0))
@@ -235,6 +237,27 @@ def test_the_library_gives_the_radius_of_the_search():
     # Of a normal error the 95 % radius is between 1.96 (a line) and 2.45 (a circle) long standard deviations.
     assert 1.6 < found.cells["radius95_m"][0] / found.cells["sigma_major_m"][0] < 3.0
     assert found.summary["p_ok"] == 1.0
+
+
+@pytest.mark.slow
+def test_predicted_radii_are_those_that_locate_states():
+    """At a place near the wall and one in the middle, for whole images with other noise and another clock."""
+    camera, terrain = load_camera("fisheye-2048"), load_terrain("shackleton-thesis")
+    positions_m = np.array([[6500.0, 3000.0], [-500.0, 1500.0]])
+    predicted_m = startrack.predict(camera, terrain, time=WHEN, positions_m=positions_m, draws=8).cells["radius95_m"]
+    stated_m = []
+    for east_m, north_m in positions_m:
+        series = Series(
+            camera=camera, terrain=terrain, catalog=load_sky_catalog("auto").brighter_than(9.5), seed=77,
+            time_utc=WHEN, east_m=east_m, north_m=north_m,
+        )  # fmt: skip
+        images = [replace(render(scene, rng=rng)[0], time_sigma_s=1.0, time_sigma_is_stated=False)
+                  for scene, rng in map(series.scene, range(4))]  # fmt: skip
+        found = [locate(image, camera, terrain, load_catalog()) for image in images]
+        stated_m.append(np.median([one.fix.radius95_m for one in found]))
+    ratio = predicted_m / stated_m
+    assert ratio.min() > 0.65 and ratio.max() < 1.5
+    assert 0.75 < np.sqrt(ratio.prod()) < 1.33
 
 
 def draws_of(status, radius, covariance):
@@ -371,15 +394,22 @@ def test_bands_are_written_with_their_names(tmp_path):
         assert file.crs.to_dict()["proj"] == "stere"
 
 
-def test_points_of_a_path_include_both_ends():
+def test_every_waypoint_is_a_point_of_the_path():
     terrain = load_terrain("shackleton-thesis")
-    drive = Drive(waypoints_m=np.array([[0.0, 0.0], [0.0, 300.0], [400.0, 300.0]]), speed_m_s=1.0)
-    points = path_points(drive, terrain, 150.0)
-    assert points.distance_m == pytest.approx(np.linspace(0, 700, 6))
-    assert points.position_m[0] == pytest.approx([0, 0])
-    assert points.position_m[-1] == pytest.approx([400, 300])
+    waypoints_m = np.array([[0.0, 0.0], [0.0, 310.0], [30.0, 310.0], [430.0, 310.0]])
+    points = path_points(Drive(waypoints_m=waypoints_m, speed_m_s=0.3), terrain, 100.0)
+    assert points.distance_m == pytest.approx([0, 77.5, 155, 232.5, 310, 340, 440, 540, 640, 740])
+    at = [0, 4, 5, 9]
+    assert np.array_equal(points.position_m[at], waypoints_m)
+    between = np.linalg.norm(np.diff(points.position_m, axis=0), axis=1)
+    assert between == pytest.approx(np.diff(points.distance_m))
+    assert points.spacing_m == pytest.approx(100.0)
+    longer = path_points(Drive(waypoints_m=waypoints_m, speed_m_s=0.3), terrain, 5000.0)
+    assert np.array_equal(longer.position_m, waypoints_m)
     with pytest.raises(BadInput, match="leaves the search area"):
         path_points(Drive(waypoints_m=np.array([[0.0, 0.0], [0.0, 11000.0]]), speed_m_s=1.0), terrain, 1000.0)
+    with pytest.raises(BadInput, match="more than 1000000"):
+        path_points(Drive(waypoints_m=waypoints_m, speed_m_s=1.0), terrain, 1e-5)
 
 
 def test_the_picture_shows_the_classes_and_the_places_without_a_position():

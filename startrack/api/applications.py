@@ -152,7 +152,7 @@ def predict(
 ) -> Prediction:
     """Expected accuracy of positions over the search area of a terrain, or at given positions.
 
-    Evidence of the stars is drawn at every place and located as `locate` does with the stars alone.
+    The stars and the light of the sky at the skyline are drawn at every place and located as `locate` does.
 
     Args:
         camera: as for `locate`; it needs a `[sensor]`.

@@ -17,10 +17,20 @@ from startrack.chain.inputs import (
 )
 from startrack.chain.measurement import CERTAIN_PROBABILITY, COMPLETE_V_MAG, locate_rays, mask_unpredictable
 from startrack.chain.near_attitude import NearAttitude, read_near_attitude
-from startrack.chain.pipeline import detect, identify, identify_blind, load_named, locate, locate_exposure
+from startrack.chain.orientation import fit_orientation
+from startrack.chain.pipeline import (
+    detect,
+    identify,
+    identify_blind,
+    load_named,
+    locate,
+    locate_exposure,
+    locate_measured,
+)  # fmt: skip
 from startrack.chain.run import add_timing
 from startrack.chain.sky_refinement import EDGE_SIGMA_PX
 from startrack.chain.sky_state import stating_sky
+from startrack.chain.source_names import identified_names
 from startrack.chain.stages import (
     STAGES,
     Detected,
@@ -41,8 +51,8 @@ __all__ = [
     "CERTAIN_PROBABILITY", "COMPLETE_V_MAG", "EDGE_SIGMA_PX", "MISSING", "STAGES", "Detected", "Identified", "Image",
     "Inputs", "Located", "Measured", "NearAttitude", "Oriented", "Outcome", "Refused", "Settings", "StarFix",
     "StarRays", "Time", "add_timing", "angle_rad", "are_unchanged", "camera_input", "content_sha256", "detect",
-    "duration_s", "exposure_input", "field_of_view_rad", "identify", "identify_blind", "input_hashes",
-    "is_list_of_centroids", "job_sha256", "last_value", "load_camera_input", "load_named", "locate", "locate_exposure",
-    "locate_rays", "mask_unpredictable", "read_near_attitude", "settings_input", "stating_sky", "terrain_input",
-    "time_input",
+    "duration_s", "exposure_input", "field_of_view_rad", "fit_orientation", "identified_names", "identify",
+    "identify_blind", "input_hashes", "is_list_of_centroids", "job_sha256", "last_value", "load_camera_input",
+    "load_named", "locate", "locate_exposure", "locate_measured", "locate_rays", "mask_unpredictable",
+    "read_near_attitude", "settings_input", "stating_sky", "terrain_input", "time_input",
 ]  # fmt: skip

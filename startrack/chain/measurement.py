@@ -21,6 +21,7 @@ from startrack.core.types import Array, Detections, Evidence, Fix, Ints, Stars
 from startrack.evidence import (
     BAND_PX,
     SURE_SIGMAS,
+    FluxScale,
     Skyline,
     SkyStep,
     StarEvidence,
@@ -74,20 +75,32 @@ def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -
     R, response = R_enu_icrs(site, when), None
     if oriented.damage is not None:
         oriented = replace(oriented, detections=with_noise_of_blocks(oriented.detections))
-    light = _photometry(oriented, terrain, R, settings.evidence, oriented.detections)
+    scale = _flux_scale(oriented, R, site)
+    light = _photometry(oriented, terrain, R, scale, settings.evidence, oriented.detections)
     if oriented.catalog_name != shown.catalog_name and not _shows_deep_stars(light, oriented.stars):
         warnings = (*shown.exposure.warnings, NO_DEEP_STARS.format(oriented.catalog_name))
         exposure = replace(shown.exposure, warnings=warnings)
         oriented = replace(shown, exposure=exposure, detections=oriented.detections)
-        light = _photometry(oriented, terrain, R, settings.evidence, oriented.detections)
+        scale = _flux_scale(oriented, R, site)
+        light = _photometry(oriented, terrain, R, scale, settings.evidence, oriented.detections)
     if oriented.damage is not None:
         response = measure_response(light)
         light = response.correct(light)
     clock = clock_at(site, when, oriented.exposure.time_sigma_s, oriented.exposure.time_sigma_is_stated)
     above = {"terrain": terrain, "site": site}
     return Measured(
-        **vars(oriented) | above, R_enu_icrs=R, clock=clock, light=light, response=response, near=settings.near
-    )
+        **vars(oriented) | above, R_enu_icrs=R, clock=clock, scale=scale, light=light, response=response,
+        near=settings.near,
+    )  # fmt: skip
+
+
+def _flux_scale(oriented: Oriented, R_enu_icrs: Array, site: Site) -> FluxScale:
+    """The scale of the light of `oriented` stars by the identified ones."""
+    found, stars = oriented.identification, oriented.stars
+    return flux_scale(
+        oriented.detections, oriented.camera, stars, (found.detection, found.star),
+        oriented.attitude_fit.attitude.R_cam_icrs, airmass_at(stars.rays_icrs @ R_enu_icrs.T, site),
+    )  # fmt: skip
 
 
 def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
@@ -164,7 +177,14 @@ def remeasure_near_skyline(measured: Located, step: SkyStep, photometry: StarEvi
     by_fix = np.where(above_px > 0, CERTAIN_PROBABILITY, 1.0 - CERTAIN_PROBABILITY)
     visible = np.where(undecided, 1.0 / (1.0 + np.exp(-light.llr)), by_fix)
     newer = _photometry(
-        measured, terrain, measured.R_enu_icrs, photometry, detections, light.star[around], visible[around]
+        measured,
+        terrain,
+        measured.R_enu_icrs,
+        measured.scale,
+        photometry,
+        detections,
+        light.star[around],
+        visible[around],
     )
     newer = newer if measured.response is None else measured.response.correct(newer)
     return replace(measured, light=light.replace_stars(newer, light.star[wanted]))
@@ -174,14 +194,15 @@ def _photometry(
     oriented: Oriented,
     terrain: Terrain,
     R_enu_icrs: Array,
+    scale: FluxScale,
     photometry: StarEvidence,
     detections: Detections,
     only: Ints | None = None,
     visible: Array | None = None,
 ) -> StarPhotometry:
     """Photometry of all stars, or of those with the indices `only`; 0 evidence where the terrain is not known."""
-    R, stars, found = oriented.attitude_fit.attitude.R_cam_icrs, oriented.stars, oriented.identification
-    air = airmass_at(oriented.stars.rays_icrs @ R_enu_icrs.T, terrain.site)
+    R, stars = oriented.attitude_fit.attitude.R_cam_icrs, oriented.stars
+    air = airmass_at(stars.rays_icrs @ R_enu_icrs.T, terrain.site)
     light = photometry(
         detections,
         oriented.camera,
@@ -189,7 +210,7 @@ def _photometry(
         list(oriented.bodies),
         R,
         R_enu_icrs,
-        flux_scale(oriented.detections, oriented.camera, stars, (found.detection, found.star), R, air),
+        scale,
         oriented.attitude_fit.extra_sigma_px,
         visible,
         air if air is None or only is None else air[only],

@@ -193,6 +193,16 @@ def _identify_at_fovs(detected: Detected, fovs_rad: Array, stars: Stars, near_sk
 
 
 def solve_orientation(identified: Identified, has_file: bool = True) -> Oriented:
+    """`fit_orientation` with the names of the brightest sources. Raises NotIdentified."""
+    oriented = fit_orientation(identified, has_file)
+    names = name_bright_sources(
+        oriented.detections, oriented.camera, oriented.stars, oriented.identification,
+        oriented.attitude_fit.attitude.R_cam_icrs, oriented.bodies, oriented.exposure.time_utc,
+    )  # fmt: skip
+    return replace(oriented, names=names, bodies=names.bodies)
+
+
+def fit_orientation(identified: Identified, has_file: bool = True) -> Oriented:
     """The attitude that fits the `identified` stars. Raises NotIdentified.
 
     Where the stars show that the lens differs from its file the value's camera is the corrected one. Without `has_file`
@@ -204,12 +214,8 @@ def solve_orientation(identified: Identified, has_file: bool = True) -> Oriented
         identified.stars.rays_icrs[found.star], found.R_cam_icrs,
     )  # fmt: skip
     camera, fit, change_px = correct_lens(*matches) if has_file else (*solve_with_misfit(*matches), 0.0)
-    names = name_bright_sources(
-        detections, camera, identified.stars, found, fit.attitude.R_cam_icrs, identified.bodies,
-        identified.exposure.time_utc,
-    )  # fmt: skip
-    corrected = {"camera": camera, "names": names, "bodies": names.bodies}
-    return Oriented(**vars(identified) | corrected, attitude_fit=fit, lens_change_px=change_px)
+    corrected = vars(identified) | {"camera": camera}
+    return Oriented(**corrected, attitude_fit=fit, lens_change_px=change_px)
 
 
 def check_one_attitude(oriented: Oriented) -> None:

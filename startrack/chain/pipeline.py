@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +24,7 @@ from startrack.chain.orientation import (
 )  # fmt: skip
 from startrack.chain.run import Run, add_timing
 from startrack.chain.sky_refinement import measured_skyline, refine_by_sky_light
-from startrack.chain.stages import Detected, Inputs, Located, Oriented, Refused, Settings
+from startrack.chain.stages import Detected, Inputs, Located, Measured, Oriented, Refused, Settings
 from startrack.core.types import BadInput, Exposure
 from startrack.detection import find_damage
 from startrack.evidence import check_single_skyline
@@ -57,23 +59,35 @@ def locate(
             check_one_attitude(oriented)
         with run.stage("evidence"):
             measured = run.reached = measure_evidence(oriented, ground, settings)
+        located = locate_measured(measured, settings, run.stage)
         with run.stage("locate"):
-            first = replace(measured.evidence(), is_first_look=settings.evidence_sources != "stars")
-            measured, fix = fix_position(measured, settings.localizer, first)
-            located = Located(**vars(measured), fix=fix)
-        with run.stage("evidence"):
-            step = sky_step_at(located)
-            is_bright = step is not None and step.exceeds_noise
-            if step is not None and is_bright:
-                located = remeasure_near_skyline(located, step, settings.evidence)
-        with run.stage("locate"):
-            if located.damage is None:  # which changes the light of stars in part
-                check_single_skyline(located.light, located.terrain, located.position_at_time_m)
-            located = _refine(located, is_bright, settings)
-            sky_mag = None if step is None else step.brightness_mag_arcsec2(camera, exposure.exposure_s)
             skyline = measured_skyline(located)
-        return run.finish(replace(located, sky_brightness_mag_arcsec2=sky_mag, skyline=skyline))
+        return run.finish(replace(located, skyline=skyline))
     return run.refusal
+
+
+def locate_measured(
+    measured: Measured, settings: Settings, stage: Callable[[str], AbstractContextManager[Any]] = nullcontext
+) -> Located:
+    """The position by the stars of `measured` and the light of the sky in its image, as `settings` ask for.
+
+    The work is done in blocks of `stage`, which is given the name of each. Raises NoSolution of the localizer.
+    """
+    with stage("locate"):
+        first = replace(measured.evidence(), is_first_look=settings.evidence_sources != "stars")
+        measured, fix = fix_position(measured, settings.localizer, first)
+        located = Located(**vars(measured), fix=fix)
+    with stage("evidence"):
+        step = sky_step_at(located)
+        is_bright = step is not None and step.exceeds_noise
+        if step is not None and is_bright:
+            located = remeasure_near_skyline(located, step, settings.evidence)
+    with stage("locate"):
+        if located.damage is None:  # which changes the light of stars in part
+            check_single_skyline(located.light, located.terrain, located.position_at_time_m)
+        located = _refine(located, is_bright, settings)
+    sky_mag = None if step is None else step.brightness_mag_arcsec2(located.camera, located.exposure.exposure_s)
+    return replace(located, sky_brightness_mag_arcsec2=sky_mag)
 
 
 def _refine(located: Located, is_newer: bool, settings: Settings) -> Located:

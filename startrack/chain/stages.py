@@ -38,7 +38,7 @@ from startrack.core.types import (
 )  # fmt: skip
 from startrack.detection import Damage, Detector
 from startrack.estimation.attitude import AttitudeFit
-from startrack.evidence import DamagedResponse, SkyLight, StarEvidence, StarPhotometry
+from startrack.evidence import DamagedResponse, FluxScale, SkyLight, StarEvidence, StarPhotometry
 from startrack.frames import R_from_rotvec, Site
 from startrack.identification import Identifier
 from startrack.localization import DEFAULT_LOCALIZER, Localizer, has_posterior, require_localizer
@@ -173,9 +173,8 @@ class StarRays:
         """The same under the sky of a time later by `seconds`, which is right to `reach_s`."""
         R = R_from_rotvec(seconds * self.clock.turn_rad_s)
         clock = replace(self.clock, offset_s=self.clock.offset_s + seconds, reach_s=reach_s)
-        return replace(
-            self, R_enu_icrs=R @ self.R_enu_icrs, light=self.light.turn_frame(R, self.terrain.air), clock=clock
-        )
+        light = self.light.turn_frame(R, self.terrain.air)
+        return replace(self, R_enu_icrs=R @ self.R_enu_icrs, light=light, clock=clock)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -195,6 +194,7 @@ class Measured(StarRays, Oriented):
     """An attitude above a terrain, with photometry at every catalogue star in view."""
 
     site: Site  # of the terrain
+    scale: FluxScale  # of the stars' light
     response: DamagedResponse | None = None  # of a damaged image to stars
 
     @property

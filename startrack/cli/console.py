@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
 
 STEP_S = {  # of a step, by the first word of what is done: images of 4 Mpx, draws on a height map, 2 cores
-    "calibrate": 0.25, "calibrate-board": 1.0, "horizon": 0.7, "locate": 0.6, "predict": 1.0,
+    "calibrate": 0.25, "calibrate-board": 1.0, "horizon": 0.7, "locate": 0.6, "predict": 2.0,
     "render": 1.3, "track": 1.0,
 }  # fmt: skip
 LINE_S = 10.0

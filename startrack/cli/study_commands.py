@@ -102,7 +102,7 @@ COMMANDS = (
     ),
     Command(
         "predict", function_at("studies.predict"), "expected accuracy over a terrain, before a drive",
-        "Predict how well images would be located: evidence of the stars is drawn at every place and located as "
+        "Predict how well images would be located: stars and the sky's light are drawn at every place and located as "
         "`locate` does. Writes predict.tif, predict.qml, predict.png, predict.ecsv and predict.json. Draws are kept in "
         "OUT/.predict: a stopped run is resumed.",
         {
@@ -126,7 +126,7 @@ COMMANDS = (
                 )),
                 flag("--target-radius95 M", "wanted at nine of ten places", types.positive_number),
                 flag("--compare CAMERA2", "a second camera at the same places"),
-                flag("--path WAYPOINTS", "CSV with east_m,north_m: the places are on this path"),
+                flag("--path WAYPOINTS", "CSV with east_m,north_m: places at these points and between"),
                 flag("--odometry-sigma F", "with --path: odometry between the places, error of a move", types.amount),
                 flag("--odometry-floor M", "beside that, in quadrature (as of `track`)", types.amount),
             ),

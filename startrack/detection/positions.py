@@ -53,16 +53,25 @@ class PositionDetector:
         frame = source.frame(sigma_px)
         column, row = nearest_pixels(xy_px, frame.shape, 0).T
         noise_2 = np.square(frame.noise.at(row, column).astype(np.float64))
-        # Of a Gaussian that noise, photons and its own shape (a part of the signal) disturb; the sums are integrals.
-        width_2, photons = sigma_px**2 + PIXEL_VARIANCE_PX2, source.source_noise.per_unit
-        flux_2 = 4 * np.pi * width_2 * noise_2 + photons * flux + np.square(MODEL_ERROR * flux) / (2 * np.pi * width_2)
-        place_2 = 8 * np.pi * width_2**2 * noise_2 / flux**2 + photons * width_2 / flux + MODEL_ERROR**2 / (2 * np.pi)
+        flux_2, place_2 = source_variances(flux, noise_2, sigma_px, source.source_noise.per_unit)
         place_2 = place_2 if self.sigma_px is None else np.full(len(flux), self.sigma_px**2)
         return Detections(
             xy_px=xy_px, covariance_px2=place_2[:, None, None] * np.eye(2), flux_e=flux, flux_sigma_e=np.sqrt(flux_2),
             snr=flux / np.sqrt(flux_2), saturated=source.unusable[row, column], psf_sigma_px=sigma_px,
             image_e=source.image, dead=source.unusable, background=frame.background, noise=frame.noise, mask=mask,
         )  # fmt: skip
+
+
+def source_variances(flux: Array, noise_2: Array | float, psf_sigma_px: float, photons: float) -> tuple[Array, Array]:
+    """Variances (n,) of flux and position per axis [px^2] of a matched filter for sources of `flux` (n,).
+
+    `noise_2` is the variance of a pixel without a source, `photons` what one unit of light adds to it. Of a Gaussian
+    that noise, photons and its own shape (a part of the signal) disturb; the sums are integrals.
+    """
+    width_2 = psf_sigma_px**2 + PIXEL_VARIANCE_PX2
+    flux_2 = 4 * np.pi * width_2 * noise_2 + photons * flux + np.square(MODEL_ERROR * flux) / (2 * np.pi * width_2)
+    place_2 = 8 * np.pi * width_2**2 * noise_2 / flux**2 + photons * width_2 / flux + MODEL_ERROR**2 / (2 * np.pi)
+    return flux_2, place_2
 
 
 def _checked(found: Any, size_px: tuple[int, int]) -> tuple[Array, Array]:

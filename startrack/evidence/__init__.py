@@ -39,6 +39,7 @@ from startrack.evidence.sky_step import (
     height_above_px,
     measure_sky_step,
     reliable_azimuths,
+    skyline_band,
     subtract_sky_step,
 )
 from startrack.evidence.star_evidence import (
@@ -60,5 +61,5 @@ __all__ = [
     "expect_stars", "expected_flux_scale", "filtered_noise_e", "fit_flux_scale", "flux_scale", "half_width",
     "height_above_px", "leave_out_obstacles", "measure", "measure_response", "measure_sky_light", "measure_sky_step",
     "measure_star_offsets", "neighbour_profiles", "offset_terms", "order_by_cell", "pixels_near_skyline", "profiles_of",
-    "reliable_azimuths", "sectors_with_step", "subtract_sky_step", "with_noise_of_blocks",
+    "reliable_azimuths", "sectors_with_step", "skyline_band", "subtract_sky_step", "with_noise_of_blocks",
 ]  # fmt: skip

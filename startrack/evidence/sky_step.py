@@ -184,8 +184,10 @@ def height_above_px(
     return np.asarray((elevation_rad - horizon(azimuth_rad)) * px_per_rad)
 
 
-def skyline_band(shape: tuple[int, ...], camera: Camera, R_cam_enu: Array, horizon: Horizon) -> Bools:
-    """Pixels (H, W) of an image of that `shape` within BAND_PX of a `horizon`, with some to spare.
+def skyline_band(
+    shape: tuple[int, ...], camera: Camera, R_cam_enu: Array, horizon: Horizon, reach_px: float = BAND_PX
+) -> Bools:
+    """Pixels (H, W) of an image of that `shape` within `reach_px` of a `horizon`, with some to spare.
 
     `camera` and `R_cam_enu` place the skyline in the image.
     """
@@ -194,7 +196,7 @@ def skyline_band(shape: tuple[int, ...], camera: Camera, R_cam_enu: Array, horiz
     picture = np.full(shape, 0, dtype=np.uint8)  # np.zeros would take small memory pages
     points = np.rint(xy).astype(np.int32)
     both = np.flatnonzero(inside & np.roll(inside, 1))
-    cv2.polylines(picture, list(np.stack([points[both - 1], points[both]], axis=1)), False, 1, int(2 * BAND_PX) + 3)
+    cv2.polylines(picture, list(np.stack([points[both - 1], points[both]], axis=1)), False, 1, int(2 * reach_px) + 3)
     return picture.view(np.bool_)
 
 

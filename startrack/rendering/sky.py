@@ -50,12 +50,22 @@ def diffuse_e(scene: Scene) -> Array:
     sky, above = _sky_and_mask(scene)
     if scene.terrain is None:
         return sky
-    fraction = np.where(above, 1.0, scene.wall_reflectance)
     edge = _skyline_pixels(above, _sigma_px(scene)) & (sky > 0)
     y, x = np.nonzero(edge)
-    fraction[y, x] = scene.wall_reflectance + (1 - scene.wall_reflectance) * coverage(scene, np.stack([x, y], axis=-1))
-    sky *= fraction
-    return sky
+    return sky * _part_of_sky(scene, above, edge, np.stack([x, y], axis=-1))
+
+
+def diffuse_at_e(scene: Scene, xy_px: Ints, edge: Bools) -> Array:
+    """The electrons (n,) that `diffuse_e` has in pixels (n, 2), some of which are close to the skyline: `edge` (n,)."""
+    sky, above = _sky_function(scene)(*scene.camera.radial(xy_px.astype(np.float64)))
+    return sky * _part_of_sky(scene, above, edge, xy_px[edge])
+
+
+def _part_of_sky(scene: Scene, above: Bools, edge: Bools, edge_px: Ints) -> Array:
+    """Light as a fraction of the sky's of pixels `above` the skyline or below; those at its `edge` are at `edge_px`."""
+    fraction = np.where(above, 1.0, scene.wall_reflectance)
+    fraction[edge] = scene.wall_reflectance + (1 - scene.wall_reflectance) * coverage(scene, edge_px)
+    return fraction
 
 
 def coverage(scene: Scene, xy_px: Ints | Array) -> Array:
@@ -121,27 +131,36 @@ def _skyline_pixels(above: Bools, sigma_px: float) -> Bools:
 def _sky_and_mask(scene: Scene) -> tuple[Array, Bools]:
     """Sky light (H, W) [e] with no terrain before it, and whether the pixel's centre is above the skyline (H, W)."""
     camera, (width, height) = scene.camera, scene.camera.size_px
-    rho, sky_e, side, axial = _lens_table(scene)
     fx, fy = camera.handed_focal_px
     u = (np.arange(width) - camera.centre_px[0]) / fx
     v = (np.arange(height)[:, None] - camera.centre_px[1]) / fy
-    shift_of = _decentring_of_rows(camera)
+    shift_of, sky_at = _decentring_of_rows(camera), _sky_function(scene)
     sky, above = np.empty((height, width)), np.ones((height, width), dtype=bool)
-    tan_horizon = None if scene.terrain is None else np.tan(np.minimum(scene.skyline_rad[1], 1.5707))
-    east, north, up = scene.R_cam_enu.T
     for top in range(0, height, ROWS_PER_BLOCK):
         rows = slice(top, min(top + ROWS_PER_BLOCK, height))
         du, dv = shift_of(rows)
-        x, y = u - du, v[rows] - dv
+        sky[rows], above[rows] = sky_at(u - du, v[rows] - dv)
+    return sky, above
+
+
+def _sky_function(scene: Scene) -> Callable[[Array, Array], tuple[Array, Bools]]:
+    """A function of places x, y in the image [focal lengths], decentring removed, to what `_sky_and_mask` returns."""
+    rho, sky_e, side, axial = _lens_table(scene)
+    tan_horizon = None if scene.terrain is None else np.tan(np.minimum(scene.skyline_rad[1], 1.5707))
+    east, north, up = scene.R_cam_enu.T
+
+    def sky_at(x: Array, y: Array) -> tuple[Array, Bools]:
         r = np.sqrt(x * x + y * y)
-        sky[rows] = np.interp(r, rho, sky_e, right=0.0)
+        sky = np.interp(r, rho, sky_e, right=0.0)
         s, c = np.interp(r, rho, side), np.interp(r, rho, axial)
         e, n, h = ((axis[0] * x + axis[1] * y) * s + axis[2] * c for axis in (east, north, up))
         if scene.sky_gradient:
-            sky[rows] *= sky_gradient(scene, e, n)
-        if tan_horizon is not None:
-            above[rows] = _is_above_horizon(e, n, h, scene.skyline_rad[0], tan_horizon)
-    return sky, above
+            sky *= sky_gradient(scene, e, n)
+        if tan_horizon is None:
+            return sky, np.ones(sky.shape, dtype=bool)
+        return sky, _is_above_horizon(e, n, h, scene.skyline_rad[0], tan_horizon)
+
+    return sky_at
 
 
 def _decentring_of_rows(camera: Camera) -> Callable[[slice], Array]:

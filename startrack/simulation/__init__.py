@@ -1,7 +1,10 @@
 """Evidence without pixels: what the pipeline measures of a scene, drawn without pixels."""
 
 from startrack.simulation.ground_errors import draw_ground
-from startrack.simulation.star_rays import simulate_rays
+from startrack.simulation.skyline_image import draw_band, draw_camera, simulate_measured
+from startrack.simulation.star_rays import simulate_rays, simulate_stars
 from startrack.simulation.starlight import Starlight
 
-__all__ = ["Starlight", "draw_ground", "simulate_rays"]
+__all__ = [
+    "Starlight", "draw_band", "draw_camera", "draw_ground", "simulate_measured", "simulate_rays", "simulate_stars",
+]  # fmt: skip

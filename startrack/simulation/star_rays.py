@@ -2,21 +2,23 @@
 
 What is left out: errors of the attitude and of the lens (a hundredth of a pixel), hot pixels and cosmic rays (the
 photometry masks them), light of the bodies beyond their glare, trails, and errors of the background near the skyline.
+`skyline_image.py` adds pixels near the skyline.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from datetime import datetime
 
 import numpy as np
 
 from startrack.catalog import StarCatalog, airmass_at, apparent_stars
 from startrack.chain import CERTAIN_PROBABILITY, StarRays, mask_unpredictable
-from startrack.core.types import TIME_SIGMA_S, Array, BadInput, Bools, Ints
+from startrack.core.types import TIME_SIGMA_S, Array, BadInput, Bools, Ints, Mask, Stars
 from startrack.evidence import (
     SCALE_SNR,
     SCALE_STARS,
-    SKYLINE_POINTS,
+    FluxScale,
     Skyline,
     StarEvidence,
     add_obstacles,
@@ -30,10 +32,39 @@ from startrack.localization import clock_at
 from startrack.psf import noise_area_px
 from startrack.rendering import Scene, flux_e, sky_e_per_s, sky_gradient
 from startrack.simulation.starlight import Starlight
-from startrack.terrain import Terrain, require_site
+from startrack.terrain import ForwardingTerrain, Terrain, require_site
 
-EXACT_RAD = np.radians(2.0)  # from the skyline; farther, its elevations at one azimuth in 15 arcmin decide
 UNDECIDED_RAD = np.radians(0.2)  # from the skyline: here the visibility of a neighbour is not known
+
+
+class SeenGround(ForwardingTerrain):
+    """The ground `whole` with its horizon traced once, from the position of the camera (2,)."""
+
+    def __init__(self, whole: Terrain, position_m: Array) -> None:
+        super().__init__(whole)
+        self.skyline = Skyline.trace(position_m, whole)
+
+    without_table = Terrain.without_table  # itself
+
+    def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """Horizon elevation (n,) [rad] at azimuths (n,), whatever the position."""
+        return self.skyline(azimuths_rad)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SimulatedStars:
+    """The stars of a scene as they shine, and as they are measured."""
+
+    scene: Scene  # its terrain is a `SeenGround`
+    shining: Ints  # (m,) of the scene's stars: those that nothing hides
+    xy_px: Array  # (m, 2)
+    flux_e: Array  # (m,) whole PSF
+    noise_e: float  # of a pixel halfway between the axis and the edge of the view
+    saturation_e: float  # of a pixel
+    catalog: Stars  # at the stated time
+    scale: FluxScale
+    mask: Mask | None  # of the camera, and of obstacles
+    rays: StarRays
 
 
 def simulate_rays(
@@ -59,6 +90,14 @@ def simulate_rays(
 
     Raises BadInput: bad_terrain and no_time where scene or map lack what relates the stars to the ground.
     """
+    return simulate_stars(scene, catalog, terrain, time_utc=time_utc, time_sigma_s=time_sigma_s, rng=rng).rays
+
+
+def simulate_stars(
+    scene: Scene, catalog: StarCatalog, terrain: Terrain | None, *, time_utc: datetime | None,
+    time_sigma_s: float | None, rng: np.random.Generator,
+) -> SimulatedStars:  # fmt: skip
+    """The stars of a `scene` and their photometry; arguments and errors are those of `simulate_rays`."""
     ground = scene.terrain
     if ground is None:
         raise BadInput("bad_terrain", "the scene has no terrain: nothing hides the stars")
@@ -66,10 +105,9 @@ def simulate_rays(
     site = require_site(terrain)
     if scene.time_utc is None:
         raise BadInput("no_time", "the time of the scene is not known")
-    camera, when = scene.camera, time_utc or scene.time_utc
-    sensor = scene.sensor
-    skyline = Skyline.trace(scene.position_enu_m[:2], ground, SKYLINE_POINTS)
-    shining, angle_rad = _shining_stars(scene, ground, skyline)
+    camera, sensor, when = scene.camera, scene.sensor, time_utc or scene.time_utc
+    scene = replace(scene, terrain=SeenGround(ground, scene.position_enu_m[:2]))
+    shining, angle_rad = _shining_stars(scene)
     v_mag, error_mag = scene.stars.v_mag[shining], scene.v_error_mag[shining]
     # Noise of a star's flux halfway between the axis and the edge of the view.
     half = 0.5 * scene.camera.max_angle_rad
@@ -96,35 +134,35 @@ def simulate_rays(
         air=airmass_at(stars.rays_icrs @ R_enu.T, site),
     )  # fmt: skip
     true = np.asarray(stars.rays_icrs[found.star] @ scene.R_enu_icrs.T)  # directions at the true time
-    above = _height_above(true, skyline)
+    above = _height_above(scene, true)
     sure = np.where(above > 0, CERTAIN_PROBABILITY, 1.0 - CERTAIN_PROBABILITY)
     visible = np.where(np.abs(above) < UNDECIDED_RAD, 0.5, sure)[found.measurable]
     variance = _pixel_variance_e2(scene, true, above > 0)[found.measurable]
     xy_px, _ = camera.project(rays_icrs @ scene.R_cam_icrs.T)
-    light = Starlight(xy_px, light_e, sensor.psf_sigma_px).measure(
-        found.sources(visible), variance, sensor.gain_e_per_adu * (sensor.saturation_adu - sensor.bias_adu), rng=rng
-    )
+    saturation_e = sensor.gain_e_per_adu * (sensor.saturation_adu - sensor.bias_adu)
+    sources = found.sources(visible)
+    light = Starlight(xy_px, light_e, sensor.psf_sigma_px).measure(sources, variance, saturation_e, rng=rng)
     measured = mask_unpredictable(StarEvidence().judge(found, light), terrain)
     sigma_s = TIME_SIGMA_S if time_sigma_s is None else time_sigma_s
     clock = clock_at(site, when, sigma_s, is_stated=time_sigma_s is not None)
-    return StarRays(terrain=terrain, R_enu_icrs=R_enu, clock=clock, light=measured)
+    return SimulatedStars(
+        scene=scene, shining=shining, xy_px=xy_px, flux_e=light_e, noise_e=float(np.sqrt(pixel_e2)),
+        saturation_e=saturation_e, catalog=stars, scale=scale, mask=mask,
+        rays=StarRays(terrain=terrain, R_enu_icrs=R_enu, clock=clock, light=measured),
+    )  # fmt: skip
 
 
-def _shining_stars(scene: Scene, ground: Terrain, skyline: Skyline) -> tuple[Ints, Array]:
+def _shining_stars(scene: Scene) -> tuple[Ints, Array]:
     """The scene's stars (m,) in the image circle that the ground leaves visible at mid-exposure, and their angles."""
     angle = off_axis_rad(scene.stars.rays_icrs @ scene.R_cam_icrs.T)
     star = np.flatnonzero(angle <= scene.camera.max_angle_rad)
-    rays_enu = scene.stars.rays_icrs[star] @ scene.R_enu_icrs.T
-    above = _height_above(rays_enu, skyline)
-    near = np.flatnonzero(np.abs(above) < EXACT_RAD)
-    azimuth, elevation = azel_from_rays(rays_enu[near])
-    above[near] = elevation - np.asarray(ground.horizon_rad(scene.position_enu_m[None, :2], azimuth)).ravel()
-    return star[above > 0], angle[star[above > 0]]
+    star = star[_height_above(scene, scene.stars.rays_icrs[star] @ scene.R_enu_icrs.T) > 0]
+    return star, angle[star]
 
 
-def _height_above(rays_enu: Array, skyline: Skyline) -> Array:
+def _height_above(scene: Scene, rays_enu: Array) -> Array:
     azimuth, elevation = azel_from_rays(rays_enu)
-    return np.asarray(elevation - skyline(azimuth))
+    return np.asarray(elevation - scene.horizon_rad(azimuth))
 
 
 def _pixel_variance_e2(scene: Scene, rays_enu: Array, above: Bools) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from enum import IntEnum
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -13,21 +13,21 @@ import numpy as np
 
 from startrack.camera import Camera, load_camera
 from startrack.catalog import StarCatalog, has_deep_catalog, load_catalog, load_deep_catalog
-from startrack.chain import COMPLETE_V_MAG, locate_rays
+from startrack.chain import COMPLETE_V_MAG, Settings, locate_measured
 from startrack.core import MAX_COUNT
 from startrack.core.chunk_store import Chunk, ChunkStore, Progress, settings_digest
 from startrack.core.runner import TASK_LIMIT_S
-from startrack.core.types import Array, BadInput, NoSolution, Stars
+from startrack.core.types import TIME_SIGMA_S, Array, BadInput, NoSolution, Stars
 from startrack.localization import require_localizer
 from startrack.rendering import FAINTEST_V_MAG, Series, limiting_v_mag, load_sky_catalog
-from startrack.simulation import draw_ground, simulate_rays
+from startrack.simulation import draw_camera, draw_ground, simulate_measured
 from startrack.terrain import Terrain, load_terrain
 
 DRAW_FOLDER = ".predict"
 LOCATED = "radius95_m", "covariance_m2", "offset_m", "protection_level_m"  # of draws with one position
 DRAW_SOURCES = (  # their content is part of a chunk's key
-    "localization/*.py", "simulation/*.py", "evidence/*.py", "rendering/*.py", "terrain/*.py", "chain/measurement.py",
-    "applications/prediction/draws.py",
+    "localization/*.py", "simulation/*.py", "evidence/*.py", "rendering/*.py", "terrain/*.py", "chain/*.py",
+    "estimation/*.py", "applications/prediction/draws.py",
 )  # fmt: skip
 BELOW_LIMIT_MAG = 3.0  # below the limit at 5 sigma: fainter stars add 2 % to the variance of a star's flux
 
@@ -90,7 +90,7 @@ class Predictor:
 
     def __init__(self, camera: Camera, terrain: Terrain, conditions: Conditions) -> None:
         self.camera, self.terrain, self.conditions = camera, terrain, conditions
-        self.localizer = require_localizer(conditions.localizer)
+        self.settings = Settings(localizer=require_localizer(conditions.localizer))
         self._skies: dict[int, tuple[Stars, Array]] = {}
 
     @cached_property
@@ -137,11 +137,17 @@ class Predictor:
         if draw not in self._skies:
             self._skies[draw] = series.draw_sky(self.conditions.times_utc[draw])
         scene, rng = series.scene(place.number, sky=self._skies[draw])
-        scene = replace(scene, terrain=draw_ground(self.terrain, rng=rng.spawn(1)[0]))
-        rays = simulate_rays(scene, self.catalog, self.terrain, rng=rng)
+        of_ground, of_files = rng.spawn(2)
+        ground, camera = draw_ground(self.terrain, rng=of_ground), draw_camera(self.camera, rng=of_files)
+        scene = replace(scene, terrain=ground, camera=camera)
+        late_s = TIME_SIGMA_S * of_files.standard_normal()
+        stated = self.conditions.times_utc[draw] + timedelta(seconds=late_s)
         nothing = (np.nan, np.full((2, 2), np.nan), np.full(2, np.nan), np.nan)
         try:
-            fix = locate_rays(rays, self.localizer).fix
+            measured = simulate_measured(
+                scene, self.catalog, self.terrain, self.camera, time_utc=stated, time_sigma_s=None, rng=rng
+            )
+            fix = locate_measured(measured, self.settings).fix
         except BadInput:
             raise
         except NoSolution:

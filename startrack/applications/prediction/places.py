@@ -28,7 +28,7 @@ def numbered_places(numbers: Iterable[int], position_m: Array) -> list[Place]:
 
 @dataclass(frozen=True, eq=False)
 class PathPoints:
-    """Points of a path."""
+    """Points of a path: its waypoints, and points between them."""
 
     distance_m: Array  # (k,) from its start
     position_m: Array  # (k, 2) east and north
@@ -36,8 +36,8 @@ class PathPoints:
 
     @property
     def spacing_m(self) -> float:
-        """Between neighbours along the path [m]."""
-        return float(self.distance_m[1])
+        """Largest distance of neighbours along the path [m]."""
+        return float(np.diff(self.distance_m).max())
 
     @property
     def places(self) -> list[Place]:
@@ -112,16 +112,16 @@ def default_spacing_m(terrain: Terrain) -> float:
 
 
 def path_points(drive: Drive, terrain: Terrain, spacing_m: float) -> PathPoints:
-    """Points along the path of a `drive` on a `terrain`, `spacing_m` apart or a little less, with both ends.
+    """The waypoints of a `drive` on a `terrain`, with evenly spaced points between, at most `spacing_m` apart.
 
     Raises BadInput (bad_odometry) where a point is outside of the search area, or no camera can stand there.
     """
-    length_m = float(drive.distance_m[-1])
-    count = int(np.ceil(length_m / spacing_m * (1 - STEP_ROUNDING_1))) + 1
-    if count > MAX_COUNT:
-        raise BadInput("bad_odometry", f"{count} points on the path: more than {MAX_COUNT}")
-    distance_m = np.linspace(0.0, length_m, count)
-    points_m = np.stack([drive.position_m(distance / drive.speed_m_s) for distance in distance_m])
+    parts = np.ceil(np.diff(drive.distance_m) / spacing_m * (1 - STEP_ROUNDING_1))  # of the lines between waypoints
+    if parts.sum() >= MAX_COUNT:
+        raise BadInput("bad_odometry", f"{parts.sum() + 1:.0f} points on the path: more than {MAX_COUNT}")
+    number = np.append(0, np.cumsum(np.maximum(parts, 1)))  # of each waypoint among the points
+    distance_m = np.interp(np.arange(number[-1] + 1), number, drive.distance_m)
+    points_m = np.stack([np.interp(distance_m, drive.distance_m, axis) for axis in drive.waypoints_m.T], axis=-1)
     bad = np.hypot(*points_m.T) > terrain.search_radius_m
     bad |= ~np.asarray(terrain.allowed(points_m), dtype=bool)
     if bad.any():

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.chain import Measured, Settings, locate, locate_measured
+from startrack.core.types import NotLocated
 from startrack.evidence import Skyline, measure_sky_light, pixels_near_skyline, sectors_with_step
 from startrack.rendering import Scene, Series, light_e, render
 from startrack.simulation import draw_band, draw_camera, simulate_measured, simulate_stars
@@ -119,6 +120,15 @@ def test_without_light_of_the_sky_the_stars_count_alone(series: Series, sky_mag:
     assert "no step of light" in located.sky_unused
     error_m = np.linalg.norm((located.fix.position_enu_m - scene.position_enu_m)[:2])
     assert error_m < located.fix.radius999_m
+
+
+def test_without_the_skyline_in_view_there_is_no_position(series: Series):
+    narrow = replace(series, camera=replace(series.camera, max_angle_rad=0.7, calibrated_angle_rad=0.69))
+    scene, rng = narrow.scene(2)
+    measured = measure(narrow, scene, rng)
+    assert measured.detections.dead.all()
+    with pytest.raises(NotLocated):
+        locate_measured(measured, Settings())
 
 
 @pytest.mark.slow

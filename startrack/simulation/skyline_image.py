@@ -50,7 +50,7 @@ def simulate_measured(
     pixels_adu, band = draw_band(stars, rng=rng)
     exposure = Exposure(pixels_adu=pixels_adu, time_utc=time_utc, exposure_s=scene.exposure_s)
     image_e, dead = electrons(exposure, camera)
-    level_e, noise_e = np.median(image_e[band]), stars.noise_e
+    level_e, noise_e = np.median(image_e[band]) if band.any() else 0.0, stars.noise_e
     background, noise = (
         SmoothImage(np.full((1, width), one, np.float32), height, height) for one in (level_e, noise_e)
     )

@@ -14,6 +14,7 @@ from scipy.special import ndtr
 from startrack.core.types import SECTORS, Array
 from startrack.evidence import BAND_PX
 from startrack.evidence.sky_pixels import SkyPixels
+from startrack.evidence.skyline import CLIP_SHIFT_PX
 
 EDGE_PX = 1.04  # a PSF of 1 px, and the pixel
 PX_PER_RAD = 652.0
@@ -49,8 +50,8 @@ def paint_pixels(
     ground, sky = GROUND_E + slopes_e[0] * height, GROUND_E + step_e + slopes_e[1] * height
     noise = np.repeat(rng.normal(0, noise_e, n // group), group)
     return SkyPixels(
-        azimuth_rad=azimuth, elevation_rad=ELEVATION_RAD + height / PX_PER_RAD, px_per_rad=np.full(n, PX_PER_RAD),
-        height_px=height, light_e=ground + (sky - ground) * visible + noise, edge_px=EDGE_PX,
+        azimuth_rad=azimuth, px_per_rad=np.full(n, PX_PER_RAD), height_px=height,
+        light_e=ground + (sky - ground) * visible + noise, edge_px=EDGE_PX, reach_px=np.full(SECTORS, CLIP_SHIFT_PX),
     )  # fmt: skip
 
 

@@ -14,12 +14,12 @@ from scipy.special import ndtr
 from startrack.camera import Camera, Sensor
 from startrack.core.types import Exposure
 
-REACH_SIGMAS = 6.0
+SKYLINE_SIGMAS = 6.0
 
 
 def paint(image: np.ndarray, xy_px: np.ndarray, flux: np.ndarray, sigma_px: float) -> None:
     """Add Gaussian stars, integrated over the pixels, to the image (H, W) in place."""
-    reach = int(np.ceil(REACH_SIGMAS * sigma_px)) + 1
+    reach = int(np.ceil(SKYLINE_SIGMAS * sigma_px)) + 1
     height, width = image.shape
     for (x, y), f in zip(xy_px, flux, strict=True):
         i, j = round(x), round(y)

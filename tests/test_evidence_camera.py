@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from stage_helpers import as_stage
 
 from startrack.catalog import load_catalog
-from startrack.chain import Settings, measurement
+from startrack.chain import Oriented, Settings, measurement
 from startrack.chain.measurement import measure_evidence
 
 
@@ -19,7 +20,7 @@ def with_covariance(camera, sigma_px):
 
 
 def photometry(result):
-    return measure_evidence(result, result.terrain, Settings(deep_stars=False)).light
+    return measure_evidence(as_stage(result, Oriented), result.terrain, Settings(deep_stars=False)).light
 
 
 def test_an_uncertain_lens_weakens_the_evidence_at_the_rim(located):

@@ -13,18 +13,11 @@ from sky_helpers import EDGE_PX, ELEVATION_RAD, GROUND_E, NOISE_E, PX_PER_RAD, l
 
 from startrack.core.kernels import normal_cdf
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, sector_of
-from startrack.evidence import BAND_PX, Skyline
+from startrack.evidence import BAND_PX, Skyline, SkylineEstimate
+from startrack.evidence.sky_levels import GROUND, LEVEL_SECTORS, SKY, SkyLevels, measure_levels
 from startrack.evidence.sky_light import CELL_PX, LEVELS, SkyLight, measure_sky_light, sectors_with_step
-from startrack.evidence.sky_pixels import (
-    GROUND,
-    LEVEL_SECTORS,
-    SKY,
-    SkyLevels,
-    SkyPixels,
-    measure_levels,
-    pixels_near_skyline,
-    scale_across,
-)
+from startrack.evidence.sky_pixels import SkyPixels, pixels_near_skyline
+from startrack.evidence.skyline import CLIP_SHIFT_PX, MOST_REACH_PX, scale_across
 from startrack.frames import rays_from_azel
 
 STEPS_E = (7.0, 90.0)
@@ -94,7 +87,8 @@ def test_sectors_with_too_few_pixels_on_one_side_are_not_covered() -> None:
     pixels = paint_pixels(np.random.default_rng(5), 90.0)
     sector = sector_of(pixels.azimuth_rad)
     gone = ((sector >= 10) & (sector < 14) & (pixels.height_px > 0)) | ((sector == 100) & (pixels.height_px < 0))
-    kept = SkyPixels(*(a[~gone] for a in vars(pixels).values() if isinstance(a, np.ndarray)), edge_px=EDGE_PX)
+    rows = {name: a[~gone] for name, a in vars(pixels).items() if np.shape(a) == gone.shape}
+    kept = replace(pixels, **rows)
     sky = sky_of(kept)
     missing = [10, 11, 12, 13, 100]
     assert np.flatnonzero(~sky.levels.covered).tolist() == missing
@@ -216,12 +210,24 @@ def test_another_predicted_skyline_moves_the_shifts() -> None:
     def raised(azimuth_rad: Array) -> Array:
         return level_horizon(azimuth_rad) + wave_px(azimuth_rad) / PX_PER_RAD
 
-    height = (pixels.elevation_rad - raised(pixels.azimuth_rad)) * pixels.px_per_rad
+    height = pixels.height_px - wave_px(pixels.azimuth_rad)
     above = measure_sky_light(replace(pixels, height_px=height), raised)
     sigma = np.sqrt(np.median(sky.variance_px2))
     assert np.abs(above.shift_px - (sky.shift_px - wave_px(MIDDLES_RAD))).max() < 1.5 * sigma
     assert np.abs(above.shift_px).mean() < sigma < 0.4 * np.abs(sky.shift_px).mean()
     assert np.allclose(above.elevation_rad, raised(MIDDLES_RAD))
+
+
+def test_a_skyline_far_from_a_prediction_of_as_large_an_error_is_found_within_its_sigma() -> None:
+    """One that is taken to be right to a pixel loses the pixels between both as outliers."""
+    pixels = paint_pixels(np.random.default_rng(21), 90.0, shift_px=lambda azimuth: np.full(azimuth.shape, 2.6))
+    z, sigma_px = {}, {}
+    for reach_px in (CLIP_SHIFT_PX, 3.0):
+        sky = sky_of(replace(pixels, reach_px=np.full(SECTORS, reach_px)))
+        z[reach_px] = (sky.shift_px - 2.6) / np.sqrt(sky.variance_px2)
+        sigma_px[reach_px] = np.median(sky.shift_sigma_px)
+    assert abs(z[3.0].mean()) < 0.25 and np.square(z[3.0]).mean() < 1.5
+    assert sigma_px[3.0] < 0.9 * sigma_px[CLIP_SHIFT_PX] or abs(z[CLIP_SHIFT_PX].mean()) > 1.0
 
 
 @pytest.mark.parametrize("step_e", STEPS_E)
@@ -282,10 +288,14 @@ def test_too_few_sectors_with_a_step_do_not_count() -> None:
 def test_pixels_of_an_image_near_its_skyline(located: Any) -> None:
     result = located.result
     horizon = Skyline.trace(located.truth.position_enu_m[:2], result.terrain)
-    pixels = pixels_near_skyline(result.detections, result.camera, result.R_cam_enu, horizon, result.light)
-    assert len(pixels.light_e) > 20_000
-    assert np.abs(pixels.height_px).max() < BAND_PX
-    rays_cam = rays_from_azel(pixels.azimuth_rad, pixels.elevation_rad) @ result.R_cam_enu.T
+    near = SkylineEstimate(horizon, np.zeros(SECTORS))
+    band = pixels_near_skyline(result.detections, result.camera, result.R_cam_enu, near)
+    assert np.array_equal(band.reach_px, np.full(SECTORS, CLIP_SHIFT_PX))
+    pixels = band.without_stars(result.light)
+    assert len(band.pixel) > len(pixels.light_e) > 20_000
+    assert np.abs(band.height_px).max() < BAND_PX
+    elevation = horizon(pixels.azimuth_rad) + pixels.height_px / pixels.px_per_rad
+    rays_cam = rays_from_azel(pixels.azimuth_rad, elevation) @ result.R_cam_enu.T
     xy, inside = result.camera.project(rays_cam)
     assert inside.all() and np.abs(xy - np.rint(xy)).max() < 1e-6
     columns, rows = np.rint(xy).astype(int).T
@@ -297,6 +307,15 @@ def test_pixels_of_an_image_near_its_skyline(located: Any) -> None:
     up, _ = result.camera.project(rays_from_azel(pixels.azimuth_rad, horizon(pixels.azimuth_rad)) @ result.R_cam_enu.T)
     assert np.hypot(*(xy - up).T) == pytest.approx(np.abs(pixels.height_px), rel=0.03, abs=0.05)
     assert pixels.edge_px == pytest.approx(np.hypot(result.detections.psf_sigma_px, np.sqrt(1 / 12)))
+    # The band follows the error of the prediction, and leaves out what is hardly known.
+    sigma_px = np.where(np.arange(SECTORS) < 120, 1.5, 4.0)
+    wide = pixels_near_skyline(
+        result.detections, result.camera, result.R_cam_enu,
+        SkylineEstimate(horizon, sigma_px / np.median(pixels.px_per_rad)),
+    )  # fmt: skip
+    assert np.median(wide.reach_px[:120]) == pytest.approx(3.0, rel=0.2)
+    assert BAND_PX + 1.0 < np.abs(wide.height_px).max() < BAND_PX + MOST_REACH_PX
+    assert set(sector_of(wide.azimuth_rad)) <= set(np.flatnonzero(wide.reach_px < MOST_REACH_PX))
 
 
 def test_the_scale_across_a_steep_skyline_is_that_of_the_shortest_way(located: Any) -> None:

@@ -12,10 +12,9 @@ from localization_helpers import locate_or_refuse
 from test_localization_refinement import CRATER, PX_PER_RAD, sky_rows
 from test_localization_shape import TRUE, evidence_at
 
-from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Bools, Fix
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Bools, Explored, Fix
 from startrack.localization import ExactPosterior
 from startrack.localization.integrity import DIVISIONS, GROUPS, RISK, WRONG_GROUP, _divide
-from startrack.localization.search import Explored
 from startrack.output import SCHEMAS, result_dict, verbose_text
 from startrack.terrain import Cylinder
 

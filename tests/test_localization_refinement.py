@@ -11,12 +11,11 @@ from render_helpers import CRATER
 from scipy.special import ndtr
 from sky_helpers import EDGE_PX, PX_PER_RAD
 
-from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, ImageErrors, NotLocated
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, Explored, ImageErrors, NotLocated
 from startrack.evidence.sky_light import CELL_PX, LEVELS
 from startrack.evidence.star_offsets import offset_terms
 from startrack.localization import ExactPosterior
 from startrack.localization.likelihood import PositionLikelihood
-from startrack.localization.search import Explored
 from startrack.localization.sector_likelihood import row_contribution
 from startrack.localization.sky_profiles import SkyProfiles
 from startrack.localization.skyline_profiles import _cubic

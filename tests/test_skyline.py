@@ -216,7 +216,7 @@ def test_the_skyline_is_measured_once(
     def fail(located: Located) -> None:
         raise AssertionError("the skyline is measured again")
 
-    monkeypatch.setattr("startrack.chain.sky_refinement.measured_skyline", fail)
+    monkeypatch.setattr("startrack.chain.image_skyline.measured_skyline", fail)
     monkeypatch.setattr("startrack.chain.pipeline.measured_skyline", fail)
     write_results(by_source["both"], tmp_path / "frame.fix.json")
     assert Solution(by_source["both"]).skyline is not None

@@ -28,7 +28,7 @@ from startrack.chain.pipeline import (
     locate_measured,
 )  # fmt: skip
 from startrack.chain.run import add_timing
-from startrack.chain.sky_refinement import EDGE_SIGMA_PX
+from startrack.chain.second_pass import EDGE_SIGMA_PX
 from startrack.chain.sky_state import stating_sky
 from startrack.chain.source_names import identified_names
 from startrack.chain.stages import (

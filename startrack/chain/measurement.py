@@ -17,24 +17,22 @@ from startrack.catalog import (
 )
 from startrack.chain.orientation import require_time_and_site
 from startrack.chain.stages import Located, Measured, Oriented, Settings, StarFix, StarRays
-from startrack.core.types import Array, Detections, Evidence, Fix, Ints, Stars
+from startrack.core.types import Array, Detections, Evidence, Fix, Ints, Stars, sector_of
 from startrack.evidence import (
     BAND_PX,
+    SKYLINE_SIGMAS,
     SURE_SIGMAS,
     FluxScale,
-    Skyline,
-    SkyStep,
+    SkyLight,
+    SkylineBand,
     StarEvidence,
     StarPhotometry,
     add_obstacles,
     filtered_noise_e,
     flux_scale,
-    height_above_px,
     leave_out_obstacles,
     measure_response,
-    measure_sky_step,
-    reliable_azimuths,
-    subtract_sky_step,
+    take_out_sky_step,
     with_noise_of_blocks,
 )  # fmt: skip
 from startrack.frames import LOWEST_PREDICTED_RAD, R_enu_icrs, Site
@@ -50,6 +48,7 @@ from startrack.terrain import Terrain
 
 LOW_IN_AIR = "low in the air"
 NEIGHBOURS_PX = 10.0  # of stars that are measured again: up to this distance from them the PSFs overlap
+MOST_SHIFT_PX = SKYLINE_SIGMAS * 0.7  # of a skyline whose step is known where each star is
 UNDECIDED_PX = 2.0  # farther from the skyline than this, the fix decides which stars are visible
 CERTAIN_PROBABILITY = 0.99  # of being visible, or hidden, for the stars that the fix decides
 OPEN_SKY_RAD = np.radians(45.0)  # no skyline is as high, except beside a wall
@@ -141,53 +140,30 @@ def _shows_deep_stars(light: StarPhotometry, stars: Stars) -> bool:
     return part + SURE_SIGMAS / np.sqrt(information) > DEEP_PART
 
 
-def sky_step_at(located: Located) -> SkyStep | None:
-    """The step of the sky brightness at the terrain's skyline seen from the fix of a `located` image.
+def remeasure_stars(first: Located, band: SkylineBand, sky: SkyLight, photometry: StarEvidence) -> Located:
+    """The stars beside a skyline measured again, with the step of the `sky` brightness taken out of their background.
 
-    None if the image does not contain that skyline, is damaged so that levels of light cannot be compared, or has no
-    single position with its error.
+    `band` has the pixels beside the skyline of the `first` fix, `photometry` the settings.
     """
-    has_levels = located.damage is None or located.damage.has_levels
-    if located.fix.ambiguous or located.fix.search == "approximate" or not has_levels:
-        return None
-    horizon = Skyline.trace(located.position_at_time_m, located.terrain)
-    return measure_sky_step(located.detections, located.camera, located.R_cam_enu, horizon)
-
-
-def remeasure_near_skyline(measured: Located, step: SkyStep, photometry: StarEvidence) -> Located:
-    """The stars near the skyline of a fix measured again, with the `step` of the sky brightness subtracted.
-
-    `photometry` has the settings of the measurement.
-    """
-    camera, terrain, position_m = measured.camera, measured.terrain, measured.position_at_time_m
-    R = measured.R_cam_enu
-    horizon = step.horizon
-    detections = subtract_sky_step(measured.detections, camera, R, horizon)
-    axes = np.linalg.cholesky(measured.fix.covariance_m2).T
-    reliable = reliable_azimuths(horizon, [Skyline.trace(position_m + axis, terrain) for axis in axes], camera, R)
-    light = measured.light
+    light = first.light
     azimuth, elevation = light.azimuth_rad, light.elevation_rad
-    above_px, is_reliable = height_above_px(azimuth, elevation, camera, R, horizon), reliable(azimuth)
+    sector = sector_of(azimuth)
+    above_px = band.heights_px(azimuth, elevation)
+    is_reliable = sky.levels.covered[sector] & (band.reach_px[sector] < MOST_SHIFT_PX) & band.near.is_level(azimuth)
     wanted = (np.abs(above_px) < BAND_PX) & is_reliable
-    if measured.fix.blocked is not None:
-        wanted &= ~measured.fix.blocked.hides(azimuth)
+    if first.fix.blocked is not None:
+        wanted &= ~first.fix.blocked.hides(azimuth)
     around = np.abs(above_px) < BAND_PX + NEIGHBOURS_PX
     # The fix determines the visibility of neighbours better than their faint flux does, except next to the skyline.
     undecided = (np.abs(above_px) < UNDECIDED_PX) | ~is_reliable
     by_fix = np.where(above_px > 0, CERTAIN_PROBABILITY, 1.0 - CERTAIN_PROBABILITY)
     visible = np.where(undecided, 1.0 / (1.0 + np.exp(-light.llr)), by_fix)
     newer = _photometry(
-        measured,
-        terrain,
-        measured.R_enu_icrs,
-        measured.scale,
-        photometry,
-        detections,
-        light.star[around],
-        visible[around],
-    )
-    newer = newer if measured.response is None else measured.response.correct(newer)
-    return replace(measured, light=light.replace_stars(newer, light.star[wanted]))
+        first, first.terrain, first.R_enu_icrs, first.scale, photometry, take_out_sky_step(band, sky),
+        light.star[around], visible[around],
+    )  # fmt: skip
+    newer = newer if first.response is None else first.response.correct(newer)
+    return replace(first, light=light.replace_stars(newer, light.star[wanted]))
 
 
 def _photometry(
@@ -228,12 +204,22 @@ def mask_unpredictable(light: StarPhotometry, terrain: Terrain) -> StarPhotometr
 
 
 def locate_rays(rays: StarRays, localizer: Localizer | None = None) -> StarFix:
-    """The position that explains photometry of stars; `localizer` None: the posterior.
+    """The position that explains photometry of stars, found in two passes; `localizer` None: the posterior.
 
     Raises NotLocated (or another NoSolution of the `localizer`) where the pipeline refuses an image with these `rays`.
     """
-    seen, fix = fix_position(rays, localizer or require_localizer(DEFAULT_LOCALIZER), rays.evidence())
-    return StarFix(**vars(seen), fix=fix)
+    localizer = localizer or require_localizer(DEFAULT_LOCALIZER)
+    rays, first = fix_position(rays, localizer, replace(rays.evidence(), is_first_look=True))
+    rays, fix = fix_again(rays, first, localizer, rays.evidence())
+    return StarFix(**vars(rays), fix=fix)
+
+
+def fix_again(rays: R, first: Fix, localizer: Localizer, evidence: Evidence) -> tuple[R, Fix]:
+    """`fix_position` that begins at the points of a `first` fix; a method without a posterior says nothing new."""
+    if first.search == "approximate":
+        return rays, first
+    support = None if first.ambiguous else first.samples
+    return fix_position(rays, localizer, replace(evidence, support=support))
 
 
 def fix_position(rays: R, localizer: Localizer, evidence: Evidence) -> tuple[R, Fix]:

@@ -6,13 +6,13 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from startrack.camera import Camera, load_camera
 from startrack.catalog import StarCatalog, load_catalog
-from startrack.chain.measurement import fix_position, measure_evidence, remeasure_near_skyline, sky_step_at
+from startrack.chain.image_skyline import measured_skyline
+from startrack.chain.measurement import measure_evidence
 from startrack.chain.orientation import (
     check_inputs,
     check_one_attitude,
@@ -23,7 +23,7 @@ from startrack.chain.orientation import (
     solve_orientation,
 )  # fmt: skip
 from startrack.chain.run import Run, add_timing
-from startrack.chain.sky_refinement import measured_skyline, refine_by_sky_light
+from startrack.chain.second_pass import fix_by_all, fix_by_stars, measure_at, see_skyline
 from startrack.chain.stages import Detected, Inputs, Located, Measured, Oriented, Refused, Settings
 from startrack.core.types import BadInput, Exposure
 from startrack.detection import find_damage
@@ -61,47 +61,28 @@ def locate(
             measured = run.reached = measure_evidence(oriented, ground, settings)
         located = locate_measured(measured, settings, run.stage)
         with run.stage("locate"):
-            skyline = measured_skyline(located)
-        return run.finish(replace(located, skyline=skyline))
+            located = replace(located, skyline=measured_skyline(located))
+        return run.finish(located)
     return run.refusal
 
 
 def locate_measured(
-    measured: Measured, settings: Settings, stage: Callable[[str], AbstractContextManager[Any]] = nullcontext
+    measured: Measured, settings: Settings, stage: Callable[[str], AbstractContextManager[object]] = nullcontext
 ) -> Located:
     """The position by the stars of `measured` and the light of the sky in its image, as `settings` ask for.
 
-    The work is done in blocks of `stage`, which is given the name of each. Raises NoSolution of the localizer.
+    It is found in two passes: roughly by the stars, which tells where the skyline stands; then by all that is measured
+    there. The work is done in blocks of `stage`, which is given the name of each. Raises NoSolution of the localizer.
     """
     with stage("locate"):
-        first = replace(measured.evidence(), is_first_look=settings.evidence_sources != "stars")
-        measured, fix = fix_position(measured, settings.localizer, first)
-        located = Located(**vars(measured), fix=fix)
+        first = fix_by_stars(measured, settings.localizer)
+        near = see_skyline(first)
     with stage("evidence"):
-        step = sky_step_at(located)
-        is_bright = step is not None and step.exceeds_noise
-        if step is not None and is_bright:
-            located = remeasure_near_skyline(located, step, settings.evidence)
+        complete = measure_at(near, first, settings)
     with stage("locate"):
-        if located.damage is None:  # which changes the light of stars in part
-            check_single_skyline(located.light, located.terrain, located.position_at_time_m)
-        located = _refine(located, is_bright, settings)
-    sky_mag = None if step is None else step.brightness_mag_arcsec2(located.camera, located.exposure.exposure_s)
-    return replace(located, sky_brightness_mag_arcsec2=sky_mag)
-
-
-def _refine(located: Located, is_newer: bool, settings: Settings) -> Located:
-    """The position by all of the evidence that is asked for; `is_newer`: its stars were measured after the fix."""
-    by_stars = settings.evidence_sources == "stars"
-    if not by_stars:
-        located = refine_by_sky_light(located, settings.localizer, settings.evidence_sources == "both")
-    if located.sky is None and (is_newer or not by_stars):
-        is_traced = not located.terrain.axisymmetric  # a round crater is searched again in no time
-        support = located.fix.samples if is_traced and not located.fix.ambiguous else None
-        rows = replace(located.evidence(), support=support)
-        located, fix = fix_position(located, settings.localizer, rows)
-        return replace(located, fix=fix)
-    return located
+        if complete.damage is None:  # which changes the light of stars in part
+            check_single_skyline(complete.light, complete.terrain, complete.position_at_time_m)
+        return fix_by_all(complete, settings.localizer)
 
 
 def locate_exposure(exposure: Exposure, settings: Settings | None = None) -> Located | Refused:

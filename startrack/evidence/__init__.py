@@ -22,25 +22,22 @@ from startrack.evidence.photometry import (
     profiles_of,
 )
 from startrack.evidence.sky_light import (
-    CLIP_SHIFT_PX,
     NEEDED_SECTORS,
     SkyLight,
     average_shifts,
     measure_sky_light,
     sectors_with_step,
 )
-from startrack.evidence.sky_pixels import pixels_near_skyline
-from startrack.evidence.sky_step import (
+from startrack.evidence.sky_pixels import SkylineBand, SkyPixels, pixels_near_skyline
+from startrack.evidence.sky_step import brightness_mag_arcsec2, exceeds_noise, take_out_sky_step
+from startrack.evidence.skyline import (
     BAND_PX,
     SKYLINE_POINTS,
+    SKYLINE_SIGMAS,
     Horizon,
     Skyline,
-    SkyStep,
-    height_above_px,
-    measure_sky_step,
-    reliable_azimuths,
+    SkylineEstimate,
     skyline_band,
-    subtract_sky_step,
 )
 from startrack.evidence.star_evidence import (
     DECIDABLE_SNR,
@@ -55,11 +52,12 @@ from startrack.evidence.star_evidence import (
 from startrack.evidence.star_offsets import measure_star_offsets, offset_terms
 
 __all__ = [
-    "BAND_PX", "CLIP_SHIFT_PX", "DECIDABLE_SNR", "NEEDED_SECTORS", "SCALE_SNR", "SCALE_STARS", "SEEN_LLR",
-    "SKYLINE_POINTS", "SURE_SIGMAS", "DamagedResponse", "FluxScale", "Horizon", "Photometry", "SkyLight", "SkyStep",
-    "Skyline", "Sources", "StarEvidence", "StarPhotometry", "add_obstacles", "average_shifts", "check_single_skyline",
-    "expect_stars", "expected_flux_scale", "filtered_noise_e", "fit_flux_scale", "flux_scale", "half_width",
-    "height_above_px", "leave_out_obstacles", "measure", "measure_response", "measure_sky_light", "measure_sky_step",
-    "measure_star_offsets", "neighbour_profiles", "offset_terms", "order_by_cell", "pixels_near_skyline", "profiles_of",
-    "reliable_azimuths", "sectors_with_step", "skyline_band", "subtract_sky_step", "with_noise_of_blocks",
+    "BAND_PX", "DECIDABLE_SNR", "NEEDED_SECTORS", "SCALE_SNR", "SCALE_STARS", "SEEN_LLR", "SKYLINE_POINTS",
+    "SKYLINE_SIGMAS", "SURE_SIGMAS", "DamagedResponse", "FluxScale", "Horizon", "Photometry", "SkyLight", "SkyPixels",
+    "Skyline", "SkylineBand", "SkylineEstimate", "Sources", "StarEvidence", "StarPhotometry", "add_obstacles",
+    "average_shifts", "brightness_mag_arcsec2", "check_single_skyline", "exceeds_noise", "expect_stars",
+    "expected_flux_scale", "filtered_noise_e", "fit_flux_scale", "flux_scale", "half_width", "leave_out_obstacles",
+    "measure", "measure_response", "measure_sky_light", "measure_star_offsets", "neighbour_profiles", "offset_terms",
+    "order_by_cell", "pixels_near_skyline", "profiles_of", "sectors_with_step", "skyline_band", "take_out_sky_step",
+    "with_noise_of_blocks",
 ]  # fmt: skip

@@ -19,7 +19,7 @@ import numpy as np
 
 from startrack.core.types import Array, Bools, NotLocated
 from startrack.evidence.photometry import CLIPPED_SIGMAS
-from startrack.evidence.sky_step import SKYLINE_POINTS, Skyline
+from startrack.evidence.skyline import SKYLINE_POINTS, Skyline
 from startrack.evidence.star_evidence import StarPhotometry
 from startrack.terrain import Terrain
 

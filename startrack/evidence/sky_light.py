@@ -11,7 +11,7 @@ from __future__ import annotations
 # mypy: disable-error-code="no-untyped-def"
 from dataclasses import dataclass
 from functools import cached_property
-from math import sqrt
+from math import ceil, sqrt
 from typing import Any
 
 import numpy as np
@@ -20,19 +20,19 @@ from startrack.core.kernels import njit, normal_cdf
 from startrack.core.statistics import relative_weights, robust_sigma
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Bools, Evidence, Ints, sector_of
 from startrack.evidence.photometry import SURE_SIGMAS
-from startrack.evidence.sky_pixels import CLIP_SIGMAS, GROUND, LEVEL_SECTORS, SKY, SkyLevels, SkyPixels, measure_levels
-from startrack.evidence.sky_step import Horizon
+from startrack.evidence.sky_levels import CLIP_SIGMAS, GROUND, SKY, SkyLevels, measure_levels
+from startrack.evidence.sky_pixels import SkyPixels
+from startrack.evidence.skyline import CLIP_SHIFT_PX, Horizon
 from startrack.evidence.star_evidence import SEEN_LLR
 
 CELL_PX = 0.75  # of a cell
-LEVELS = 13  # cells of a sector: up to 4.9 px above and below the predicted skyline
-CLIP_SHIFT_PX = 1.0  # a pixel is an outlier only if no skyline within this distance explains it
-SHIFTS_PX = np.linspace(-4.0, 4.0, 161)  # of the skyline in one sector, above the predicted one
+LEVELS = 13  # cells of a sector: up to 4.9 px above and below a predicted skyline that is right to CLIP_SHIFT_PX
+SHIFT_PX, SHIFT_STEP_PX = 4.0, 0.05  # of the skyline in one sector: the largest, for such a prediction, and a step
 NEEDED_SECTORS = SECTORS // 4  # with a step; fewer determine no shift of the skyline
 MIN_STEP_SIGMAS = 8.0  # of the mean step
 SECTOR_STEP_SIGMAS = 3.0  # of the step of one sector
 MISFIT_SIGMAS = 6.0  # of a sector's misfit against the others'
-RAMP_PX = SHIFTS_PX[-1]  # standard deviation of an edge that is no skyline: light that fades
+RAMP_PX = 4.0  # standard deviation of an edge that is no skyline: light that fades
 SHARP_NATS = 10.0  # by which the sharp edge must explain the pixels better than such a ramp
 # Widths of the skyline's edge, in those of a star's. Photographs behind an edge of 0.95 px, stars of 0.53 px: where the
 # edge was taken to be as sharp as the stars, it was found 0.1 px too low, by a bright and noisy sky up to 0.5 px.
@@ -48,14 +48,20 @@ class SkyLight:
     horizon: Horizon  # the predicted one
     elevation_rad: Array  # (SECTORS,) of the predicted skyline at MIDDLES_RAD
     px_per_rad: Array  # (SECTORS,)
-    height_px: Array  # (SECTORS, LEVELS) of the cells above the predicted skyline, means by information
-    llr: Array  # (SECTORS, LEVELS)
-    extended_nats: Array  # (SECTORS, LEVELS)
-    edge_px: float
+    reach_px: Array  # (SECTORS,) no farther from the predicted skyline the true one was sought
+    height_px: Array  # (SECTORS, cells) of the cells above the predicted skyline, means by information
+    llr: Array  # (SECTORS, cells)
+    extended_nats: Array  # (SECTORS, cells)
+    width_px: float  # of the edge in pixels
     fades: bool  # over more than the edge of a skyline
     shift_px: Array  # (SECTORS,) how much higher than predicted the skyline stands
     shift_sigma_px: Array  # (SECTORS,) infinite where the sector is not covered
     misfit_nats: Array  # (SECTORS,) by which the best cells exceed the best skyline
+
+    @property
+    def edge_px(self) -> float:
+        """Width of the edge in cells."""
+        return float(_widened(self.width_px))
 
     @cached_property
     def variance_px2(self) -> Array:
@@ -97,12 +103,14 @@ def measure_sky_light(pixels: SkyPixels, horizon: Horizon) -> SkyLight:
     """The light of the sky by `pixels` near a predicted `horizon`, above which their heights are."""
     sector = sector_of(pixels.azimuth_rad)
     levels = measure_levels(pixels, sector)
-    width_px = pixels.edge_px
+    width_px, beyond_px = (
+        pixels.edge_px,
+        float(pixels.reach_px[levels.covered].max(initial=CLIP_SHIFT_PX)) - CLIP_SHIFT_PX,
+    )
     for _ in range(EDGE_ROUNDS):
-        cells, scale = _sum_pixels(pixels, sector, levels, width_px)
+        cells, scale = _sum_pixels(pixels, sector, levels, width_px, LEVELS + 2 * ceil(beyond_px / CELL_PX))
         height_px, llr, extended = cells
-        edge_px = _widened(width_px)
-        shift, sigma, misfit = _shifts(*cells, edge_px)
+        shift, sigma, misfit = _shifts(*cells, _widened(width_px), SHIFT_PX + beyond_px)
         informed, before = np.isfinite(sigma), width_px
         if informed.any():
             shifted = height_px[informed] - shift[informed, None], llr[informed], extended[informed]
@@ -116,10 +124,11 @@ def measure_sky_light(pixels: SkyPixels, horizon: Horizon) -> SkyLight:
         horizon=horizon,
         elevation_rad=horizon(MIDDLES_RAD),
         px_per_rad=np.where(seen, scale[:, 1] / np.maximum(scale[:, 0], 1.0), 1.0),
+        reach_px=pixels.reach_px,
         height_px=height_px,
         llr=llr,
         extended_nats=extended,
-        edge_px=edge_px,
+        width_px=width_px,
         fades=width_px >= SOFTNESS[-1] * pixels.edge_px,
         shift_px=np.where(seen, shift, 0.0),
         shift_sigma_px=np.where(seen, sigma, np.inf),
@@ -128,13 +137,14 @@ def measure_sky_light(pixels: SkyPixels, horizon: Horizon) -> SkyLight:
 
 
 def _sum_pixels(
-    pixels: SkyPixels, sector: Ints, levels: SkyLevels, width_px: float
+    pixels: SkyPixels, sector: Ints, levels: SkyLevels, width_px: float, cells: int
 ) -> tuple[tuple[Array, Array, Array], Array]:
-    """Cells' heights, l and c (SECTORS, LEVELS) of `pixels` (n,) beside an edge of that width; see `_sum_cells`."""
-    sums, scale = np.zeros((SECTORS, LEVELS, 3)), np.zeros((SECTORS, 2))
+    """Heights, l and c (SECTORS, cells) of `pixels` (n,) beside an edge of that width; see `_sum_cells`."""
+    sums, scale = np.zeros((SECTORS, cells, 3)), np.zeros((SECTORS, 2))
     _sum_cells(
         sector, pixels.height_px, pixels.light_e, pixels.px_per_rad, levels.covered, levels.level_e, levels.slope_e,
-        np.square(levels.noise_e) * levels.correlation, levels.correlation, width_px, CLIP_SIGMAS, sums, scale,
+        np.square(levels.noise_e) * levels.correlation, levels.correlation, width_px, pixels.reach_px,
+        CLIP_SIGMAS, sums, scale,
     )  # fmt: skip
     llr, extended, moment = np.moveaxis(sums, -1, 0)
     return (moment / np.where(extended > 0, extended, 1.0), llr, extended), scale
@@ -146,20 +156,23 @@ def _widened(width_px: Any) -> Any:
 
 
 def _nats(height_px: Array, llr: Array, extended: Array, edge_px: float) -> float:
-    """Log-likelihood ratio of an edge of this width at height 0, against ground everywhere, by cells (n, LEVELS)."""
+    """Log-likelihood ratio of an edge of this width at height 0, against ground everywhere, by cells (n, m)."""
     from scipy.special import ndtr
 
     fraction: Any = ndtr(height_px / edge_px)
     return float(np.sum(fraction * (llr + 0.5 * extended * (1.0 - fraction))))
 
 
-def _shifts(height_px: Array, llr: Array, extended: Array, edge_px: float) -> tuple[Array, Array, Array]:
+def _shifts(
+    height_px: Array, llr: Array, extended: Array, edge_px: float, most_px: float
+) -> tuple[Array, Array, Array]:
     """Mean and standard deviation (SECTORS,) of the skyline's height above the predicted one, and the misfit."""
-    log = np.empty((SECTORS, len(SHIFTS_PX)))
-    _score_shifts(height_px, llr, extended, edge_px, log)
+    shifts_px = np.linspace(-most_px, most_px, 2 * ceil(most_px / SHIFT_STEP_PX) + 1)
+    log = np.empty((SECTORS, len(shifts_px)))
+    _score_shifts(height_px, llr, extended, edge_px, shifts_px, log)
     best = log.max(axis=1)
     informed = best - np.maximum(log[:, 0], log[:, -1]) > SEEN_LLR
-    _, mean, sigma = average_shifts(log, SHIFTS_PX)
+    _, mean, sigma = average_shifts(log, shifts_px)
     # Each cell's own best fraction of sky, free of any skyline.
     free = np.clip(llr / np.where(extended > 0, extended, 1.0) + 0.5, 0.0, 1.0)
     misfit = (llr * free + 0.5 * extended * free * (1.0 - free)).sum(axis=1) - best
@@ -181,17 +194,14 @@ def sectors_with_step(sky: SkyLight) -> Bools:
     None at all where the step as a whole is too weak, or fades instead of stepping.
     """
     levels = sky.levels
-    averaged = 2 * sqrt(np.pi) * LEVEL_SECTORS  # sectors in one smoothed level
-    sigma = np.hypot(*(levels.own_sigma_e * sqrt(levels.correlation / averaged)))
-    good = levels.covered & np.isfinite(sky.shift_sigma_px) & (levels.step_e > SECTOR_STEP_SIGMAS * sigma)
+    good = levels.covered & np.isfinite(sky.shift_sigma_px) & (levels.step_e > SECTOR_STEP_SIGMAS * levels.step_sigma_e)
     own = np.abs(levels.own_e) / (levels.own_sigma_e * sqrt(levels.correlation))
     good &= (own < SURE_SIGMAS).all(axis=0)
     if good.any():
         misfit = sky.misfit_nats[good]
         good &= sky.misfit_nats < np.median(misfit) + MISFIT_SIGMAS * max(robust_sigma(misfit), 1.0)
-    mean_step = levels.step_e[good].mean() if good.any() else 0.0
-    mean_sigma = sqrt(float(np.sum(np.square(sigma[good]))) * LEVEL_SECTORS) / max(int(np.count_nonzero(good)), 1)
-    enough = np.count_nonzero(good) >= NEEDED_SECTORS and mean_step > MIN_STEP_SIGMAS * mean_sigma
+    step_e, sigma_e = levels.mean_step_e(good)
+    enough = np.count_nonzero(good) >= NEEDED_SECTORS and step_e > MIN_STEP_SIGMAS * sigma_e
     return good if enough and _is_sharp(sky, good) else np.zeros(SECTORS, dtype=bool)
 
 
@@ -202,20 +212,22 @@ def _is_sharp(sky: SkyLight, sectors: Bools) -> bool:
 
 
 @njit(cache=True)
-def _score_shifts(height, llr, extended, edge, log):
-    """Fill log (SECTORS, shifts) with the log-likelihoods of a skyline shifted by SHIFTS_PX."""
+def _score_shifts(height, llr, extended, edge, shifts, log):
+    """Fill log (SECTORS, shifts) with the log-likelihoods of a skyline that is shifted."""
     for i in range(log.shape[0]):
         for m in range(log.shape[1]):
             total = 0.0
             for j in range(llr.shape[1]):
-                visible = normal_cdf((height[i, j] - SHIFTS_PX[m]) / edge)
+                visible = normal_cdf((height[i, j] - shifts[m]) / edge)
                 total += visible * (llr[i, j] + 0.5 * extended[i, j] * (1.0 - visible))
             log[i, m] = total
 
 
 @njit(cache=True)
-def _sum_cells(sector, height, light, scale, covered, level, slope, variance, correlation, edge, clip, sums, scales):
-    """Add up sums (SECTORS, LEVELS, 3) of l, c and c times the height; scales (SECTORS, 2): pixels, their scale."""
+def _sum_cells(
+    sector, height, light, scale, covered, level, slope, variance, correlation, edge, reach, clip, sums, scales
+):
+    """Add up sums (SECTORS, cells, 3) of l, c and c times the height; scales (SECTORS, 2): pixels, their scale."""
     half = 0.5 * sums.shape[1] * CELL_PX
     for k in range(len(sector)):
         i, h = sector[k], height[k]
@@ -223,7 +235,7 @@ def _sum_cells(sector, height, light, scale, covered, level, slope, variance, co
             ground = level[GROUND, i] + slope[GROUND, i] * h
             step = level[SKY, i] + slope[SKY, i] * h - ground
             visible = normal_cdf(h / edge)
-            least, most = normal_cdf((h - CLIP_SHIFT_PX) / edge), normal_cdf((h + CLIP_SHIFT_PX) / edge)
+            least, most = normal_cdf((h - reach[i]) / edge), normal_cdf((h + reach[i]) / edge)
             s2 = variance[GROUND, i] + max(variance[SKY, i] - variance[GROUND, i], 0.0) * visible
             q = light[k] - ground
             beyond = max(step * least - q, q - step * most, 0.0)

@@ -16,7 +16,7 @@ import numpy as np
 from startrack.camera import Camera, compensating_rotation, lens_jacobian
 from startrack.core.types import Array, Bools
 from startrack.evidence.photometry import CLIPPED_SIGMAS
-from startrack.evidence.sky_step import ELEVATION_STEP_RAD, SKYLINE_POINTS, Horizon
+from startrack.evidence.skyline import ELEVATION_STEP_RAD, SKYLINE_POINTS, Horizon
 from startrack.frames import azel_from_rays, off_axis_rad, rays_from_azel
 
 NEAR_SKYLINE_PX = 60.0  # from the skyline to the stars that are used: five degrees of a 180-degree fisheye

@@ -1,22 +1,32 @@
-"""The step of the sky brightness at the skyline: measured, subtracted, and not changed where it is not known."""
+"""The skyline in the image: pixels above it, the step of the sky brightness there, and where it is not known."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from startrack.camera import Camera, Pinhole, load_camera
 from startrack.core.smooth_image import SmoothImage
-from startrack.core.types import Detections
-from startrack.evidence import height_above_px, measure_sky_step, reliable_azimuths, subtract_sky_step
+from startrack.core.types import MIDDLES_RAD, SECTORS, Detections
+from startrack.evidence import (
+    Skyline,
+    SkylineEstimate,
+    exceeds_noise,
+    measure_sky_light,
+    pixels_near_skyline,
+    take_out_sky_step,
+)
+from startrack.evidence.skyline import scale_across
 from startrack.frames import azel_from_rays
 from startrack.terrain import load_terrain
 
 CAMERA, CRATER = load_camera("fisheye-2048"), load_terrain("shackleton-thesis")
 PLACE = np.array([3000.0, 2000.0])
+NO_STARS = SimpleNamespace(xy_px=np.empty((0, 2)), expected_e=np.empty(0))
 STEP_E, NOISE_E = 90.0, 10.0
 R_CAM_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]) * np.array([[1.0], [1.0], [-1.0]])
 
@@ -25,13 +35,15 @@ def horizon_at(place):
     return partial(CRATER.horizon_rad, np.asarray(place)[None, :])
 
 
-def subtract_step(image, found, horizon):
-    found = replace(found, image_e=image)
-    step = measure_sky_step(found, CAMERA, R_CAM_ENU, horizon)
-    assert step is not None and step.exceeds_noise
-    assert step.light_e == pytest.approx(STEP_E, abs=max(4 * step.sigma_e, 0.01 * STEP_E))
-    assert 0.05 < step.sigma_e < 0.5
-    return subtract_sky_step(found, CAMERA, R_CAM_ENU, horizon)
+def take_out_step(image, found, place):
+    near = SkylineEstimate(Skyline.trace(np.asarray(place), CRATER), np.zeros(SECTORS))
+    band = pixels_near_skyline(replace(found, image_e=image), CAMERA, R_CAM_ENU, near)
+    sky = measure_sky_light(band.without_stars(NO_STARS), near.skyline)
+    step_e, sigma_e = sky.levels.mean_step_e(sky.levels.covered)
+    assert sky.levels.covered.all() and exceeds_noise(sky)
+    assert step_e == pytest.approx(STEP_E, abs=max(4 * sigma_e, 0.01 * STEP_E))
+    assert 0.02 < sigma_e < 0.5
+    return take_out_sky_step(band, sky)
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +52,8 @@ def frame():
     rows, columns = np.mgrid[0:2048, 0:2048]
     xy = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float)
     azimuth, elevation = azel_from_rays(CAMERA.unproject(xy) @ R_CAM_ENU)
-    above = height_above_px(azimuth, elevation, CAMERA, R_CAM_ENU, horizon_at(PLACE))
-    above = above.reshape(2048, 2048)
+    scale = scale_across(CAMERA, R_CAM_ENU, horizon_at(PLACE))(azimuth)
+    above = ((elevation - horizon_at(PLACE)(azimuth)) * scale).reshape(2048, 2048)
     rng = np.random.default_rng(5)
     light = STEP_E / (1 + np.exp(np.clip(-above / 0.6, -50, 50)))
     noise = NOISE_E * np.where(above > 0, 1.5, 1.0)
@@ -58,7 +70,7 @@ def frame():
 
 def test_the_step_is_subtracted_and_each_side_has_its_own_noise(frame):
     image, found, above, light = frame
-    better = subtract_step(image, found, horizon_at(PLACE))
+    better = take_out_step(image, found, PLACE)
     inner = np.abs(above) < 8
     assert np.sqrt(np.mean((found.background_e - light)[inner] ** 2)) > 30
     assert np.sqrt(np.mean((better.background_e - light)[inner] ** 2)) < 3
@@ -68,10 +80,9 @@ def test_the_step_is_subtracted_and_each_side_has_its_own_noise(frame):
 
 
 def test_a_skyline_a_little_off_gives_the_same_background(frame):
-    """An error of the fix shifts the profile's origin, not the subtracted step."""
+    """The step is where the image shows it."""
     image, found, above, light = frame
-    aside = horizon_at(PLACE + np.array([12.0, -8.0]))
-    better = subtract_step(image, found, aside)
+    better = take_out_step(image, found, PLACE + np.array([12.0, -8.0]))
     assert np.sqrt(np.mean((better.background_e - light)[np.abs(above) < 6] ** 2)) < 4
 
 
@@ -82,25 +93,23 @@ def test_distances_from_the_skyline_are_pixels_in_every_lens():
         max_angle_rad=np.radians(62.0), calibrated_angle_rad=np.radians(62.0), lens=Pinhole(),
     )  # fmt: skip
     for skyline_rad in np.radians([30.0, 85.0]):
-        horizon = partial(np.full_like, fill_value=skyline_rad)
-        px_rad = np.sin(skyline_rad) ** 2 / 1000.0
-        elevation = skyline_rad + np.array([11.0, 13.0]) * px_rad
-        assert (height_above_px(np.zeros(2), elevation, pinhole, R_CAM_ENU, horizon) < 12.0).tolist() == [True, False]
+        scale = scale_across(pinhole, R_CAM_ENU, partial(np.full_like, fill_value=skyline_rad))
+        assert scale(np.linspace(0, 6, 50)) == pytest.approx(1000.0 / np.sin(skyline_rad) ** 2, rel=1e-3)
 
 
 def test_right_below_a_wall_the_skyline_is_not_known():
-    azimuth = np.linspace(0, 2 * np.pi, 360, endpoint=False)
-    middle = horizon_at([0.0, 0.0])
-    assert reliable_azimuths(middle, [horizon_at([4.0, 0.0]), horizon_at([0.0, 4.0])], CAMERA, R_CAM_ENU)(azimuth).all()
-    wall = horizon_at([9850.0, 0.0])
-    known = reliable_azimuths(wall, [horizon_at([9852.0, 0.0]), horizon_at([9850.0, 2.0])], CAMERA, R_CAM_ENU)(azimuth)
-    assert known[250:290].all()  # the far rim
-    along_the_wall = np.r_[0:5, 355:360, 175:185]  # north and south: the skyline changes fastest there
-    assert not known[along_the_wall].any()
+    """A sigma of the position of four metres in the middle, and of two metres at the wall."""
+    middle = SkylineEstimate.of(np.zeros(2), 16.0 * np.eye(2), CRATER, None)
+    wall = SkylineEstimate.of(np.array([9850.0, 0.0]), 4.0 * np.eye(2), CRATER, None)
+    px = CAMERA.focal_px[0]
+    assert (middle.sigma_rad * px < 0.7).all() and middle.is_level(np.linspace(0, 2 * np.pi, 360, endpoint=False)).all()
+    assert (wall.sigma_rad * px < 0.7)[167:193].all()  # the far rim
+    along_the_wall = np.r_[0:3, 237:240, 117:123]  # north and south: the skyline changes fastest there
+    assert not ((wall.sigma_rad * px < 0.7)[along_the_wall] & wall.is_level(MIDDLES_RAD[along_the_wall])).any()
 
 
-def test_near_means_pixels():
-    azimuth = np.zeros(3)
-    height = CRATER.horizon_rad(PLACE[None], np.zeros(1))[0] + np.array([-20, 0, 20]) / 652.0
-    above_px = height_above_px(azimuth, height, CAMERA, R_CAM_ENU, horizon_at(PLACE))
-    assert (np.abs(above_px) < 12.0).tolist() == [False, True, False]
+def test_the_estimate_is_raised_by_the_errors_that_a_fix_shows():
+    raised = 1e-3 * (1.0 + np.sin(MIDDLES_RAD))
+    plain, higher = (SkylineEstimate.of(PLACE, np.eye(2), CRATER, by) for by in (None, raised))
+    assert higher.skyline(MIDDLES_RAD) - plain.skyline(MIDDLES_RAD) == pytest.approx(raised, abs=1e-6)
+    assert np.array_equal(higher.sigma_rad, plain.sigma_rad)

@@ -32,6 +32,26 @@ def ridge(width_deg: tuple[float, float], height_deg: tuple[float, float]) -> Gr
     return ground
 
 
+def notch(width_deg: tuple[float, float], depth_deg: tuple[float, float]) -> Ground:
+    """A gap that the map has filled: a box of a depth between two (even in its logarithm)."""
+
+    def ground(stated: Terrain, rng: Rng) -> Terrain:
+        width, depth = rng.uniform(*width_deg), np.exp(rng.uniform(*np.log(depth_deg)))
+        return Risen(stated, box_rise(rng.uniform(0, 2 * np.pi), *np.radians([width, -depth])))
+
+    return ground
+
+
+def dip(width_deg: tuple[float, float], depth_deg: tuple[float, float]) -> Ground:
+    """A crest that the map has too high: a triangle."""
+
+    def ground(stated: Terrain, rng: Rng) -> Terrain:
+        size = np.radians([rng.uniform(*width_deg), -rng.uniform(*depth_deg)])
+        return Risen(stated, ridge_rise(rng.uniform(0, 2 * np.pi), *size))
+
+    return ground
+
+
 def second_wall(stated: Terrain, rng: Rng) -> Terrain:
     """A second wall over 100 to 200 degrees, as if seen from a place 50 to 1000 m off."""
     away = np.exp(rng.uniform(np.log(50), np.log(1000)))

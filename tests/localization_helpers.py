@@ -10,7 +10,14 @@ from scipy.special import ndtr
 from startrack.core.errors import Reason
 from startrack.core.types import SECTORS, Array, Evidence, Fix, NotLocated
 from startrack.localization import ExactPosterior
-from startrack.localization.obstacle_chain import LEVELS_RAD, STATES, WRONG_SECTOR, transitions
+from startrack.localization.obstacle_chain import (
+    LEVELS_RAD,
+    NOTCH_LEVELS_RAD,
+    RISEN,
+    STATES,
+    WRONG_SECTOR,
+    transitions,
+)
 from startrack.localization.sector_likelihood import Sectors
 from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS, sector_of
 from startrack.terrain import Cylinder, ForwardingTerrain, Terrain, load_terrain
@@ -111,7 +118,9 @@ def slow_chain_scores(points_m: Array, evidence: Evidence, terrain: Terrain, ref
         margin = evidence.elevation_rad[own] - terrain.horizon_rad(points_m[:, None], azimuth[own])
         (anywhere,) = _mean_likelihoods(about[own][None], llr, [(LOW_RAD, HIGH_RAD)])
         e[:, s, 0] = np.exp((llr * (margin > 0)).sum(axis=1))
-        e[:, s, 1 : len(LEVELS_RAD)] = np.stack(_mean_likelihoods(margin, llr, list(pairwise(LEVELS_RAD))), axis=1)
+        e[:, s, 1:RISEN] = np.stack(_mean_likelihoods(margin, llr, list(pairwise(LEVELS_RAD))), axis=1)
+        sunk = [(-high, -low) for low, high in pairwise(NOTCH_LEVELS_RAD)]
+        e[:, s, RISEN + 1 :] = np.stack(_mean_likelihoods(margin, llr, sunk), axis=1)
         e[:, s] = (1 - WRONG_SECTOR) * e[:, s] + WRONG_SECTOR * anywhere
     return slow_chain(e)
 

@@ -238,7 +238,7 @@ class Located(StarFix, Measured):
     @property
     def warnings(self) -> list[str]:
         """Those of `Measured`, what blocks the view, and errors beyond the defaults of facts that no file states."""
-        blocked = [f"blocked and left out: {self.fix.blocked.text}"] if self.fix.blocked else []
+        blocked = [f"not the map's skyline, and left out: {self.fix.blocked.text}"] if self.fix.blocked else []
         shown = [f"the image shows {one.text}, which no file states: it is estimated" for one in self.fix.shown]
         return [*super().warnings, *blocked, *shown, *self.fix.cautions]
 

@@ -110,17 +110,20 @@ class ShownError:
 
 @dataclass(frozen=True, eq=False)
 class Blocked:
-    """Probability that something on no map blocks the view, by sectors of azimuth from north eastward."""
+    """Probability that the skyline is not the map's, by sectors of azimuth from north eastward.
+
+    Something on no map hides it, or it lies below the map's.
+    """
 
     probability: Array  # (n,)
 
     @property
     def whole(self) -> Bools:
-        """(n,) which sectors are more likely blocked than not."""
+        """(n,) in which sectors the skyline is more likely not the map's."""
         return np.asarray(self.probability > 0.5)
 
     def hides(self, azimuth_rad: Array) -> Bools:
-        """Whether directions (n,) at `azimuth_rad` are in blocked sectors."""
+        """Whether directions (n,) at `azimuth_rad` are in such sectors."""
         n = len(self.probability)
         return self.whole[(azimuth_rad / (2 * np.pi) * n).astype(np.int64) % n]
 
@@ -129,7 +132,7 @@ class Blocked:
 
     @property
     def ranges_rad(self) -> list[tuple[float, float]]:
-        """From and to of each range in which the skyline is blocked, eastward; across north `to` is the smaller."""
+        """From and to of each range of such sectors, eastward; across north `to` is the smaller."""
         if self.whole.all():
             return [(0.0, 2 * np.pi)]
         width = 2 * np.pi / len(self.whole)

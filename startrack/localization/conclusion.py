@@ -121,7 +121,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
     require_map_in_view(best.model, clear)
     integrity = None
     if not best.model.seen.rows.is_first_look:
-        require_files(found, parameters, clear)
+        require_files(found, best.found.likeliest(own))
         if not ambiguous:
             integrity = assess_integrity(best.model, parameters, near[:2, :2], clear, covariance, radius999)
     blocked = Blocked(1.0 - clear)

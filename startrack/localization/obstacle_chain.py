@@ -1,8 +1,9 @@
-"""The skyline around the compass as a Markov chain: the map's, or risen by something on no map, or nothing seen.
+"""The skyline around the compass as a Markov chain: the map's, above it, below it, or nothing seen.
 
-In each sector the skyline is the map's (state 0), stands above it by one of the levels of LEVELS_RAD, or hides
-everything (the last state). An obstacle pays once to begin and little to continue; its level stays, moves to a
-neighbour or, seldom, jumps. Besides, each sector may show a skyline that is anywhere. The likelihood is the trace of
+In each sector the skyline is the map's (state 0), stands above it by one of the levels of LEVELS_RAD (something on no
+map), hides everything, or lies below it by one of the levels of NOTCH_LEVELS_RAD (a gap that the map has filled, a
+crest that it has too high). An obstacle or a notch pays once to begin and little to continue; its level stays, moves to
+a neighbour or, seldom, jumps. Besides, each sector may show a skyline that is anywhere. The likelihood is the trace of
 the product of transitions and emissions around the circle.
 """
 
@@ -19,33 +20,51 @@ from startrack.core.types import SECTORS, Array, Ints
 from startrack.localization.skyline_profiles import Profiles, cell_at, integral_to, log_at
 
 LEVELS_RAD = np.radians([0.04, 0.08, 0.14, 0.24, 0.4, 0.65, 1.0, 1.6, 2.5, 4.0, 6.5, 10.0, 16.0])  # edges
-STATES = len(LEVELS_RAD) + 1  # the map's skyline, the levels between the edges, and everything hidden
-START = 0.03 / SECTORS  # of an obstacle, a sector: 0.03 obstacles around the circle
-STOP, KEEP, NEAR = 0.05, 0.84, 0.14  # an obstacle ends; else its level stays, or goes to a neighbour
+NOTCH_LEVELS_RAD = np.radians([0.04, 0.1, 0.25, 0.65, 1.6, 4.0, 8.0])  # edges, below the map's skyline
+RISEN = len(LEVELS_RAD)  # states 1 to here: the levels, from low to high, and everything hidden
+STATES = RISEN + len(NOTCH_LEVELS_RAD)  # behind them the levels of notches, from shallow to deep
+FROM_RAD = np.concatenate([LEVELS_RAD[:-1], [np.inf], -NOTCH_LEVELS_RAD[1:]])  # (STATES - 1,) lower edges
+TO_RAD = np.concatenate([LEVELS_RAD[1:], [np.inf], -NOTCH_LEVELS_RAD[:-1]])  # (STATES - 1,) upper edges
+START, NOTCH_START = 0.03 / SECTORS, 0.01 / SECTORS  # a sector: 0.03 obstacles and 0.01 notches around the circle
+STOP, KEEP, NEAR = 0.05, 0.84, 0.14  # one of them ends; else its level stays, or goes to a neighbour
 WRONG_SECTOR = 1e-3  # probability that the skyline of a sector is anywhere
 NODES = 33  # of shifts, at which the emissions of the levels are prepared
 BLOCK = 64  # points that are computed together
 CLEAR = 1e-3  # least probability of a state over which the circle is closed
 
 
+class Group(NamedTuple):
+    """States that go over into each other, and their probabilities from one sector to the next."""
+
+    first: int  # state
+    last: int
+    start: float  # from the map's skyline to each
+    jump: float  # from each to each
+
+
 class Moves(NamedTuple):
     """Probabilities of the chain from one sector to the next."""
 
-    start: float  # to each risen state
+    risen: Group
+    sunk: Group
     stop: float
-    jump: float  # from each risen state to each
     keep: float
     near: float  # to each neighbour
 
 
+def _group(first: int, last: int, start: float) -> Group:
+    count = last - first + 1
+    return Group(first, last, start / count, (1 - STOP) * (1 - KEEP - NEAR) / count)
+
+
 MOVES = Moves(
-    START / (STATES - 1), STOP, (1 - STOP) * (1 - KEEP - NEAR) / (STATES - 1), (1 - STOP) * KEEP,
+    _group(1, RISEN, START), _group(RISEN + 1, STATES - 1, NOTCH_START), STOP, (1 - STOP) * KEEP,
     0.5 * (1 - STOP) * NEAR,
 )  # fmt: skip
 
 
 class Levels(NamedTuple):
-    """Emissions of the risen states at shifts of the map's skyline, prepared on nodes closer to each other about 0."""
+    """Emissions of all states but the first at shifts of the map's skyline, on nodes closer to each other about 0."""
 
     reach: Array  # (SECTORS,) largest shift
     table: Array  # (SECTORS, STATES - 1, NODES), float32
@@ -53,28 +72,24 @@ class Levels(NamedTuple):
 
 @njit(cache=True)
 def prepare_levels(profiles, reach):
-    """Emissions (SECTORS, STATES - 1, NODES) of the risen states at shifts up to `reach` (SECTORS,)."""
-    table, to = np.zeros((len(reach), STATES - 1, NODES), dtype=np.float32), np.empty(len(LEVELS_RAD))
+    """Emissions (SECTORS, STATES - 1, NODES) of the states but the first at shifts up to `reach` (SECTORS,)."""
+    table = np.zeros((len(reach), STATES - 1, NODES), dtype=np.float32)
     for s in range(len(reach)):
         for i in range(NODES):
             u = 2.0 * i / (NODES - 1) - 1.0
-            shift = reach[s] * u * abs(u)
-            for j in range(len(to)):
-                to[j] = integral_to(profiles, s, shift + LEVELS_RAD[j])
-            for j in range(STATES - 2):
-                mean = (to[j + 1] - to[j]) / (LEVELS_RAD[j + 1] - LEVELS_RAD[j])
-                table[s, j, i] = (1.0 - WRONG_SECTOR) * mean + WRONG_SECTOR
-            table[s, STATES - 2, i] = (1.0 - WRONG_SECTOR) * exp(-profiles.free[s]) + WRONG_SECTOR
+            for j in range(1, STATES):
+                table[s, j - 1, i] = level_emission(profiles, s, reach[s] * u * abs(u), j)
     return table
 
 
 @njit(cache=True, inner=True)
-def risen_emission(profiles, s, shift, j):
-    """Likelihood of a sector whose skyline stands in level j above the map's, which is higher by `shift`."""
-    if j == STATES - 1:
-        return (1.0 - WRONG_SECTOR) * exp(-profiles.free[s]) + WRONG_SECTOR
-    low, high = LEVELS_RAD[j - 1], LEVELS_RAD[j]
-    mean = (integral_to(profiles, s, shift + high) - integral_to(profiles, s, shift + low)) / (high - low)
+def level_emission(profiles, s, shift, j):
+    """Likelihood of a sector in state j, above or below the map's skyline, which is higher by `shift`."""
+    if j == RISEN:
+        mean = exp(-profiles.free[s])
+    else:
+        low, high = FROM_RAD[j - 1], TO_RAD[j - 1]
+        mean = (integral_to(profiles, s, shift + high) - integral_to(profiles, s, shift + low)) / (high - low)
     return (1.0 - WRONG_SECTOR) * mean + WRONG_SECTOR
 
 
@@ -91,7 +106,7 @@ def emissions(profiles, shift):
     for s in range(len(shift)):
         found[s, 0] = clear_emission(profiles, s, shift[s])
         for j in range(1, STATES):
-            found[s, j] = risen_emission(profiles, s, shift[s], j)
+            found[s, j] = level_emission(profiles, s, shift[s], j)
     return found
 
 
@@ -100,15 +115,19 @@ def chain_log_likelihoods(profiles, levels, moves, shifts, cut, closing, found):
     """Fill found (n,) with the log-likelihoods at shifts (n, SECTORS) of the map's skyline.
 
     The circle is cut at the sector `cut` and closed over its states `closing`. Blocks of points go from sector to
-    sector together, so that processors compute several points at a time. The risen states are held with a zero on
-    either side; in float32, which is right to 1e-5 nats.
+    sector together, so that processors compute several points at a time. The states of each group are held with a zero
+    on either side; in float32, which is right to 1e-5 nats.
     """
     count, sectors = shifts.shape
-    start, stop, jump = np.float32(moves.start), np.float32(moves.stop), np.float32(moves.jump)
-    keep, near, stay = np.float32(moves.keep), np.float32(moves.near), np.float32(1.0 - moves.start * (STATES - 1))
-    risen, moved = np.zeros((STATES + 1, BLOCK), dtype=np.float32), np.zeros((STATES + 1, BLOCK), dtype=np.float32)
+    starts = np.array([moves.risen.start, moves.sunk.start], dtype=np.float32)
+    jumps = np.array([moves.risen.jump, moves.sunk.jump], dtype=np.float32)
+    rows = np.array([[1, RISEN + 1], [RISEN + 2, STATES + 1]])  # of each group, its end excluded
+    stop, keep, near = np.float32(moves.stop), np.float32(moves.keep), np.float32(moves.near)
+    stay = np.float32(1.0 - moves.risen.start * RISEN - moves.sunk.start * (STATES - 1 - RISEN))
+    off, moved = np.zeros((STATES + 2, BLOCK), dtype=np.float32), np.zeros((STATES + 2, BLOCK), dtype=np.float32)
     clear, total = np.empty(BLOCK, dtype=np.float32), np.empty(BLOCK, dtype=np.float32)
-    part, node = np.empty(BLOCK, dtype=np.float32), np.empty(BLOCK, dtype=np.int64)
+    ended, part = np.empty(BLOCK, dtype=np.float32), np.empty(BLOCK, dtype=np.float32)
+    node = np.empty(BLOCK, dtype=np.int64)
     reach, table = levels.reach, levels.table
     logs, product, clear_emissions = np.empty(BLOCK), np.empty(BLOCK), np.empty((sectors, BLOCK))
     for first in range(0, count, BLOCK):
@@ -118,22 +137,28 @@ def chain_log_likelihoods(profiles, levels, moves, shifts, cut, closing, found):
         found[first : first + BLOCK] = -np.inf
         for k in closing:
             clear[:], logs[:], product[:] = 0.0, 0.0, 1.0
-            risen[:], moved[:] = 0.0, 0.0
+            off[:], moved[:] = 0.0, 0.0
+            at_end = k if k <= RISEN else k + 1  # row of the state
             for step in range(sectors + 1):
                 s = cut + step if cut + step < sectors else cut + step - sectors
                 if step > 0:
-                    total[:] = 0.0
-                    for j in range(1, STATES):
-                        for p in range(points):
-                            total[p] += risen[j, p]
-                    for j in range(1, STATES):
-                        for p in range(points):
-                            common = start * clear[p] + jump * total[p]
-                            moved[j, p] = common + keep * risen[j, p] + near * (risen[j - 1, p] + risen[j + 1, p])
-                    for p in range(points):  # the outermost levels have one neighbour, to which they go twice as often
-                        moved[2, p] += near * risen[1, p]
-                        moved[STATES - 2, p] += near * risen[STATES - 1, p]
-                        clear[p] = stay * clear[p] + stop * total[p]
+                    ended[:] = 0.0
+                    for g in range(2):
+                        start, jump, begin, end = starts[g], jumps[g], rows[g, 0], rows[g, 1]
+                        total[:] = 0.0
+                        for r in range(begin, end):
+                            for p in range(points):
+                                total[p] += off[r, p]
+                        for r in range(begin, end):
+                            for p in range(points):
+                                common = start * clear[p] + jump * total[p]
+                                moved[r, p] = common + keep * off[r, p] + near * (off[r - 1, p] + off[r + 1, p])
+                        for p in range(points):  # the outermost levels go to their only neighbour twice as often
+                            moved[begin + 1, p] += near * off[begin, p]
+                            moved[end - 2, p] += near * off[end - 1, p]
+                            ended[p] += stop * total[p]
+                    for p in range(points):
+                        clear[p] = stay * clear[p] + ended[p]
                 if step == sectors:
                     break
                 for p in range(points):
@@ -144,31 +169,32 @@ def chain_log_likelihoods(profiles, levels, moves, shifts, cut, closing, found):
                     part[p] = at - node[p]
                 if step == 0:
                     clear[:] = 1.0 if k == 0 else 0.0
-                    moved[k] = 1.0 if k > 0 else 0.0
-                for j in range(1, STATES):
-                    emission = table[s, j - 1]
-                    for p in range(points):
-                        low = emission[node[p]]
-                        risen[j, p] = moved[j, p] * (low + part[p] * (emission[node[p] + 1] - low))
+                    moved[at_end] = 1.0 if k > 0 else 0.0
+                for g in range(2):
+                    for r in range(rows[g, 0], rows[g, 1]):
+                        emission = table[s, r - 1 - g]
+                        for p in range(points):
+                            low = emission[node[p]]
+                            off[r, p] = moved[r, p] * (low + part[p] * (emission[node[p] + 1] - low))
                 for p in range(points):
                     clear[p] *= clear_emissions[s, p]
                 if step % 4 == 3:
                     for p in range(points):  # numba takes 1.5 s to compile total[:] = clear
                         total[p] = clear[p]
-                    for j in range(1, STATES):
+                    for r in range(1, STATES + 1):
                         for p in range(points):
-                            total[p] += risen[j, p]
+                            total[p] += off[r, p]
                     for p in range(points):
                         product[p] *= total[p]
                         clear[p] /= total[p]
-                    for j in range(1, STATES):
+                    for r in range(1, STATES + 1):
                         for p in range(points):
-                            risen[j, p] /= total[p]
+                            off[r, p] /= total[p]
                 if step % 32 == 31:
                     for p in range(points):
                         logs[p] += log(product[p])
                         product[p] = 1.0
-            last = clear if k == 0 else moved[k]
+            last = clear if k == 0 else moved[at_end]
             for p in range(points):
                 value = logs[p] + log(product[p]) + log(max(last[p], np.float32(1e-37)))
                 top = max(value, found[first + p])
@@ -196,14 +222,16 @@ def fill_clear_emissions(profiles, shifts, found):
 
 def transitions(moves: Moves = MOVES) -> Array:
     """The transitions (STATES, STATES) of the chain, from rows to columns."""
-    T = np.full((STATES, STATES), moves.jump)
-    T[0], T[:, 0] = moves.start, moves.stop
-    T[0, 0] = 1.0 - moves.start * (STATES - 1)
-    for j in range(1, STATES):
-        T[j, j] += moves.keep
-        neighbours = [i for i in (j - 1, j + 1) if 1 <= i < STATES]
-        for i in neighbours:
-            T[j, i] += 2.0 * moves.near / len(neighbours)
+    T = np.zeros((STATES, STATES))
+    T[0, 0], T[1:, 0] = 1.0, moves.stop
+    for group in (moves.risen, moves.sunk):
+        own = np.arange(group.first, group.last + 1)
+        T[0, own], T[np.ix_(own, own)] = group.start, group.jump
+        T[0, 0] -= group.start * len(own)
+        T[own, own] += moves.keep
+        for j in own:
+            neighbours = [i for i in (j - 1, j + 1) if i in own]
+            T[j, neighbours] += 2.0 * moves.near / len(neighbours)
     return T
 
 

@@ -26,23 +26,23 @@ def require_map_in_view(model: SkylineModel, clear: Array) -> None:
     hidden = Blocked(1.0 - clear).whole
     if np.average(hidden, weights=model.seen.moments.information) > MOST_BLOCKED:
         raise NotLocated(
-            f"something on no map hides {360.0 * hidden.mean():.0f} degrees of the skyline, or terrain, time or "
-            "camera file are wrong",
+            f"over {360.0 * hidden.mean():.0f} degrees the skyline is not the map's: something on no map "
+            "stands there, or terrain, time or camera file are wrong",
             reason="inconsistent_evidence",
         )
 
 
-def require_files(found: Sequence[Hypothesis], parameters: Array, clear: Array) -> None:
+def require_files(found: Sequence[Hypothesis], parameters: Array) -> None:
     """Raises NotLocated (inconsistent_evidence) where something else explains the rows better than the files.
 
     Args:
         found: the hypotheses, the heaviest first.
-        parameters: (2 + a,) of the best position and errors.
-        clear: (SECTORS,) probability that the map's skyline shows.
+        parameters: (2 + a,) of the likeliest position and errors.
     """
-    wrong, model = Blocked(1.0 - clear), found[0].model
+    model = found[0].model
     better = free_log_likelihood(model.seen.profiles, model.shift_of(parameters)) - _log_map(found[0], parameters)
     if better > 0.0:
+        wrong = Blocked(1.0 - model.states(parameters)[:, 0])
         where = f", most at azimuths {wrong.text}" if wrong else ""
         raise NotLocated(
             f"a skyline unlike the map's explains the image better, by {better:.0f} nats{where}: wrong terrain, time "

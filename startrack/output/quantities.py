@@ -60,8 +60,9 @@ LIGHT_QUANTITIES: tuple[Quantity, ...] = (
       "without a site those that have a source there, the Moon as from the middle of the Earth (up to 1 degree off), "
       "without a time none", list_schema(BODY), before=[]),
     Q("evidence.blocked", "deg", Located, blocked_deg,
-      "list of [from, to]: azimuths in which something on no map more likely hides the map's skyline than not; across "
-      "north `to` is the smaller", list_schema(list_schema("number", count=2)), before=[], optional=True,
+      "list of [from, to]: azimuths in which the skyline is more likely not the map's: hidden by something on no map, "
+      "or below it; across north `to` is the smaller", list_schema(list_schema("number", count=2)), before=[],
+      optional=True,
       shown=(Show("text", "evidence", lambda a: f"; blocked {ranges_text(a)}" if a else ""),
              Show("page", "Blocked azimuths", ranges_text))),
     Q("evidence.damage", "", Inputs, lambda v: None if v.damage is None else v.damage.cause,

@@ -195,7 +195,7 @@ def _deciding_stars(measured: Measured, longer: float) -> int:
 
 
 def _more_skyline(measured: Measured) -> Iterator[str]:
-    """Azimuths in which the skyline is not in view, or blocked."""
+    """Azimuths in which the skyline is not in view, or not the map's."""
     rays_cam = rays_from_azel(MIDDLES_RAD, _skyline(measured)) @ measured.R_cam_enu.T
     xy_px, inside = measured.camera.project(rays_cam)
     known = inside & (measured.camera.angle_rad(xy_px) <= measured.camera.calibrated_angle_rad)
@@ -203,7 +203,7 @@ def _more_skyline(measured: Measured) -> Iterator[str]:
     if 2 * np.pi * np.mean(hidden.whole) > LEAST_HIDDEN_RAD:
         yield f"more of the skyline: azimuths {hidden.text} are not in view; look up more steeply, or take a wider lens"
     if isinstance(measured, Located) and measured.fix.blocked is not None:
-        yield f"a free view: something on no map stands at azimuths {measured.fix.blocked.text}; drive on some metres"
+        yield f"a free view: the skyline is not the map's at azimuths {measured.fix.blocked.text}; drive on some metres"
 
 
 def _skyline(measured: Measured) -> Array:

@@ -24,7 +24,6 @@ from startrack.catalog import load_catalog
 from startrack.chain import Measured, last_value, locate
 from startrack.core.types import Evidence, Fix, NoSolution
 from startrack.localization import ExactPosterior
-from startrack.localization.horizon_bias import lower_evidence
 from startrack.rendering import Series, render
 from startrack.terrain import HeightMap, load_terrain
 
@@ -51,7 +50,9 @@ def main() -> None:
     for number in range(args.frames):
         evidence, position = load_or_observe(args.keep, true, args.seed, number)
         for name, (terrain, bias) in maps.items():
-            rows[name].append(score_fix(lower_evidence(evidence, -bias), terrain, position))
+            rows[name].append(
+                score_fix(replace(evidence, elevation_rad=evidence.elevation_rad + bias), terrain, position)
+            )
             print(number, name, rows[name][-1], flush=True)
     body = summary(rows)
     print(body)

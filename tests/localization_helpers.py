@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -18,7 +19,7 @@ from startrack.localization.obstacle_chain import (
     WRONG_SECTOR,
     transitions,
 )
-from startrack.localization.sector_likelihood import Sectors
+from startrack.localization.search_profiles import SEARCH_EPSILON
 from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS, sector_of
 from startrack.terrain import Cylinder, ForwardingTerrain, Terrain, load_terrain
 
@@ -54,16 +55,34 @@ def slow_contributions(evidence: Evidence, margin_rad: Array, sigma_rad: Array) 
     return np.where(extended > 0, llr * visible + extended * visible * (1.0 - visible) / 2, point)
 
 
-def slow_scores(points_m: Array, evidence: Evidence, terrain: Terrain, sectors: Sectors) -> Array:
-    """Log-likelihoods (n,) of positions (n, 2)."""
-    azimuth = evidence.azimuth_rad
-    horizon = terrain.horizon_rad(points_m[:, None], azimuth)
-    sigma = np.hypot(evidence.edge_sigma_rad, terrain.horizon_sigma_rad(points_m[:, None], azimuth))
+def slow_sums(points_m: Array, evidence: Evidence, terrain: Terrain) -> Array:
+    """Sums (n, SECTORS) of the contributions of rows at positions (n, 2), each with its own horizon."""
+    evidence = replace(evidence, llr=np.where(evidence.extended_nats > 0, evidence.llr, capped_llr(evidence)))
+    horizon = terrain.horizon_rad(points_m[:, None], evidence.azimuth_rad)
+    sigma = np.hypot(evidence.edge_sigma_rad, terrain.horizon_sigma_rad(points_m[:, None], evidence.azimuth_rad))
     value = slow_contributions(evidence, evidence.elevation_rad - horizon, sigma)
-    key = np.arange(len(points_m))[:, None] * sectors.count + sectors.sector
-    sums = np.bincount(key.ravel(), weights=value.ravel(), minlength=len(points_m) * sectors.count)
-    sums = sums.reshape(len(points_m), sectors.count)
-    return sectors.score(sums)
+    key = np.arange(len(points_m))[:, None] * SECTORS + sector_of(evidence.azimuth_rad)
+    sums = np.bincount(key.ravel(), weights=value.ravel(), minlength=len(points_m) * SECTORS)
+    return sums.reshape(len(points_m), SECTORS)
+
+
+def capped_llr(evidence: Evidence) -> Array:
+    """The llr (n,) of stars, as far as one counts."""
+    return np.clip(evidence.llr, -ROW_NATS, ROW_NATS)
+
+
+def best_levels(evidence: Evidence) -> Array:
+    """(SECTORS,) the greatest sum of the llr of stars above one elevation."""
+    found, sector, llr = np.zeros(SECTORS), sector_of(evidence.azimuth_rad), capped_llr(evidence)
+    for s in np.unique(sector):
+        own = np.flatnonzero(sector == s)
+        found[s] = max(np.cumsum(llr[own[np.argsort(-evidence.elevation_rad[own])]]).max(), 0.0)
+    return found
+
+
+def search_scores(below: Array) -> Array:
+    """Log-likelihoods (n,) of the search of sums (n, SECTORS), less the best ones."""
+    return np.log((1 - SEARCH_EPSILON) * np.exp(np.minimum(below, 0.0)) + SEARCH_EPSILON).sum(axis=-1)
 
 
 def locate_or_refuse(evidence: Evidence, terrain: Terrain) -> tuple[Fix | None, Reason | None]:

@@ -11,23 +11,20 @@ from localization_helpers import (
     TERRAIN,
     WRAPPERS,
     ThreeMethods,
+    best_levels,
     perfect_list,
     random_position,
+    search_scores,
     sky,
     slow_chain_scores,
-    slow_contributions,
-    slow_scores,
+    slow_sums,
 )
 
 from startrack.chain import Settings
 from startrack.core.types import Array, Evidence, NotLocated
 from startrack.localization import ExactPosterior, Hull, Localizer, PseudoGradient
-from startrack.localization.likelihood import PositionLikelihood
-from startrack.localization.search import Guess, Search
-from startrack.localization.sector_likelihood import add_contributions
+from startrack.localization.search import BoxModel
 from startrack.terrain import Cylinder, ForwardingTerrain
-
-NO_GUESS = Guess(np.zeros((0, 2)), np.zeros(0))
 
 
 def measure_stars(rng: np.random.Generator, at_m: Array, terrain: Cylinder, n: int, sigma_rad: float = 0.0) -> Evidence:
@@ -151,16 +148,14 @@ def test_exact_posterior_equals_brute_force(seed: int, terrain: Cylinder) -> Non
 def test_bounds_hold_at_random_positions_of_every_box(sigma_rad: float) -> None:
     rng = np.random.default_rng(8)
     evidence = measure_stars(rng, random_position(rng), TERRAIN, 400, sigma_rad)
-    likelihood = PositionLikelihood.from_evidence(evidence, TERRAIN)
-    search = Search(likelihood, NO_GUESS, prune_nats=np.inf, budget_horizons=np.inf)
+    centres, model = np.array([[1000.0, 2000.0], [-7000.0, 3000.0], [6500.0, -6500.0]]), BoxModel(evidence, TERRAIN)
     for half in (300.0, 20.0):
-        centres, upper = search._bound(np.array([[1000.0, 2000.0], [-7000.0, 3000.0], [6500.0, -6500.0]]), half)
-        for centre, most in zip(centres, upper, strict=True):
+        for centre, most in zip(centres, model.bounds(centres, half), strict=True):
             inside = centre + half * (2 * rng.random((60, 2)) - 1)
             inside = inside[TERRAIN.allowed(inside)]
-            score = slow_scores(inside, evidence, TERRAIN, likelihood.sectors)
+            score = search_scores(slow_sums(inside, evidence, TERRAIN) - best_levels(evidence))
             assert np.all(score <= most + 1e-4)
-            np.testing.assert_allclose(likelihood.exact_scores(inside), score, atol=2e-3)
+            assert most < -5.0  # it excludes something
 
 
 @pytest.mark.parametrize("sigma_rad", [0.0, 0.002])
@@ -275,27 +270,6 @@ def test_stars_high_above_the_rim_locate_nothing() -> None:
     with pytest.raises(NotLocated) as refusal:
         ExactPosterior()(evidence, TERRAIN)
     assert refusal.value.reason == "insufficient_geometry"
-
-
-def rows(rng: np.random.Generator, n: int) -> Evidence:
-    """Point sources and extended light, half each."""
-    return Evidence(
-        azimuth_rad=np.zeros(n), elevation_rad=rng.random(n), llr=6 * rng.standard_normal(n),
-        extended_nats=np.where(np.arange(n) % 2, 20 * rng.random(n), 0.0),
-    )  # fmt: skip
-
-
-def test_contributions_are_those_written_out() -> None:
-    """The mixture of both cases for point sources, the parabola for extended light."""
-    rng = np.random.default_rng(6)
-    e, horizon, sigma = rows(rng, 60), rng.random(60), 0.3 * rng.random(60)
-    found, each = np.zeros((60, 1)), np.arange(60)
-    add_contributions(each, np.zeros_like(each), e.llr, e.extended_nats, e.elevation_rad - horizon, sigma, found)
-    found = found[:, 0]
-    expected = slow_contributions(e, e.elevation_rad - horizon, sigma)
-    point = e.extended_nats == 0
-    np.testing.assert_allclose(found[point], expected[point], atol=1e-11)
-    np.testing.assert_allclose(found, expected, atol=1e-5)  # V of extended light is from a table, to 5e-7
 
 
 def test_pixels_of_the_sky_and_several_exposures_are_rows_like_any_other() -> None:

@@ -12,8 +12,9 @@ from scipy.stats import norm
 
 from startrack.core.types import Evidence, Fix, NotLocated
 from startrack.localization import ExactPosterior, Hull, PseudoGradient
-from startrack.localization.posterior import SEARCH_EPSILON
 from startrack.localization.pseudo_gradient import descend
+from startrack.localization.search_profiles import SEARCH_EPSILON
+from startrack.localization.skyline_profiles import ROW_NATS
 from startrack.terrain import Cylinder, load_terrain
 
 THESIS = load_terrain("shackleton-thesis")
@@ -38,7 +39,11 @@ def log_likelihood(places: np.ndarray, evidence: Evidence) -> np.ndarray:
         gain, ceiling, running = np.zeros(len(places)), 0.0, 0.0
         rays = np.flatnonzero(sector == s)
         for i in rays[np.argsort(-evidence.elevation_rad[rays])]:
-            a, e, llr = evidence.azimuth_rad[i], evidence.elevation_rad[i], evidence.llr[i]
+            a, e, llr = (
+                evidence.azimuth_rad[i],
+                evidence.elevation_rad[i],
+                np.clip(evidence.llr[i], -ROW_NATS, ROW_NATS),
+            )
             along = places @ [np.sin(a), np.cos(a)]
             reach = -along + np.sqrt(along**2 + 100.0**2 - np.sum(places**2, axis=1))  # to the wall
             above = e - np.arctan2(40.0, reach)

@@ -10,11 +10,10 @@ from startrack.localization.importance_sampling import ENOUGH, Gaussian, Weighte
 from startrack.localization.integrity import RISK, clear_logs
 from startrack.localization.posterior import MIN_ROW_NATS, ExactPosterior
 from startrack.localization.pseudo_gradient import PseudoGradient, descend
-from startrack.localization.sector_likelihood import Sectors
 from startrack.localization.sector_moments import solve_linear
 from startrack.localization.shared_errors import ErrorBasis, SharedErrors
 from startrack.localization.skyline_model import SkylineModel
-from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD
+from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS
 from startrack.localization.steepness import settle_steepness
 from startrack.localization.summary import camera_at
 from startrack.terrain import Terrain
@@ -70,7 +69,7 @@ def require_localizer(given: Any) -> Localizer:
 
 __all__ = [
     "AMBIGUOUS_MASS", "DEFAULT_LOCALIZER", "ENOUGH", "HIGH_RAD", "LOCALIZERS", "LOW_RAD", "MIN_ROW_NATS", "RISK",
-    "ErrorBasis", "ExactPosterior", "Gaussian", "Hull", "Localizer", "PseudoGradient", "Sectors", "SharedErrors",
+    "ROW_NATS", "ErrorBasis", "ExactPosterior", "Gaussian", "Hull", "Localizer", "PseudoGradient", "SharedErrors",
     "SkylineModel", "WeightedPoints", "camera_at", "clear_logs", "clock_at", "clock_matters", "descend", "duration",
     "has_posterior", "hull_position", "localizer_name", "moments", "require_localizer", "sample", "settle_steepness",
     "solve_linear",

@@ -12,8 +12,6 @@ from startrack.core.time_limit import check_time
 from startrack.core.types import Array, Clock, Evidence, NotLocated
 from startrack.frames import Air, R_from_rotvec, Site, sky_rotvec_rad, turn_sky, ut1_sigma_s
 from startrack.localization import search
-from startrack.localization.horizon_bias import LinearSolution, at_likeliest_bias
-from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.shared_errors import is_noticeable
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain
@@ -74,18 +72,18 @@ def clock_matters(clock: Clock | None, terrain: Terrain) -> bool:
 
 @dataclass(frozen=True)
 class Scan:
-    """A time [s later] and the boxes that fit best there: log-likelihood and position (2,) of the best centre."""
+    """A time [s later] and the boxes that fit best there, and how well the best one fits on average."""
 
     later_s: float
     fit: float
-    position_m: Array
     centres_m: Array  # (n, 2), the best average first
     half_m: float
 
     def leads_to(self, other: Scan, step_s: float) -> bool:
         """Whether the next time, of those `step_s` apart, fits better at nearly the same position."""
         is_next = 0 < abs(self.later_s - other.later_s) < 1.5 * step_s and self.fit < other.fit
-        return is_next and float(np.abs(self.position_m - other.position_m).max()) <= BOXES_APART * self.half_m
+        apart_m = np.abs(self.centres_m[0] - other.centres_m[0]).max() if is_next else np.inf
+        return bool(apart_m <= BOXES_APART * self.half_m)
 
 
 @dataclass(frozen=True)
@@ -96,18 +94,17 @@ class Track:
     terrain: Terrain
     clock: Clock
 
-    def likely_way(self) -> tuple[Array, Array, Array]:
-        """Times (n,) that matter [s later], the logarithms of their shares (n,), and the best positions (n, 2).
+    def likely_places(self) -> list[search.Place]:
+        """The best place at each time that matters; `later_s` is that time, its prior is in the log-likelihood.
 
         Raises NotLocated (outside_search_area, insufficient_geometry).
         """
-        found: list[tuple[float, float, Array]] = []
-        for later_s, position_m in self._likely_times():
-            settled = self._settle_time(later_s, position_m, [time_s for time_s, _, _ in found])
+        found: list[search.Place] = []
+        for place in self._begin_places():
+            settled = self._settle_time(place, found)
             if settled is not None:
                 found.append(settled)
-        later, share, position = zip(*found, strict=True)
-        return np.array(later), np.array(share), np.array(position)
+        return found
 
     @property
     def limits_s(self) -> tuple[float, float]:
@@ -121,8 +118,8 @@ class Track:
         """Between two times."""
         return float(TIME_STEP_RAD / np.linalg.norm(self.clock.turn_rad_s))
 
-    def _likely_times(self) -> list[tuple[float, Array]]:
-        """Likely times [s later], the best first, each with a position (2,) [m, enu]."""
+    def _begin_places(self) -> list[search.Place]:
+        """The best places at likely times, the best first."""
         low, high = self.limits_s
         times = np.linspace(low, high, 2 * int(np.ceil(0.5 * (high - low) / self.step_s)) + 1)
         if len(times) > MOST_SCANNED:
@@ -130,54 +127,48 @@ class Track:
                 f"a clock that is right to {duration(self.clock.sigma_s)} leaves too many times to search on this "
                 "terrain: find the time more exactly (--time-sigma states its error)"
             )
-        scanned = [one for one in map(self._scan, times) if one.fit > -np.inf]
-        if not scanned:
-            raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
-        found = []
+        scanned = [one for one in map(self._scan, times) if len(one.centres_m)]
+        found: list[search.Place] = []
         for one in scanned:
             if not any(one.leads_to(other, self.step_s) for other in scanned):
-                likelihood = self._likelihood(one.later_s)
-                guess = search.refine_boxes(likelihood, one.centres_m, one.half_m)
-                found.append((guess.best + self._log_offset(one.later_s, likelihood), one.later_s, guess.points_m[0]))
-        found.sort(key=lambda one: -one[0])
-        return [(later_s, position) for fit, later_s, position in found if fit > found[0][0] - TRACKED_NATS]
+                places = self._model(one.later_s).fit_places(one.centres_m, one.half_m, most=1)
+                found.extend(self._at_time(one.later_s, place) for place in places)
+        if not found:
+            raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
+        found.sort(key=lambda one: -one.log_likelihood)
+        return [one for one in found if one.log_likelihood > found[0].log_likelihood - TRACKED_NATS]
 
     def _scan(self, later_s: float) -> Scan:
         """The best boxes at a time [s later]."""
-        likelihood = self._likelihood(later_s)
-        centres, half = search.last_boxes(likelihood, *search.BEAMS[0])
-        points = centres[: search.SCORED][np.asarray(self.terrain.allowed(centres[: search.SCORED]))]
-        scores = likelihood.exact_scores(points) if len(points) else np.zeros(0)
-        fit = float(scores.max(initial=-np.inf)) + self._log_offset(later_s, likelihood)
-        return Scan(later_s, fit, points[np.argmax(scores)] if len(points) else np.zeros(2), centres, half)
+        model = self._model(later_s)
+        centres, half = model.last_boxes(*search.BEAMS[0])
+        fit = float(model.averages(centres[:1], half)[0]) if len(centres) else -np.inf
+        return Scan(later_s, fit + float(self.clock.log_prior(later_s)), centres, half)
 
-    def _settle_time(
-        self, later_s: float, position_m: Array, found_s: list[float]
-    ) -> tuple[float, float, Array] | None:
-        """The time that the rows show about a time [s later], the logarithm of its share, and the best position."""
-        low, high = self.limits_s
+    def _settle_time(self, begin: search.Place, found: list[search.Place]) -> search.Place | None:
+        """The place at the time that the rows show about that of another; None where it is among those `found`."""
+        (low, high), place = self.limits_s, begin
         for _ in range(TIME_ROUNDS):
-            if any(abs(later_s - time_s) < 0.5 * self.step_s for time_s in found_s):
+            if any(abs(place.later_s - one.later_s) < 0.5 * self.step_s for one in found):
                 return None
-            solution = LinearSolution.near(self._rows(later_s), self.terrain, position_m)
-            later_s = min(max(later_s + solution.later_s, low), high)
-            position_m = solution.position_m
-            if is_linear(self.clock, solution.later_s):
+            models = self._model(place.later_s).fit_places(place.position_m[None], search.FIT_M, most=1)
+            if not models:
+                return None
+            off_s = models[0].later_s
+            later_s = min(max(place.later_s + off_s, low), high)
+            place = self._at_time(later_s, models[0])
+            if is_linear(self.clock, off_s):
                 break
-        likelihood = self._likelihood(later_s)
-        points = position_m[None]
-        _, guess = at_likeliest_bias(likelihood, search.Guess(points, likelihood.exact_scores(points)))
-        return later_s, guess.best + self._log_offset(later_s, likelihood), guess.points_m[0]
+        return place
 
-    def _log_offset(self, later_s: float, likelihood: PositionLikelihood) -> float:
-        """The prior, and what makes likelihoods at different times comparable: their sectors hold different rows."""
-        return float(self.clock.log_prior(later_s)) + float(likelihood.sectors.ceiling.sum())
+    def _at_time(self, later_s: float, place: search.Place) -> search.Place:
+        """A place of rows at a time [s later] with that time, and its prior."""
+        return place._replace(
+            later_s=later_s, log_likelihood=place.log_likelihood + float(self.clock.log_prior(later_s))
+        )
 
-    def _likelihood(self, later_s: float) -> PositionLikelihood:
-        return PositionLikelihood.from_evidence(self._rows(later_s), self.terrain)
-
-    def _rows(self, later_s: float) -> Evidence:
-        return turn_evidence(self.evidence, later_s, self.terrain.air)
+    def _model(self, later_s: float) -> search.BoxModel:
+        return search.BoxModel(turn_evidence(self.evidence, later_s, self.terrain.air), self.terrain)
 
 
 def is_wide(clock: Clock, terrain: Terrain) -> bool:
@@ -192,20 +183,17 @@ def is_linear(clock: Clock, error_s: float) -> bool:
     return abs(error_s) * float(np.linalg.norm(clock.turn_rad_s)) <= LINEAR_TURN_RAD
 
 
-def explore_times(
-    plain: PositionLikelihood, evidence: Evidence, clock: Clock
-) -> list[tuple[Evidence, search.Explored]]:
+def explore_times(evidence: Evidence, terrain: Terrain, clock: Clock) -> list[tuple[Evidence, search.Explored]]:
     """The rows turned to each likely time that a wide clock allows, and the boxes there.
 
-    `plain` is the likelihood of the search. Raises NotLocated as `Track` does.
+    Raises NotLocated as `Track` does.
     """
-    later_s, log_share, way_m = Track(evidence, plain.terrain, clock).likely_way()
-    found: list[tuple[Evidence, search.Explored]] = []
-    for at in _peaks(later_s, log_share, clock):
-        rows = turn_evidence(evidence, float(later_s[at]), plain.terrain.air)
-        guess = search.Guess(way_m[at][None], np.zeros(1))
-        found.append((rows, search.local_posterior(plain.with_rows(rows), guess, -np.inf)))
-    return found
+    places = Track(evidence, terrain, clock).likely_places()
+    later_s, fits = np.array([one.later_s for one in places]), np.array([one.log_likelihood for one in places])
+    return [
+        (turn_evidence(evidence, float(later_s[at]), terrain.air), search.boxes_about([places[at]], terrain, -np.inf))
+        for at in _peaks(later_s, fits, clock)
+    ]
 
 
 def turned_model(model: SkylineModel, later_s: float, is_rough: bool = False) -> SkylineModel:

@@ -17,7 +17,7 @@ import numpy as np
 
 from startrack.core.statistics import shares
 from startrack.core.time_limit import check_time
-from startrack.core.types import Array, Bools
+from startrack.core.types import Array
 
 DEGREES, FAR_DEGREES = 5.0, 3.0  # of freedom of the t distributions
 FAR_PART, FAR, FAR_OTHERS = 0.4, 4.0, 1.4  # of the points; how much farther out, in position and in the others
@@ -147,7 +147,7 @@ class WeightedPoints:
         """(n,) parts of the whole."""
         return shares(self.log_weight)
 
-    def likeliest(self, among: Bools) -> Array:
+    def likeliest(self, among: Array) -> Array:
         """The point (d,) of the greatest density of those `among` (n,) them."""
         return np.asarray(self.points[np.argmax(np.where(among, self.log_weight + self.log_drawn, -np.inf))])
 

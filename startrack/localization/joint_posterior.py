@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 
 from startrack.core.types import Array, Evidence, NotLocated
-from startrack.localization.horizon_bias import NEARBY_M
 from startrack.localization.hypothesis import WIDER, Hypothesis, sample_gross_errors, sample_hypothesis
 from startrack.localization.importance_sampling import (
     ENOUGH,
@@ -19,7 +18,7 @@ from startrack.localization.importance_sampling import (
     moments,
     temper_weights,
 )
-from startrack.localization.search import NATS, Explored, choose_apart
+from startrack.localization.search import FIT_M, NATS, Explored, choose_apart
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain
@@ -45,7 +44,7 @@ def sample_posterior(explored: Explored, rows: Evidence, terrain: Terrain) -> li
     references_m = np.array([centres_m[0] for centres_m, _ in groups])
     found: list[Hypothesis] = []
     for number, (centres_m, reach_m) in enumerate(groups):
-        model = SkylineModel.of(terrain, rows, centres_m[0], max(reach_m, NEARBY_M), errors, rows.image_errors)
+        model = SkylineModel.of(terrain, rows, centres_m[0], max(reach_m, FIT_M), errors, rows.image_errors)
         start = Start.among_boxes(model, centres_m, explored.half_m)
         if start is None:
             continue

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from startrack.core.types import Array, Bools, NotLocated, PositionPrior
-from startrack.localization.search import Explored
-from startrack.localization.sector_likelihood import CERTAIN_SIGMAS
+from startrack.localization.search import Place
+from startrack.localization.sky_profiles import CERTAIN_SIGMAS
 from startrack.terrain import ForwardingTerrain, Terrain
 
 LEAST_REACH_M = 300.0  # of the first disk: in a smaller one few edges of evidence show which way is likelier
@@ -34,31 +34,30 @@ class SearchedNear(ForwardingTerrain):
         inside = np.hypot(points_m[..., 0] - east, points_m[..., 1] - north) <= reach
         return np.asarray(inside & self.whole.allowed(points_m))
 
-    def is_at_edge(self, found: Explored) -> bool:
-        """Whether the likeliest position of a posterior is at the edge of the disk, within the search area."""
-        if self.radius_m > 2 * self.reach_m or not len(found.log_likelihood):
+    def is_at_edge(self, places: list[Place]) -> bool:
+        """Whether the likeliest of `places` is at the edge of the disk, within the search area."""
+        if self.radius_m > 2 * self.reach_m or not places:
             return False
-        best_m = found.centres_m[np.argmax(found.log_likelihood)]
-        return bool(np.linalg.norm(best_m - self.near_prior.mean_m) > EDGE_PART * self.radius_m)
+        return bool(np.linalg.norm(places[0].position_m - self.near_prior.mean_m) > EDGE_PART * self.radius_m)
 
     def enlarged(self) -> SearchedNear:
         """The same with a larger disk."""
         return SearchedNear(self.whole, self.near_prior, ENLARGED * self.radius_m)
 
 
-def weigh_by_prior(found: Explored, near: PositionPrior) -> Explored:
-    """The posterior with the prior. Raises NotLocated (inconsistent_evidence) where the two contradict each other.
+def require_agreement(places: list[Place], near: PositionPrior) -> None:
+    """Raises NotLocated (inconsistent_evidence) where the prior contradicts the likely `places`, the best first.
 
-    Of two normal distributions the maximum of the product lies chi^2 / 2 below the product of the maxima. The prior's
-    maximum in a box is at its point nearest to the mean.
+    Of two normal distributions the maximum of the product lies chi^2 / 2 below the product of the maxima.
     """
-    off = found.centres_m - near.mean_m
-    nearest_m = near.mean_m + np.sign(off) * np.maximum(np.abs(off) - found.half_m, 0.0)
-    weighed = found.log_likelihood + near.log_density(nearest_m)
-    lost = np.max(found.log_likelihood, initial=-np.inf) - np.max(weighed, initial=-np.inf)
+    if not places:
+        return
+    off = np.array([one.position_m for one in places]) - near.mean_m
+    both = np.array([one.covariance_m2 for one in places]) + near.sigma_m**2 * np.eye(2)
+    chi2 = np.einsum("ni,ni->n", off, np.linalg.solve(both, off[:, :, None])[:, :, 0])
+    lost = places[0].log_likelihood - max(one.log_likelihood - 0.5 * c for one, c in zip(places, chi2, strict=True))
     if lost > 0.5 * CONTRADICTED_SIGMAS**2:
         raise contradiction(near, f"lie {np.sqrt(2 * lost):.1f} sigma from it")
-    return found._replace(log_likelihood=weighed)
 
 
 def contradiction(near: PositionPrior, how: str) -> NotLocated:

@@ -10,30 +10,25 @@ from startrack.core.compilation import announce_compilation
 from startrack.core.types import Evidence, Fix, NotLocated, PositionPrior
 from startrack.localization.clock import explore_times, is_wide
 from startrack.localization.conclusion import conclude
-from startrack.localization.horizon_bias import find_start
 from startrack.localization.joint_posterior import sample_posterior
-from startrack.localization.likelihood import SECTOR_RAD, PositionLikelihood
-from startrack.localization.position_prior import SearchedNear, name_prior, weigh_by_prior
-from startrack.localization.search import NATS, Explored, Search, log_sum
+from startrack.localization.position_prior import SearchedNear, name_prior, require_agreement
+from startrack.localization.search import NATS, Explored, explore, log_sum
 from startrack.localization.steepness import settle_steepness
 from startrack.terrain import Terrain, require_terrain
 
 MIN_ROWS = 8
-MIN_ROW_NATS = 1e-3  # |llr| below which a row is left out
-SEARCH_EPSILON = 0.1  # of a sector in the search: an obstacle costs the true position 2.3 nats a sector, not 9
 SLACK_NATS = 44.0  # by which the published model may favour a position over the search: 29 degrees of obstacles
-NEAR_BOXES = 60  # likely with a prior, whose middles are compared with the best position
+MIN_ROW_NATS = 1e-3  # |llr| below which a row is left out
 
 
 @dataclass(frozen=True)
 class ExactPosterior:
     """The posterior of position, shared errors and obstacles; see docs/method.md.
 
-    A branch and bound over the search area leaves the boxes that may matter: each row is visible, hidden or open over
-    a box, which bounds the likelihood of the search. Its sectors are nearly independent of each other and lose little
-    by an obstacle, so that boxes are dropped only where they are less likely than the best by `prune_nats`. In what is
-    left the published model, the chain of obstacles, is sampled. Where the proof would trace more horizons than the
-    budget allows, the best positions known and the open boxes are sampled, with `search` "beam".
+    A branch and bound over the search area leaves the boxes that may matter. Its sectors are independent of each other
+    and lose little by an obstacle, so that boxes are dropped only where they are less likely than the best place by
+    `prune_nats`. In what is left the published model, the chain of obstacles, is sampled. Where the proof would trace
+    more horizons than the budget allows, the neighbourhoods of the best places known are, with `search` "beam".
     """
 
     prune_nats: float = NATS + SLACK_NATS
@@ -68,41 +63,30 @@ class ExactPosterior:
         if rows.near is not None:
             return [(rows, self._explore_near(rows, terrain, rows.near))]
         if rows.clock is not None and is_wide(rows.clock, terrain):
-            return explore_times(self.likelihood(rows, terrain), rows, rows.clock)
+            return explore_times(rows, terrain, rows.clock)
         return [(rows, self.explore(rows, terrain))]
 
     def explore(self, evidence: Evidence, terrain: Terrain) -> Explored:
-        """The boxes of the `terrain` that may matter by `evidence`, with the likeliest common error of the horizon."""
-        likelihood = self.likelihood(evidence, terrain)
-        found = Search(*find_start(likelihood), self.prune_nats, self.budget_horizons).run()
-        if found.search == "proven":
-            return found
-        return Search(*find_start(likelihood, all_beams=True), self.prune_nats, self.budget_horizons).run()
+        """The boxes of the `terrain` that may matter by `evidence`."""
+        return explore(evidence, terrain, self.prune_nats, self.budget_horizons)[0]
 
     def _explore_near(self, evidence: Evidence, terrain: Terrain, near: PositionPrior) -> Explored:
         """As `explore`, in the neighbourhood of the prior.
 
-        The searched disk is enlarged until the likeliest position is not at its edge: else nothing would show how far
-        off the prior the evidence is. Raises NotLocated (inconsistent_evidence) where the two contradict each other.
+        The searched disk is enlarged until the likeliest place is not at its edge: else nothing would show how far off
+        the prior the evidence is. Raises NotLocated (inconsistent_evidence) where the two contradict each other.
         """
         nearby = SearchedNear(terrain, near)
-        found = self.explore(evidence, nearby)
-        while nearby.is_at_edge(found):
+        found, places = explore(evidence, nearby, self.prune_nats, self.budget_horizons)
+        while nearby.is_at_edge(places):
             wider = nearby.enlarged()
             try:
-                found, nearby = self.explore(evidence, wider), wider
+                found, places = explore(evidence, wider, self.prune_nats, self.budget_horizons)
             except NotLocated:  # the smaller disk has an answer
                 break
-        likely = np.argsort(-(found.log_likelihood + near.log_density(found.centres_m)), kind="stable")[:NEAR_BOXES]
-        scores = found.log_likelihood.copy()  # averages of boxes lie below that of the positions that count in them
-        exact = self.likelihood(evidence, terrain).exact_scores(found.centres_m[likely])
-        scores[likely] = np.maximum(scores[likely], exact)
-        return weigh_by_prior(found._replace(log_likelihood=scores), near)
-
-    @staticmethod
-    def likelihood(evidence: Evidence, terrain: Terrain) -> PositionLikelihood:
-        """The likelihood of `evidence` on a `terrain` that the search bounds."""
-        return PositionLikelihood.from_evidence(evidence, terrain, SECTOR_RAD, SEARCH_EPSILON)
+            nearby = wider
+        require_agreement(places, near)
+        return found._replace(log_likelihood=found.log_likelihood + near.log_density(found.centres_m))
 
 
 def _dropped_probability(explored: Explored) -> float:

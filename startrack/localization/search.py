@@ -1,18 +1,26 @@
-"""The search for positions: a first guess by a beam over ever smaller boxes, then branch and bound."""
+"""The search for positions: likely places by a beam over ever smaller boxes, then branch and bound."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from math import ceil, log2
+from typing import NamedTuple
 
 import numpy as np
 
 from startrack.core.time_limit import check_time
-from startrack.core.types import Array, Explored, NotLocated
-from startrack.localization.likelihood import PositionLikelihood
-from startrack.terrain import Terrain
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, Explored, NotLocated
+from startrack.localization.search_profiles import SearchProfiles
+from startrack.localization.shared_errors import SharedErrors
+from startrack.localization.skyline_model import SkylineModel
+from startrack.terrain import Terrain, require_bounds
 
 NATS = 16.0  # positions that are e^-16 as likely as the best are dropped
+WITHIN_RAD = np.pi / SECTORS  # from the middle of a sector to its ends
+MAP_SIGMAS, SHARED_SIGMAS = 6.0, 3.0  # of errors of the map and of all azimuths, by which bounds are wider
+NARROWEST_RAD = 1e-6  # of a range of skylines
+TRACED_EVERY = 3  # sectors: a traced horizon costs a hundred times a look-up
 SMALL_BOX_M = 20.0  # half side up to which boxes are tested for allowed ground point by point
 QUARTERS = np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])  # of half a side
 TRACED_BELOW_M = 400.0  # half side; the horizons of smaller boxes may be traced instead of looked up
@@ -23,18 +31,27 @@ LAST_HALF_M = {False: SMALL_BOX_M, True: FINEST_M}  # of the last boxes, looked 
 # 2, where traced ones rank the true box among the first 70 at every level; of 8 on a map with errors of 5 m a post,
 # one is not among the first 200.
 BEAMS = ((32, False), (80, True), (200, True), (500, True))
-SCORED, CLOSER = 8, 4  # of the last boxes, row by row; of these, at each smaller size
-EXPLAINED_NATS = -0.57  # mean over the sectors with rows; true positions: -0.10 to -0.52, the best false one: -0.62
-LAST_STEP_M, CLIMB_NATS = 1.0, 1.0  # of a climb; what it must gain to go on in steps of the same size
-APART_M = 60.0  # between the positions of a guess
-FIRST_REACH_M, LAST_REACH_M, BOXES_ACROSS = 16.0, 256.0, 5  # of boxes about a position, and how many along a side
-RIM_NATS = 3.0  # less probability than the whole has the rim of these boxes
+FITTED, APART_BOXES = 4, 4.0  # boxes at which the model is fitted, and their distance in halves of boxes
+FIT_M, FIT_ROUNDS = 40.0, 4  # half side of a neighbourhood that is fitted, at least; how often it may follow the fit
+APART_M = 1.0  # between two places
+FIRST_REACH_M, LAST_REACH_M, BOXES_ACROSS = 16.0, 256.0, 5  # of boxes about a place, and how many along a side
+REACH_SIGMAS = 4.0  # from a place to the ends of these boxes
 BOXES_AT_ONCE = 2000  # so that memory stays flat
 # The search ends once the levels to come would take so many budgets, if boxes go on to grow in number as they do now.
 # That is foreseen below this half side, of the searched radius: on a rough map from 125 m, in 34 searches always right.
 FORESEEN_PART, FORESEEN_BUDGETS = 1 / 30, 2.0
 LOOK_UP_COST = 0.08  # of a bound, in horizons traced
-LAST_MOST_BOXES = 16_000  # of a level: it is the last one; from a sixteenth of it on a better position is sought
+LAST_MOST_BOXES = 16_000  # of a level: it is the last one
+POINT_M = 0.01  # half side of a box that stands for a point
+
+
+class Place(NamedTuple):
+    """A position that explains the rows, by the linear model of its neighbourhood."""
+
+    position_m: Array  # (2,)
+    covariance_m2: Array  # (2, 2)
+    log_likelihood: float  # of the published model, its shared errors integrated
+    later_s: float  # how much later than that of the rows the true time is
 
 
 def log_sum(values: Array) -> float:
@@ -64,73 +81,6 @@ def square_grid(half_m: float, across: int) -> Array:
     return np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
 
 
-@dataclass(frozen=True)
-class Guess:
-    """Positions that explain the evidence well, the best first, and their exact log-likelihoods."""
-
-    points_m: Array  # (n, 2); n may be 0
-    log_likelihood: Array  # (n,) lower bounds of the maximum
-
-    @property
-    def best(self) -> float:
-        """Of the best position; -inf without one."""
-        return float(self.log_likelihood.max(initial=-np.inf))
-
-
-def explains_sectors(guess: Guess, likelihood: PositionLikelihood) -> bool:
-    """Whether the best position of a `guess` explains all sectors as well as a true one does."""
-    return guess.best > EXPLAINED_NATS * likelihood.sectors.occupied
-
-
-def beam_search(likelihood: PositionLikelihood, beam: tuple[int, bool]) -> Guess:
-    """A few good positions: of ever smaller boxes those with the best average likelihood are quartered.
-
-    The guess decides nothing: without a good one the proof takes longer.
-    """
-    return refine_boxes(likelihood, *last_boxes(likelihood, *beam))
-
-
-def last_boxes(likelihood: PositionLikelihood, width: int, traced: bool) -> tuple[Array, float]:
-    """Centres (n, 2) of the last boxes, the best average first, and half their side [m]."""
-    terrain, (east_m, north_m, half) = likelihood.terrain, likelihood.terrain.searched
-    centres = np.array([[east_m, north_m]])
-    while half > LAST_HALF_M[traced] and len(centres):
-        check_time()
-        centres, half = split_boxes(centres, half, terrain), half / 2
-        score = likelihood.average.score(terrain, centres, half, traced=traced and half < TRACED_BELOW_M)
-        centres = centres[np.argsort(-score, kind="stable")[:width]]
-    return centres, half
-
-
-def refine_boxes(likelihood: PositionLikelihood, centres_m: Array, half_m: float) -> Guess:
-    """The best positions about the first of boxes with the centres (n, 2), the best average first.
-
-    Ever smaller boxes of the best average, and climbs in ever smaller steps: where the rows are strong only an average
-    shows from afar where the top is, and near it only the positions themselves.
-    """
-    terrain, near, half = likelihood.terrain, centres_m[:CLOSER], half_m
-    while half > LAST_STEP_M and len(near):
-        check_time()
-        near, half = split_boxes(near, half, terrain), half / 2
-        near = near[np.argsort(-likelihood.average.score(terrain, near, half), kind="stable")[:CLOSER]]
-    found, score = np.zeros((0, 2)), np.zeros(0)
-    new, step_m, gained = np.vstack([centres_m[:SCORED], near]), half_m, np.inf
-    while len(new) and (step_m > LAST_STEP_M or gained > CLIMB_NATS):
-        check_time()
-        new = new[np.asarray(terrain.allowed(new))]
-        before = float(score.max(initial=-np.inf))
-        found, score = np.vstack([found, new]), np.append(score, likelihood.exact_scores(new))
-        if not len(found):
-            break
-        gained = float(score.max()) - before
-        if gained <= CLIMB_NATS:
-            step_m /= 2
-        around = found[np.argmax(score)] + square_grid(step_m, 3)
-        new = around[np.abs(around[:, None] - found).max(axis=2).min(axis=1) > 0.1 * LAST_STEP_M]
-    chosen = choose_apart(found, score, APART_M)
-    return Guess(found[chosen], score[chosen])
-
-
 def choose_apart(points: Array, score: Array, apart: float, nats: float = np.inf, most: int | None = None) -> list[int]:
     """The best of points (n, d) with a score (n,) that are farther `apart` from each other along an axis.
 
@@ -145,64 +95,194 @@ def choose_apart(points: Array, score: Array, apart: float, nats: float = np.inf
     return chosen
 
 
-def local_posterior(likelihood: PositionLikelihood, guess: Guess, log_open: float) -> Explored:
-    """Boxes about the likely positions of a guess, where no proof excludes all others.
+@dataclass(frozen=True, eq=False)
+class BoxModel:
+    """The likelihood of `rows` on a `terrain`: over boxes of positions that of the search, at places the published."""
 
-    `log_open` is the logarithm of a bound of the mass [m2] that the search left open elsewhere.
+    rows: Evidence
+    terrain: Terrain
+
+    @cached_property
+    def profiles(self) -> SearchProfiles:
+        """Of the rows."""
+        return SearchProfiles.of(self.rows)
+
+    @cached_property
+    def errors(self) -> SharedErrors:
+        """That all azimuths share."""
+        return SharedErrors.of(self.terrain, self.rows.clock)
+
+    @cached_property
+    def wider_rad(self) -> Array:
+        """(SECTORS,) by which the errors that all azimuths share may move the skyline; gross ones are not meant."""
+        if not len(self.errors):
+            return np.zeros(SECTORS)
+        east_m, north_m, reach_m = self.terrain.searched
+        points = np.array([east_m, north_m]) + square_grid(0.6 * reach_m, 3)
+        points = points[np.asarray(self.terrain.allowed(points))]
+        slopes = [
+            self.errors.slopes_rad(
+                self.terrain, at, MIDDLES_RAD, np.asarray(self.terrain.horizon_rad(at[None], MIDDLES_RAD)).ravel()
+            )
+            for at in points
+        ]
+        variance = [np.square(self.errors.sigma()[:, None] * one).sum(axis=0) for one in slopes]
+        return SHARED_SIGMAS * np.sqrt(np.max(variance, axis=0, initial=0.0))
+
+    def bounds(self, centres_m: Array, half_m: float) -> Array:
+        """Upper bounds (n,) of the search's log-likelihood over boxes (n, 2)."""
+        boxes = centres_m[:, None, :]
+        low, high = self.terrain.horizon_bounds_rad(boxes, np.array(half_m), MIDDLES_RAD, WITHIN_RAD)
+        require_bounds(self.terrain, low, high)
+        wider = MAP_SIGMAS * self.terrain.max_horizon_sigma_rad(boxes, half_m, MIDDLES_RAD, WITHIN_RAD) + self.wider_rad
+        return self.profiles.bound(low - wider, high + wider)
+
+    def averages(self, centres_m: Array, half_m: float, is_traced: bool = False) -> Array:
+        """Log-likelihoods (n,) of the search of boxes (n, 2), on average.
+
+        With bounds of the horizon, or, if it `is_traced`, its estimated spread about that of each centre in every third
+        sector.
+        """
+        azimuth, boxes = MIDDLES_RAD[:: TRACED_EVERY if is_traced else 1], centres_m[:, None, :]
+        if is_traced:
+            middle, width = self.terrain.horizon_spread_rad(boxes, half_m, azimuth)
+            low, high = middle - width, middle + width
+        else:
+            low, high = self.terrain.horizon_bounds_rad(boxes, np.array(half_m), azimuth, WITHIN_RAD)
+            require_bounds(self.terrain, low, high)
+        if not self.terrain.hard_edges:
+            sigma = self.terrain.max_horizon_sigma_rad(boxes, half_m, azimuth, WITHIN_RAD)
+            low, high = low - sigma, high + sigma
+        return self.profiles.average(low - NARROWEST_RAD, high + NARROWEST_RAD)
+
+    def last_boxes(self, width: int, is_traced: bool) -> tuple[Array, float]:
+        """Centres (n, 2) of the last boxes, the best average first, and half their side [m].
+
+        Of ever smaller boxes those with the best average are quartered.
+        """
+        terrain, (east_m, north_m, half) = self.terrain, self.terrain.searched
+        centres = np.array([[east_m, north_m]])
+        while half > LAST_HALF_M[is_traced] and len(centres):
+            check_time()
+            centres, half = split_boxes(centres, half, terrain), half / 2
+            score = self.averages(centres, half, is_traced and half < TRACED_BELOW_M)
+            centres = centres[np.argsort(-score, kind="stable")[:width]]
+        return centres, half
+
+    def fit_places(self, centres_m: Array, half_m: float, most: int = FITTED) -> list[Place]:
+        """The places near the first of boxes (n, 2) that are apart, the likeliest first; none where none is allowed."""
+        order = -np.arange(len(centres_m), dtype=np.float64)
+        chosen = choose_apart(centres_m, order, APART_BOXES * half_m, most=most)
+        found = [self._fit(centres_m[i], half_m) for i in chosen]
+        return sorted((one for one in found if one is not None), key=lambda one: -one.log_likelihood)
+
+    def _fit(self, centre_m: Array, half_m: float) -> Place | None:
+        """The likeliest place that linear solutions lead to from a box."""
+        best: Place | None = None
+        reach_m = max(2.0 * half_m, FIT_M)
+        for _ in range(FIT_ROUNDS):
+            check_time()
+            model = SkylineModel.of(self.terrain, self.rows, centre_m, reach_m, self.errors, self.rows.image_errors)
+            found = _place_of(model)
+            if found is None or (best is not None and found.log_likelihood <= best.log_likelihood):
+                break
+            best = found
+            if np.abs(found.position_m - centre_m).max() < 0.5 * reach_m:
+                break
+            centre_m = found.position_m
+        return best
+
+
+def _place_of(model: SkylineModel) -> Place | None:
+    """The likelier one of the reference and the linear solution about it; None where neither is allowed."""
+    linear, covariance, weight = model.solve()
+    tried = np.vstack([model.with_likely_errors(model.around.reference_m[None], weight), linear])
+    tried = tried[np.asarray(model.terrain.allowed(tried[:, :2]))]
+    if not len(tried):
+        return None
+    value = model.log_likelihood(tried) - 0.5 * np.square(tried[:, 2:]).sum(axis=1)
+    best = tried[np.argmax(value)]
+    of_errors = 0.5 * float(np.linalg.slogdet(covariance[2:, 2:])[1])
+    errors = model.basis.mean + model.basis.shown @ best[2:]
+    later_s = float(errors[-1]) if model.errors.clock is not None else 0.0
+    return Place(best[:2], covariance[:2, :2], float(value.max()) + of_errors + model.seen.log_offset, later_s)
+
+
+def boxes_about(places: list[Place], terrain: Terrain, log_open: float) -> Explored:
+    """Boxes about the likely ones of `places`, where no proof excludes all others.
+
+    `log_open` is the logarithm of a bound of the integral of the likelihood [m2] over what the search left open.
     """
-    terrain, reach_m = likelihood.terrain, FIRST_REACH_M
-    modes = guess.points_m[guess.log_likelihood > guess.best - NATS]
-    while True:
-        check_time()
-        centres = (modes[:, None] + square_grid(reach_m, BOXES_ACROSS)).reshape(-1, 2)
-        score = np.where(terrain.allowed(centres), likelihood.exact_scores(centres), -np.inf)
-        off = np.abs(centres[:, None] - modes).max(axis=2).min(axis=1)
-        at_rim = log_sum(score[off > 0.9 * reach_m]) - log_sum(score)
-        if at_rim < -RIM_NATS or reach_m >= LAST_REACH_M:
-            break
-        reach_m *= 2
-    centres, score = np.vstack([guess.points_m, centres]), np.append(guess.log_likelihood, score)
-    likely = np.isfinite(score)
-    return Explored(centres[likely], reach_m / (BOXES_ACROSS - 1), score[likely], log_open, "beam")
+    likely = [one for one in places if one.log_likelihood > places[0].log_likelihood - NATS]
+    sigma_m = max(float(np.sqrt(np.linalg.eigvalsh(one.covariance_m2)[-1])) for one in likely)
+    reach_m = min(max(REACH_SIGMAS * sigma_m, FIRST_REACH_M), LAST_REACH_M)
+    centres = np.concatenate([one.position_m + square_grid(reach_m, BOXES_ACROSS) for one in likely])
+    score = np.repeat([one.log_likelihood for one in likely], BOXES_ACROSS**2)
+    score -= 0.5 * np.square(np.tile(np.linalg.norm(square_grid(REACH_SIGMAS, BOXES_ACROSS), axis=1), len(likely)))
+    allowed = np.asarray(terrain.allowed(centres))
+    return Explored(centres[allowed], reach_m / (BOXES_ACROSS - 1), score[allowed], log_open, "beam")
+
+
+def explore(
+    rows: Evidence, terrain: Terrain, prune_nats: float, budget_horizons: float
+) -> tuple[Explored, list[Place]]:
+    """The boxes of a `terrain` that may matter by `rows`, and the best places known.
+
+    Boxes are dropped where they are less likely than the best place by `prune_nats`. Where the proof would trace more
+    horizons than the budget, wider beams look for better places, and those are what is left.
+    Raises NotLocated (outside_search_area).
+    """
+    model = BoxModel(rows, terrain)
+    places = model.fit_places(*model.last_boxes(*BEAMS[0]), most=1)
+    found = Proof(model, prune_nats, budget_horizons).run(places)
+    if found.search != "proven":
+        for beam in BEAMS[1:]:
+            places = merge_places(places, model.fit_places(*model.last_boxes(*beam)))
+        found = Proof(model, prune_nats, budget_horizons).run(places)
+    return found, places
+
+
+def merge_places(*parts: list[Place]) -> list[Place]:
+    """The places of all parts that are apart, the likeliest first."""
+    whole = sorted((one for part in parts for one in part), key=lambda one: -one.log_likelihood)
+    if not whole:
+        return []
+    points, score = np.array([one.position_m for one in whole]), np.array([one.log_likelihood for one in whole])
+    return [whole[i] for i in choose_apart(points, score, APART_M)]
 
 
 @dataclass
-class Search:
-    """One run: the work done, how much probability was dropped, and the best log-likelihood known."""
+class Proof:
+    """One run of branch and bound: the work done, and how much probability was dropped."""
 
-    likelihood: PositionLikelihood
-    guess: Guess
+    model: BoxModel
     prune_nats: float  # boxes that are less likely than the best by more are dropped
     budget_horizons: float
-    log_dropped: float = -np.inf  # logarithm of a bound of the mass [m2]
+    log_dropped: float = field(default=-np.inf, init=False)  # logarithm of a bound of the integral [m2]
     work: float = field(default=0.0, init=False)  # in horizons traced
-    best: float = -np.inf  # log-likelihood known
 
-    def run(self) -> Explored:
-        """The boxes that may matter ("proven"); where the budget ends first, those about the best positions ("beam").
+    def run(self, places: list[Place]) -> Explored:
+        """The boxes that may matter ("proven"); where the budget ends first, those about the best places ("beam").
 
         Raises NotLocated (outside_search_area).
         """
-        self.best, terrain = self.guess.best, self.likelihood.terrain
+        terrain = self.model.terrain
+        best = max((float(self.model.averages(one.position_m[None], POINT_M)[0]) for one in places), default=-np.inf)
         centres, half = np.array([terrain.searched[:2]]), terrain.searched[2]
         finest_m = min(FINEST_M, FINEST_PART * half)
         while True:
             count = len(centres)
-            centres, upper = self._bound(centres, half)
-            if not len(centres):  # the best position known is in none: between the points where boxes were tested
-                return self._about_best(upper, half)
+            centres, upper = self._bound(centres, half, best)
             is_last = 4 * len(centres) > LAST_MOST_BOXES
-            if 16 * len(centres) > LAST_MOST_BOXES and self._climb(centres, half):
-                continue
-            if half <= finest_m or is_last:
-                average = self.likelihood.average.score(terrain, centres, half)
-                likely = np.mean(average > average.max() - self.prune_nats)
-                resolved = average.max() > self.guess.best - self.prune_nats and likely > 0.5
-                if half <= finest_m or resolved:
-                    return self._ranked(centres, average, half)
-                return self._about_best(upper, half)
+            if len(centres) and (half <= finest_m or is_last):
+                average = self.model.averages(centres, half)
+                keep = average > average.max() - self.prune_nats
+                if half <= finest_m or np.mean(keep) > 0.5:
+                    return Explored(
+                        centres[keep], half, average[keep], self._with_dropped(average[~keep], half), "proven"
+                    )
             quarters = split_boxes(centres, half, terrain)
-            if not len(quarters):
+            if not len(quarters) and not places:
                 raise NotLocated(
                     "no camera can stand anywhere in the search area: is [search] max_slope_deg too small?",
                     reason="outside_search_area",
@@ -210,65 +290,34 @@ class Search:
             self.work += self._work_of(len(quarters))
             levels = np.arange(1, 1 + ceil(log2(max(half / 2 / finest_m, 1.0))))
             coming = self._work_of(float(np.sum(len(quarters) * (len(quarters) / count) ** levels)))
-            hopeless = half < FORESEEN_PART * terrain.searched[2] and coming > FORESEEN_BUDGETS * self.budget_horizons
-            if self.work > self.budget_horizons or hopeless:
-                self._climb(centres, half)
-                return self._about_best(upper, half)
+            is_hopeless = (
+                half < FORESEEN_PART * terrain.searched[2] and coming > FORESEEN_BUDGETS * self.budget_horizons
+            )
+            if is_last or is_hopeless or not len(quarters) or self.work > self.budget_horizons:
+                if not places:
+                    raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
+                return boxes_about(places, terrain, self._with_dropped(upper, half))
             centres, half = quarters, half / 2
 
-    def _bound(self, centres: Array, half: float) -> tuple[Array, Array]:
+    def _bound(self, centres: Array, half: float, best: float) -> tuple[Array, Array]:
         """Centres (n, 2) of the boxes that may matter, and upper bounds (n,) of their log-likelihood.
 
         A large box is kept at a smaller likelihood: it holds more probability.
         """
-        lk, kept = self.likelihood, []
         nats = self.prune_nats + max(0.0, 2.0 * float(np.log(half / FINEST_M)))
+        upper = np.empty(len(centres))
         for start in range(0, len(centres), BOXES_AT_ONCE):
             check_time()
-            some = centres[start : start + BOXES_AT_ONCE]
-            first, last = lk.sums.open_rays(lk.terrain, some, half)
-            visible, least, most = lk.sums.sums(first, last)
-            sure = lk.sectors.score(visible + least)[np.asarray(lk.terrain.allowed(some))]
-            self.best = max(self.best, float(sure.max(initial=-np.inf)))
-            upper = lk.sectors.score(visible + most)
-            keep = upper > self.best - nats
-            self._drop(upper[~keep], half)
-            kept.append((some[keep], upper[keep]))
-        return np.concatenate([part[0] for part in kept]), np.concatenate([part[1] for part in kept])
-
-    def _climb(self, centres: Array, half: float) -> bool:
-        """Whether a better position than the best known is near the boxes (n, 2) with the best average."""
-        if explains_sectors(self.guess, self.likelihood):
-            return False
-        average = self.likelihood.average.score(self.likelihood.terrain, centres, half)
-        found = refine_boxes(self.likelihood, centres[np.argsort(-average, kind="stable")], half)
-        is_better = found.best > self.guess.best + CLIMB_NATS
-        if is_better:
-            self.guess, self.best = found, max(self.best, found.best)
-        return is_better
+            some = slice(start, start + BOXES_AT_ONCE)
+            upper[some] = self.model.bounds(centres[some], half)
+        keep = upper > best - nats
+        self.log_dropped = self._with_dropped(upper[~keep], half)
+        return centres[keep], upper[keep]
 
     def _work_of(self, boxes: float) -> float:
         """Cost of the bounds of so many boxes, in horizons traced."""
-        return self.likelihood.terrain.horizon_cost * LOOK_UP_COST * self.likelihood.sectors.count * boxes
+        return self.model.terrain.horizon_cost * LOOK_UP_COST * SECTORS * boxes
 
-    def _drop(self, log_likelihood: Array, half: float) -> None:
-        lost = log_sum(log_likelihood) + 2.0 * float(np.log(2 * half))
-        self.log_dropped = float(np.logaddexp(self.log_dropped, lost))
-
-    def _ranked(self, centres: Array, average: Array, half: float) -> Explored:
-        """The boxes with their average log-likelihood (n,), and the guess with its own; unlikely boxes are dropped."""
-        keep = average > average.max() - self.prune_nats
-        self._drop(average[~keep], half)
-        centres = np.vstack([self.guess.points_m, centres[keep]])
-        log_likelihood = np.append(self.guess.log_likelihood, average[keep])
-        return Explored(centres, half, log_likelihood, self.log_dropped, "proven")
-
-    def _about_best(self, upper: Array, half: float) -> Explored:
-        """The neighbourhoods of the best positions known, where boxes with bounds (n,) are left open.
-
-        Raises NotLocated (outside_search_area) where none is known.
-        """
-        self._drop(upper, half)
-        if not len(self.guess.points_m):
-            raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
-        return local_posterior(self.likelihood, self.guess, self.log_dropped)
+    def _with_dropped(self, log_likelihood: Array, half: float) -> float:
+        """`log_dropped` with boxes of bounds (n,) besides."""
+        return float(np.logaddexp(self.log_dropped, log_sum(log_likelihood) + 2.0 * float(np.log(2 * half))))

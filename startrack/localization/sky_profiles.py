@@ -9,8 +9,9 @@ import numpy as np
 
 from startrack.core.kernels import njit, normal_cdf
 from startrack.core.types import Array, Evidence, Ints
-from startrack.localization.sector_likelihood import CERTAIN_SIGMAS, EDGE_SIGMAS
 
+EDGE_SIGMAS = 8.0  # beyond this the edge of a single row is not computed, and splines of rows are constant
+CERTAIN_SIGMAS = 6.0  # to the ends of a normal distribution: a ray beyond is visible or hidden, to 1e-9
 KNOT_SIGMAS = 0.2  # of the edge: distance of the knots; a cubic errs by 0.03 nats in a sector of 2e4 nats
 MAP_STEPS = 3.0  # points of the average in a standard deviation, of the map's error or of the sector's likelihood
 LEAST_LIKELIHOOD = np.finfo(np.float64).tiny  # the floor of a sector is far above it

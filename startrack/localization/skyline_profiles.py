@@ -16,8 +16,7 @@ import numpy as np
 
 from startrack.core.kernels import njit
 from startrack.core.types import SECTORS, Array, Evidence, Ints, sector_of
-from startrack.localization.sector_likelihood import EDGE_SIGMAS
-from startrack.localization.sky_profiles import SkyProfiles
+from startrack.localization.sky_profiles import EDGE_SIGMAS, SkyProfiles
 
 LOW_RAD, HIGH_RAD = np.radians(-12.0), np.radians(20.0)  # window of heights: beyond it a skyline is no skyline
 ROW_NATS = 6.0  # most that one star counts: one in 400 is variable, misnamed or not in the catalogue
@@ -45,16 +44,21 @@ class Profiles(NamedTuple):
     guide: Ints  # (SECTORS, 2 GUIDE + 1) cells of heights closer to each other about 0, where a search begins
 
 
-def profiles_of(rows: Evidence, above_rad: Array, map_sigma_rad: Array) -> Profiles:
-    """Profiles of rows (n,) that stand `above_rad` (n,) the skyline; map errors (SECTORS,) are averaged over."""
+def profiles_of(
+    rows: Evidence, above_rad: Array, map_sigma_rad: Array, window_rad: tuple[float, float] = (LOW_RAD, HIGH_RAD)
+) -> Profiles:
+    """Profiles of rows (n,) that stand `above_rad` (n,) the skyline; map errors (SECTORS,) are averaged over.
+
+    `window_rad`: lowest and highest height.
+    """
     extended = rows.extended_nats * rows.edge_sigma_rad > 0.0
-    star = np.flatnonzero(~extended & (above_rad > LOW_RAD) & (above_rad < HIGH_RAD))
+    star = np.flatnonzero(~extended & (above_rad > window_rad[0]) & (above_rad < window_rad[1]))
     order = star[np.argsort(sector_of(rows.azimuth_rad[star]) * 100.0 + above_rad[star])]
     sector = sector_of(rows.azimuth_rad[order])
     llr = np.clip(rows.llr[order], -ROW_NATS, ROW_NATS)
     starts = np.searchsorted(sector, np.arange(SECTORS + 1))
     knots = _sky_knots(rows, above_rad, np.flatnonzero(extended))
-    hard = _fill_cells(above_rad[order], llr, starts, *knots)
+    hard = _fill_cells(above_rad[order], llr, starts, *knots, *window_rad)
     sigma = map_sigma_rad
     if len(star) and rows.edge_sigma_rad[star].any():
         count = np.maximum(np.bincount(sector, minlength=SECTORS), 1)
@@ -95,7 +99,7 @@ def _cubic(values, at):
 
 
 @njit(cache=True)
-def _fill_cells(above, llr, starts, sky_low, sky_step, cell, sky_values):
+def _fill_cells(above, llr, starts, sky_low, sky_step, cell, sky_values, lowest, highest):
     """Cells between the stars of a sector, and of equal width where the sky's light shows the skyline."""
     sectors, knots = len(starts) - 1, sky_values.shape[1]
     room = len(above) + 3 * sectors
@@ -110,14 +114,14 @@ def _fill_cells(above, llr, starts, sky_low, sky_step, cell, sky_values):
         for k in range(starts[s], starts[s + 1]):
             total += llr[k]
         k, end = starts[s], starts[s + 1]
-        sky_at, sky_end = HIGH_RAD, LOW_RAD
+        sky_at, sky_end = highest, lowest
         if sky_step[s] > 0.0:
-            sky_at = max(sky_low[s], LOW_RAD + cell[s])
-            sky_end = min(sky_low[s] + (knots - 1) * sky_step[s], HIGH_RAD - cell[s])
-        at = LOW_RAD
-        while at < HIGH_RAD:
+            sky_at = max(sky_low[s], lowest + cell[s])
+            sky_end = min(sky_low[s] + (knots - 1) * sky_step[s], highest - cell[s])
+        at = lowest
+        while at < highest:
             x[n], left[n] = at, total
-            following = HIGH_RAD
+            following = highest
             if k < end:
                 following = min(following, above[k])
             if sky_at <= sky_end:
@@ -136,14 +140,14 @@ def _fill_cells(above, llr, starts, sky_low, sky_step, cell, sky_values):
                 sky_at += cell[s]
             at = following
             n += 1
-        x[n], left[n], right[n] = HIGH_RAD, 0.0, 0.0
+        x[n], left[n], right[n] = highest, 0.0, 0.0
         n += 1
         first[s + 1] = n
-    return _integrate(first, x[:n].copy(), left[:n].copy(), right[:n].copy(), bend[:n].copy())
+    return _integrate(first, x[:n].copy(), left[:n].copy(), right[:n].copy(), bend[:n].copy(), highest - lowest)
 
 
 @njit(cache=True, inner=True)
-def _integrate(first, x, left, right, bend):
+def _integrate(first, x, left, right, bend, width):
     """The cells with `free`, the guide and the integral; each cell by Simpson's rule."""
     sectors = len(first) - 1
     integral, free = np.zeros(len(x)), np.zeros(sectors)
@@ -158,9 +162,9 @@ def _integrate(first, x, left, right, bend):
             total += (x[k + 1] - x[k]) / 6.0 * (exp(left[k] - top) + 4.0 * middle + exp(right[k] - top))
         last = first[s + 1] - 1
         integral[last] = total
-        free[s] = top + np.log(total / (HIGH_RAD - LOW_RAD))
+        free[s] = top + np.log(total / width)
         for k in range(first[s], last + 1):
-            integral[k] *= (HIGH_RAD - LOW_RAD) / total
+            integral[k] *= width / total
     return first, x, left, right, bend, integral, free, _guide_to(first, x)
 
 
@@ -266,7 +270,7 @@ def _average_over_map(profiles, sigma, bins):
             x[n], left[n], right[n], bend[n] = profiles.x[j], profiles.left[j], profiles.right[j], profiles.bend[j]
             n += 1
         first[s + 1] = n
-    return _integrate(first, x[:n].copy(), left[:n].copy(), right[:n].copy(), bend[:n].copy())
+    return _integrate(first, x[:n].copy(), left[:n].copy(), right[:n].copy(), bend[:n].copy(), HIGH_RAD - LOW_RAD)
 
 
 @njit(cache=True, inner=True)

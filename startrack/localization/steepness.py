@@ -9,8 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.core.types import Evidence, NotLocated
-from startrack.localization.likelihood import PositionLikelihood
-from startrack.localization.search import BEAMS, NATS, beam_search
+from startrack.localization.search import BEAMS, NATS, BoxModel
 from startrack.terrain import Terrain
 
 STEEPNESS_SIGMAS = 3.0  # of what is stated, to the last steepness that is tried
@@ -56,6 +55,7 @@ def _climb(log_steepness: float, fit: float, evidence: Evidence, terrain: Terrai
 
 
 def _fit(log_steepness: float, evidence: Evidence, terrain: Terrain, sigma: float) -> float:
-    """Log-likelihood of the best position of a beam at this steepness, with the prior of that."""
-    likelihood = PositionLikelihood.from_evidence(evidence, terrain.with_steepness(float(np.exp(log_steepness))))
-    return beam_search(likelihood, BEAMS[0]).best - 0.5 * (log_steepness / sigma) ** 2
+    """Log-likelihood of the best place of a beam at this steepness, with the prior of that."""
+    model = BoxModel(evidence, terrain.with_steepness(float(np.exp(log_steepness))))
+    places = model.fit_places(*model.last_boxes(*BEAMS[0]), most=1)
+    return places[0].log_likelihood - 0.5 * (log_steepness / sigma) ** 2 if places else -np.inf

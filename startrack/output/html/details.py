@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from startrack.catalog import proper_name_designations
 from startrack.core.declaration import LARGEST
-from startrack.core.types import Array, Bools, Evidence
-from startrack.localization import Sectors
+from startrack.core.types import Array, Bools
+from startrack.localization import ROW_NATS
 from startrack.output.picture.annotate import layers_of, picture_in
 from startrack.output.picture.canvas import QUALITY, encoded_bytes
 from startrack.output.picture.relief import edge_cover, ground_cells, hill_shading
@@ -160,14 +160,19 @@ def _heights_rad(stars: MeasuredStars, horizon: Horizon) -> Array:
 def _nats_by_sector(azimuth_rad: Array, above_rad: Array, llr: Array) -> Array:
     """Log-likelihood (PAGE_SECTORS,) of the horizon beside the best shifted one; nan where a sector has no row.
 
-    Elevations are counted from the horizon, so that the best level skyline of a sector is the horizon shifted.
+    Elevations are counted from the horizon, so that the best level skyline of a sector is the horizon shifted. A star
+    counts as much as in the posterior.
     """
-    evidence = Evidence(azimuth_rad=azimuth_rad, elevation_rad=np.clip(above_rad, -np.pi / 2, np.pi / 2), llr=llr)
-    sectors = Sectors(evidence, PAGE_SECTORS, epsilon=0.0)
-    visible = np.where(above_rad > 0, llr, 0.0)
-    sums = np.bincount(sectors.sector, weights=visible, minlength=PAGE_SECTORS).astype(np.float64)
-    occupied = np.bincount(sectors.sector, minlength=PAGE_SECTORS) > 0
-    return np.where(occupied, sectors.by_sector(sums), np.nan)
+    found = np.full(PAGE_SECTORS, np.nan)
+    llr, sector = (
+        np.clip(llr, -ROW_NATS, ROW_NATS),
+        (azimuth_rad / (2 * np.pi) * PAGE_SECTORS).astype(int) % PAGE_SECTORS,
+    )
+    for s in np.unique(sector):
+        order = np.flatnonzero(sector == s)[np.argsort(-above_rad[sector == s])]
+        by_height = np.concatenate([[0.0], np.cumsum(llr[order])])  # the horizon above all stars, below the first ...
+        found[s] = by_height[np.count_nonzero(above_rad[order] > 0)] - by_height.max()
+    return found
 
 
 def skyline_of(path: Path, horizon: Horizon | None, stars: dict[str, Any] | None) -> dict[str, Any] | None:

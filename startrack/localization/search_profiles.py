@@ -1,0 +1,135 @@
+"""The rows over boxes of positions: the most that a skyline between two bounds can explain of them, and on average.
+
+The log-likelihood F of a sector of azimuth is that of the published model. In place of the chain of obstacles each
+sector may lie below its best level skyline by a limited amount: F less its greatest value, M, counts as
+log((1 - e) exp(min(F - M, 0)) + e). So an obstacle costs the true position some nats a sector, and boxes can be bounded
+sector by sector. A box counts each row that its skylines may meet as it suits best.
+"""
+
+from __future__ import annotations
+
+# mypy: disable-error-code="no-untyped-def"
+from dataclasses import dataclass, replace
+from math import exp, floor, log
+
+import numpy as np
+
+from startrack.core.kernels import njit
+from startrack.core.types import SECTORS, Array, Evidence, Ints, sector_of
+from startrack.localization.skyline_profiles import EDGE_SIGMAS, ROW_NATS, profiles_of
+
+SEARCH_EPSILON = 0.1  # e: an obstacle costs the true position 2.3 nats a sector
+LOWEST_RAD, HIGHEST_RAD = np.radians(-20.0), np.radians(92.0)  # elevations of skylines
+STEP_RAD = np.radians(0.04)  # between them: boxes of 12 m see a rim 10 km away in 0.14 degrees
+COUNT = int((HIGHEST_RAD - LOWEST_RAD) / STEP_RAD) + 1
+
+
+@dataclass(frozen=True, eq=False)
+class SearchProfiles:
+    """Sums over the rows of each sector, at elevations of its skyline (SECTORS, COUNT), as the kernels read them."""
+
+    visible: Array  # of the llr of rows that stand above for certain
+    open_from: Array  # of the greatest contributions of rows that may stand above
+    open_above: Array  # and of those that stand above for certain
+    integral: Array  # of exp (F - M) up to the elevation
+    best: Array  # (SECTORS,) M
+
+    @classmethod
+    def of(cls, rows: Evidence) -> SearchProfiles:
+        """Of rows (n,)."""
+        sector, margin = sector_of(rows.azimuth_rad), EDGE_SIGMAS * rows.edge_sigma_rad
+        hard = replace(rows, edge_sigma_rad=np.where(rows.extended_nats > 0.0, rows.edge_sigma_rad, 0.0))
+        profiles = profiles_of(hard, rows.elevation_rad, np.zeros(SECTORS), (LOWEST_RAD, HIGHEST_RAD))
+        llr = np.where(rows.extended_nats > 0.0, rows.llr, np.clip(rows.llr, -ROW_NATS, ROW_NATS))
+        most = _greatest_contributions(llr, rows.extended_nats)
+        integral, best = np.empty((SECTORS, COUNT)), np.empty(SECTORS)
+        _fill_integral(profiles, integral, best)
+        return cls(
+            _sum_above(sector, rows.elevation_rad - margin, llr),
+            _sum_above(sector, rows.elevation_rad + margin, most),
+            _sum_above(sector, rows.elevation_rad - margin, most), integral, best,
+        )  # fmt: skip
+
+    def bound(self, low_rad: Array, high_rad: Array) -> Array:
+        """Upper bounds (n,) of the log-likelihood where skylines are between (n, SECTORS) and (n, SECTORS)."""
+        found = np.empty(len(low_rad))
+        _fill_bounds(
+            self.visible, self.open_from, self.open_above, self.best, np.ascontiguousarray(low_rad),
+            np.ascontiguousarray(high_rad), found,
+        )  # fmt: skip
+        return found
+
+    def average(self, low_rad: Array, high_rad: Array) -> Array:
+        """Log-likelihoods (n,) where skylines are anywhere between (n, m) and (n, m), for m evenly spread sectors.
+
+        Each sector's skyline is equally likely anywhere there, independently of the others.
+        """
+        found = np.empty(len(low_rad))
+        _fill_averages(self.integral, np.ascontiguousarray(low_rad), np.ascontiguousarray(high_rad), found)
+        return found
+
+
+def _greatest_contributions(llr: Array, extended: Array) -> Array:
+    """Greatest contribution (n,) of each row over all visible fractions from 0 to 1."""
+    most = np.maximum(llr, 0.0)
+    inner = np.abs(llr) < 0.5 * extended  # the parabola has its top inside
+    most[inner] = np.maximum(most[inner], np.square(llr[inner] + 0.5 * extended[inner]) / (2 * extended[inner]))
+    return most
+
+
+def _sum_above(sector: Ints, elevation_rad: Array, value: Array) -> Array:
+    """Sums (SECTORS, COUNT) of the values of rows at or above each elevation."""
+    at = np.floor((elevation_rad - LOWEST_RAD) / STEP_RAD).astype(np.int64)
+    inside = at >= 0
+    cell = sector[inside] * COUNT + np.minimum(at[inside], COUNT - 1)
+    each = np.bincount(cell, weights=value[inside], minlength=SECTORS * COUNT).reshape(SECTORS, COUNT)
+    return np.ascontiguousarray(np.cumsum(each[:, ::-1], axis=1)[:, ::-1])
+
+
+@njit(cache=True)
+def _fill_integral(profiles, integral, best):
+    for s in range(len(best)):
+        k, last = profiles.first[s], profiles.first[s + 1] - 1
+        best[s] = -np.inf
+        for j in range(k, last):
+            best[s] = max(best[s], profiles.left[j], profiles.right[j])
+        scale = exp(profiles.free[s] - best[s])
+        for i in range(integral.shape[1]):
+            at = LOWEST_RAD + i * STEP_RAD
+            while k < last - 1 and profiles.x[k + 1] <= at:
+                k += 1
+            u = (at - profiles.x[k]) / (profiles.x[k + 1] - profiles.x[k])
+            integral[s, i] = scale * (profiles.integral[k] + u * (profiles.integral[k + 1] - profiles.integral[k]))
+
+
+@njit(cache=True)
+def _fill_bounds(visible, open_from, open_above, best, low, high, found):
+    for n in range(len(found)):
+        total = 0.0
+        for s in range(len(best)):
+            a = min(max(floor((low[n, s] - LOWEST_RAD) / STEP_RAD), 0), COUNT - 2)
+            b = min(max(floor((high[n, s] - LOWEST_RAD) / STEP_RAD), 0), COUNT - 2) + 1
+            value = visible[s, b] + open_from[s, a] - open_above[s, b] - best[s]
+            if value < 0.0:  # within a sector a real skyline hardly beats the best level one
+                total += log((1.0 - SEARCH_EPSILON) * exp(value) + SEARCH_EPSILON)
+        found[n] = total
+
+
+@njit(cache=True)
+def _fill_averages(integral, low, high, found):
+    every = len(integral) // low.shape[1]
+    for n in range(len(found)):
+        total = 0.0
+        for k in range(low.shape[1]):
+            rise = _integral_to(integral[k * every], high[n, k]) - _integral_to(integral[k * every], low[n, k])
+            mean = min(max(rise / (high[n, k] - low[n, k]), 0.0), 1.0)
+            total += log((1.0 - SEARCH_EPSILON) * mean + SEARCH_EPSILON)
+        found[n] = total
+
+
+@njit(cache=True, inner=True)
+def _integral_to(integral, elevation):
+    """The integral of a sector up to an elevation, linear between those of the table."""
+    at = (elevation - LOWEST_RAD) / STEP_RAD
+    i = min(max(floor(at), 0), COUNT - 2)
+    return integral[i] + (at - i) * (integral[i + 1] - integral[i])

@@ -99,7 +99,8 @@ def test_the_places_of_a_beam_are_near_the_top(shackleton):
         best = model.fit_places(*model.last_boxes(*BEAMS[0]))[0]
         exact = SkylineModel.of(shackleton, evidence, place, 5.0, model.errors)
         assert best.log_likelihood > exact.log_likelihood(place[None])[0] + exact.seen.log_offset - 3.0
-        assert np.linalg.norm(best.position_m - place) < 30.0
+        off = best.position_m - place
+        assert off @ np.linalg.solve(best.covariance_m2, off) < 14.0
 
 
 def test_stars_of_another_position_or_time_are_refused(shackleton):

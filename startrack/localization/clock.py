@@ -191,7 +191,7 @@ def explore_times(evidence: Evidence, terrain: Terrain, clock: Clock) -> list[tu
     places = Track(evidence, terrain, clock).likely_places()
     later_s, fits = np.array([one.later_s for one in places]), np.array([one.log_likelihood for one in places])
     return [
-        (turn_evidence(evidence, float(later_s[at]), terrain.air), search.boxes_about([places[at]], terrain, -np.inf))
+        (turn_evidence(evidence, float(later_s[at]), terrain.air), search.boxes_about([places[at]], terrain))
         for at in _peaks(later_s, fits, clock)
     ]
 

@@ -32,7 +32,7 @@ LAST_HALF_M = {False: SMALL_BOX_M, True: FINEST_M}  # of the last boxes, looked 
 # one is not among the first 200.
 BEAMS = ((32, False), (80, True), (200, True), (500, True))
 FITTED, APART_BOXES = 4, 4.0  # boxes at which the model is fitted, and their distance in halves of boxes
-FIT_M, FIT_ROUNDS = 40.0, 4  # half side of a neighbourhood that is fitted, at least; how often it may follow the fit
+FIT_M, FIT_ROUNDS, FIT_NATS = 40.0, 6, 0.5  # half side of a neighbourhood that is fitted; how often, and for what gain
 APART_M = 1.0  # between two places
 FIRST_REACH_M, LAST_REACH_M, BOXES_ACROSS = 16.0, 256.0, 5  # of boxes about a place, and how many along a side
 REACH_SIGMAS = 4.0  # from a place to the ends of these boxes
@@ -178,28 +178,30 @@ class BoxModel:
 
     def _fit(self, centre_m: Array, half_m: float) -> Place | None:
         """The likeliest place that linear solutions lead to from a box."""
-        best: Place | None = None
-        reach_m = max(2.0 * half_m, FIT_M)
+        points = centre_m + square_grid(half_m, 5)
+        points = points[np.asarray(self.terrain.allowed(points))]
+        if not len(points):
+            return None
+        at_m, best, reach_m = points[np.argmin(np.linalg.norm(points - centre_m, axis=1))], None, max(2 * half_m, FIT_M)
         for _ in range(FIT_ROUNDS):
             check_time()
-            model = SkylineModel.of(self.terrain, self.rows, centre_m, reach_m, self.errors, self.rows.image_errors)
+            model = SkylineModel.of(self.terrain, self.rows, at_m, reach_m, self.errors, self.rows.image_errors)
             found = _place_of(model)
-            if found is None or (best is not None and found.log_likelihood <= best.log_likelihood):
+            gained = np.inf if best is None else found.log_likelihood - best.log_likelihood
+            if gained > 0.0:
+                best = found
+            if gained < FIT_NATS or (found.position_m == at_m).all():
                 break
-            best = found
-            if np.abs(found.position_m - centre_m).max() < 0.5 * reach_m:
-                break
-            centre_m = found.position_m
+            at_m, reach_m = found.position_m, FIT_M
         return best
 
 
-def _place_of(model: SkylineModel) -> Place | None:
-    """The likelier one of the reference and the linear solution about it; None where neither is allowed."""
+def _place_of(model: SkylineModel) -> Place:
+    """The likelier one of the reference of a model and the linear solution about it, if that is allowed."""
     linear, covariance, weight = model.solve()
-    tried = np.vstack([model.with_likely_errors(model.around.reference_m[None], weight), linear])
-    tried = tried[np.asarray(model.terrain.allowed(tried[:, :2]))]
-    if not len(tried):
-        return None
+    tried = model.with_likely_errors(model.around.reference_m[None], weight)
+    if bool(model.terrain.allowed(linear[None, :2])[0]):
+        tried = np.vstack([tried, linear])
     value = model.log_likelihood(tried) - 0.5 * np.square(tried[:, 2:]).sum(axis=1)
     best = tried[np.argmax(value)]
     of_errors = 0.5 * float(np.linalg.slogdet(covariance[2:, 2:])[1])
@@ -208,19 +210,16 @@ def _place_of(model: SkylineModel) -> Place | None:
     return Place(best[:2], covariance[:2, :2], float(value.max()) + of_errors + model.seen.log_offset, later_s)
 
 
-def boxes_about(places: list[Place], terrain: Terrain, log_open: float) -> Explored:
-    """Boxes about the likely ones of `places`, where no proof excludes all others.
-
-    `log_open` is the logarithm of a bound of the integral of the likelihood [m2] over what the search left open.
-    """
+def boxes_about(places: list[Place], terrain: Terrain) -> Explored:
+    """Boxes about the likely ones of `places`, where no proof excludes all others."""
     likely = [one for one in places if one.log_likelihood > places[0].log_likelihood - NATS]
     sigma_m = max(float(np.sqrt(np.linalg.eigvalsh(one.covariance_m2)[-1])) for one in likely)
     reach_m = min(max(REACH_SIGMAS * sigma_m, FIRST_REACH_M), LAST_REACH_M)
-    centres = np.concatenate([one.position_m + square_grid(reach_m, BOXES_ACROSS) for one in likely])
-    score = np.repeat([one.log_likelihood for one in likely], BOXES_ACROSS**2)
-    score -= 0.5 * np.square(np.tile(np.linalg.norm(square_grid(REACH_SIGMAS, BOXES_ACROSS), axis=1), len(likely)))
+    off, less = square_grid(reach_m, BOXES_ACROSS), 0.5 * np.square(square_grid(REACH_SIGMAS, BOXES_ACROSS)).sum(axis=1)
+    centres = np.concatenate([one.position_m + off for one in likely])
+    score = np.concatenate([one.log_likelihood - less for one in likely])
     allowed = np.asarray(terrain.allowed(centres))
-    return Explored(centres[allowed], reach_m / (BOXES_ACROSS - 1), score[allowed], log_open, "beam")
+    return Explored(centres[allowed], reach_m / (BOXES_ACROSS - 1), score[allowed], np.inf, "beam")
 
 
 def explore(
@@ -235,7 +234,14 @@ def explore(
     model = BoxModel(rows, terrain)
     places = model.fit_places(*model.last_boxes(*BEAMS[0]), most=1)
     found = Proof(model, prune_nats, budget_horizons).run(places)
-    if found.search != "proven":
+    if found.search == "proven":
+        places = merge_places(places, model.fit_places(found.centres_m, found.half_m, most=1))
+        points = np.array([one.position_m for one in places])
+        found = found._replace(  # the best place is the first reference of the sampling
+            centres_m=np.vstack([points, found.centres_m]),
+            log_likelihood=np.append(model.averages(points, POINT_M), found.log_likelihood),
+        )
+    else:
         for beam in BEAMS[1:]:
             places = merge_places(places, model.fit_places(*model.last_boxes(*beam)))
         found = Proof(model, prune_nats, budget_horizons).run(places)
@@ -272,11 +278,13 @@ class Proof:
         finest_m = min(FINEST_M, FINEST_PART * half)
         while True:
             count = len(centres)
-            centres, upper = self._bound(centres, half, best)
+            centres = self._bound(centres, half, best)
             is_last = 4 * len(centres) > LAST_MOST_BOXES
             if len(centres) and (half <= finest_m or is_last):
                 average = self.model.averages(centres, half)
-                keep = average > average.max() - self.prune_nats
+                order = np.argsort(-average, kind="stable")
+                centres, average = centres[order], average[order]
+                keep = average > average[0] - self.prune_nats
                 if half <= finest_m or np.mean(keep) > 0.5:
                     return Explored(
                         centres[keep], half, average[keep], self._with_dropped(average[~keep], half), "proven"
@@ -296,11 +304,11 @@ class Proof:
             if is_last or is_hopeless or not len(quarters) or self.work > self.budget_horizons:
                 if not places:
                     raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
-                return boxes_about(places, terrain, self._with_dropped(upper, half))
+                return boxes_about(places, terrain)
             centres, half = quarters, half / 2
 
-    def _bound(self, centres: Array, half: float, best: float) -> tuple[Array, Array]:
-        """Centres (n, 2) of the boxes that may matter, and upper bounds (n,) of their log-likelihood.
+    def _bound(self, centres: Array, half: float, best: float) -> Array:
+        """Centres (n, 2) of the boxes that may matter.
 
         A large box is kept at a smaller likelihood: it holds more probability.
         """
@@ -312,7 +320,7 @@ class Proof:
             upper[some] = self.model.bounds(centres[some], half)
         keep = upper > best - nats
         self.log_dropped = self._with_dropped(upper[~keep], half)
-        return centres[keep], upper[keep]
+        return centres[keep]
 
     def _work_of(self, boxes: float) -> float:
         """Cost of the bounds of so many boxes, in horizons traced."""

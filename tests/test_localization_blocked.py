@@ -113,6 +113,18 @@ def test_ground_below_the_map_is_found_with_its_azimuths(seed):
     assert error_m(fix, POSITION_M) < fix.radius999_m
 
 
+@pytest.mark.parametrize("width_deg", [20, 80, 120])
+def test_the_search_keeps_the_true_box_behind_wide_obstacles(width_deg: float) -> None:
+    """The model charges an obstacle once, the search each of its sectors: the slack covers the difference."""
+    rng = np.random.default_rng(width_deg)
+    for height_deg in (0.4, 3.0, 8.0):
+        place, start = rng.uniform(-6000, 6000, 2), rng.uniform(0, 360)
+        rows = rows_seen(int(rng.integers(1000)), ridge(height_deg, start, (start + width_deg) % 360), place)
+        found = ExactPosterior().explore(rows, CRATER)
+        assert found.search == "proven"
+        assert np.abs(found.centres_m - place).max(axis=1).min() <= found.half_m
+
+
 def test_a_fix_beside_a_blocked_quarter_is_right(located: Any) -> None:
     known = located.result
     pixels = known.exposure.pixels_adu.copy()

@@ -21,10 +21,12 @@ from startrack.localization.importance_sampling import moments
 from startrack.localization.joint_posterior import sample_posterior
 from startrack.localization.obstacle_chain import (
     LEVELS_RAD,
+    NODES,
     RISEN,
     STATES,
     WRONG_SECTOR,
     emissions,
+    prepare_levels,
     state_probabilities,
     transitions,
 )
@@ -302,3 +304,11 @@ def test_levels_and_the_wrong_sector_leave_no_sector_without_likelihood(obstruct
     far = emissions(obstructed.seen.profiles, np.full(SECTORS, np.radians(-5.0)))
     assert far.min() >= WRONG_SECTOR
     assert np.all(np.diff(LEVELS_RAD) > 0)
+
+
+def test_prepared_levels_are_the_emissions_at_their_nodes(obstructed: SkylineModel) -> None:
+    profiles, reach = obstructed.seen.profiles, np.radians(np.where(np.arange(SECTORS) % 7, 0.3, 15.0))
+    table = prepare_levels(profiles, reach)
+    for node, u in enumerate(np.linspace(-1.0, 1.0, NODES)):
+        at_node = emissions(profiles, reach * u * abs(u))[:, 1:]
+        np.testing.assert_allclose(table[:, :, node], at_node, rtol=1e-4, atol=1e-6)

@@ -25,6 +25,8 @@ RISEN = len(LEVELS_RAD)  # states 1 to here: the levels, from low to high, and e
 STATES = RISEN + len(NOTCH_LEVELS_RAD)  # behind them the levels of notches, from shallow to deep
 FROM_RAD = np.concatenate([LEVELS_RAD[:-1], [np.inf], -NOTCH_LEVELS_RAD[1:]])  # (STATES - 1,) lower edges
 TO_RAD = np.concatenate([LEVELS_RAD[1:], [np.inf], -NOTCH_LEVELS_RAD[:-1]])  # (STATES - 1,) upper edges
+EDGES_RAD = np.concatenate([-NOTCH_LEVELS_RAD[::-1], LEVELS_RAD])
+LOWER_EDGE, UPPER_EDGE = (np.searchsorted(EDGES_RAD, np.minimum(e, EDGES_RAD[-1])) for e in (FROM_RAD, TO_RAD))
 START, NOTCH_START = 0.03 / SECTORS, 0.01 / SECTORS  # a sector: 0.03 obstacles and 0.01 notches around the circle
 STOP, KEEP, NEAR = 0.05, 0.84, 0.14  # one of them ends; else its level stays, or goes to a neighbour
 WRONG_SECTOR = 1e-3  # probability that the skyline of a sector is anywhere
@@ -72,13 +74,30 @@ class Levels(NamedTuple):
 
 @njit(cache=True)
 def prepare_levels(profiles, reach):
-    """Emissions (SECTORS, STATES - 1, NODES) of the states but the first at shifts up to `reach` (SECTORS,)."""
-    table = np.zeros((len(reach), STATES - 1, NODES), dtype=np.float32)
+    """Emissions (SECTORS, STATES - 1, NODES) of the states but the first at shifts up to `reach` (SECTORS,).
+
+    As `level_emission`; the cells are met in the order of the nodes.
+    """
+    table, to = np.zeros((len(reach), STATES - 1, NODES), dtype=np.float32), np.empty((len(EDGES_RAD), NODES))
+    x, integral, free = profiles.x, profiles.integral, profiles.free
     for s in range(len(reach)):
-        for i in range(NODES):
-            u = 2.0 * i / (NODES - 1) - 1.0
-            for j in range(1, STATES):
-                table[s, j - 1, i] = level_emission(profiles, s, reach[s] * u * abs(u), j)
+        last, outside = profiles.first[s + 1] - 1, exp(-free[s])
+        for e in range(len(EDGES_RAD)):
+            k = cell_at(x, profiles.guide, s, EDGES_RAD[e] - reach[s])
+            for i in range(NODES):
+                u = 2.0 * i / (NODES - 1) - 1.0
+                at = EDGES_RAD[e] + reach[s] * u * abs(u)
+                while k < last - 1 and x[k + 1] <= at:
+                    k += 1
+                inside = min(at, x[last])
+                to[e, i] = integral[k] + (inside - x[k]) / (x[k + 1] - x[k]) * (integral[k + 1] - integral[k])
+                to[e, i] += (at - inside) * outside
+        for j in range(1, STATES):
+            for i in range(NODES):
+                mean = outside
+                if j != RISEN:
+                    mean = (to[UPPER_EDGE[j - 1], i] - to[LOWER_EDGE[j - 1], i]) / (TO_RAD[j - 1] - FROM_RAD[j - 1])
+                table[s, j - 1, i] = (1.0 - WRONG_SECTOR) * mean + WRONG_SECTOR
     return table
 
 

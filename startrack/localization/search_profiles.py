@@ -79,11 +79,19 @@ def _greatest_contributions(llr: Array, extended: Array) -> Array:
 
 def _sum_above(sector: Ints, elevation_rad: Array, value: Array) -> Array:
     """Sums (SECTORS, COUNT) of the values of rows at or above each elevation."""
-    at = np.floor((elevation_rad - LOWEST_RAD) / STEP_RAD).astype(np.int64)
-    inside = at >= 0
-    cell = sector[inside] * COUNT + np.minimum(at[inside], COUNT - 1)
-    each = np.bincount(cell, weights=value[inside], minlength=SECTORS * COUNT).reshape(SECTORS, COUNT)
-    return np.ascontiguousarray(np.cumsum(each[:, ::-1], axis=1)[:, ::-1])
+    found = np.zeros((SECTORS, COUNT))
+    _fill_sums(sector, (elevation_rad - LOWEST_RAD) / STEP_RAD, value, found)
+    return found
+
+
+@njit(cache=True)
+def _fill_sums(sector, at, value, found):
+    for k in range(len(sector)):
+        if at[k] >= 0.0:
+            found[sector[k], min(int(at[k]), COUNT - 1)] += value[k]
+    for s in range(len(found)):
+        for i in range(COUNT - 2, -1, -1):
+            found[s, i] += found[s, i + 1]
 
 
 @njit(cache=True)

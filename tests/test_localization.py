@@ -148,7 +148,7 @@ def test_exact_posterior_equals_brute_force(seed: int, terrain: Cylinder) -> Non
 def test_bounds_hold_at_random_positions_of_every_box(sigma_rad: float) -> None:
     rng = np.random.default_rng(8)
     evidence = measure_stars(rng, random_position(rng), TERRAIN, 400, sigma_rad)
-    centres, model = np.array([[1000.0, 2000.0], [-7000.0, 3000.0], [6500.0, -6500.0]]), BoxModel(evidence, TERRAIN)
+    centres, model = np.array([[1000.0, 2000.0], [-7000.0, 3000.0], [6500.0, -6500.0]]), BoxModel.of(evidence, TERRAIN)
     for half in (300.0, 20.0):
         for centre, most in zip(centres, model.bounds(centres, half), strict=True):
             inside = centre + half * (2 * rng.random((60, 2)) - 1)

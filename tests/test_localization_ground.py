@@ -76,7 +76,7 @@ def test_box_averages_equal_those_of_random_horizons_between_the_bounds(shacklet
     rng = np.random.default_rng(6)
     evidence = simulate_rays(shackleton, np.array([-80.0, 30.0]), rng, 3000, 0.0)
     centres, half = np.array([[-90.0, 40.0], [150.0, -20.0]]), 40.0
-    found, sector = BoxModel(evidence, shackleton).averages(centres, half), sector_of(evidence.azimuth_rad)
+    found, sector = BoxModel.of(evidence, shackleton).averages(centres, half), sector_of(evidence.azimuth_rad)
     low, high = shackleton.horizon_bounds_rad(centres[:, None], np.array(half), MIDDLES_RAD, np.pi / SECTORS)
     best, llr, draws = best_levels(evidence), capped_llr(evidence), (np.arange(4000) + 0.5) / 4000
     for box in range(2):
@@ -95,7 +95,7 @@ def test_the_places_of_a_beam_are_near_the_top(shackleton):
         rng = np.random.default_rng([7, seed])
         place = rng.uniform(-200, 200, 2)
         evidence = simulate_rays(shackleton, place, rng, 1500, 0.0005)
-        model = BoxModel(evidence, shackleton)
+        model = BoxModel.of(evidence, shackleton)
         best = model.fit_places(*model.last_boxes(*BEAMS[0]))[0]
         exact = SkylineModel.of(shackleton, evidence, place, 5.0, model.errors)
         assert best.log_likelihood > exact.log_likelihood(place[None])[0] + exact.seen.log_offset - 3.0

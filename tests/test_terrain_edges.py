@@ -12,7 +12,7 @@ from edge_helpers import CHANGES, RIGHT, draw_rays, draw_scene
 from hazard_helpers import catalog_to, rays_of, small_camera
 
 from startrack.chain import StarRays, locate_rays
-from startrack.core.types import Fix, NoSolution
+from startrack.core.types import SECTORS, Fix, NoSolution
 from startrack.localization.neighbourhood import Neighbourhood
 from startrack.localization.search import BoxModel, Place, Proof
 from startrack.rendering import Series
@@ -97,8 +97,8 @@ def test_no_evidence_is_taken_where_ground_off_the_map_could_hide_it_from_anywhe
 def test_a_search_whose_best_place_is_in_no_box_is_about_that_place() -> None:
     """The boxes are tested at points: one that holds a good position between them may be left out."""
     rays, _ = rays_of("shackleton-thesis", (3000.0, 1000.0), 3)
-    place = Place(np.array([3000.0, 1000.0]), 25.0 * np.eye(2), 0.0, 0.0)
-    found = Proof(BoxModel(rays.evidence(), rays.terrain), -1e6, 1e5).run([place])
+    place = Place(np.array([3000.0, 1000.0]), 25.0 * np.eye(2), 0.0, np.zeros(SECTORS), 0.0)
+    found = Proof(BoxModel.of(rays.evidence(), rays.terrain), -1e6, 1e5).run([place])
     assert found.search == "beam"
     assert np.abs(found.centres_m - place.position_m).max() <= 256.0
 

@@ -168,7 +168,7 @@ class Track:
         )
 
     def _model(self, later_s: float) -> search.BoxModel:
-        return search.BoxModel(turn_evidence(self.evidence, later_s, self.terrain.air), self.terrain)
+        return search.BoxModel.of(turn_evidence(self.evidence, later_s, self.terrain.air), self.terrain)
 
 
 def is_wide(clock: Clock, terrain: Terrain) -> bool:

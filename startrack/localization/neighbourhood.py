@@ -28,11 +28,13 @@ class Neighbourhood:
 
     terrain: Terrain
     reference_m: Array
-    half_m: float  # horizons are prepared for positions so far from the reference
+    half_m: float  # horizons are prepared for positions so far from the reference; 0: each is traced
 
     @cached_property
     def ground(self) -> Terrain:
         """The terrain, prepared for the neighbourhood."""
+        if self.half_m == 0.0:
+            return self.terrain
         return self.terrain.near(self.reference_m, self.half_m, MIDDLES_RAD, NODES_ACROSS)
 
     @cached_property

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 from math import ceil, log2
 from typing import NamedTuple
 
@@ -18,7 +17,7 @@ from startrack.terrain import Terrain, require_bounds
 
 NATS = 16.0  # positions that are e^-16 as likely as the best are dropped
 WITHIN_RAD = np.pi / SECTORS  # from the middle of a sector to its ends
-MAP_SIGMAS, SHARED_SIGMAS = 6.0, 3.0  # of errors of the map and of all azimuths, by which bounds are wider
+MAP_SIGMAS = 6.0  # of errors of the map by which bounds are wider
 NARROWEST_RAD = 1e-6  # of a range of skylines
 TRACED_EVERY = 3  # sectors: a traced horizon costs a hundred times a look-up
 SMALL_BOX_M = 20.0  # half side up to which boxes are tested for allowed ground point by point
@@ -32,7 +31,8 @@ LAST_HALF_M = {False: SMALL_BOX_M, True: FINEST_M}  # of the last boxes, looked 
 # one is not among the first 200.
 BEAMS = ((32, False), (80, True), (200, True), (500, True))
 FITTED, APART_BOXES = 4, 4.0  # boxes at which the model is fitted, and their distance in halves of boxes
-FIT_M, FIT_ROUNDS, FIT_NATS = 40.0, 6, 0.5  # half side of a neighbourhood that is fitted; how often, and for what gain
+FIT_M = 40.0  # half side of a neighbourhood, at least
+FIT_ROUNDS, FIT_NATS = 6, 0.5  # how often a fit follows its solution, and for what gain
 APART_M = 1.0  # between two places
 FIRST_REACH_M, LAST_REACH_M, BOXES_ACROSS = 16.0, 256.0, 5  # of boxes about a place, and how many along a side
 REACH_SIGMAS = 4.0  # from a place to the ends of these boxes
@@ -51,6 +51,7 @@ class Place(NamedTuple):
     position_m: Array  # (2,)
     covariance_m2: Array  # (2, 2)
     log_likelihood: float  # of the published model, its shared errors integrated
+    raised_rad: Array  # (SECTORS,) by how much errors that all azimuths share raise the skyline
     later_s: float  # how much later than that of the rows the true time is
 
 
@@ -101,41 +102,26 @@ class BoxModel:
 
     rows: Evidence
     terrain: Terrain
+    profiles: SearchProfiles
+    errors: SharedErrors  # that all azimuths share
+    raised_rad: Array | float = 0.0  # (SECTORS,) by how much these raise the skyline
 
-    @cached_property
-    def profiles(self) -> SearchProfiles:
-        """Of the rows."""
-        return SearchProfiles.of(self.rows)
+    @classmethod
+    def of(cls, rows: Evidence, terrain: Terrain) -> BoxModel:
+        """With the errors at zero."""
+        return cls(rows, terrain, SearchProfiles.of(rows), SharedErrors.of(terrain, rows.clock))
 
-    @cached_property
-    def errors(self) -> SharedErrors:
-        """That all azimuths share."""
-        return SharedErrors.of(self.terrain, self.rows.clock)
-
-    @cached_property
-    def wider_rad(self) -> Array:
-        """(SECTORS,) by which the errors that all azimuths share may move the skyline; gross ones are not meant."""
-        if not len(self.errors):
-            return np.zeros(SECTORS)
-        east_m, north_m, reach_m = self.terrain.searched
-        points = np.array([east_m, north_m]) + square_grid(0.6 * reach_m, 3)
-        points = points[np.asarray(self.terrain.allowed(points))]
-        slopes = [
-            self.errors.slopes_rad(
-                self.terrain, at, MIDDLES_RAD, np.asarray(self.terrain.horizon_rad(at[None], MIDDLES_RAD)).ravel()
-            )
-            for at in points
-        ]
-        variance = [np.square(self.errors.sigma()[:, None] * one).sum(axis=0) for one in slopes]
-        return SHARED_SIGMAS * np.sqrt(np.max(variance, axis=0, initial=0.0))
+    def raised_as(self, places: list[Place]) -> BoxModel:
+        """The same with the errors that the best of `places` shows, the first one."""
+        return replace(self, raised_rad=places[0].raised_rad) if places else self
 
     def bounds(self, centres_m: Array, half_m: float) -> Array:
         """Upper bounds (n,) of the search's log-likelihood over boxes (n, 2)."""
         boxes = centres_m[:, None, :]
         low, high = self.terrain.horizon_bounds_rad(boxes, np.array(half_m), MIDDLES_RAD, WITHIN_RAD)
         require_bounds(self.terrain, low, high)
-        wider = MAP_SIGMAS * self.terrain.max_horizon_sigma_rad(boxes, half_m, MIDDLES_RAD, WITHIN_RAD) + self.wider_rad
-        return self.profiles.bound(low - wider, high + wider)
+        wider = MAP_SIGMAS * self.terrain.max_horizon_sigma_rad(boxes, half_m, MIDDLES_RAD, WITHIN_RAD)
+        return self.profiles.bound(low + self.raised_rad - wider, high + self.raised_rad + wider)
 
     def averages(self, centres_m: Array, half_m: float, is_traced: bool = False) -> Array:
         """Log-likelihoods (n,) of the search of boxes (n, 2), on average.
@@ -153,7 +139,8 @@ class BoxModel:
         if not self.terrain.hard_edges:
             sigma = self.terrain.max_horizon_sigma_rad(boxes, half_m, azimuth, WITHIN_RAD)
             low, high = low - sigma, high + sigma
-        return self.profiles.average(low - NARROWEST_RAD, high + NARROWEST_RAD)
+        raised = self.raised_rad if isinstance(self.raised_rad, float) else self.raised_rad[:: SECTORS // len(azimuth)]
+        return self.profiles.average(low + raised - NARROWEST_RAD, high + raised + NARROWEST_RAD)
 
     def last_boxes(self, width: int, is_traced: bool) -> tuple[Array, float]:
         """Centres (n, 2) of the last boxes, the best average first, and half their side [m].
@@ -182,17 +169,17 @@ class BoxModel:
         points = points[np.asarray(self.terrain.allowed(points))]
         if not len(points):
             return None
-        at_m, best, reach_m = points[np.argmin(np.linalg.norm(points - centre_m, axis=1))], None, max(2 * half_m, FIT_M)
+        at_m, best = points[np.argmin(np.linalg.norm(points - centre_m, axis=1))], None
         for _ in range(FIT_ROUNDS):
             check_time()
-            model = SkylineModel.of(self.terrain, self.rows, at_m, reach_m, self.errors, self.rows.image_errors)
+            model = SkylineModel.of(self.terrain, self.rows, at_m, 0.0, self.errors, self.rows.image_errors)
             found = _place_of(model)
             gained = np.inf if best is None else found.log_likelihood - best.log_likelihood
             if gained > 0.0:
                 best = found
             if gained < FIT_NATS or (found.position_m == at_m).all():
                 break
-            at_m, reach_m = found.position_m, FIT_M
+            at_m = found.position_m
         return best
 
 
@@ -207,7 +194,8 @@ def _place_of(model: SkylineModel) -> Place:
     of_errors = 0.5 * float(np.linalg.slogdet(covariance[2:, 2:])[1])
     errors = model.basis.mean + model.basis.shown @ best[2:]
     later_s = float(errors[-1]) if model.errors.clock is not None else 0.0
-    return Place(best[:2], covariance[:2, :2], float(value.max()) + of_errors + model.seen.log_offset, later_s)
+    raised, fit = errors @ model.error_slopes_rad, float(value.max()) + of_errors + model.seen.log_offset
+    return Place(best[:2], covariance[:2, :2], fit, raised, later_s)
 
 
 def boxes_about(places: list[Place], terrain: Terrain) -> Explored:
@@ -231,20 +219,21 @@ def explore(
     horizons than the budget, wider beams look for better places, and those are what is left.
     Raises NotLocated (outside_search_area).
     """
-    model = BoxModel(rows, terrain)
+    model = BoxModel.of(rows, terrain)
     places = model.fit_places(*model.last_boxes(*BEAMS[0]), most=1)
-    found = Proof(model, prune_nats, budget_horizons).run(places)
+    found = Proof(model.raised_as(places), prune_nats, budget_horizons).run(places)
+    if found.search != "proven":
+        for beam in BEAMS[1:]:
+            places = merge_places(places, model.fit_places(*model.last_boxes(*beam)))
+        found = Proof(model.raised_as(places), prune_nats, budget_horizons).run(places)
     if found.search == "proven":
-        places = merge_places(places, model.fit_places(found.centres_m, found.half_m, most=1))
+        if not places or np.abs(places[0].position_m - found.centres_m[0]).max() > APART_BOXES * found.half_m:
+            places = merge_places(places, model.fit_places(found.centres_m, found.half_m, most=1))
         points = np.array([one.position_m for one in places])
         found = found._replace(  # the best place is the first reference of the sampling
             centres_m=np.vstack([points, found.centres_m]),
-            log_likelihood=np.append(model.averages(points, POINT_M), found.log_likelihood),
+            log_likelihood=np.append(model.raised_as(places).averages(points, POINT_M), found.log_likelihood),
         )
-    else:
-        for beam in BEAMS[1:]:
-            places = merge_places(places, model.fit_places(*model.last_boxes(*beam)))
-        found = Proof(model, prune_nats, budget_horizons).run(places)
     return found, places
 
 

@@ -56,6 +56,6 @@ def _climb(log_steepness: float, fit: float, evidence: Evidence, terrain: Terrai
 
 def _fit(log_steepness: float, evidence: Evidence, terrain: Terrain, sigma: float) -> float:
     """Log-likelihood of the best place of a beam at this steepness, with the prior of that."""
-    model = BoxModel(evidence, terrain.with_steepness(float(np.exp(log_steepness))))
+    model = BoxModel.of(evidence, terrain.with_steepness(float(np.exp(log_steepness))))
     places = model.fit_places(*model.last_boxes(*BEAMS[0]), most=1)
     return places[0].log_likelihood - 0.5 * (log_steepness / sigma) ** 2 if places else -np.inf

@@ -16,10 +16,11 @@ from startrack.localization.obstacle_chain import (
     NOTCH_LEVELS_RAD,
     RISEN,
     STATES,
+    STOP,
     WRONG_SECTOR,
     transitions,
 )
-from startrack.localization.search_profiles import SEARCH_EPSILON
+from startrack.localization.search_profiles import HIDE, SEARCH_EPSILON
 from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS, sector_of
 from startrack.terrain import Cylinder, ForwardingTerrain, Terrain, load_terrain
 
@@ -80,9 +81,18 @@ def best_levels(evidence: Evidence) -> Array:
     return found
 
 
-def search_scores(below: Array) -> Array:
-    """Log-likelihoods (n,) of the search of sums (n, SECTORS), less the best ones."""
-    return np.log((1 - SEARCH_EPSILON) * np.exp(np.minimum(below, 0.0)) + SEARCH_EPSILON).sum(axis=-1)
+def search_scores(below: Array, best: Array) -> Array:
+    """Log-likelihoods (n,) of the search of sums (n, SECTORS), less the best ones (SECTORS,)."""
+    emission = np.stack(
+        np.broadcast_arrays((1 - SEARCH_EPSILON) * np.exp(np.minimum(below, 0.0)) + SEARCH_EPSILON, np.exp(-best)),
+        axis=-1,
+    )
+    T, product, log = np.array([[1 - HIDE, HIDE], [STOP, 1 - STOP]]), np.eye(2), np.zeros(len(below))
+    for s in range(SECTORS):
+        product = product @ T * emission[:, s, None]
+        size = product.sum(axis=(1, 2))
+        product, log = product / size[:, None, None], log + np.log(size)
+    return np.asarray(log + np.log(np.trace(product, axis1=1, axis2=2)))
 
 
 def locate_or_refuse(evidence: Evidence, terrain: Terrain) -> tuple[Fix | None, Reason | None]:

@@ -55,7 +55,7 @@ def test_the_text_has_the_values_of_the_table() -> None:
         f"neighbouring one ({values[chain + 'NEAR']}, ",
         f"probability {float(values[chain + 'NOTCH_START']) * 240:.2g} / 240 / 6",
         f"e = {values['search_profiles.SEARCH_EPSILON']}:",
-        f"{values['posterior.SLACK_NATS']} nats, which are 29 degrees",
+        f"{values['search_profiles.SLACK_NATS']} nats, which are 29 degrees",
         f"limited to {values['skyline_profiles.ROW_NATS']} nats",
         f"rounds ({values['importance_sampling.ROUNDS']} points)",
     ):

@@ -23,7 +23,7 @@ from localization_helpers import (
 from startrack.chain import Settings
 from startrack.core.types import Array, Evidence, NotLocated
 from startrack.localization import ExactPosterior, Hull, Localizer, PseudoGradient
-from startrack.localization.search import BoxModel
+from startrack.localization.places import BoxModel
 from startrack.terrain import Cylinder, ForwardingTerrain
 
 
@@ -153,7 +153,7 @@ def test_bounds_hold_at_random_positions_of_every_box(sigma_rad: float) -> None:
         for centre, most in zip(centres, model.bounds(centres, half), strict=True):
             inside = centre + half * (2 * rng.random((60, 2)) - 1)
             inside = inside[TERRAIN.allowed(inside)]
-            score = search_scores(slow_sums(inside, evidence, TERRAIN) - best_levels(evidence))
+            score = search_scores(slow_sums(inside, evidence, TERRAIN) - best_levels(evidence), best_levels(evidence))
             assert np.all(score <= most + 1e-4)
             assert most < -5.0  # it excludes something
 

@@ -6,14 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from localization_helpers import slow_chain_scores
+from localization_helpers import search_scores, slow_chain_scores
 from scipy.spatial import cKDTree
 from scipy.stats import norm
 
 from startrack.core.types import Evidence, Fix, NotLocated
 from startrack.localization import ExactPosterior, Hull, PseudoGradient
 from startrack.localization.pseudo_gradient import descend
-from startrack.localization.search_profiles import SEARCH_EPSILON
 from startrack.localization.skyline_profiles import ROW_NATS
 from startrack.terrain import Cylinder, load_terrain
 
@@ -32,8 +31,8 @@ def grid() -> np.ndarray:
 
 
 def log_likelihood(places: np.ndarray, evidence: Evidence) -> np.ndarray:
-    """sum over sectors of log((1 - eps) exp(min(g - M, 0)) + eps), g the sum of log(V e^l + 1 - V), written out."""
-    total = np.zeros(len(places))
+    """That of the search by sectors, from g - M, g the sum of log(V e^l + 1 - V), written out."""
+    below, best = np.zeros((len(places), SECTORS)), np.zeros(SECTORS)
     sector = (evidence.azimuth_rad / (2 * np.pi) * SECTORS).astype(int)
     for s in np.unique(sector):
         gain, ceiling, running = np.zeros(len(places)), 0.0, 0.0
@@ -52,9 +51,8 @@ def log_likelihood(places: np.ndarray, evidence: Evidence) -> np.ndarray:
             gain += np.log(visible * np.exp(llr) + 1 - visible)
             running += llr
             ceiling = max(ceiling, running)
-        below = gain - ceiling
-        total += np.log((1 - SEARCH_EPSILON) * np.exp(np.minimum(below, 0)) + SEARCH_EPSILON)
-    return total
+        below[:, s], best[s] = gain - ceiling, ceiling
+    return search_scores(below, best)
 
 
 def simulate_rays(at_m: np.ndarray, n: int, sigma_rad: float, rng: np.random.Generator) -> Evidence:

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from localization_helpers import WRAPPERS, best_levels, capped_llr, slow_sums
+from localization_helpers import WRAPPERS, best_levels, capped_llr, search_scores, slow_sums
 
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Clock, Evidence, NotLocated, sector_of
 from startrack.localization import ExactPosterior, posterior
 from startrack.localization.conclusion import conclude
-from startrack.localization.search import BEAMS, BoxModel
-from startrack.localization.search_profiles import SEARCH_EPSILON
+from startrack.localization.places import BoxModel
+from startrack.localization.search import BEAMS
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import HeightMap, load_terrain
 
@@ -85,7 +85,7 @@ def test_box_averages_equal_those_of_random_horizons_between_the_bounds(shacklet
             horizon, own = low[box, s] + (high - low)[box, s] * draws, sector == s
             below[:, s] = (llr[own] * (evidence.elevation_rad[own] > horizon[:, None])).sum(axis=1) - best[s]
         mean = np.exp(below).mean(axis=0)
-        plain = np.log((1 - SEARCH_EPSILON) * np.minimum(mean, 1.0) + SEARCH_EPSILON).sum()
+        (plain,) = search_scores(np.log(mean + 1e-300)[None], best)
         assert found[box] == pytest.approx(plain, abs=3.0)  # the table has steps of 0.04 degrees
     assert found[0] > found[1] + 50
 

@@ -9,9 +9,10 @@ from math import hypot
 import numpy as np
 
 from startrack.core.time_limit import check_time
-from startrack.core.types import Array, Clock, Evidence, NotLocated
+from startrack.core.types import Array, Clock, Evidence, Explored, NotLocated
 from startrack.frames import Air, R_from_rotvec, Site, sky_rotvec_rad, turn_sky, ut1_sigma_s
-from startrack.localization import search
+from startrack.localization.places import FIT_M, BoxModel, Place, choose_apart
+from startrack.localization.search import BEAMS, boxes_about
 from startrack.localization.shared_errors import is_noticeable
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain
@@ -94,12 +95,12 @@ class Track:
     terrain: Terrain
     clock: Clock
 
-    def likely_places(self) -> list[search.Place]:
+    def likely_places(self) -> list[Place]:
         """The best place at each time that matters; `later_s` is that time, its prior is in the log-likelihood.
 
         Raises NotLocated (outside_search_area, insufficient_geometry).
         """
-        found: list[search.Place] = []
+        found: list[Place] = []
         for place in self._begin_places():
             settled = self._settle_time(place, found)
             if settled is not None:
@@ -118,7 +119,7 @@ class Track:
         """Between two times."""
         return float(TIME_STEP_RAD / np.linalg.norm(self.clock.turn_rad_s))
 
-    def _begin_places(self) -> list[search.Place]:
+    def _begin_places(self) -> list[Place]:
         """The best places at likely times, the best first."""
         low, high = self.limits_s
         times = np.linspace(low, high, 2 * int(np.ceil(0.5 * (high - low) / self.step_s)) + 1)
@@ -128,7 +129,7 @@ class Track:
                 "terrain: find the time more exactly (--time-sigma states its error)"
             )
         scanned = [one for one in map(self._scan, times) if len(one.centres_m)]
-        found: list[search.Place] = []
+        found: list[Place] = []
         for one in scanned:
             if not any(one.leads_to(other, self.step_s) for other in scanned):
                 places = self._model(one.later_s).fit_places(one.centres_m, one.half_m, most=1)
@@ -141,17 +142,17 @@ class Track:
     def _scan(self, later_s: float) -> Scan:
         """The best boxes at a time [s later]."""
         model = self._model(later_s)
-        centres, half = model.last_boxes(*search.BEAMS[0])
+        centres, half = model.last_boxes(*BEAMS[0])
         fit = float(model.averages(centres[:1], half)[0]) if len(centres) else -np.inf
         return Scan(later_s, fit + float(self.clock.log_prior(later_s)), centres, half)
 
-    def _settle_time(self, begin: search.Place, found: list[search.Place]) -> search.Place | None:
+    def _settle_time(self, begin: Place, found: list[Place]) -> Place | None:
         """The place at the time that the rows show about that of another; None where it is among those `found`."""
         (low, high), place = self.limits_s, begin
         for _ in range(TIME_ROUNDS):
             if any(abs(place.later_s - one.later_s) < 0.5 * self.step_s for one in found):
                 return None
-            models = self._model(place.later_s).fit_places(place.position_m[None], search.FIT_M, most=1)
+            models = self._model(place.later_s).fit_places(place.position_m[None], FIT_M, most=1)
             if not models:
                 return None
             off_s = models[0].later_s
@@ -161,14 +162,14 @@ class Track:
                 break
         return place
 
-    def _at_time(self, later_s: float, place: search.Place) -> search.Place:
+    def _at_time(self, later_s: float, place: Place) -> Place:
         """A place of rows at a time [s later] with that time, and its prior."""
         return place._replace(
             later_s=later_s, log_likelihood=place.log_likelihood + float(self.clock.log_prior(later_s))
         )
 
-    def _model(self, later_s: float) -> search.BoxModel:
-        return search.BoxModel.of(turn_evidence(self.evidence, later_s, self.terrain.air), self.terrain)
+    def _model(self, later_s: float) -> BoxModel:
+        return BoxModel.of(turn_evidence(self.evidence, later_s, self.terrain.air), self.terrain)
 
 
 def is_wide(clock: Clock, terrain: Terrain) -> bool:
@@ -183,7 +184,7 @@ def is_linear(clock: Clock, error_s: float) -> bool:
     return abs(error_s) * float(np.linalg.norm(clock.turn_rad_s)) <= LINEAR_TURN_RAD
 
 
-def explore_times(evidence: Evidence, terrain: Terrain, clock: Clock) -> list[tuple[Evidence, search.Explored]]:
+def explore_times(evidence: Evidence, terrain: Terrain, clock: Clock) -> list[tuple[Evidence, Explored]]:
     """The rows turned to each likely time that a wide clock allows, and the boxes there.
 
     Raises NotLocated as `Track` does.
@@ -191,7 +192,7 @@ def explore_times(evidence: Evidence, terrain: Terrain, clock: Clock) -> list[tu
     places = Track(evidence, terrain, clock).likely_places()
     later_s, fits = np.array([one.later_s for one in places]), np.array([one.log_likelihood for one in places])
     return [
-        (turn_evidence(evidence, float(later_s[at]), terrain.air), search.boxes_about([places[at]], terrain))
+        (turn_evidence(evidence, float(later_s[at]), terrain.air), boxes_about([places[at]], terrain))
         for at in _peaks(later_s, fits, clock)
     ]
 
@@ -222,4 +223,4 @@ def _fit(model: SkylineModel) -> float:
 def _peaks(later_s: Array, fits: Array, clock: Clock) -> list[int]:
     """The likeliest times that are apart from each other."""
     apart_s = TIME_STEP_RAD / float(np.linalg.norm(clock.turn_rad_s))
-    return search.choose_apart(later_s[:, None], fits, apart_s, TIME_NATS, MOST_TIMES)
+    return choose_apart(later_s[:, None], fits, apart_s, TIME_NATS, MOST_TIMES)

@@ -18,7 +18,8 @@ from startrack.localization.importance_sampling import (
     moments,
     temper_weights,
 )
-from startrack.localization.search import FIT_M, NATS, Explored, choose_apart
+from startrack.localization.places import FIT_M, choose_apart
+from startrack.localization.search import NATS, Explored
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain

@@ -11,7 +11,7 @@ from startrack.core.circle import interpolate_circle
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, ImageErrors
 from startrack.localization.sector_moments import SectorMoments, measure_moments
 from startrack.localization.shared_errors import SharedErrors
-from startrack.localization.skyline_profiles import HIGH_RAD, ROW_NATS, Profiles, profiles_of
+from startrack.localization.skyline_profiles import Profiles, profiles_of
 from startrack.terrain import NO_POST, ExpectedCrests, Terrain
 
 SAMPLES = 6 * SECTORS  # of the skyline around the reference, between which rows are compared with it
@@ -144,9 +144,7 @@ class SectorRows:
     @cached_property
     def log_offset(self) -> float:
         """What makes log-likelihoods of different references and times comparable: they see other windows of rows."""
-        rows = self.rows
-        high = (self.above_rad >= HIGH_RAD) & (rows.extended_nats == 0.0)
-        return float(self.profiles.free.sum() + np.clip(rows.llr[high], -ROW_NATS, ROW_NATS).sum())
+        return float(self.profiles.offset.sum())
 
     @cached_property
     def image_rise(self) -> Array:

@@ -81,7 +81,7 @@ def prepare_levels(profiles, reach):
     table, to = np.zeros((len(reach), STATES - 1, NODES), dtype=np.float32), np.empty((len(EDGES_RAD), NODES))
     x, integral, free = profiles.x, profiles.integral, profiles.free
     for s in range(len(reach)):
-        last, outside = profiles.first[s + 1] - 1, exp(-free[s])
+        last, outside, scale = profiles.first[s + 1] - 1, exp(-free[s]), profiles.scale[s]
         for e in range(len(EDGES_RAD)):
             k = cell_at(x, profiles.guide, s, EDGES_RAD[e] - reach[s])
             for i in range(NODES):
@@ -94,10 +94,11 @@ def prepare_levels(profiles, reach):
                 to[e, i] += (at - inside) * outside
         for j in range(1, STATES):
             for i in range(NODES):
-                mean = outside
+                mean = profiles.hidden[s]
                 if j != RISEN:
                     mean = (to[UPPER_EDGE[j - 1], i] - to[LOWER_EDGE[j - 1], i]) / (TO_RAD[j - 1] - FROM_RAD[j - 1])
-                table[s, j - 1, i] = (1.0 - WRONG_SECTOR) * mean + WRONG_SECTOR
+                    mean *= scale
+                table[s, j - 1, i] = (1.0 - WRONG_SECTOR) * mean + WRONG_SECTOR * scale
     return table
 
 
@@ -105,17 +106,18 @@ def prepare_levels(profiles, reach):
 def level_emission(profiles, s, shift, j):
     """Likelihood of a sector in state j, above or below the map's skyline, which is higher by `shift`."""
     if j == RISEN:
-        mean = exp(-profiles.free[s])
+        mean = profiles.hidden[s]
     else:
         low, high = FROM_RAD[j - 1], TO_RAD[j - 1]
         mean = (integral_to(profiles, s, shift + high) - integral_to(profiles, s, shift + low)) / (high - low)
-    return (1.0 - WRONG_SECTOR) * mean + WRONG_SECTOR
+        mean *= profiles.scale[s]
+    return (1.0 - WRONG_SECTOR) * mean + WRONG_SECTOR * profiles.scale[s]
 
 
 @njit(cache=True, inner=True)
 def clear_emission(profiles, s, shift):
     """Likelihood of a sector whose skyline is the map's."""
-    return (1.0 - WRONG_SECTOR) * exp(log_at(profiles, s, shift)) + WRONG_SECTOR
+    return profiles.scale[s] * ((1.0 - WRONG_SECTOR) * exp(log_at(profiles, s, shift)) + WRONG_SECTOR)
 
 
 @njit(cache=True)
@@ -227,7 +229,7 @@ def fill_clear_emissions(profiles, shifts, found):
     The arrays are taken out of the tuple once: numba counts references at each access, which took two thirds of the
     time.
     """
-    _, x, left, right, bend, _, free, guide = profiles
+    _, x, left, right, bend, _, free, guide, scale, _, _ = profiles
     for s in range(len(shifts)):
         for p in range(shifts.shape[1]):
             at = shifts[s, p]
@@ -236,7 +238,7 @@ def fill_clear_emissions(profiles, shifts, found):
             if rise != 0.0 or bend[k] != 0.0:
                 u = min(max((at - x[k]) / (x[k + 1] - x[k]), 0.0), 1.0)
                 value += u * rise + u * (1.0 - u) * bend[k]
-            found[s, p] = (1.0 - WRONG_SECTOR) * exp(value - free[s]) + WRONG_SECTOR
+            found[s, p] = scale[s] * ((1.0 - WRONG_SECTOR) * exp(value - free[s]) + WRONG_SECTOR)
 
 
 def transitions(moves: Moves = MOVES) -> Array:

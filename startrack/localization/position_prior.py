@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from startrack.core.types import Array, Bools, NotLocated, PositionPrior
-from startrack.localization.search import Place
+from startrack.localization.places import Place
 from startrack.localization.sky_profiles import CERTAIN_SIGMAS
 from startrack.terrain import ForwardingTerrain, Terrain
 

@@ -13,11 +13,11 @@ from startrack.localization.conclusion import conclude
 from startrack.localization.joint_posterior import sample_posterior
 from startrack.localization.position_prior import SearchedNear, name_prior, require_agreement
 from startrack.localization.search import NATS, Explored, explore, log_sum
+from startrack.localization.search_profiles import SLACK_NATS
 from startrack.localization.steepness import settle_steepness
 from startrack.terrain import Terrain, require_terrain
 
 MIN_ROWS = 8
-SLACK_NATS = 44.0  # by which the published model may favour a position over the search: 29 degrees of obstacles
 MIN_ROW_NATS = 1e-3  # |llr| below which a row is left out
 
 

@@ -3,7 +3,8 @@
 The log-likelihood F of a sector of azimuth is that of the published model. In place of the chain of obstacles each
 sector may lie below its best level skyline by a limited amount: F less its greatest value, M, counts as
 log((1 - e) exp(min(F - M, 0)) + e). So an obstacle costs the true position some nats a sector, and boxes can be bounded
-sector by sector. A box counts each row that its skylines may meet as it suits best.
+sector by sector. Sectors in which everything is hidden, up to the zenith, cost as much once. A box counts each
+row that its skylines may meet as it suits best.
 """
 
 from __future__ import annotations
@@ -16,10 +17,13 @@ import numpy as np
 
 from startrack.core.kernels import njit
 from startrack.core.types import SECTORS, Array, Evidence, Ints, sector_of
+from startrack.localization.obstacle_chain import STOP
 from startrack.localization.skyline_profiles import EDGE_SIGMAS, ROW_NATS, profiles_of
 
 SEARCH_EPSILON = 0.1  # e: an obstacle costs the true position 2.3 nats a sector
 LOWEST_RAD, HIGHEST_RAD = np.radians(-20.0), np.radians(92.0)  # elevations of skylines
+SLACK_NATS = 44.0  # by which the published model may favour a position over the search: 29 degrees of obstacles
+HIDE = exp(-SLACK_NATS)  # that all is hidden from one sector to the next: beside a wall the rest must not count less
 STEP_RAD = np.radians(0.04)  # between them: boxes of 12 m see a rim 10 km away in 0.14 degrees
 COUNT = int((HIGHEST_RAD - LOWEST_RAD) / STEP_RAD) + 1
 
@@ -33,6 +37,7 @@ class SearchProfiles:
     open_above: Array  # and of those that stand above for certain
     integral: Array  # of exp (F - M) up to the elevation
     best: Array  # (SECTORS,) M
+    hidden: Array  # (SECTORS,) exp(-M): likelihood if everything is hidden
 
     @classmethod
     def of(cls, rows: Evidence) -> SearchProfiles:
@@ -47,17 +52,22 @@ class SearchProfiles:
         return cls(
             _sum_above(sector, rows.elevation_rad - margin, llr),
             _sum_above(sector, rows.elevation_rad + margin, most),
-            _sum_above(sector, rows.elevation_rad - margin, most), integral, best,
+            _sum_above(sector, rows.elevation_rad - margin, most), integral, best, np.exp(-best),
         )  # fmt: skip
 
     def bound(self, low_rad: Array, high_rad: Array) -> Array:
         """Upper bounds (n,) of the log-likelihood where skylines are between (n, SECTORS) and (n, SECTORS)."""
         found = np.empty(len(low_rad))
         _fill_bounds(
-            self.visible, self.open_from, self.open_above, self.best, np.ascontiguousarray(low_rad),
+            self.visible, self.open_from, self.open_above, self.best, self.hidden, np.ascontiguousarray(low_rad),
             np.ascontiguousarray(high_rad), found,
         )  # fmt: skip
         return found
+
+    def score(self, sums: Array) -> Array:
+        """Log-likelihoods (n,) of sums (n, SECTORS) of the contributions of rows."""
+        clear = (1.0 - SEARCH_EPSILON) * np.exp(np.minimum(sums - self.best, 0.0)) + SEARCH_EPSILON
+        return np.array([_log_circle(one, self.hidden, 1) for one in clear])
 
     def average(self, low_rad: Array, high_rad: Array) -> Array:
         """Log-likelihoods (n,) where skylines are anywhere between (n, m) and (n, m), for m evenly spread sectors.
@@ -65,8 +75,25 @@ class SearchProfiles:
         Each sector's skyline is equally likely anywhere there, independently of the others.
         """
         found = np.empty(len(low_rad))
-        _fill_averages(self.integral, np.ascontiguousarray(low_rad), np.ascontiguousarray(high_rad), found)
+        _fill_averages(self.integral, self.hidden, np.ascontiguousarray(low_rad), np.ascontiguousarray(high_rad), found)
         return found
+
+
+def sum_contributions(rows: Evidence, margin_rad: Array) -> Array:
+    """Sums (1, SECTORS) of the contributions of rows that stand `margin_rad` (n,) above the skyline.
+
+    Of stars as far as one counts, with hard edges.
+    """
+    from scipy.special import ndtr
+
+    soft = rows.extended_nats > 0.0
+    visible = np.where(margin_rad > 0.0, 1.0, 0.0)
+    visible[soft] = ndtr(margin_rad[soft] / np.maximum(rows.edge_sigma_rad[soft], 1e-9))
+    llr = np.where(soft, rows.llr, np.clip(rows.llr, -ROW_NATS, ROW_NATS))
+    value = visible * (llr + 0.5 * rows.extended_nats * (1.0 - visible))
+    return np.asarray(
+        np.bincount(sector_of(rows.azimuth_rad), weights=value, minlength=SECTORS)[None], dtype=np.float64
+    )
 
 
 def _greatest_contributions(llr: Array, extended: Array) -> Array:
@@ -111,28 +138,43 @@ def _fill_integral(profiles, integral, best):
 
 
 @njit(cache=True)
-def _fill_bounds(visible, open_from, open_above, best, low, high, found):
+def _fill_bounds(visible, open_from, open_above, best, hidden, low, high, found):
+    clear = np.empty(len(best))
     for n in range(len(found)):
-        total = 0.0
         for s in range(len(best)):
             a = min(max(floor((low[n, s] - LOWEST_RAD) / STEP_RAD), 0), COUNT - 2)
             b = min(max(floor((high[n, s] - LOWEST_RAD) / STEP_RAD), 0), COUNT - 2) + 1
             value = visible[s, b] + open_from[s, a] - open_above[s, b] - best[s]
-            if value < 0.0:  # within a sector a real skyline hardly beats the best level one
-                total += log((1.0 - SEARCH_EPSILON) * exp(value) + SEARCH_EPSILON)
-        found[n] = total
+            clear[s] = 1.0  # within a sector a real skyline hardly beats the best level one
+            if value < 0.0:
+                clear[s] = (1.0 - SEARCH_EPSILON) * exp(value) + SEARCH_EPSILON
+        found[n] = _log_circle(clear, hidden, 1)
 
 
 @njit(cache=True)
-def _fill_averages(integral, low, high, found):
-    every = len(integral) // low.shape[1]
+def _fill_averages(integral, hidden, low, high, found):
+    every, clear = len(integral) // low.shape[1], np.empty(low.shape[1])
     for n in range(len(found)):
-        total = 0.0
         for k in range(low.shape[1]):
             rise = _integral_to(integral[k * every], high[n, k]) - _integral_to(integral[k * every], low[n, k])
             mean = min(max(rise / (high[n, k] - low[n, k]), 0.0), 1.0)
-            total += log((1.0 - SEARCH_EPSILON) * mean + SEARCH_EPSILON)
-        found[n] = total
+            clear[k] = (1.0 - SEARCH_EPSILON) * mean + SEARCH_EPSILON
+        found[n] = _log_circle(clear, hidden, every)
+
+
+@njit(cache=True)
+def _log_circle(clear, hidden, every):
+    """Logarithm of the trace around the circle: every so many sectors that are clear, or in which all is hidden."""
+    total, a, b, c, d = 0.0, 1.0, 0.0, 0.0, 1.0  # rows of the product: begun clear, begun hidden
+    for k in range(len(clear)):
+        e, h = clear[k], hidden[k * every]
+        a, b = (a * (1.0 - HIDE) + b * STOP) * e, (a * HIDE + b * (1.0 - STOP)) * h
+        c, d = (c * (1.0 - HIDE) + d * STOP) * e, (c * HIDE + d * (1.0 - STOP)) * h
+        if k % 16 == 15:
+            size = a + b + c + d
+            a, b, c, d = a / size, b / size, c / size, d / size
+            total += log(size)
+    return total + log(a + d)
 
 
 @njit(cache=True, inner=True)

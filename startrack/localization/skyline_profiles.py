@@ -10,7 +10,7 @@ from __future__ import annotations
 
 # mypy: disable-error-code="no-untyped-def"
 from math import copysign, erf, exp, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,6 +42,11 @@ class Profiles(NamedTuple):
     integral: Array  # (m,) of exp(F - free) from the lowest height to x
     free: Array  # (SECTORS,) R
     guide: Ints  # (SECTORS, 2 GUIDE + 1) cells of heights closer to each other about 0, where a search begins
+    scale: (
+        Array  # (SECTORS,) exp(R + H - N): H is the sum of the stars above the window, N the greater one of R + H and 0
+    )
+    hidden: Array  # (SECTORS,) exp(-N): of a sector in which everything is hidden, the stars above the window too
+    offset: Array  # (SECTORS,) N: all likelihoods of a sector are less it
 
 
 def profiles_of(
@@ -58,14 +63,27 @@ def profiles_of(
     llr = np.clip(rows.llr[order], -ROW_NATS, ROW_NATS)
     starts = np.searchsorted(sector, np.arange(SECTORS + 1))
     knots = _sky_knots(rows, above_rad, np.flatnonzero(extended))
-    hard = _fill_cells(above_rad[order], llr, starts, *knots, *window_rad)
+    cells = _fill_cells(above_rad[order], llr, starts, *knots, *window_rad)
     sigma = map_sigma_rad
     if len(star) and rows.edge_sigma_rad[star].any():
         count = np.maximum(np.bincount(sector, minlength=SECTORS), 1)
         own = np.bincount(sector, weights=np.square(rows.edge_sigma_rad[order]), minlength=SECTORS) / count
         sigma = np.sqrt(np.square(sigma) + own)
-    found = Profiles(*hard)
-    return Profiles(*_average_over_map(found, sigma, SOFT_BINS)) if sigma.any() else found
+    is_high = ~extended & (above_rad >= window_rad[1])
+    above = np.bincount(
+        sector_of(rows.azimuth_rad[is_high]), weights=np.clip(rows.llr[is_high], -ROW_NATS, ROW_NATS), minlength=SECTORS
+    )
+    hard = _with_stars_above(cells, above)
+    return _with_stars_above(_average_over_map(hard, sigma, SOFT_BINS), above) if sigma.any() else hard
+
+
+def _with_stars_above(cells: Any, above: Any) -> Profiles:
+    """Profiles of the first fields as the kernels fill them, and the sums (SECTORS,) of stars above the window."""
+    first, x, left, right, bend, integral, free, guide = cells[:8]
+    offset = np.maximum(free + above, 0.0)
+    return Profiles(
+        first, x, left, right, bend, integral, free, guide, np.exp(free + above - offset), np.exp(-offset), offset
+    )
 
 
 def _sky_knots(rows: Evidence, above_rad: Array, which: Ints) -> tuple[Array, Array, Array, Array]:

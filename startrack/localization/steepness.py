@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.core.types import Evidence, NotLocated
-from startrack.localization.search import BEAMS, NATS, BoxModel
+from startrack.localization.places import BoxModel
+from startrack.localization.search import BEAMS, NATS
 from startrack.terrain import Terrain
 
 STEEPNESS_SIGMAS = 3.0  # of what is stated, to the last steepness that is tried

@@ -10,7 +10,7 @@ import numpy as np
 from startrack.core.kernels import njit
 from startrack.core.types import Array
 from startrack.localization.obstacle_chain import clear_emission
-from startrack.localization.skyline_profiles import LOW_RAD, Profiles
+from startrack.localization.profile_cells import LOW_RAD, Profiles
 
 FREE_HEIGHTS, SPREAD = 121, 6.5  # of heights about the map's skyline, closer about it
 ROUGHNESS_RAD = np.radians([0.003, 0.01, 0.03, 0.1])  # mean steps from sector to sector, equally likely

@@ -9,9 +9,10 @@ import numpy as np
 
 from startrack.core.circle import interpolate_circle
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, ImageErrors
+from startrack.localization.profile_cells import Profiles
 from startrack.localization.sector_moments import SectorMoments, measure_moments
 from startrack.localization.shared_errors import SharedErrors
-from startrack.localization.skyline_profiles import Profiles, profiles_of
+from startrack.localization.skyline_profiles import profiles_of
 from startrack.terrain import NO_POST, ExpectedCrests, Terrain
 
 SAMPLES = 6 * SECTORS  # of the skyline around the reference, between which rows are compared with it

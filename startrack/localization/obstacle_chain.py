@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from startrack.core.kernels import REORDERED_SUMS, njit
-from startrack.core.types import SECTORS, Array, Ints
-from startrack.localization.skyline_profiles import Profiles, cell_at, integral_to, log_at
+from startrack.core.types import SECTORS, Array
+from startrack.localization.profile_cells import cell_at, integral_to, log_at
 
 LEVELS_RAD = np.radians([0.04, 0.08, 0.14, 0.24, 0.4, 0.65, 1.0, 1.6, 2.5, 4.0, 6.5, 10.0, 16.0])  # edges
 NOTCH_LEVELS_RAD = np.radians([0.04, 0.1, 0.25, 0.65, 1.6, 4.0, 8.0])  # edges, below the map's skyline
@@ -32,7 +32,6 @@ STOP, KEEP, NEAR = 0.05, 0.84, 0.14  # one of them ends; else its level stays, o
 WRONG_SECTOR = 1e-3  # probability that the skyline of a sector is anywhere
 NODES = 33  # of shifts, at which the emissions of the levels are prepared
 BLOCK = 64  # points that are computed together
-CLEAR = 1e-3  # least probability of a state over which the circle is closed
 
 
 class Group(NamedTuple):
@@ -239,63 +238,3 @@ def fill_clear_emissions(profiles, shifts, found):
                 u = min(max((at - x[k]) / (x[k + 1] - x[k]), 0.0), 1.0)
                 value += u * rise + u * (1.0 - u) * bend[k]
             found[s, p] = scale[s] * ((1.0 - WRONG_SECTOR) * exp(value - free[s]) + WRONG_SECTOR)
-
-
-def transitions(moves: Moves = MOVES) -> Array:
-    """The transitions (STATES, STATES) of the chain, from rows to columns."""
-    T = np.zeros((STATES, STATES))
-    T[0, 0], T[1:, 0] = 1.0, moves.stop
-    for group in (moves.risen, moves.sunk):
-        own = np.arange(group.first, group.last + 1)
-        T[0, own], T[np.ix_(own, own)] = group.start, group.jump
-        T[0, 0] -= group.start * len(own)
-        T[own, own] += moves.keep
-        for j in own:
-            neighbours = [i for i in (j - 1, j + 1) if i in own]
-            T[j, neighbours] += 2.0 * moves.near / len(neighbours)
-    return T
-
-
-@njit(cache=True)
-def _smooth(e, T):
-    """Posterior (SECTORS, STATES) by two rounds forward and backward: the second has forgotten where it began."""
-    sectors, states = e.shape
-    f, post, a, b = np.zeros((sectors, states)), np.zeros((sectors, states)), np.zeros(states), np.zeros(states)
-    for step in range(2 * sectors):
-        s, total = step % sectors, 0.0
-        for j in range(states):
-            moved = 1.0 if step == 0 else 0.0
-            for i in range(states):
-                moved += a[i] * T[i, j]
-            f[s, j] = moved * e[s, j]
-            total += f[s, j]
-        for j in range(states):
-            f[s, j] /= total
-            a[j] = f[s, j]
-    for j in range(states):
-        a[j] = 1.0
-    for step in range(2 * sectors):
-        s, total, whole = sectors - 1 - step % sectors, 0.0, 0.0
-        for j in range(states):
-            post[s, j], b[j] = f[s, j] * a[j], a[j] * e[s, j]
-            total += post[s, j]
-        for i in range(states):
-            post[s, i] /= total
-            a[i] = 0.0
-            for j in range(states):
-                a[i] += T[i, j] * b[j]
-            whole += a[i]
-        for i in range(states):
-            a[i] /= whole
-    return post
-
-
-def state_probabilities(profiles: Profiles, shift: Array) -> Array:
-    """Probabilities (SECTORS, STATES) of the states where the map's skyline is higher by `shift` (SECTORS,) [rad]."""
-    return np.asarray(_smooth(emissions(profiles, shift), transitions()))
-
-
-def closing_of(states: Array) -> tuple[int, Ints]:
-    """The sector where the circle is best cut, and its states that count, by probabilities (SECTORS, STATES)."""
-    cut = int(np.argmax(states[:, 0]))
-    return cut, np.flatnonzero(states[cut] > CLEAR)

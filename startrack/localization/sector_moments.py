@@ -10,7 +10,7 @@ import numpy as np
 
 from startrack.core.kernels import njit
 from startrack.core.types import Array
-from startrack.localization.skyline_profiles import Profiles, cell_at
+from startrack.localization.profile_cells import Profiles, cell_at
 
 REACH_RAD = np.radians(1.2)  # of heights about the reference's skyline
 LEAST_SIGMA_RAD, LEAST_SHOWN_PART = 1e-7, 1e-9

@@ -14,14 +14,13 @@ from functools import cached_property
 import numpy as np
 
 from startrack.core.types import SECTORS, Array, Evidence, ImageErrors, Ints
+from startrack.localization.chain_states import closing_of, state_probabilities
 from startrack.localization.neighbourhood import NO_IMAGE_ERRORS, Neighbourhood, SectorRows
 from startrack.localization.obstacle_chain import (
     MOVES,
     Levels,
     chain_log_likelihoods,
-    closing_of,
     prepare_levels,
-    state_probabilities,
 )
 from startrack.localization.sector_moments import solve_linear
 from startrack.localization.shared_errors import ErrorBasis, SharedErrors

@@ -129,9 +129,10 @@ def _image_errors(measured: Measured, sky: SkyLight, used: Bools) -> ImageErrors
 
 def _too_few_text(sky: SkyLight, used: Bools) -> str:
     """Why too few sectors (SECTORS,) are `used`: the skyline is not in view, has no step, or is not in the map."""
-    in_view, on_map, needed = (n * 360.0 / SECTORS for n in (sky.levels.covered.sum(), used.sum(), NEEDED_SECTORS))
+    counts = sky.levels.covered.sum(), sectors_with_step(sky).sum(), used.sum(), NEEDED_SECTORS
+    in_view, clear, on_map, needed = (n * 360.0 / SECTORS for n in counts)
     if in_view < needed:
         return f"the image shows sky and ground beside {in_view:.0f}° of the skyline, and {needed:.0f}° are needed"
-    if not on_map:
+    if not clear:
         return f"no step of light is clear over {needed:.0f}° of the skyline"
     return f"the terrain gives {on_map:.0f}° of the skyline that has a step of light, and {needed:.0f}° are needed"

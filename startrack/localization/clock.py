@@ -96,7 +96,9 @@ class Track:
     clock: Clock
 
     def likely_places(self) -> list[Place]:
-        """The best place at each time that matters; `later_s` is that time, its prior is in the log-likelihood.
+        """The best place at each time that matters; `later_s` is that time.
+
+        The prior of the time is in the log-likelihood: the clock is one of the errors of the model.
 
         Raises NotLocated (outside_search_area, insufficient_geometry).
         """
@@ -133,7 +135,7 @@ class Track:
         for one in scanned:
             if not any(one.leads_to(other, self.step_s) for other in scanned):
                 places = self._model(one.later_s).fit_places(one.centres_m, one.half_m, most=1)
-                found.extend(self._at_time(one.later_s, place) for place in places)
+                found.extend(place._replace(later_s=one.later_s) for place in places)
         if not found:
             raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
         found.sort(key=lambda one: -one.log_likelihood)
@@ -157,16 +159,10 @@ class Track:
                 return None
             off_s = models[0].later_s
             later_s = min(max(place.later_s + off_s, low), high)
-            place = self._at_time(later_s, models[0])
+            place = models[0]._replace(later_s=later_s)
             if is_linear(self.clock, off_s):
                 break
         return place
-
-    def _at_time(self, later_s: float, place: Place) -> Place:
-        """A place of rows at a time [s later] with that time, and its prior."""
-        return place._replace(
-            later_s=later_s, log_likelihood=place.log_likelihood + float(self.clock.log_prior(later_s))
-        )
 
     def _model(self, later_s: float) -> BoxModel:
         return BoxModel.of(turn_evidence(self.evidence, later_s, self.terrain.air), self.terrain)

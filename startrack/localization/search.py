@@ -67,14 +67,16 @@ def explore(
     model = BoxModel.of(rows, terrain)
     places = model.fit_places(*model.last_boxes(*BEAMS[0]), most=1)
     found = Proof(model.raised_as(places), prune_nats, budget_horizons).run(places)
-    if found.search != "proven":
+    if found is None or found.search != "proven":
         for beam in BEAMS[1:]:
             places = merge_places(places, model.fit_places(*model.last_boxes(*beam)))
         found = Proof(model.raised_as(places), prune_nats, budget_horizons).run(places)
+    if found is None:
+        raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
     if found.search == "proven":
         if not places or np.abs(places[0].position_m - found.centres_m[0]).max() > PLACES_APART * found.half_m:
             places = merge_places(places, model.fit_places(found.centres_m, found.half_m, most=1))
-        points, raised = np.array([one.position_m for one in places]), model.raised_as(places)
+        points, raised = np.reshape([one.position_m for one in places], (-1, 2)), model.raised_as(places)
         log_likelihood = [raised.score_place(one) for one in points]
         found = found._replace(  # the best place is the first reference of the sampling
             centres_m=np.vstack([points, found.centres_m]),
@@ -102,8 +104,10 @@ class Proof:
     log_dropped: float = field(default=-np.inf, init=False)  # logarithm of a bound of the integral [m2]
     work: float = field(default=0.0, init=False)  # in horizons traced
 
-    def run(self, places: list[Place]) -> Explored:
+    def run(self, places: list[Place]) -> Explored | None:
         """The boxes that may matter ("proven"); where the budget ends first, those about the best places ("beam").
+
+        None where the budget ends and no place is known.
 
         Raises NotLocated (outside_search_area).
         """
@@ -137,9 +141,7 @@ class Proof:
                 half < FORESEEN_PART * terrain.searched[2] and coming > FORESEEN_BUDGETS * self.budget_horizons
             )
             if is_last or is_hopeless or not len(quarters) or self.work > self.budget_horizons:
-                if not places:
-                    raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
-                return boxes_about(places, terrain)
+                return boxes_about(places, terrain) if places else None
             centres, half = quarters, half / 2
 
     def _bound(self, centres: Array, half: float, best: float) -> Array:

@@ -27,7 +27,8 @@ DRAW_FOLDER = ".predict"
 LOCATED = "radius95_m", "covariance_m2", "offset_m", "protection_level_m"  # of draws with one position
 DRAW_SOURCES = (  # their content is part of a chunk's key
     "localization/*.py", "simulation/*.py", "evidence/*.py", "rendering/*.py", "terrain/*.py", "chain/*.py",
-    "estimation/*.py", "applications/prediction/draws.py",
+    "estimation/*.py", "detection/*.py", "camera/*.py", "frames/*.py", "core/*.py", "psf.py",
+    "applications/prediction/draws.py",
 )  # fmt: skip
 BELOW_LIMIT_MAG = 3.0  # below the limit at 5 sigma: fainter stars add 2 % to the variance of a star's flux
 

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.chain import Measured, Settings, locate, locate_measured
-from startrack.core.types import NotLocated
-from startrack.evidence import Skyline, measure_sky_light, pixels_near_skyline, sectors_with_step
+from startrack.core.types import SECTORS, NotLocated
+from startrack.evidence import Skyline, SkylineEstimate, measure_sky_light, pixels_near_skyline, sectors_with_step
 from startrack.rendering import Scene, Series, light_e, render
 from startrack.simulation import draw_band, draw_camera, simulate_measured, simulate_stars
 from startrack.terrain import load_terrain
@@ -63,8 +63,9 @@ def test_the_skyline_of_the_band_is_measured_as_that_of_images(
         measured = measure(series, scene, rng)
         true = Skyline.trace(scene.position_enu_m[:2], series.terrain)
         horizon = Skyline(true.elevation_rad + raised_px / series.camera.focal_px[0])
-        pixels = pixels_near_skyline(measured.detections, series.camera, scene.R_cam_enu, horizon, measured.light)
-        sky = measure_sky_light(pixels, horizon)
+        near = SkylineEstimate(horizon, np.zeros(SECTORS))
+        band = pixels_near_skyline(measured.detections, series.camera, scene.R_cam_enu, near)
+        sky = measure_sky_light(band.without_stars(measured.light), horizon)
         good = sectors_with_step(sky)
         error_px = (sky.shift_px + raised_px * sky.px_per_rad / series.camera.focal_px[0])[good]
         off.append(np.average(error_px, weights=1.0 / sky.variance_px2[good]))

@@ -149,8 +149,6 @@ class Predictor:
                 scene, self.catalog, self.terrain, self.camera, time_utc=stated, time_sigma_s=None, rng=rng
             )
             fix = locate_measured(measured, self.settings).fix
-        except BadInput:
-            raise
         except NoSolution:
             return Status.REFUSED, *nothing
         if fix.ambiguous:

@@ -371,7 +371,7 @@ def test_a_progress_bar_on_a_terminal_only(monkeypatch):
         shown[kind] = sys.stderr.getvalue()
     assert shown[io.StringIO] == "" and "fixes" in shown[Terminal]
     with progress("predict", 1000, jobs=2):
-        assert "predict: about 8 minutes" in sys.stderr.getvalue()
+        assert "predict: about 17 minutes" in sys.stderr.getvalue()
     with progress("predict", 1000, shown=False):
         assert sys.stderr.getvalue().count("about") == 1
 

@@ -65,8 +65,9 @@ class PositionDetector:
 def source_variances(flux: Array, noise_2: Array | float, psf_sigma_px: float, photons: float) -> tuple[Array, Array]:
     """Variances (n,) of flux and position per axis [px^2] of a matched filter for sources of `flux` (n,).
 
-    `noise_2` is the variance of a pixel without a source, `photons` what one unit of light adds to it. Of a Gaussian
-    that noise, photons and its own shape (a part of the signal) disturb; the sums are integrals.
+    `psf_sigma_px` is the width of the PSF without the pixel [px], `noise_2` the variance of a pixel without a source,
+    `photons` what one unit of light adds to it. Of a Gaussian that noise, photons and its own shape (a part of the
+    signal) disturb; the sums are integrals.
     """
     width_2 = psf_sigma_px**2 + PIXEL_VARIANCE_PX2
     flux_2 = 4 * np.pi * width_2 * noise_2 + photons * flux + np.square(MODEL_ERROR * flux) / (2 * np.pi * width_2)

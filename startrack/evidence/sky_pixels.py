@@ -58,7 +58,7 @@ class SkylineBand:
     reach_px: Array  # (SECTORS,) no farther from the predicted skyline is the true one
 
     def heights_px(self, azimuth_rad: Array, elevation_rad: Array) -> Array:
-        """Heights (n,) of directions (n,) above the skyline, across it."""
+        """Heights (n,) [px] of directions `azimuth_rad`, `elevation_rad` (n,) in enu above the skyline, across it."""
         return np.asarray((elevation_rad - self.near.skyline(azimuth_rad)) * self.to_px(azimuth_rad))
 
     def without_stars(self, stars: StarPhotometry) -> SkyPixels:

@@ -26,7 +26,7 @@ FADE_PX = 3.0  # over which the light beside the skyline goes over to the backgr
 
 
 def exceeds_noise(sky: SkyLight) -> bool:
-    """Whether the step is larger than the noise of a pixel: a smaller one shifts no star's flux by much."""
+    """Whether the step of the `sky` is larger than the noise of a pixel: else it shifts no star's flux by much."""
     covered = sky.levels.covered
     step_e = sky.levels.step_e[covered]
     return bool(covered.any() and np.median(step_e) >= np.median(sky.levels.noise_e[:, covered]))

@@ -62,7 +62,7 @@ class SkylineEstimate:
     def of(cls, position_m: Array, covariance_m2: Array, terrain: Terrain, raised_rad: Array | None) -> SkylineEstimate:
         """That of a `terrain` at `position_m` (2,), raised by `raised_rad` (SECTORS,); None: by nothing.
 
-        Its sigma is by the covariance (2, 2) of the position and by the errors of the map.
+        Its sigma is by the covariance `covariance_m2` (2, 2) of the position and by the errors of the map.
         """
         skyline = Skyline.trace(position_m, terrain)
         variance_m2, axes = np.linalg.eigh(covariance_m2)
@@ -73,7 +73,7 @@ class SkylineEstimate:
         return cls(skyline if raised_rad is None else skyline.raised(raised_rad), sigma)
 
     def is_level(self, azimuth_rad: Array) -> Bools:
-        """Whether the skyline is so level at azimuths (n,) that a small shift does not turn it."""
+        """Whether (n,) the skyline is so level at azimuths `azimuth_rad` (n,) that a small shift does not turn it."""
         azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_POINTS, endpoint=False)
         here = self.skyline(azimuth)
         run = 2 * np.pi / SKYLINE_POINTS * np.cos(here)

@@ -178,8 +178,9 @@ def photons(mean_e: Array, *, rng: np.random.Generator) -> NDArray[np.float32]:
 
 
 def read_out(mean_e: Array, sensor: Sensor, *, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Numbers (H, W) [ADU, whole] that the sensor gives for the mean electrons (H, W) of light and dark current.
+    """Numbers [ADU, whole] that the `sensor` gives for `mean_e`, the mean electrons of light and dark current.
 
+    Both have the same shape. The noise is drawn by `rng`.
     adu = round((Poisson(mean) + N(0, read noise)) / gain + bias), clipped to 0..saturation and to 16 bits.
     """
     electrons = photons(mean_e, rng=rng)

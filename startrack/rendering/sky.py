@@ -56,7 +56,10 @@ def diffuse_e(scene: Scene) -> Array:
 
 
 def diffuse_at_e(scene: Scene, xy_px: Ints, edge: Bools) -> Array:
-    """The electrons (n,) that `diffuse_e` has in pixels (n, 2), some of which are close to the skyline: `edge` (n,)."""
+    """The electrons (n,) that `diffuse_e` has in pixels `xy_px` (n, 2) of a `scene`.
+
+    `edge` (n,): those close to the skyline.
+    """
     sky, above = _sky_function(scene)(*scene.camera.radial(xy_px.astype(np.float64)))
     return sky * _part_of_sky(scene, above, edge, xy_px[edge])
 

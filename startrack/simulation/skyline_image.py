@@ -42,8 +42,9 @@ def simulate_measured(
 ) -> Measured:  # fmt: skip
     """What the pipeline measures in the image of a `scene` before it has a position.
 
-    The scene holds the truth, with its camera; `camera` is the stated one. The other arguments are those of
-    `simulate_rays`. Raises BadInput as that does, NotIdentified where no attitude fits the stars that are seen.
+    The scene holds the truth, with its camera; `camera` is the stated one. `catalog`, `terrain`, `time_utc`,
+    `time_sigma_s` [s] and `rng` are those of `simulate_rays`. Raises BadInput as that does, NotIdentified where no
+    attitude fits the stars that are seen.
     """
     stars = simulate_stars(scene, catalog, terrain, time_utc=time_utc, time_sigma_s=time_sigma_s, rng=rng)
     width, height = camera.size_px
@@ -76,7 +77,8 @@ def simulate_measured(
 def draw_band(stars: SimulatedStars, *, rng: np.random.Generator) -> tuple[Image, Bools]:
     """Counts (H, W) [ADU] of the pixels near the skyline, and which (H, W) these are; the others are 0.
 
-    Wide enough for the pixels of the sky, and for stars, at the skyline of a position that is MOVED_PX off.
+    The light is that of the `stars` and the sky, its noise is drawn by `rng`. The band is wide enough for the pixels of
+    the sky, and for stars, at the skyline of a position that is MOVED_PX off.
     """
     scene, sensor = stars.scene, stars.scene.sensor
     width, height = scene.camera.size_px

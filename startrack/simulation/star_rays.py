@@ -97,7 +97,10 @@ def simulate_stars(
     scene: Scene, catalog: StarCatalog, terrain: Terrain | None, *, time_utc: datetime | None,
     time_sigma_s: float | None, rng: np.random.Generator,
 ) -> SimulatedStars:  # fmt: skip
-    """The stars of a `scene` and their photometry; arguments and errors are those of `simulate_rays`."""
+    """The stars of a `scene` and their photometry.
+
+    `catalog`, `terrain`, `time_utc`, `time_sigma_s` [s], `rng` and the errors are those of `simulate_rays`.
+    """
     ground = scene.terrain
     if ground is None:
         raise BadInput("bad_terrain", "the scene has no terrain: nothing hides the stars")

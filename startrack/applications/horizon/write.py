@@ -53,7 +53,7 @@ def output_files(output: str) -> tuple[Path, ...]:
 
 
 def check_outputs(*outputs: str, overwrite: bool) -> None:
-    """Raise BadOutput for an output of an unknown suffix, that takes no files, or has the path of another one.
+    """Raise BadOutput for one of the `outputs` of an unknown suffix, that takes no files, or has the path of another.
 
     And for one that exists, if `overwrite` is False.
     """

@@ -70,7 +70,7 @@ def test_profiles_are_the_sums_of_their_rows(nats: float) -> None:
     stars, sky = star_rows(PLACE, rng, 30), sky_rows(PLACE, rng, nats)
     mixed = Evidence.concatenate(stars, sky).take(rng.permutation(30 + len(sky)))
     rows = np.flatnonzero(mixed.extended_nats > 0)
-    profiles = SkyProfiles.from_rows(mixed, rows, np.zeros(len(mixed)))
+    profiles = SkyProfiles.from_rows(mixed, rows)
     azimuth = mixed.azimuth_rad[profiles.row]
     assert azimuth == pytest.approx(MIDDLES_RAD)
     middle = CRATER.horizon_rad(PLACE[None], azimuth)
@@ -79,27 +79,6 @@ def test_profiles_are_the_sums_of_their_rows(nats: float) -> None:
     for k in range(0, SECTORS, 30):
         which = np.flatnonzero((mixed.extended_nats > 0) & (mixed.azimuth_rad == azimuth[k]))
         assert found[:, k] == pytest.approx(slow_profile(mixed, which, horizon[:, k]), abs=3e-5 * nats + 5e-5)
-
-
-@pytest.mark.parametrize("nats", [1.0, 50.0, 1500.0])
-@pytest.mark.parametrize("map_px", [0.1, 0.4, 2.0])
-def test_profiles_are_averaged_over_an_error_of_the_map(nats: float, map_px: float) -> None:
-    rng = np.random.default_rng(9)
-    sky = sky_rows(PLACE, rng, nats)
-    profiles = SkyProfiles.from_rows(sky, np.arange(len(sky)), np.full(len(sky), map_px / PX_PER_RAD))
-    middle = CRATER.horizon_rad(PLACE[None], MIDDLES_RAD)
-    shift_px = np.linspace(-2.5, 2.5, 41) * np.hypot(map_px, 0.1)
-    found = profile_sums(profiles, middle + shift_px[:, None] / PX_PER_RAD)
-    errors_px = np.linspace(-6 * map_px, 6 * map_px, 6001)
-    weight = np.exp(-0.5 * np.square(errors_px / map_px))
-    for k in range(0, SECTORS, 48):
-        which = np.flatnonzero(sky.azimuth_rad == MIDDLES_RAD[k])
-        all_px = (shift_px[:, None] + errors_px).ravel()
-        log = slow_profile(sky, which, middle[k] + all_px / PX_PER_RAD).reshape(41, -1)
-        expected = np.log(np.exp(log - log.max()) @ weight / weight.sum()) + log.max()
-        likely = expected > expected.max() - 3.0
-        assert found[likely, k] == pytest.approx(expected[likely], abs=0.05)
-        assert found[:, k] == pytest.approx(expected, abs=0.5)
 
 
 def posterior_on_a_grid(rows: Evidence, middle_m: Array, reach_m: float) -> tuple[Array, Array]:

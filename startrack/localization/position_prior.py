@@ -8,10 +8,10 @@ import numpy as np
 
 from startrack.core.types import Array, Bools, NotLocated, PositionPrior
 from startrack.localization.places import Place
-from startrack.localization.sky_profiles import CERTAIN_SIGMAS
 from startrack.terrain import ForwardingTerrain, Terrain
 
-LEAST_REACH_M = 300.0  # of the first disk: in a smaller one few edges of evidence show which way is likelier
+DISK_SIGMAS = 6.0  # of the prior, to the edge of the first disk
+LEAST_REACH_M = 300.0  # of that radius: in a smaller disk few edges of evidence show which way is likelier
 EDGE_PART, ENLARGED = 0.7, 3.0  # of the disk's radius, where its edge begins; factor of the next radius
 CONTRADICTED_SIGMAS = 4.5  # of evidence and prior together: a true prior is farther off once in 25,000 images
 
@@ -21,7 +21,7 @@ class SearchedNear(ForwardingTerrain):
 
     def __init__(self, whole: Terrain, near: PositionPrior, radius_m: float | None = None) -> None:
         super().__init__(whole)
-        self.near_prior, self.radius_m = near, radius_m or max(CERTAIN_SIGMAS * near.sigma_m, LEAST_REACH_M)
+        self.near_prior, self.radius_m = near, radius_m or max(DISK_SIGMAS * near.sigma_m, LEAST_REACH_M)
 
     @property
     def searched(self) -> tuple[float, float, float]:  # type: ignore[override]

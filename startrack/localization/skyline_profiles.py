@@ -73,7 +73,7 @@ def _sky_knots(rows: Evidence, above_rad: Array, which: Ints) -> tuple[Array, Ar
         azimuth_rad=rows.azimuth_rad[which], elevation_rad=above_rad[which], llr=rows.llr[which],
         edge_sigma_rad=rows.edge_sigma_rad[which], extended_nats=rows.extended_nats[which],
     )  # fmt: skip
-    sky = SkyProfiles.from_rows(level, np.arange(len(which)), np.zeros(len(which)))
+    sky = SkyProfiles.from_rows(level, np.arange(len(which)))
     at = sector_of(level.azimuth_rad[sky.row])
     values = np.zeros((SECTORS, sky.values.shape[1]))
     low[at], step[at], values[at] = sky.low_rad, sky.step_rad, sky.values

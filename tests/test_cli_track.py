@@ -25,7 +25,6 @@ from startrack.cli.main import main
 from startrack.estimation.trajectory import radius_holding
 from startrack.frames import R_from_quat_xyzw
 from startrack.localization import posterior
-from startrack.localization.search import Search
 from startrack.terrain import write_map
 
 FRAMES = 5
@@ -97,7 +96,8 @@ def test_a_track_of_one_image_states_what_locate_states(drive, tmp_path):
 
 def test_a_search_that_proved_nothing_is_stated(drive, tracked, tmp_path, capsys, monkeypatch):
     assert {one["search"] for one in json.loads((tracked / "track.json").read_text())["frames"]} == {"proven"}
-    monkeypatch.setattr(posterior, "Search", lambda *of: Search(*of[:-1], budget_horizons=0.0))
+    explore = posterior.explore
+    monkeypatch.setattr(posterior, "explore", lambda rows, terrain, nats, budget: explore(rows, terrain, nats, 0.0))
     for _ in ("located", "kept"):
         assert run(min((drive / "frames").glob("*.png")), "-D", tmp_path / "out", "--no-plots") == 0
         line, _ = capsys.readouterr().out.splitlines()

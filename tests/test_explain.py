@@ -76,7 +76,7 @@ def test_a_skyline_out_of_view_and_a_blocked_one_are_named(located: Any) -> None
     outcome = replace(with_fix(located, radius95_m=30.0, blocked=Blocked(blocked)), camera=narrow)
     _, out_of_view, ridge = explain(outcome)
     assert out_of_view.startswith("more of the skyline: azimuths ") and "wider lens" in out_of_view
-    assert ridge.startswith("a free view: something on no map stands at azimuths 30 to 60 degrees")
+    assert ridge.startswith("a free view: the skyline is not the map's at azimuths 30 to 60 degrees")
 
 
 def test_a_contradiction_names_what_may_be_wrong(located: Any) -> None:

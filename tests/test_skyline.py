@@ -42,7 +42,7 @@ CAMERA = replace(
     centre_px=(511.5, 511.5),
 )  # fmt: skip
 EXPOSURE_S = 3.0
-PLACES_M = {"near the middle": (1200.0, 800.0), "halfway": (-4500.0, 3000.0)}
+PLACES_M = {"near the middle": (1200.0, 800.0), "halfway": (-4500.0, 3100.0)}
 
 
 @pytest.fixture(scope="module")

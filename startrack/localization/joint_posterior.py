@@ -45,10 +45,10 @@ def sample_posterior(explored: Explored, rows: Evidence, terrain: Terrain) -> li
     references_m = np.array([centres_m[0] for centres_m, _ in groups])
     found: list[Hypothesis] = []
     for number, (centres_m, reach_m) in enumerate(groups):
-        model = SkylineModel.of(terrain, rows, centres_m[0], max(reach_m, FIT_M), errors, rows.image_errors)
-        start = Start.among_boxes(model, centres_m, explored.half_m)
+        start = _begin_group(terrain, rows, errors, centres_m, max(reach_m, FIT_M), explored.half_m)
         if start is None:
             continue
+        references_m[number] = start.model.around.reference_m
         best = max((one.found.log_evidence for one in found), default=-np.inf)
         plain = _sample_group(start, references_m, best, is_first=number == 0)
         references_m[number] = plain.model.around.reference_m
@@ -65,6 +65,25 @@ def sample_posterior(explored: Explored, rows: Evidence, terrain: Terrain) -> li
         for one in found
     ]
     return sorted(found, key=lambda one: -one.found.log_evidence)
+
+
+def _begin_group(
+    terrain: Terrain, rows: Evidence, errors: SharedErrors, centres_m: Array, reach_m: float, half_m: float
+) -> Start | None:
+    """Where the sampling of boxes (n, 2) begins, which lie within `reach_m` of the first one.
+
+    In a round crater, where a model serves any distance, the reference is near the best point: rows of a sector stand
+    above the skyline that has the shape of the reference's. On a height map the last rounds have a reference of their
+    own.
+    """
+    at_m = centres_m[0]
+    for _ in range(2):
+        model = SkylineModel.of(terrain, rows, at_m, reach_m, errors, rows.image_errors)
+        start = Start.among_boxes(model, centres_m, half_m)
+        if start is None or not terrain.axisymmetric or np.abs(start.best_m - at_m).max() < FIT_M:
+            break
+        at_m = start.best_m
+    return start
 
 
 def _group_boxes(explored: Explored, reach_m: float) -> list[tuple[Array, float]]:
@@ -88,6 +107,7 @@ class Start:
     model: SkylineModel
     modes: list[Gaussian]
     boxes: BoxDistribution
+    best_m: Array  # (2,) the likeliest position
 
     @classmethod
     def among_boxes(cls, model: SkylineModel, centres_m: Array, half_m: float) -> Start | None:
@@ -116,7 +136,8 @@ class Start:
             modes = [(linear, WIDER * covariance), *modes[: MOST_MODES - 1]]
         of_errors = covariance[2:, 2:] - covariance[2:, :2] @ np.linalg.solve(covariance[:2, :2], covariance[:2, 2:])
         drawn = BoxDistribution(boxes, half_m, share, np.asarray(np.linalg.cholesky(of_errors)), MOST_BOXES)
-        return cls(model.with_closing(model.states(tried[int(np.argmax(value))])), modes, drawn)
+        best = tried[int(np.argmax(value))]
+        return cls(model.with_closing(model.states(best)), modes, drawn, best[:2])
 
 
 def _sample_group(start: Start, references_m: Array, best: float, is_first: bool) -> Hypothesis:

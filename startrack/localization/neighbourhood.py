@@ -13,7 +13,7 @@ from startrack.localization.profile_cells import Profiles
 from startrack.localization.sector_moments import SectorMoments, measure_moments
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_profiles import profiles_of
-from startrack.terrain import NO_POST, ExpectedCrests, Terrain
+from startrack.terrain import NO_POST, ExpectedCrests, Terrain, require_horizons
 
 SAMPLES = 6 * SECTORS  # of the skyline around the reference, between which rows are compared with it
 TRACED_RAD = np.radians(0.7)  # rows this near the skyline are compared with its own elevation at their azimuth
@@ -62,7 +62,9 @@ class Neighbourhood:
     def skyline_rad(self) -> Array:
         """(SAMPLES,) of the map at the reference, from north eastward."""
         around = np.linspace(0.0, 2 * np.pi, SAMPLES, endpoint=False)
-        return np.asarray(self.terrain.horizon_rad(self.reference_m[None], around)).ravel()
+        horizon = np.asarray(self.terrain.horizon_rad(self.reference_m[None], around)).ravel()
+        require_horizons(self.terrain, self.reference_m[None], horizon)
+        return horizon
 
     @cached_property
     def crests(self) -> ExpectedCrests | None:

@@ -67,9 +67,12 @@ class SkylineEstimate:
         skyline = Skyline.trace(position_m, terrain)
         variance_m2, axes = np.linalg.eigh(covariance_m2)
         axes = (axes * np.sqrt(np.maximum(variance_m2, 0.0))).T
-        there = terrain.horizon_rad((position_m + np.vstack([np.zeros(2), axes]))[:, None], MIDDLES_RAD)
+        there = terrain.horizon_rad((position_m + np.vstack([np.zeros(2), axes, -axes]))[:, None], MIDDLES_RAD)
         by_map = np.asarray(terrain.horizon_sigma_rad(np.asarray(position_m)[None], MIDDLES_RAD)).ravel()
-        sigma = np.sqrt(np.square(there[1:] - there[0]).sum(axis=0) + np.square(by_map))
+        moved = (
+            np.abs(there[1:] - there[0]).reshape(2, 2, -1).min(axis=0)
+        )  # beyond a wall nearby the horizon is no measure
+        sigma = np.sqrt(np.square(moved).sum(axis=0) + np.square(by_map))
         return cls(skyline if raised_rad is None else skyline.raised(raised_rad), sigma)
 
     def is_level(self, azimuth_rad: Array) -> Bools:

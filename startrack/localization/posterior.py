@@ -12,7 +12,7 @@ from startrack.localization.clock import explore_times, is_wide
 from startrack.localization.conclusion import conclude
 from startrack.localization.joint_posterior import sample_posterior
 from startrack.localization.position_prior import SearchedNear, name_prior, require_agreement
-from startrack.localization.search import NATS, Explored, explore, log_sum
+from startrack.localization.search import NATS, Explored, dropped_probability, explore
 from startrack.localization.search_profiles import SLACK_NATS
 from startrack.localization.steepness import settle_steepness
 from startrack.terrain import Terrain, require_terrain
@@ -52,7 +52,7 @@ class ExactPosterior:
             parts = self._explore_times(rows, terrain)
             found = [one for turned, explored in parts for one in sample_posterior(explored, turned, terrain)]
             found.sort(key=lambda one: -one.found.log_evidence)
-            return conclude(found, terrain, parts[0][1], _dropped_probability(parts[0][1]))
+            return conclude(found, terrain, parts[0][1], dropped_probability(parts[0][1]))
         except NotLocated as refusal:
             raise name_prior(refusal, near) from refusal
 
@@ -87,11 +87,3 @@ class ExactPosterior:
             nearby = wider
         require_agreement(places, near)
         return found._replace(log_likelihood=found.log_likelihood + near.log_density(found.centres_m))
-
-
-def _dropped_probability(explored: Explored) -> float:
-    """Bound of the part of the posterior that a search left out."""
-    if explored.dropped_probability is not None:
-        return explored.dropped_probability
-    log_mass = log_sum(explored.log_likelihood) + float(np.log(4 * explored.half_m**2))
-    return float(np.exp(min(explored.log_dropped + SLACK_NATS - log_mass, 0.0)))

@@ -19,6 +19,7 @@ from startrack.localization.places import (
     split_boxes,
     square_grid,
 )
+from startrack.localization.search_profiles import SLACK_NATS
 from startrack.terrain import Terrain
 
 NATS = 16.0  # positions that are e^-16 as likely as the best are dropped
@@ -41,6 +42,18 @@ LAST_MOST_BOXES = 16_000  # of a level: it is the last one
 def log_sum(values: Array) -> float:
     """Logarithm of the sum of exponentials; -inf of none."""
     return float(np.logaddexp.reduce(values, initial=-np.inf))
+
+
+def dropped_probability(explored: Explored, log_known: float = -np.inf) -> float:
+    """Bound of the part of the posterior that a search left out; 1 where nothing is known.
+
+    `log_known` is the logarithm of the integral of the likelihood [m2] about known places: where rows are strong it is
+    more than the boxes hold by their averages.
+    """
+    if explored.dropped_probability is not None:
+        return explored.dropped_probability
+    log_mass = max(log_sum(explored.log_likelihood) + float(np.log(4 * explored.half_m**2)), log_known)
+    return float(np.exp(min(explored.log_dropped + SLACK_NATS - log_mass, 0.0)))
 
 
 def boxes_about(places: list[Place], terrain: Terrain) -> Explored:
@@ -78,9 +91,12 @@ def explore(
             places = merge_places(places, model.fit_places(found.centres_m, found.half_m, most=1))
         points, raised = np.reshape([one.position_m for one in places], (-1, 2)), model.raised_as(places)
         log_likelihood = [raised.score_place(one) for one in points]
+        areas_m2 = [2 * np.pi * np.sqrt(np.linalg.det(one.covariance_m2)) for one in places]
+        log_masses = np.add(log_likelihood, np.log(areas_m2))
         found = found._replace(  # the best place is the first reference of the sampling
             centres_m=np.vstack([points, found.centres_m]),
             log_likelihood=np.append(log_likelihood, found.log_likelihood),
+            dropped_probability=dropped_probability(found, max(log_masses)) if places else None,
         )
     return found, places
 

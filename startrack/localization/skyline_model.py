@@ -134,8 +134,16 @@ class SkylineModel:
         return np.asarray(self.basis.mean @ self.error_slopes_rad + self.around.expected_rise_rad)
 
     def rise_rad(self, parameters: Array) -> Array | None:
-        """Rise (SECTORS,) of the skyline above the map's by the shared errors of parameters (2 + a,); None of none."""
-        return np.asarray(parameters[2:] @ self.slopes_rad + self._expected_rise) if len(self.errors) else None
+        """Rise (SECTORS,) of the skyline above the map's by the shared errors of parameters (2 + a,); None of none.
+
+        On real ground without that of the clock: the sky is turned to the time that it shows.
+        """
+        if not len(self.errors):
+            return None
+        values = self.basis.mean + self.basis.shown @ parameters[2:]
+        if self.errors.clock is not None and not self.terrain.axisymmetric:
+            values[-1] = 0.0
+        return np.asarray(values @ self.error_slopes_rad + self.around.expected_rise_rad)
 
     def log_likelihood(self, parameters: Array) -> Array:
         """(n,) of parameters (n, 2 + a): position [m], and coordinates of the shared errors; see `basis`."""

@@ -88,8 +88,8 @@ class Cylinder(Crater):
         """Horizon elevation [rad]; pi/2 from inside the wall. See `Terrain`."""
         points, azimuths = np.asarray(points_m, dtype=np.float64), np.asarray(azimuths_rad, dtype=np.float64)
         if points.ndim == 3 and points.shape[1] == 1 and azimuths.ndim == 1:  # each point with each azimuth
-            return _horizons_of_circle(
-                np.ascontiguousarray(points[:, 0]), np.sin(azimuths), np.cos(azimuths), self.radius_m, self.wall_m
+            return _horizons_of_circle(  # the copy can be written to: the kernel is compiled for one kind of data
+                points[:, 0].copy(), np.sin(azimuths), np.cos(azimuths), self.radius_m, self.wall_m
             )
         return np.arctan2(self.wall_m, distance_to_circle(points, azimuths, self.radius_m))
 

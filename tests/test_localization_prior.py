@@ -92,6 +92,15 @@ def test_a_wrong_prior_is_refused(off_m: list[float], sigma_m: float) -> None:
     assert refusal.value.reason == "inconsistent_evidence"
 
 
+def test_a_prior_outside_the_search_area_is_named() -> None:
+    near = PositionPrior(90_000.0, 0.0, 50.0)
+    with pytest.raises(
+        NotLocated, match="--near 90000,0,50 is 90000 m from the origin .* radius .* 10000 m"
+    ) as refusal:
+        ExactPosterior()(evidence(near), CRATER)
+    assert refusal.value.reason == "outside_search_area"
+
+
 def test_only_the_posterior_takes_a_prior() -> None:
     near = PositionPrior(0.0, 0.0, 10.0)
     assert Settings(near=near).near == near

@@ -45,6 +45,18 @@ class SearchedNear(ForwardingTerrain):
         return SearchedNear(self.whole, self.near_prior, ENLARGED * self.radius_m)
 
 
+def require_prior_inside(nearby: SearchedNear) -> None:
+    """Raises NotLocated (outside_search_area) where no part of the disk of a prior is in the search area."""
+    east_m, north_m, radius_m = nearby.searched
+    away_m = float(np.hypot(east_m, north_m))
+    if away_m > nearby.reach_m + radius_m:
+        raise NotLocated(
+            f"--near {nearby.near_prior} is {away_m:.0f} m from the origin of the terrain, and the radius of its search "
+            f"area is {nearby.search_radius_m:.0f} m",
+            reason="outside_search_area",
+        )
+
+
 def require_agreement(places: list[Place], near: PositionPrior) -> None:
     """Raises NotLocated (inconsistent_evidence) where the prior contradicts the likely `places`, the best first.
 

@@ -11,7 +11,7 @@ from startrack.core.types import Evidence, Fix, NotLocated, PositionPrior
 from startrack.localization.clock import explore_times, is_wide
 from startrack.localization.conclusion import conclude
 from startrack.localization.joint_posterior import sample_posterior
-from startrack.localization.position_prior import SearchedNear, name_prior, require_agreement
+from startrack.localization.position_prior import SearchedNear, name_prior, require_agreement, require_prior_inside
 from startrack.localization.search import NATS, Explored, dropped_probability, explore
 from startrack.localization.search_profiles import SLACK_NATS
 from startrack.localization.steepness import settle_steepness
@@ -74,9 +74,11 @@ class ExactPosterior:
         """As `explore`, in the neighbourhood of the prior.
 
         The searched disk is enlarged until the likeliest place is not at its edge: else nothing would show how far off
-        the prior the evidence is. Raises NotLocated (inconsistent_evidence) where the two contradict each other.
+        the prior the evidence is. Raises NotLocated: inconsistent_evidence where the two contradict each other,
+        outside_search_area where the prior is.
         """
         nearby = SearchedNear(terrain, near)
+        require_prior_inside(nearby)
         found, places = explore(evidence, nearby, self.prune_nats, self.budget_horizons)
         while nearby.is_at_edge(places):
             wider = nearby.enlarged()

@@ -95,7 +95,7 @@ def test_a_wrong_prior_is_refused(off_m: list[float], sigma_m: float) -> None:
 def test_a_prior_outside_the_search_area_is_named() -> None:
     near = PositionPrior(90_000.0, 0.0, 50.0)
     with pytest.raises(
-        NotLocated, match="--near 90000,0,50 is 90000 m from the origin .* radius .* 10000 m"
+        NotLocated, match=r"--near 90000,0,50 is 90000 m from the origin .* radius .* 10000 m"
     ) as refusal:
         ExactPosterior()(evidence(near), CRATER)
     assert refusal.value.reason == "outside_search_area"

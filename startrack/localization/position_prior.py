@@ -51,8 +51,8 @@ def require_prior_inside(nearby: SearchedNear) -> None:
     away_m = float(np.hypot(east_m, north_m))
     if away_m > nearby.reach_m + radius_m:
         raise NotLocated(
-            f"--near {nearby.near_prior} is {away_m:.0f} m from the origin of the terrain, and the radius of its search "
-            f"area is {nearby.search_radius_m:.0f} m",
+            f"--near {nearby.near_prior} is {away_m:.0f} m from the origin of the terrain, and the radius of its "
+            f"search area is {nearby.search_radius_m:.0f} m",
             reason="outside_search_area",
         )
 

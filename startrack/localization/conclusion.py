@@ -14,6 +14,7 @@ from startrack.localization.hypothesis import Hypothesis
 from startrack.localization.importance_sampling import moments
 from startrack.localization.integrity import assess_integrity
 from startrack.localization.search import Explored
+from startrack.localization.shared_errors import CLOCK_FACT
 from startrack.localization.summary import camera_at, link_points, require_inside
 from startrack.localization.wrong_files import require_files, require_map_in_view
 from startrack.terrain import DIAMETER, Terrain
@@ -235,7 +236,9 @@ def _restart_points(whole: Posterior, explored: Explored, dropped_probability: f
     order = np.argsort(-one.found.log_weight)[:SUPPORT]
     points, log = one.found.points[order, :2], one.found.log_weight[order]
     spread = np.sqrt(max(float(np.linalg.eigvalsh(moments(points, relative_weights(log))[1])[1]), 1e-6))
-    has_tried = explored.has_tried_times or any(plain.tries_times for plain in whole.hypotheses if not plain.gross)
+    has_tried = explored.has_tried_times or any(
+        plain.tries_times and CLOCK_FACT in plain.model.errors.facts for plain in whole.hypotheses if not plain.gross
+    )
     return explored._replace(
         centres_m=points, half_m=0.5 * spread, log_likelihood=log, dropped_probability=dropped_probability,
         has_tried_times=has_tried,

@@ -35,6 +35,6 @@ def test_a_star_counts_alike_in_every_likelihood(llr: float) -> None:
     assert step_of(published) == pytest.approx(counted)
     assert search.visible[SECTOR, 0] == pytest.approx(counted)
     assert search.best[SECTOR] == pytest.approx(max(counted, 0.0))
-    assert sum_contributions(star, np.array([0.05]))[0, SECTOR] == pytest.approx(counted)
+    assert sum_contributions(star, np.array([0.05]))[SECTOR] == pytest.approx(counted)
     page = _nats_by_sector(star.azimuth_rad, np.array([0.05]), star.llr)
     assert page[SECTOR * PAGE_SECTORS // SECTORS] == pytest.approx(min(counted, 0.0))

@@ -103,10 +103,8 @@ def measure_sky_light(pixels: SkyPixels, horizon: Horizon) -> SkyLight:
     """The light of the sky by `pixels` near a predicted `horizon`, above which their heights are."""
     sector = sector_of(pixels.azimuth_rad)
     levels = measure_levels(pixels, sector)
-    width_px, beyond_px = (
-        pixels.edge_px,
-        float(pixels.reach_px[levels.covered].max(initial=CLIP_SHIFT_PX)) - CLIP_SHIFT_PX,
-    )
+    width_px = pixels.edge_px
+    beyond_px = float(pixels.reach_px[levels.covered].max(initial=CLIP_SHIFT_PX)) - CLIP_SHIFT_PX
     for _ in range(EDGE_ROUNDS):
         cells, scale = _sum_pixels(pixels, sector, levels, width_px, LEVELS + 2 * ceil(beyond_px / CELL_PX))
         height_px, llr, extended = cells

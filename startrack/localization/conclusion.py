@@ -9,11 +9,21 @@ from functools import cached_property
 import numpy as np
 
 from startrack.core.statistics import relative_weights, shares
-from startrack.core.types import Array, Blocked, ClockError, Fix, Ints, Mode, NotLocated, ShownError, UnstatedFact
+from startrack.core.types import (
+    Array,
+    Blocked,
+    ClockError,
+    Explored,
+    Fix,
+    Ints,
+    Mode,
+    NotLocated,
+    ShownError,
+    UnstatedFact,
+)
 from startrack.localization.hypothesis import Hypothesis
 from startrack.localization.importance_sampling import moments
 from startrack.localization.integrity import assess_integrity
-from startrack.localization.search import Explored
 from startrack.localization.shared_errors import CLOCK_FACT
 from startrack.localization.summary import camera_at, link_points, require_inside
 from startrack.localization.wrong_files import require_files, require_map_in_view

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from startrack.core.types import Array, Evidence, NotLocated
+from startrack.core.types import Array, Evidence, Explored, NotLocated
 from startrack.localization.hypothesis import WIDER, Hypothesis, sample_gross_errors, sample_hypothesis
 from startrack.localization.importance_sampling import (
     ENOUGH,
@@ -19,7 +19,7 @@ from startrack.localization.importance_sampling import (
     temper_weights,
 )
 from startrack.localization.places import FIT_M, choose_apart
-from startrack.localization.search import NATS, Explored
+from startrack.localization.search import NATS
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain

@@ -108,12 +108,10 @@ class BoxModel:
         rows, sector = self.rows, sector_of(self.rows.azimuth_rad)
         raised = np.broadcast_to(self.raised_rad, SECTORS)[sector]
         low, high = self.terrain.horizon_bounds_rad(point_m[None, None], np.array(POINT_M), MIDDLES_RAD, WITHIN_RAD)
-        margin = EDGE_SIGMAS * rows.edge_sigma_rad
         horizon = 0.5 * (low + high)[0, sector] + raised
-        near = np.abs(rows.elevation_rad - horizon) <= 0.5 * (high - low)[0, sector] + margin
+        near = np.abs(rows.elevation_rad - horizon) <= 0.5 * (high - low)[0, sector] + EDGE_SIGMAS * rows.edge_sigma_rad
         horizon[near] = np.ravel(self.terrain.horizon_rad(point_m[None], rows.azimuth_rad[near])) + raised[near]
-        margin_rad = rows.elevation_rad - horizon
-        return float(self.profiles.score(sum_contributions(rows, margin_rad))[0])
+        return self.profiles.score(sum_contributions(rows, rows.elevation_rad - horizon))
 
     def averages(self, centres_m: Array, half_m: float, is_traced: bool = False) -> Array:
         """Log-likelihoods (n,) of the search of boxes (n, 2), on average.
@@ -131,7 +129,7 @@ class BoxModel:
         if not self.terrain.hard_edges:
             sigma = self.terrain.max_horizon_sigma_rad(boxes, half_m, azimuth, WITHIN_RAD)
             low, high = low - sigma, high + sigma
-        raised = self.raised_rad if isinstance(self.raised_rad, float) else self.raised_rad[:: SECTORS // len(azimuth)]
+        raised = np.broadcast_to(self.raised_rad, SECTORS)[:: SECTORS // len(azimuth)]
         return self.profiles.average(low + raised - NARROWEST_RAD, high + raised + NARROWEST_RAD)
 
     def last_boxes(self, width: int, is_traced: bool) -> tuple[Array, float]:

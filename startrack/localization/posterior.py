@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.core.compilation import announce_compilation
-from startrack.core.types import Evidence, Fix, NotLocated, PositionPrior
+from startrack.core.types import Evidence, Explored, Fix, NotLocated, PositionPrior
 from startrack.localization.clock import explore_times, is_wide
 from startrack.localization.conclusion import conclude
 from startrack.localization.joint_posterior import sample_posterior
 from startrack.localization.position_prior import SearchedNear, name_prior, require_agreement, require_prior_inside
-from startrack.localization.search import NATS, Explored, dropped_probability, explore
+from startrack.localization.search import NATS, dropped_probability, explore
 from startrack.localization.search_profiles import SLACK_NATS
 from startrack.localization.steepness import settle_steepness
 from startrack.terrain import Terrain, require_terrain

@@ -3,7 +3,7 @@
 The log-likelihood F of a sector of azimuth is that of the published model. In place of the chain of obstacles each
 sector may lie below its best level skyline by a limited amount: F less its greatest value, M, counts as
 log((1 - e) exp(min(F - M, 0)) + e). So an obstacle costs the true position some nats a sector, and boxes can be bounded
-sector by sector. Sectors in which everything is hidden, up to the zenith, cost as much once. A box counts each
+sector by sector. Sectors in which everything is hidden, up to the zenith, cost SLACK_NATS once. A box counts each
 row that its skylines may meet as it suits best.
 """
 
@@ -45,7 +45,7 @@ class SearchProfiles:
         sector, margin = sector_of(rows.azimuth_rad), EDGE_SIGMAS * rows.edge_sigma_rad
         hard = replace(rows, edge_sigma_rad=np.where(rows.extended_nats > 0.0, rows.edge_sigma_rad, 0.0))
         profiles = profiles_of(hard, rows.elevation_rad, np.zeros(SECTORS), (LOWEST_RAD, HIGHEST_RAD))
-        llr = np.where(rows.extended_nats > 0.0, rows.llr, np.clip(rows.llr, -ROW_NATS, ROW_NATS))
+        llr = _counted_llr(rows)
         most = _greatest_contributions(llr, rows.extended_nats)
         integral, best = np.empty((SECTORS, COUNT)), np.empty(SECTORS)
         _fill_integral(profiles, integral, best)
@@ -64,10 +64,10 @@ class SearchProfiles:
         )  # fmt: skip
         return found
 
-    def score(self, sums: Array) -> Array:
-        """Log-likelihoods (n,) of sums (n, SECTORS) of the contributions of rows."""
+    def score(self, sums: Array) -> float:
+        """Log-likelihood of sums (SECTORS,) of the contributions of rows."""
         clear = (1.0 - SEARCH_EPSILON) * np.exp(np.minimum(sums - self.best, 0.0)) + SEARCH_EPSILON
-        return np.array([_log_circle(one, self.hidden, 1) for one in clear])
+        return float(_log_circle(clear, self.hidden, 1))
 
     def average(self, low_rad: Array, high_rad: Array) -> Array:
         """Log-likelihoods (n,) where skylines are anywhere between (n, m) and (n, m), for m evenly spread sectors.
@@ -80,7 +80,7 @@ class SearchProfiles:
 
 
 def sum_contributions(rows: Evidence, margin_rad: Array) -> Array:
-    """Sums (1, SECTORS) of the contributions of rows that stand `margin_rad` (n,) above the skyline.
+    """Sums (SECTORS,) of the contributions of rows that stand `margin_rad` (n,) above the skyline.
 
     Of stars as far as one counts, with hard edges.
     """
@@ -89,11 +89,13 @@ def sum_contributions(rows: Evidence, margin_rad: Array) -> Array:
     soft = rows.extended_nats > 0.0
     visible = np.where(margin_rad > 0.0, 1.0, 0.0)
     visible[soft] = ndtr(margin_rad[soft] / np.maximum(rows.edge_sigma_rad[soft], 1e-9))
-    llr = np.where(soft, rows.llr, np.clip(rows.llr, -ROW_NATS, ROW_NATS))
-    value = visible * (llr + 0.5 * rows.extended_nats * (1.0 - visible))
-    return np.asarray(
-        np.bincount(sector_of(rows.azimuth_rad), weights=value, minlength=SECTORS)[None], dtype=np.float64
-    )
+    value = visible * (_counted_llr(rows) + 0.5 * rows.extended_nats * (1.0 - visible))
+    return np.bincount(sector_of(rows.azimuth_rad), weights=value, minlength=SECTORS).astype(np.float64)
+
+
+def _counted_llr(rows: Evidence) -> Array:
+    """The llr (n,) of rows; of a star as far as one counts."""
+    return np.where(rows.extended_nats > 0.0, rows.llr, np.clip(rows.llr, -ROW_NATS, ROW_NATS))
 
 
 def _greatest_contributions(llr: Array, extended: Array) -> Array:

@@ -24,7 +24,7 @@ from startrack.core.types import (
 from startrack.localization.hypothesis import Hypothesis
 from startrack.localization.importance_sampling import moments
 from startrack.localization.integrity import assess_integrity
-from startrack.localization.shared_errors import CLOCK_FACT
+from startrack.localization.shared_errors import CLOCK_FACT, OWN_EDGE
 from startrack.localization.summary import camera_at, link_points, require_inside
 from startrack.localization.wrong_files import require_files, require_map_in_view
 from startrack.terrain import DIAMETER, Terrain
@@ -67,7 +67,11 @@ class Posterior:
     @cached_property
     def is_core(self) -> Array:
         """(n,) points of hypotheses with the gross error of the best one, if it has any."""
-        return np.concatenate([np.full(len(one.log_weight), one.gross == self.best.gross) for one in self.hypotheses])
+        return self.is_gross(self.best.gross)
+
+    def is_gross(self, fact: str) -> Array:
+        """(n,) points of hypotheses with a gross error of `fact`."""
+        return np.concatenate([np.full(len(one.log_weight), one.gross == fact) for one in self.hypotheses])
 
     @cached_property
     def label(self) -> Ints:
@@ -145,6 +149,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
         horizon_error_rad=bias_rad, clock=_clock(whole), blocked=blocked if blocked else None,
         integrity=integrity, unstated=_unstated_facts(whole), raised_rad=best.model.rise_rad(parameters),
         at_time_m=parameters[:2], shown=_shown_errors(best),
+        light_doubt=float(whole.share[whole.is_gross(OWN_EDGE)].sum()),
         samples=_restart_points(whole, explored, dropped_probability),
     )  # fmt: skip
 

@@ -15,14 +15,19 @@ from startrack.localization.profile_cells import LOW_RAD, Profiles
 FREE_HEIGHTS, SPREAD = 121, 6.5  # of heights about the map's skyline, closer about it
 ROUGHNESS_RAD = np.radians([0.003, 0.01, 0.03, 0.1])  # mean steps from sector to sector, equally likely
 JUMP = 1e-4  # probability of a step to anywhere
-HEIGHTS_RAD = -LOW_RAD * np.sinh(SPREAD * np.linspace(-1, 1, FREE_HEIGHTS)) / np.sinh(SPREAD)
-CELLS_RAD = np.gradient(HEIGHTS_RAD)
+HEIGHTS = np.sinh(SPREAD * np.linspace(-1, 1, FREE_HEIGHTS)) / np.sinh(SPREAD)  # in the farthest one
 
 
-def free_log_likelihood(profiles: Profiles, shift: Array) -> float:
-    """Log-likelihood of the rows if the skyline is the map's, higher by `shift` (SECTORS,), and any smooth curve."""
-    likelihood = _emissions(profiles, shift, HEIGHTS_RAD)
-    logs = [_pass(likelihood, HEIGHTS_RAD, CELLS_RAD, rough) for rough in ROUGHNESS_RAD]
+def free_log_likelihood(
+    profiles: Profiles, shift: Array, reach_rad: float = -LOW_RAD, roughness_rad: Array = ROUGHNESS_RAD
+) -> float:
+    """Log-likelihood of the rows if the skyline is the map's, higher by `shift` (SECTORS,), and any smooth curve.
+
+    The curve is within `reach_rad` of zero, and as rough as one of `roughness_rad` (n,).
+    """
+    heights = reach_rad * HEIGHTS
+    likelihood, cells = _emissions(profiles, shift, heights), np.gradient(heights)
+    logs = [_pass(likelihood, heights, cells, rough) for rough in roughness_rad]
     return float(np.logaddexp.reduce(logs)) - log(len(logs))
 
 

@@ -18,6 +18,7 @@ from startrack.localization.importance_sampling import (
     moments,
     temper_weights,
 )
+from startrack.localization.own_edge import with_own_edge
 from startrack.localization.places import FIT_M, choose_apart
 from startrack.localization.search import NATS
 from startrack.localization.shared_errors import SharedErrors
@@ -55,6 +56,7 @@ def sample_posterior(explored: Explored, rows: Evidence, terrain: Terrain) -> li
         found.append(plain)
         if plain.found.log_evidence >= best - NATS:
             found.extend(sample_gross_errors(plain, references_m))
+            found.extend(_sample_own_edge(plain, start.model.around.half_m, explored, references_m))
     if not found:
         raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
     best = max(one.found.log_evidence for one in found)
@@ -84,6 +86,15 @@ def _begin_group(
             break
         at_m = start.best_m
     return start
+
+
+def _sample_own_edge(plain: Hypothesis, half_m: float, explored: Explored, references_m: Array) -> list[Hypothesis]:
+    """The hypothesis that the sky's light has an edge of its own, within `half_m` of the plain one's reference."""
+    model = with_own_edge(plain, half_m)
+    start = None if model is None else Start.among_boxes(model, explored.centres_m, explored.half_m)
+    if start is None:
+        return []
+    return [sample_hypothesis(start.model, references_m, start.modes, first=[start.boxes], enough=FEW)]
 
 
 def _group_boxes(explored: Explored, reach_m: float) -> list[tuple[Array, float]]:

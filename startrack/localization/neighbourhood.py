@@ -122,6 +122,7 @@ class SectorRows:
     rows: Evidence
     image_errors: ImageErrors = NO_IMAGE_ERRORS
     is_rough: bool = False  # rows are compared with samples of the skyline alone
+    apart_nats: float = 0.0  # log-likelihood of further rows of the image, which the skyline does not explain
 
     @cached_property
     def above_rad(self) -> Array:
@@ -147,7 +148,7 @@ class SectorRows:
     @cached_property
     def log_offset(self) -> float:
         """What makes log-likelihoods of different references and times comparable: they see other windows of rows."""
-        return float(self.profiles.offset.sum())
+        return float(self.profiles.offset.sum()) + self.apart_nats
 
     @cached_property
     def image_rise(self) -> Array:

@@ -21,6 +21,8 @@ LEAST_SIZE = 1e-3  # of a crater, in the stated one: a normal error reaches beyo
 SCALE_STEP = 1e-3  # of a crater's size, at which the skyline's change with it is taken
 TURN_STEP_RAD = 2e-3  # of the sky, at which the skyline's change with the time is taken: its crests are no narrower
 CLOCK_FACT = "time_sigma_s"
+OWN_EDGE = "sky_edge"  # no fact: the edge of the sky's light is not the skyline
+OWN_EDGE_PROBABILITY = 0.01
 RESIDUAL_PART = 1e-3  # of a gross error: the sigma of an error that is zero unless it is gross
 NEGLIGIBLE_M = 0.05  # by which an error of the clock moves a row over the search area, without an effect on the fix
 LEAST_INFORMATION = 0.03  # beside that of the prior, from which on a direction is sampled: a sigma smaller by 1.5 %
@@ -89,7 +91,8 @@ class SharedErrors:
     def log_probability(self, gross: str = "") -> float:
         """Logarithm of the prior probability that the fact `gross` alone has a gross error; "": that none has."""
         each = {one.fact: one.gross_probability for one in self.listed}
-        return float(sum(np.log(p if fact == gross else 1.0 - p) for fact, p in each.items()))
+        own_edge = np.log(OWN_EDGE_PROBABILITY) if gross == OWN_EDGE else 0.0
+        return float(sum(np.log(p if fact == gross else 1.0 - p) for fact, p in each.items()) + own_edge)
 
     def slopes_rad(self, terrain: Terrain, position_m: Array, azimuth_rad: Array, horizon_rad: Array) -> Array:
         """Rise (k, n) of the skyline `horizon_rad` (n,) at `azimuth_rad` (n,) by one unit of each error.

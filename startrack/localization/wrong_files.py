@@ -39,8 +39,9 @@ def require_files(found: Sequence[Hypothesis], parameters: Array) -> None:
         found: the hypotheses, the heaviest first.
         parameters: (2 + a,) of the likeliest position and errors.
     """
-    model = found[0].model
-    better = free_log_likelihood(model.seen.profiles, model.shift_of(parameters)) - _log_map(found[0], parameters)
+    model, whole = found[0].model, _plain(found).model
+    free = free_log_likelihood(whole.seen.profiles, model.shift_of(parameters)) + whole.seen.log_offset
+    better = free - _log_map(found[0], parameters) - model.seen.log_offset
     if better > 0.0:
         wrong = Blocked(1.0 - model.states(parameters)[:, 0])
         where = f", most at azimuths {wrong.text}" if wrong else ""
@@ -55,6 +56,16 @@ def require_files(found: Sequence[Hypothesis], parameters: Array) -> None:
             f"an error beyond what {fact} states explains the image better, by {better:.0f} nats: is it right?",
             reason="inconsistent_evidence",
         )
+
+
+def _near(found: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The hypotheses about the reference of the first one."""
+    return [one for one in found if one.model.around.reference_m is found[0].model.around.reference_m]
+
+
+def _plain(found: Sequence[Hypothesis]) -> Hypothesis:
+    """The one of them without a gross error."""
+    return min(_near(found), key=lambda one: one.gross != "")
 
 
 def _log_map(best: Hypothesis, parameters: Array) -> float:
@@ -74,8 +85,7 @@ def weigh_wrong_facts(found: Sequence[Hypothesis]) -> Iterator[tuple[str, float]
     Both are integrals over position and errors. Facts that are certainly right are left out.
     """
     best = found[0].model
-    near = [one for one in found if one.model.around is best.around]
-    plain = min(near, key=lambda one: one.gross != "")
+    near, plain = _near(found), _plain(found)
     by_files = _log_evidence(near)
     for fact in SharedErrors.doubtable(best.terrain, best.seen.rows.clock):
         other = plain.model.with_gross(fact)

@@ -1,0 +1,85 @@
+"""Lit ground below the crest: the sky's light then has an edge of its own, and the stars tell the position."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from render_helpers import CRATER
+from sky_helpers import PX_PER_RAD
+from test_localization_refinement import PLACE, sky_rows, star_rows
+from test_skyline import CAMERA, PLACES_M, Frame, expose, locate
+from test_skyline import CRATER as RENDERED
+
+from startrack.catalog import load_catalog
+from startrack.core.types import MIDDLES_RAD, Array, Bools, Evidence, Fix
+from startrack.evidence.sky_light import LEVELS
+from startrack.evidence.skyline import Skyline, look_through, scale_across, skyline_band
+from startrack.frames import azel_from_rays
+from startrack.localization import ExactPosterior
+
+NATS = 4.0  # of a cell of the light: a sky of 7 %
+STARS = 1500  # within 1.1 degrees of the skyline
+TRUE = PLACE + np.array([1.0, -2.0])
+STRIP_PX, STRIP_RAD = 1.6, np.radians(99.0)  # how high and how long the lit strip is
+
+
+def in_strip(azimuth_rad: Array, middle_rad: float) -> Bools:
+    """(n,) whether azimuths (n,) are in the lit strip."""
+    off = (azimuth_rad - middle_rad + np.pi) % (2 * np.pi) - np.pi
+    return np.asarray(np.abs(off) < STRIP_RAD / 2)
+
+
+def fix_with(lower_rad: Array | float, seed: int, with_stars: bool = True) -> Fix:
+    """The fix from stars and an edge of the sky's light that is seen too low by (SECTORS * LEVELS,)."""
+    rng = np.random.default_rng([19, seed])
+    light, stars = sky_rows(TRUE, rng, NATS), star_rows(TRUE, rng, STARS)
+    light = replace(light, elevation_rad=light.elevation_rad - lower_rad)
+    support = ExactPosterior()(replace(stars, is_first_look=True), CRATER).samples
+    rows = Evidence.concatenate(light, stars) if with_stars else light
+    return ExactPosterior()(replace(rows, support=support), CRATER)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_lit_strip_below_the_crest_leaves_the_position_to_the_stars(seed: int) -> None:
+    lower_px = np.where(in_strip(MIDDLES_RAD, 1.2 + 1.9 * seed), STRIP_PX, 0.0)
+    fix = fix_with(np.repeat(lower_px / PX_PER_RAD, LEVELS), seed)
+    assert fix.light_doubt > 0.9
+    assert np.linalg.norm(fix.position_enu_m[:2] - TRUE) < fix.radius999_m
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_light_that_ends_at_the_skyline_is_not_doubted(seed: int) -> None:
+    fix = fix_with(0.0, seed)
+    assert fix.light_doubt < 1e-3
+    assert np.linalg.norm(fix.position_enu_m[:2] - TRUE) < fix.radius999_m
+
+
+def test_light_alone_has_no_other_edge_than_the_skyline() -> None:
+    assert fix_with(0.0, 0, with_stars=False).light_doubt == 0.0
+
+
+def light_strip(frame: Frame, light_e: float) -> Frame:
+    """The frame with a strip of ground lit below the crest."""
+    truth, shape = frame.truth, frame.exposure.pixels_adu.shape
+    crest = Skyline.trace(truth.position_enu_m[:2], RENDERED)
+    band = skyline_band(shape, CAMERA, truth.R_cam_enu, crest, 12.0)
+    pixel, rays_cam = look_through(band, CAMERA)
+    azimuth, elevation = azel_from_rays(rays_cam @ truth.R_cam_enu)
+    height = (elevation - crest(azimuth)) * scale_across(CAMERA, truth.R_cam_enu, crest)(azimuth)
+    strip = np.zeros(shape)
+    strip.ravel()[pixel] = np.clip(0.5 - height, 0, 1) * np.clip(height + STRIP_PX + 0.5, 0, 1) * in_strip(azimuth, 2.0)
+    assert CAMERA.sensor is not None
+    adu = light_e * cv2.GaussianBlur(strip, (0, 0), CAMERA.sensor.psf_sigma_px) / CAMERA.sensor.gain_e_per_adu
+    return replace(frame, exposure=replace(frame.exposure, pixels_adu=(frame.exposure.pixels_adu + adu).astype("f4")))
+
+
+def test_an_image_of_a_lit_strip_is_located_by_its_stars() -> None:
+    catalog = load_catalog().brighter_than(7.0)
+    lit = light_strip(expose(catalog, PLACES_M["halfway"], 21.0), 12.0)
+    found = locate(lit, catalog)
+    assert (found.status, found.evidence_source) == ("ok", "stars")
+    assert "its edge is not the skyline" in found.sky_unused
+    assert lit.error_m(found) < found.fix.radius999_m

@@ -46,19 +46,19 @@ def fix_with(lower_rad: Array | float, seed: int, with_stars: bool = True) -> Fi
 def test_a_lit_strip_below_the_crest_leaves_the_position_to_the_stars(seed: int) -> None:
     lower_px = np.where(in_strip(MIDDLES_RAD, 1.2 + 1.9 * seed), STRIP_PX, 0.0)
     fix = fix_with(np.repeat(lower_px / PX_PER_RAD, LEVELS), seed)
-    assert fix.light_doubt > 0.9
+    assert fix.own_edge_probability > 0.9
     assert np.linalg.norm(fix.position_enu_m[:2] - TRUE) < fix.radius999_m
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_light_that_ends_at_the_skyline_is_not_doubted(seed: int) -> None:
     fix = fix_with(0.0, seed)
-    assert fix.light_doubt < 1e-3
+    assert fix.own_edge_probability < 1e-3
     assert np.linalg.norm(fix.position_enu_m[:2] - TRUE) < fix.radius999_m
 
 
 def test_light_alone_has_no_other_edge_than_the_skyline() -> None:
-    assert fix_with(0.0, 0, with_stars=False).light_doubt == 0.0
+    assert fix_with(0.0, 0, with_stars=False).own_edge_probability == 0.0
 
 
 def light_strip(frame: Frame, light_e: float) -> Frame:

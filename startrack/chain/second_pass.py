@@ -92,7 +92,7 @@ def fix_by_all(complete: Located, localizer: Localizer) -> Located:
         rows = replace(Evidence.concatenate(rows, light) if complete.by_stars else light, image_errors=sky.errors)
     located, fix = fix_again(complete, complete.fix, localizer, rows)
     located = replace(located, fix=fix)
-    if fix.light_doubt > MOST_DOUBT:
+    if fix.own_edge_probability > MOST_DOUBT:
         return replace(located, sky=None, sky_unused="its edge is not the skyline that the stars show: lit ground?")
     if sky is not None and not fix.ambiguous:
         _require_near(located, sky)

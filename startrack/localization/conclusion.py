@@ -149,7 +149,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
         horizon_error_rad=bias_rad, clock=_clock(whole), blocked=blocked if blocked else None,
         integrity=integrity, unstated=_unstated_facts(whole), raised_rad=best.model.rise_rad(parameters),
         at_time_m=parameters[:2], shown=_shown_errors(best),
-        light_doubt=float(whole.share[whole.is_gross(OWN_EDGE)].sum()),
+        own_edge_probability=float(whole.share[whole.is_gross(OWN_EDGE)].sum()),
         samples=_restart_points(whole, explored, dropped_probability),
     )  # fmt: skip
 

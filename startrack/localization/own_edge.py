@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from startrack.core.types import Array
 from startrack.localization.free_skyline import free_log_likelihood
 from startrack.localization.hypothesis import Hypothesis
 from startrack.localization.neighbourhood import SectorRows
@@ -26,13 +27,21 @@ def with_own_edge(plain: Hypothesis, half_m: float) -> SkylineModel | None:
     It serves positions within `half_m` of the same reference.
     """
     model, rows = plain.model, plain.model.seen.rows
-    is_light = rows.extended_nats * np.ones(len(rows)) > 0.0
+    is_light = rows.extended_nats > 0.0
     if is_light.all() or not is_light.any():
         return None
     light = SectorRows(model.around, rows.take(np.flatnonzero(is_light)))
-    width_rad = float(np.median(light.rows.edge_sigma_rad))
-    shift = model.shift_of(plain.found.share @ plain.found.points)
-    nats = free_log_likelihood(light.profiles, shift, EDGE_REACH * width_rad, EDGE_ROUGHNESS * width_rad)
+    nats = edge_log_likelihood(light, model.shift_of(plain.found.share @ plain.found.points))
     stars = rows.take(np.flatnonzero(~is_light))
     apart = SkylineModel.of(model.terrain, stars, model.around.reference_m, half_m, model.errors)
     return replace(apart, gross=OWN_EDGE, seen=replace(apart.seen, apart_nats=nats + light.log_offset))
+
+
+def edge_log_likelihood(seen: SectorRows, shift: Array) -> float:
+    """Log-likelihood of rows with light, stars alike, if all have any edge as smooth as the light's own.
+
+    It is near the skyline that stands higher than the reference's by `shift` (SECTORS,).
+    """
+    rows = seen.rows
+    width_rad = float(np.median(rows.edge_sigma_rad[rows.extended_nats > 0.0]))
+    return free_log_likelihood(seen.profiles, shift, EDGE_REACH * width_rad, EDGE_ROUGHNESS * width_rad)

@@ -9,7 +9,8 @@ import numpy as np
 from startrack.core.types import Array, Blocked, NotLocated
 from startrack.localization.free_skyline import free_log_likelihood
 from startrack.localization.hypothesis import GROSS_ROUNDS, Hypothesis, clock_of_other_times, sample_gross_error
-from startrack.localization.shared_errors import SharedErrors
+from startrack.localization.own_edge import edge_log_likelihood
+from startrack.localization.shared_errors import OWN_EDGE, SharedErrors
 from startrack.localization.skyline_model import SkylineModel
 
 WRONG_FACT_NATS = 3.0  # by which a gross error of a stated fact must explain the rows better: 1 of 100 clean skies
@@ -40,8 +41,11 @@ def require_files(found: Sequence[Hypothesis], parameters: Array) -> None:
         parameters: (2 + a,) of the likeliest position and errors.
     """
     model, whole = found[0].model, _plain(found).model
-    free = free_log_likelihood(whole.seen.profiles, model.shift_of(parameters)) + whole.seen.log_offset
-    better = free - _log_map(found[0], parameters) - model.seen.log_offset
+    shift = model.shift_of(parameters)
+    free = free_log_likelihood(whole.seen.profiles, shift)
+    if model.gross == OWN_EDGE:  # which the stars must not have too
+        free = max(free, edge_log_likelihood(whole.seen, shift))
+    better = free + whole.seen.log_offset - _log_map(found[0], parameters) - model.seen.log_offset
     if better > 0.0:
         wrong = Blocked(1.0 - model.states(parameters)[:, 0])
         where = f", most at azimuths {wrong.text}" if wrong else ""

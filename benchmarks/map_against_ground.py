@@ -56,7 +56,7 @@ def main() -> None:
     for name in ("render", "locate"):
         stage = stages.add_parser(name)
         stage.add_argument("frames", type=Path)
-        stage.add_argument("--cases", nargs="*", default=[], help="names; all without")
+        stage.add_argument("--cases", nargs="*", default=[], choices=("reference", *cases_of(None)), help="all without")
         stage.add_argument("--max", type=int, default=10**6, help="frames of each case: numbers below this")
         stage.add_argument("--minutes", type=float, default=np.inf, help="after which no further frames are begun")
         if name == "locate":

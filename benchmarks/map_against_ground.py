@@ -78,7 +78,7 @@ def run_render(args: argparse.Namespace) -> None:
         print("case reference is left out: it needs --reference")
     jobs = [
         (name, number, str(args.frames.resolve()), args.reference)
-        for name in args.cases or cases for number in range(min(cases[name].frames, args.max))
+        for name in cases if name in (args.cases or cases) for number in range(min(cases[name].frames, args.max))
         if not truth_path(args.frames, name, number).exists()
     ]  # fmt: skip
     for (name, number, *_), seconds in measured(jobs, render_frame, 1, args.minutes):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -225,13 +225,26 @@ def _unstated_facts(whole: Posterior) -> tuple[UnstatedFact, ...]:
 
 
 def _positions_without_fact(one: Hypothesis, fact: str) -> Array:
-    """Positions (n, 2) of a hypothesis's points with the errors of a fact taken out, by linear regression."""
+    """Positions (n, 2) of a hypothesis's points with the errors of a fact taken out, by linear regression.
+
+    Waves, which the points do not hold, widen them as in the linear model.
+    """
+    if one.model.errors.are_waves(fact):
+        return _positions_without_waves(one)
     own = one.model.errors.is_of_fact(fact)
     _, covariance = moments(np.hstack([one.unturned_m, one.values[:, own]]), shares(one.log_weight))
     drift = np.linalg.pinv(covariance[2:, 2:], hermitian=True) @ covariance[2:, :2]
     values = one.values.copy()
     values[:, own] = 0.0
     return one.model.errors.true_positions(one.unturned_m - one.values[:, own] @ drift, values)
+
+
+def _positions_without_waves(one: Hypothesis) -> Array:
+    """Positions (n, 2) of a hypothesis's points about their mean, narrower as in the linear model without waves."""
+    exact = replace(one.model, errors=replace(one.model.errors, waves=()))
+    wide, narrow = (np.linalg.cholesky(model.solve()[1][:2, :2]) for model in (one.model, exact))
+    mean = shares(one.log_weight) @ one.positions_m
+    return np.asarray(mean + (one.positions_m - mean) @ np.linalg.solve(wide.T, narrow.T))
 
 
 def _shown_errors(best: Hypothesis) -> tuple[ShownError, ...]:

@@ -116,7 +116,7 @@ def sample_gross_errors(plain: Hypothesis, references_m: Array) -> list[Hypothes
     model, found = plain.model, []
     for gross in model.errors.facts:
         other, slopes = model.with_gross(gross), model.error_slopes_rad[model.errors.is_of_fact(gross)]
-        if not slopes.any():  # nothing shows it: the points are the same
+        if not slopes.any() and not model.errors.are_waves(gross):  # nothing shows it: the points are the same
             less = other.basis.log_probability - model.basis.log_probability
             found.append(Hypothesis(other, replace(plain.found, log_weight=plain.found.log_weight + less)))
         else:
@@ -186,7 +186,7 @@ def _gross_modes(plain: Hypothesis, other: SkylineModel) -> list[Gaussian]:
     before, after = (other.errors.sigma(gross)[own] ** -2.0 for gross in ("", other.gross))
     follow = linear @ picked.T
     drawn_out = follow @ np.linalg.pinv(picked @ follow) @ follow.T
-    spread = WIDER * same + drawn_out + LINEAR_PART * linear
+    spread = WIDER * same + drawn_out + (1.0 if other.errors.are_waves(other.gross) else LINEAR_PART) * linear
     moved = follow @ ((before - after) * (picked @ mean))
     is_far = moved @ np.linalg.solve(spread, moved) > 1.0
     return [(mean, spread), *([(mean + moved, spread)] if is_far else [])]

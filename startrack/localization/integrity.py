@@ -80,7 +80,7 @@ def _grid(model: SkylineModel, middle_m: Array, covariance_m2: Array, reach: flo
 def _sector_logs(model: SkylineModel, parameters: Array, offsets: Array, clear: Array) -> tuple[Array, Array]:
     """Log-likelihoods (n, SECTORS) of the sectors at offsets (n, 2), and logarithms (n,) of the errors' densities."""
     moved = model.with_likely_errors(parameters[:2] + offsets, clear)
-    shifts, prior = model.with_image_errors(model.shifts(moved))
+    shifts, prior = model.with_linear_errors(model.shifts(moved))
     return clear_logs(model.seen.profiles, shifts, clear), prior + model.basis.log_prior(moved[:, 2:])
 
 

@@ -1,5 +1,7 @@
 """Errors that raise the skyline at all azimuths together, of terrain and clock, and the directions that rows show.
 
+Waves of the horizon's error over azimuth are linear at any size: they are integrated in closed form, see `linear_errors`.
+
 In standard deviations of their prior, the errors have information by the rows once the position is free. Along a
 direction with next to none the errors keep their prior, and the position moves by what leaves the skyline as it is:
 a turn or a larger size of a round crater, a tilt of its rim seen from the middle. These are integrated in closed form.
@@ -7,6 +9,7 @@ a turn or a larger size of a round crater, a tilt of its rim seen from the middl
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -38,6 +41,7 @@ class SharedErrors:
 
     listed: tuple[ShapeError, ...]
     clock: Clock | None = None  # the last of the errors, where it is not None
+    waves: tuple[ShapeError, ...] = ()  # (w,) beside the others
     axisymmetric: bool = False
 
     @classmethod
@@ -48,9 +52,10 @@ class SharedErrors:
         """
         known = _known_errors(terrain, clock)
         known = [replace(one, gross_probability=1.0) if one.fact == doubted else one for one in known]
-        listed = tuple(one for one in known if one.sigma > 0.0 or one.gross_probability > 0.0 or one.mean != 0.0)
+        other = [one for one in known if one.sigma > 0.0 or one.gross_probability > 0.0 or one.mean != 0.0]
+        listed, waves = (tuple(one for one in other if bool(one.wave) == is_wave) for is_wave in (False, True))
         has_clock = any(one.fact == CLOCK_FACT for one in listed)
-        return cls(listed, clock if has_clock else None, terrain.axisymmetric)
+        return cls(listed, clock if has_clock else None, waves, terrain.axisymmetric)
 
     @staticmethod
     def doubtable(terrain: Terrain, clock: Clock | None) -> tuple[str, ...]:
@@ -64,17 +69,25 @@ class SharedErrors:
     @cached_property
     def facts(self) -> tuple[str, ...]:
         """Facts with a gross part, which no file states."""
-        return tuple(dict.fromkeys(error.fact for error in self.listed if error.gross_probability > 0.0))
+        return tuple(
+            dict.fromkeys(error.fact for error in (*self.listed, *self.waves) if error.gross_probability > 0.0)
+        )
 
     def is_of_fact(self, fact: str) -> Bools:
         """(k,) which errors are those of a fact."""
         return np.array([one.fact == fact for one in self.listed], dtype=bool)
 
+    def are_waves(self, fact: str) -> bool:
+        """Whether the errors of a fact are the waves."""
+        return any(one.fact == fact for one in self.waves)
+
     def sigma(self, gross: str = "") -> Array:
         """Standard deviations (k,); those of the fact `gross` as of a gross error."""
-        wide = np.array([one.gross_sigma for one in self.listed])
-        least = np.maximum([one.sigma for one in self.listed], RESIDUAL_PART * wide)
-        return np.where(self.is_of_fact(gross), wide, least)
+        return _sigma(self.listed, gross)
+
+    def waves_sigma_rad(self, gross: str = "") -> Array:
+        """Standard deviations (w,) of the waves; those of the fact `gross` as of a gross error."""
+        return _sigma(self.waves, gross)
 
     @property
     def later_s(self) -> float:
@@ -90,7 +103,7 @@ class SharedErrors:
 
     def log_probability(self, gross: str = "") -> float:
         """Logarithm of the prior probability that the fact `gross` alone has a gross error; "": that none has."""
-        each = {one.fact: one.gross_probability for one in self.listed}
+        each = {one.fact: one.gross_probability for one in (*self.listed, *self.waves)}
         own_edge = np.log(OWN_EDGE_PROBABILITY) if gross == OWN_EDGE else 0.0
         return float(sum(np.log(p if fact == gross else 1.0 - p) for fact, p in each.items()) + own_edge)
 
@@ -133,6 +146,13 @@ class SharedErrors:
         angle = self.clock.turn_rad_s[2] * values[:, -1]
         c, s = np.cos(angle), np.sin(angle)
         return np.stack([c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]], axis=1)
+
+
+def _sigma(errors: Sequence[ShapeError], gross: str) -> Array:
+    """Standard deviations (k,) of `errors`; those of the fact `gross` as of a gross error."""
+    wide = np.array([one.gross_sigma for one in errors])
+    least = np.maximum([one.sigma for one in errors], RESIDUAL_PART * wide)
+    return np.where([one.fact == gross for one in errors], wide, least)
 
 
 def _known_errors(terrain: Terrain, clock: Clock | None) -> list[ShapeError]:

@@ -1,9 +1,9 @@
 """The likelihood of a position and of errors that all azimuths share, near a reference position, obstacles included.
 
 The skyline in sector s stands d_s higher than the map's at the reference: by the position, exactly; by each shared
-error, to first order. Errors of the image (lens and attitude, which raise the light of the sky but not the stars) are
-integrated in closed form: at each position and shared errors their normal distribution about the best values is that
-of a linear model of the sectors, and the likelihood is taken at those values.
+error, to first order. Errors of the image (lens and attitude, which raise the light of the sky but not the stars) and
+waves of the map's error are integrated in closed form: at each position and shared errors their normal distribution
+about the best values is that of a linear model of the sectors, and the likelihood is taken at those values.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 
 from startrack.core.types import SECTORS, Array, Evidence, ImageErrors, Ints
 from startrack.localization.chain_states import closing_of, state_probabilities
+from startrack.localization.linear_errors import LinearErrors
 from startrack.localization.neighbourhood import NO_IMAGE_ERRORS, Neighbourhood, SectorRows
 from startrack.localization.obstacle_chain import (
     MOVES,
@@ -58,7 +59,7 @@ class SkylineModel:
     error_slopes_rad: Array  # (k, SECTORS) rise of the skyline by one unit of each shared error
     gross: str = ""  # fact that has a gross error
     stated_basis: ErrorBasis | None = None  # None: of the directions that the rows show
-    clear: Array = field(default_factory=lambda: np.ones(SECTORS))  # (SECTORS,) weight for the errors of the image
+    clear: Array = field(default_factory=lambda: np.ones(SECTORS))  # (SECTORS,) weight for the linear errors
     closing: Closing | None = None  # None: as at the reference
     levels: PreparedLevels = field(default_factory=PreparedLevels)
 
@@ -134,20 +135,22 @@ class SkylineModel:
         return np.asarray(self.basis.mean @ self.error_slopes_rad + self.around.expected_rise_rad)
 
     def rise_rad(self, parameters: Array) -> Array | None:
-        """Rise (SECTORS,) of the skyline above the map's by the shared errors of parameters (2 + a,); None of none.
+        """Rise (SECTORS,) of the skyline above the map's by the errors of the ground at parameters (2 + a,); None of none.
 
         On real ground without that of the clock: the sky is turned to the time that it shows.
         """
-        if not len(self.errors):
+        if not len(self.errors) and not self.errors.waves:
             return None
         values = self.basis.mean + self.basis.shown @ parameters[2:]
         if self.errors.clock is not None and not self.terrain.axisymmetric:
             values[-1] = 0.0
-        return np.asarray(values @ self.error_slopes_rad + self.around.expected_rise_rad)
+        left_rad = self.seen.moments.mean_rad - self.shifts(parameters[None])[0] - self.linear.expected_rad
+        by_waves = self.linear.waves_rad(left_rad)
+        return np.asarray(values @ self.error_slopes_rad + by_waves + self.around.expected_rise_rad)
 
     def log_likelihood(self, parameters: Array) -> Array:
         """(n,) of parameters (n, 2 + a): position [m], and coordinates of the shared errors; see `basis`."""
-        shifts, prior = self.with_image_errors(self.shifts(parameters))
+        shifts, prior = self.with_linear_errors(self.shifts(parameters))
         return self.log_likelihood_of(shifts) + prior
 
     def log_likelihood_of(self, shifts: Array) -> Array:
@@ -165,40 +168,38 @@ class SkylineModel:
 
     def shift_of(self, parameters: Array) -> Array:
         """(SECTORS,) by how much the skyline of the map at parameters (2 + a,) stands higher than at the reference."""
-        return np.asarray(self.with_image_errors(self.shifts(parameters[None]))[0][0])
+        return np.asarray(self.with_linear_errors(self.shifts(parameters[None]))[0][0])
 
     def states(self, parameters: Array) -> Array:
         """Probabilities (SECTORS, STATES) of the chain's states at parameters (2 + a,)."""
         return np.asarray(state_probabilities(self.seen.profiles, self.shift_of(parameters)))
 
-    def with_image_errors(self, shifts: Array) -> tuple[Array, Array | float]:
-        """The `shifts` (n, SECTORS) with the likeliest errors of the image, and the logarithm (n,) of their density."""
-        image, rise = self.seen.image_errors, self.seen.image_rise
-        if not len(image.mean):
-            return np.ascontiguousarray(shifts), 0.0
-        expected = rise @ image.mean
-        errors = (self.seen.moments.mean_rad - shifts - expected) @ self._image_gain.T
-        prior = -0.5 * np.einsum("ni,ij,nj->n", errors, np.linalg.inv(image.covariance), errors)
-        return np.ascontiguousarray(shifts + expected + errors @ rise.T), prior
-
     @cached_property
-    def _image_gain(self) -> Array:
-        """(j, SECTORS) from heights that are left to the likeliest errors of the image."""
-        rise = self.seen.image_rise
-        weighted = (rise * (self.clear / self.seen.moments.variance_rad2)[:, None]).T
-        normal = weighted @ rise + np.linalg.inv(self.seen.image_errors.covariance)
-        return np.asarray(np.linalg.solve(normal, weighted))
+    def linear(self) -> LinearErrors:
+        """The errors that are integrated in closed form."""
+        return LinearErrors.of(self.seen, self.errors, self.gross, self.clear)
+
+    def with_linear_errors(self, shifts: Array) -> tuple[Array, Array]:
+        """The `shifts` (n, SECTORS) with the likeliest linear errors, and the logarithm (n,) of the integral over these.
+
+        It is that of the integral in the likelihood at the shifts.
+        """
+        linear = self.linear
+        if not len(linear):
+            return np.ascontiguousarray(shifts), np.zeros(len(shifts))
+        errors, integral = linear.fit(self.seen.moments.mean_rad - shifts - linear.expected_rad)
+        return np.ascontiguousarray(shifts + linear.expected_rad + errors @ linear.rise_rad.T), integral
 
     def solve(self) -> tuple[Array, Array, Array]:
         """Parameters (2 + a,) by the linear model of the sectors, their covariance, and weights (SECTORS,)."""
-        image, k = self.seen.image_errors, 2 + len(self.basis)
-        design = np.vstack([self.around.slopes, self.slopes_rad, self.seen.image_rise.T]).T
+        linear, k = self.linear, 2 + len(self.basis)
+        design = np.vstack([self.around.slopes, self.slopes_rad, linear.rise_rad.T]).T
         prior = np.zeros((design.shape[1], design.shape[1]))
         prior[:k, :k] = np.diag(np.r_[np.full(2, self.terrain.reach_m**-2.0), np.ones(k - 2)])
-        prior[k:, k:] = np.linalg.inv(image.covariance)
+        prior[k:, k:] = linear.inverse
         moments = self.seen.moments
         left = moments._replace(mean_rad=moments.mean_rad - self._expected_rise)
-        found = solve_linear(left, design, np.r_[np.zeros(k), image.mean], prior)
+        found = solve_linear(left, design, np.r_[np.zeros(k), linear.mean], prior)
         parameters, covariance, weight = found
         return np.r_[parameters[:2] + self.around.reference_m, parameters[2:k]], covariance[:k, :k], weight
 

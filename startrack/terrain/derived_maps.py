@@ -14,6 +14,7 @@ from startrack.frames import R_from_rotvec
 from startrack.terrain.horizon_kernel import interpolate
 from startrack.terrain.protocol import ForwardingTerrain, Terrain
 from startrack.terrain.rays import rows_of_rays
+from startrack.terrain.shape import wave_slopes_rad
 from startrack.terrain.table_cache import TABLES_IN_MEMORY
 from startrack.terrain.traced_map import TracedMap
 
@@ -27,7 +28,7 @@ class DeformedMap(ForwardingTerrain):
     """The ground of a height map with errors of its shape, given by the names of `shape_errors`.
 
     In this order: the camera stands higher, sight lines bend more, tan of the horizon is stretched, the horizon rises
-    by the bias, and the skyline is turned about a horizontal axis. It has no further errors of its shape. Its bounds
+    by the bias and the waves, and the skyline is turned about a horizontal axis. It has no further errors of its shape. Its bounds
     need the table of a map with the camera at the changed height and such lines; the horizon does without.
     """
 
@@ -38,10 +39,13 @@ class DeformedMap(ForwardingTerrain):
     def __init__(
         self, whole: TracedMap, *, bias_rad: float = 0.0, stretch_1: float = 0.0, vertical_east_rad: float = 0.0,
         vertical_north_rad: float = 0.0, camera_height_m: float = 0.0, terrestrial_refraction_1: float = 0.0,
+        **waves_rad: float,
     ) -> None:  # fmt: skip
         super().__init__(whole)
         self._raised_m, self._refraction_1 = camera_height_m, terrestrial_refraction_1
         self._bias_rad, self._stretch_1 = bias_rad, stretch_1
+        self._waves_rad = {name: value for name, value in waves_rad.items() if value}
+        self._most_wave_rad = float(np.abs(list(self._waves_rad.values())).sum())
         self._tilt_rad = float(np.hypot(vertical_east_rad, vertical_north_rad))
         self._R_turned_map = R_from_rotvec([vertical_north_rad, -vertical_east_rad, 0.0])
 
@@ -71,9 +75,15 @@ class DeformedMap(ForwardingTerrain):
         """A horizon [rad] of the raised camera, stretched and with the bias."""
         return np.asarray(np.arctan((1.0 + self._stretch_1) * np.tan(horizon_rad)) + self._bias_rad)
 
+    def _before_turn_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """The horizon [rad] with all errors but the turn; see `horizon_rad`."""
+        found = self._level_rad(self._raised.horizon_rad(points_m, azimuths_rad))
+        slopes = wave_slopes_rad(azimuths_rad) if self._waves_rad else {}
+        return np.asarray(found + sum(value * slopes[name] for name, value in self._waves_rad.items()))
+
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation [rad], traced; see `Terrain`."""
-        found = self._level_rad(self._raised.horizon_rad(points_m, azimuths_rad))
+        found = self._before_turn_rad(points_m, azimuths_rad)
         return self._turned_rad(points_m, azimuths_rad, found) if self._tilt_rad else found
 
     def _turned_rad(self, points_m: Array, azimuths_rad: Array, about_rad: Array) -> Array:
@@ -85,7 +95,7 @@ class DeformedMap(ForwardingTerrain):
             if found is not about_rad and np.abs(step).max(initial=0.0) < SETTLED_RAD:
                 break
             own += step
-            found = self._level_rad(self._raised.horizon_rad(points_m, own))
+            found = self._before_turn_rad(points_m, own)
         return self._turn(own, found)[1]
 
     def _turn(self, azimuths_rad: Array, elevations_rad: Array) -> tuple[Array, Array]:
@@ -99,14 +109,14 @@ class DeformedMap(ForwardingTerrain):
         self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
     ) -> tuple[Array, Array]:
         """Bounds [rad] from those of the raised camera's map, over azimuths that hold what the turn brings in."""
-        turn = np.asarray(azimuth_half_rad)
+        turn, around_rad = np.asarray(azimuth_half_rad), self._tilt_rad + self._most_wave_rad
         if self._tilt_rad:
             high = self._level_rad(
                 self._raised.horizon_bounds_rad(centres_m, half_m, azimuths_rad, turn + WIDER_RAD)[1]
             )
-            turn = turn + 1.01 * self._tilt_rad / np.cos(np.minimum(high + self._tilt_rad, np.pi / 2 - 1e-3))
+            turn = turn + 1.01 * self._tilt_rad / np.cos(np.minimum(high + around_rad, np.pi / 2 - 1e-3))
         low, high = self._raised.horizon_bounds_rad(centres_m, half_m, azimuths_rad, turn)
-        return self._level_rad(low) - self._tilt_rad, self._level_rad(high) + self._tilt_rad
+        return self._level_rad(low) - around_rad, self._level_rad(high) + around_rad
 
     def horizon_spread_rad(self, points_m: Array, half_m: float, azimuths_rad: Array) -> tuple[Array, Array]:
         """As of the map, about the horizon of this ground; see `Terrain`."""

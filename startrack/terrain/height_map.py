@@ -35,6 +35,7 @@ class HeightMap(TracedMap):
     horizon_sigma_common_rad: float | None = None  # of an error that all azimuths share; None: see common_sigma_rad
     stretch_sigma_1: float | None = shape.EXACT  # of the factor of tan H, less 1; None: not stated, see `terrain.shape`
     vertical_sigma_rad: float | None = shape.EXACT  # of a tilt of the whole map, of each of two axes
+    waves_sigma_rad: tuple[float, ...] | None = shape.EXACT_WAVES  # of waves 1 to 8 of the horizon's error over azimuth
     camera_height_sigma_m: float | None = shape.EXACT
     terrestrial_refraction_sigma_1: float | None = shape.EXACT
     most_slope_rad: float = np.pi / 2  # a rover does not stand on steeper ground
@@ -64,13 +65,14 @@ class HeightMap(TracedMap):
 
     @cached_property
     def shape_errors(self) -> tuple[shape.ShapeError, ...]:  # type: ignore[override]
-        """Bias, stretch, tilt, height of the camera, refraction. The bias needs the table of horizons.
+        """Bias, stretch, tilt, waves, height of the camera, refraction. The bias needs the table of horizons.
 
         The camera stands as much too high as the ground between four posts is.
         """
         return (
             *shape.BIAS.shape_errors(self.common_sigma_rad), *shape.STRETCH.shape_errors(self.stretch_sigma_1),
             *shape.vertical_fact(self.site.body).shape_errors(self.vertical_sigma_rad),
+            *shape.wave_errors(self.waves_sigma_rad),
             *shape.CAMERA_ERROR.shape_errors(self.camera_height_sigma_m, beside=BETWEEN_POSTS * self.height_sigma_m),
             *shape.REFRACTION.shape_errors(self.terrestrial_refraction_sigma_1), *refraction_errors(self.air),
         )  # fmt: skip
@@ -87,6 +89,7 @@ class HeightMap(TracedMap):
             "bias_rad": np.ones(1), "stretch_1": tan * flat, "vertical_east_rad": np.sin(azimuths_rad),
             "vertical_north_rad": np.cos(azimuths_rad), "camera_height_m": -(1.0 / distance) * flat,
             "terrestrial_refraction_1": distance / (2 * self.ground.radius_m) * flat,
+            **shape.wave_slopes_rad(azimuths_rad),
         }  # fmt: skip
         return shape.select_slopes(
             self.shape_errors, slopes | refraction_slopes_rad(self.air, np.arctan(tan)), np.shape(tan)

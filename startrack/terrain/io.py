@@ -51,6 +51,7 @@ KEYS = Table(
                 "height_sigma_m": replace(shape.AMOUNT, description="of single posts, independent of each other; if "
                                           "absent 0, with a warning"),
                 **{fact.key: fact.limits for fact in (shape.BIAS, shape.STRETCH, shape.VERTICAL)},
+                shape.WAVES.key: shape.WAVES_LIMITS,
                 "scale": Number(low=-1e6, high=1e6, description="metres per unit, in place of what the files state"),
                 "offset_m": Number(low=-shape.MAX_LENGTH_M, high=shape.MAX_LENGTH_M,
                                    description="height of value 0, in place of what the files state"),
@@ -229,6 +230,13 @@ def _radians(degrees: float | None) -> float | None:
     return None if degrees is None else float(np.radians(degrees))
 
 
+def _waves(degrees: float | tuple[float, ...] | None) -> tuple[float, ...] | None:
+    """Sigmas [rad] of waves 1 to 8 of the horizon's error, from what a file states."""
+    if degrees is None:
+        return None
+    return tuple(np.radians(shape.sigmas_of_waves(degrees) if isinstance(degrees, float) else degrees).tolist())
+
+
 def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) -> Terrain:
     from startrack.terrain.height_map import HeightMap
     from startrack.terrain.map_reading import read_map, require_origin
@@ -265,6 +273,7 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
         horizon_sigma_common_rad=_radians(dem.get("horizon_sigma_deg")),
         stretch_sigma_1=dem.get("stretch_sigma_1"),
         vertical_sigma_rad=_radians(dem.get("vertical_sigma_deg")),
+        waves_sigma_rad=_waves(dem.get(shape.WAVES.key)),
         camera_height_sigma_m=rover.get("camera_height_sigma_m"),
         most_slope_rad=float(np.radians(search["max_slope_deg"])),
         glare_rad=tuple((float(np.radians(a)), float(np.radians(b))) for a, b in search.get("glare_deg", ())),

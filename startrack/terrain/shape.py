@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.core.declaration import Number
+from startrack.core.declaration import Either, List, Number
 from startrack.core.types import Array
 
 EXACT = 0.0  # sigma of a ground without the error
@@ -38,6 +38,7 @@ class ShapeError(Prior):
     name: str  # such as "depth_1" (relative), "bias_rad", "camera_height_m"
     fact: str  # the key of the terrain file that states it, such as "depth_sigma_m"
     mean: float = 0.0  # before: not 0 of a ground whose errors are counted from another one than the stated
+    wave: int = 0  # of the horizon's error: how often it rises around the compass; 0: another error
 
     @property
     def is_stated(self) -> bool:
@@ -129,13 +130,55 @@ REFRACTION_1 = (
     0.13  # mean coefficient of terrestrial refraction (Gauss 1826; Bomford, Geodesy: 0.13 by day, more at night)
 )
 EARTH_HIGHEST_M = 8850.0  # the highest ground of the Earth
+# The rest of the horizon's error as a series over azimuth, from north through east. Default and gross part: see
+# docs/terrain.md, and a seam of 20 m over half of a horizon 9 km away, whose first wave is 0.08 degrees.
+WAVE_COUNT = 8
+EXACT_WAVES = (EXACT,) * WAVE_COUNT
+WAVE_FALL = -0.5  # power of the number of the wave with which sigmas fall where one number states them
+WAVES = Fact(
+    key="horizon_waves_sigma_deg",
+    sigma=float(np.radians(0.003)),
+    gross_probability=0.01,
+    gross_sigma=float(np.radians(0.04)),
+    errors=tuple(f"wave_{m}_{part}_rad" for m in range(1, WAVE_COUNT + 1) for part in ("cos", "sin")),
+    meaning="smooth error of the horizon over azimuth: waves 1 to 8, each of the cosine and of the sine [deg]",
+    limits=Number(low=0.0, high=9.99),
+)
+WAVES_LIMITS = Either(
+    kinds=(WAVES.limits, List(each=WAVES.limits, count=WAVE_COUNT)),
+    description="of smooth errors of the horizon over azimuth, the cosine and the sine of waves 1 to 8 each; one number "
+                "is of wave 1, and wave m has it over the root of m; if absent 0.003, and with probability 1 % 0.04",
+)  # fmt: skip
 CYLINDER_FACTS = (DEPTH, DIAMETER, ELLIPSE, RIM_TILT)
-MAP_FACTS = (BIAS, STRETCH, VERTICAL, CAMERA_ERROR)
+MAP_FACTS = (BIAS, STRETCH, VERTICAL, WAVES, CAMERA_ERROR)
 
 
 def vertical_fact(body: str) -> Fact:
     """The fact of a tilt of the whole map, on the Moon or the Earth."""
     return VERTICAL_EARTH if body == "earth" else VERTICAL
+
+
+def sigmas_of_waves(sigma: float) -> tuple[float, ...]:
+    """Those of waves 1 to WAVE_COUNT where one number, of wave 1, states them."""
+    return tuple(sigma * m**WAVE_FALL for m in range(1, WAVE_COUNT + 1))
+
+
+def wave_errors(stated: tuple[float, ...] | None) -> list[ShapeError]:
+    """The errors of WAVES; `stated` holds the sigmas of the waves [rad], None where the file is silent."""
+    sigmas, gross = stated or sigmas_of_waves(WAVES.sigma), sigmas_of_waves(WAVES.gross_sigma)
+    return [
+        ShapeError(
+            name=name, fact=WAVES.key, sigma=sigmas[k // 2], gross_sigma=gross[k // 2], wave=k // 2 + 1,
+            gross_probability=0.0 if stated else WAVES.gross_probability,
+        )
+        for k, name in enumerate(WAVES.errors)
+    ]  # fmt: skip
+
+
+def wave_slopes_rad(azimuths_rad: Array) -> dict[str, Array]:
+    """Rise (...) of the horizon at azimuths (...) by one unit of each of the WAVES, by name."""
+    turns = [m * np.asarray(azimuths_rad) for m in range(1, WAVE_COUNT + 1)]
+    return dict(zip(WAVES.errors, [part(turn) for turn in turns for part in (np.cos, np.sin)], strict=True))
 
 
 def select_slopes(errors: Sequence[ShapeError], slopes_rad: dict[str, Array], shape: Iterable[int]) -> Array:

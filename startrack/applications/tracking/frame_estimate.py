@@ -75,7 +75,7 @@ class FrameModel:
 
     def log_likelihood(self, parameters: Array) -> Array:
         """(n,) of `parameters`."""
-        shifts, prior = self.model.with_image_errors(self.shifts(parameters))
+        shifts, prior = self.model.with_linear_errors(self.shifts(parameters))
         return self.model.log_likelihood_of(shifts) + prior
 
     def is_allowed(self, parameters: Array) -> Array:
@@ -94,7 +94,7 @@ class FrameModel:
         The edge of a single star is a step: the change is taken over a part of the skyline's spread. Sectors count by
         their probability to show the map's skyline.
         """
-        shifts, _ = self.model.with_image_errors(self.shifts(parameters))
+        shifts, _ = self.model.with_linear_errors(self.shifts(parameters))
         spread = np.sqrt(share @ np.square(shifts - share @ shifts))
         step = np.maximum(STEP_SIGMAS * np.hypot(spread, self.model.around.map_sigma_rad), LEAST_STEP_RAD)
         all_clear = np.ones(SECTORS)

@@ -66,7 +66,7 @@ def add_prior(graph, values, key) -> None:
 def frame_factor(data, k, keys):
     """The observation of a frame."""
     unit = np.linalg.inv(np.linalg.cholesky(data["noise"][k]))
-    by_post = data["height_sigma_m"] * data["by_post"][k]
+    by_post = data["by_post"][k]
     blocks = [data["response"][k][:, :2], data["response"][k][:, 2:], *by_post.T[:, :, None]]
     return linear_factor(keys, [unit @ block for block in blocks], unit @ data["mean"][k])
 

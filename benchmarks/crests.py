@@ -63,11 +63,11 @@ def score_draw(side_m: float, rng: np.random.Generator) -> list[list[float]]:
     second = beside(first, side_m)
     estimates = [[frame.modes[0] for frame in frames_by_evidence(course, rng)] for course in (first, second)]
     moves = [measured_moves(course.position_m, rng) for course in (first, second)]
-    alone = smooth(Observations.of(estimates[1], shipped.height_sigma_m), moves[1])
+    alone = smooth(Observations.of(estimates[1]), moves[1])
     scores = [score(alone.position_m, alone.covariance_m2, second.position_m)]
     apart = [replace(one, post=one.post + OTHER_POSTS) for one in estimates[1]]
     for later in (apart, estimates[1]):
-        both = smooth(Observations.of(estimates[0] + later, shipped.height_sigma_m), joined(moves))
+        both = smooth(Observations.of(estimates[0] + later), joined(moves))
         scores.append(score(both.position_m[FRAMES:], both.covariance_m2[FRAMES:], second.position_m))
     return scores
 

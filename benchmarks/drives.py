@@ -112,11 +112,11 @@ def score_track(case: Case, rng: np.random.Generator, pixels: bool, number: int)
     course = course_of(case, rng, pixels)
     frames = list(frames_by_pixels(course, case.share, number) if pixels else frames_by_evidence(course, rng))
     modes = [frame.modes for frame in frames]
-    sigma_m, single = course.stated.height_sigma_m, [of[0] if len(of) == 1 else None for of in modes]
+    single = [of[0] if len(of) == 1 else None for of in modes]
     used = np.flatnonzero([one is not None for one in single])
     found = {"frame": _scored([single[k] for k in used], course.position_m[used])}
     steps = odometry(case, course.position_m, rng)
-    plain = smooth(Observations.of([one and alone(one) for one in single], 0.0), steps)
+    plain = smooth(Observations.of([one and alone(one) for one in single]), steps)
     found["plain"] = _score(plain.position_m, plain.covariance_m2, course.position_m)
     if case.spacing_m == 0.0:
         _, position, covariance = positions_at_rest(frames, course.stated, course.shared)
@@ -124,9 +124,9 @@ def score_track(case: Case, rng: np.random.Generator, pixels: bool, number: int)
         found["smoothed"] = _score(position[-1:], covariance[-1:], course.position_m[:1])
     else:
         late = slice(SETTLED_FRAMES, None)
-        position, covariance, _, _ = filter_positions(modes, steps, len(course.shared), sigma_m)
+        position, covariance, _, _ = filter_positions(modes, steps, len(course.shared))
         found["filtered"] = _score(position[late], covariance[late], course.position_m[late])
-        robust = smooth_robustly(modes, steps, sigma_m).smoothed
+        robust = smooth_robustly(modes, steps).smoothed
         found["smoothed"] = _score(robust.position_m, robust.covariance_m2, course.position_m)
     return {f"{key} {what}": value for key, score in found.items() for what, value in score.items()}
 

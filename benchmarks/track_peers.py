@@ -63,11 +63,11 @@ def compare(rng: np.random.Generator, python: str) -> dict[str, float]:
     """Mean errors and differences [m], and seconds of CPU a frame, of one drive."""
     course = course_of(CASE, rng, pixels=False)
     estimates = [frame.modes[0] for frame in frames_by_evidence(course, rng)]
-    steps, sigma_m = odometry(CASE, course.position_m, rng), course.stated.height_sigma_m
+    steps = odometry(CASE, course.position_m, rng)
     start = time.process_time()
-    ours = smooth(Observations.of(estimates, sigma_m), steps).position_m
+    ours = smooth(Observations.of(estimates), steps).position_m
     middle = time.process_time()
-    filtered, _, _, _ = filter_positions([(e,) for e in estimates], steps, len(course.shared), sigma_m)
+    filtered, _, _, _ = filter_positions([(e,) for e in estimates], steps, len(course.shared))
     end = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         given, answer = Path(folder, "in.npz"), Path(folder, "out.npz")
@@ -75,7 +75,7 @@ def compare(rng: np.random.Generator, python: str) -> dict[str, float]:
         for k, e in enumerate(estimates):
             ragged["post"][k], ragged["by_post"][k] = e.post, e.by_post
         whole = {name: np.array([getattr(e, name) for e in estimates]) for name in ("mean", "response", "noise")}
-        np.savez(given, height_sigma_m=sigma_m, move_m=steps.move_m, sigma_m=steps.sigma_m, **whole, **ragged)
+        np.savez(given, move_m=steps.move_m, sigma_m=steps.sigma_m, **whole, **ragged)
         subprocess.run([python, WORKER, given, answer], check=True)
         peers = dict(np.load(answer))
 

@@ -213,7 +213,7 @@ def test_the_likelihood_of_an_explanation_is_that_of_the_joint_normal():
             covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += one.noise
         log_density = multivariate_normal(mean, covariance).logpdf(np.concatenate([one.mean for one in estimates]))
         log_density += np.log(probabilities).sum()
-        found = Explanations(1, 0.0)
+        found = Explanations(1)
         for one in estimates:
             found.add((one,), [Moves.of(steps)])
         branches = found._branches

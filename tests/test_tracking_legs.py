@@ -104,7 +104,7 @@ def test_a_position_outside_its_own_circle_is_that_of_its_image(is_ambiguous):
         assert (found.radius95_m[4], found.radius999_m[4]) == (fix.radius95_m, fix.radius999_m)
     assert [(one.first, one.last) for one in track.legs] == [(3, 5)]
     assert track.slipped.tolist() == [k in (3, 4) for k in range(FRAMES - 1)]
-    online = OnlineTrack(len(SHARED), CRATER.height_sigma_m)
+    online = OnlineTrack(len(SHARED))
     for k in range(5):
         online.add(frames[k].modes, odometry_moves(frames[: k + 1], odometry, USUAL_ODOMETRY))
     live = track_of_newest(frames[4], online, CRATER, SHARED)

@@ -35,7 +35,7 @@ def least_squares(drive: Drive, frames: int) -> tuple[np.ndarray, np.ndarray]:
         design = np.zeros((2 + k, size))
         design[:, 2 * i : 2 * i + 2] = e.response[:, :2]
         design[:, 2 * frames : 2 * frames + k] = e.response[:, 2:]
-        design[:, 2 * frames + k + e.post] = e.by_post
+        design[:, 2 * frames + k + e.post] = e.by_post / HEIGHT_SIGMA_M
         add(design, e.mean, e.noise)
     for i in range(frames - 1):
         design = np.zeros((2, size))
@@ -43,7 +43,7 @@ def least_squares(drive: Drive, frames: int) -> tuple[np.ndarray, np.ndarray]:
         if moves:
             design[:, -moves:] = -drive.steps.by_shared_m[i]
         add(design, drive.steps.move_m[i], STEP_SIGMA_M**2 * np.eye(2))
-    priors = np.concatenate([np.ones(k), np.full(posts, HEIGHT_SIGMA_M), np.ones(moves)])
+    priors = np.concatenate([np.ones(k), np.full(posts), np.ones(moves)])
     add(np.eye(size)[2 * frames :], np.zeros(len(priors)), np.diag(priors**2))
     A, b = np.vstack(rows), np.concatenate(values)
     solution = np.linalg.lstsq(A, b, rcond=None)[0]
@@ -54,13 +54,13 @@ def least_squares(drive: Drive, frames: int) -> tuple[np.ndarray, np.ndarray]:
 def test_the_smoother_is_least_squares_with_all_unknowns(shared_count, by_moves):
     drive = simulate_drive(np.random.default_rng(1), 7, shared_count)
     drive = with_shared_moves(drive) if by_moves else drive
-    found = smooth(Observations.of(drive.estimates, HEIGHT_SIGMA_M), drive.steps)
+    found = smooth(Observations.of(drive.estimates), drive.steps)
     solution, covariance = least_squares(drive, 7)
     posts = 14 + shared_count + found.post
     np.testing.assert_allclose(found.position_m.ravel(), solution[:14], atol=1e-6)
     np.testing.assert_allclose(found.shared, solution[14 : 14 + shared_count], atol=1e-7)
-    np.testing.assert_allclose(found.post_error_m, solution[posts], atol=1e-6)
-    np.testing.assert_allclose(found.post_sigma_m, np.sqrt(np.diag(covariance)[posts]), atol=1e-6)
+    np.testing.assert_allclose(HEIGHT_SIGMA_M * found.post_error, solution[posts], atol=1e-6)
+    np.testing.assert_allclose(HEIGHT_SIGMA_M * found.post_sigma, np.sqrt(np.diag(covariance)[posts]), atol=1e-6)
     for i in range(7):
         part = slice(2 * i, 2 * i + 2)
         np.testing.assert_allclose(found.covariance_m2[i], covariance[part, part], atol=1e-6)
@@ -73,13 +73,13 @@ def test_the_filter_is_the_smoother_of_the_frames_so_far(by_moves, leg):
     drive = with_shared_moves(drive) if by_moves else drive
     by_leg_m = 0.2 * np.stack([drive.steps.move_m, drive.steps.move_m[:, ::-1]], axis=-1)
     drive = replace(drive, steps=replace(drive.steps, leg=np.array(leg), by_leg_m=by_leg_m)) if by_moves else drive
-    state = TrackFilter(1, HEIGHT_SIGMA_M, drive.steps.by_shared_m.shape[-1] + drive.steps.by_leg_m.shape[-1])
+    state = TrackFilter(1, drive.steps.by_shared_m.shape[-1] + drive.steps.by_leg_m.shape[-1])
     for k, estimate in enumerate(drive.estimates):
         if k:
             state.predict(drive.steps, k - 1)
         state.update(estimate)
         steps = Steps(*(getattr(drive.steps, one.name)[:k] for one in fields(Steps)))
-        batch = smooth(Observations.of(drive.estimates[: k + 1], HEIGHT_SIGMA_M), steps)
+        batch = smooth(Observations.of(drive.estimates[: k + 1]), steps)
         np.testing.assert_allclose(state.position_m, batch.position_m[-1], atol=1e-4)
         np.testing.assert_allclose(state.covariance_m2, batch.covariance_m2[-1], atol=1e-4)
 
@@ -88,7 +88,7 @@ def test_the_filter_forgets_posts_without_a_jump(monkeypatch):
     drive = simulate_drive(np.random.default_rng(12), 30)
 
     def states():
-        state = TrackFilter(1, HEIGHT_SIGMA_M)
+        state = TrackFilter(1)
         for k, estimate in enumerate(drive.estimates):
             if k:
                 state.predict(drive.steps, k - 1)
@@ -108,9 +108,9 @@ def test_positions_have_their_stated_errors_and_the_plain_sum_has_not():
     errors, covariances, plain_errors, plain_covariances = [], [], [], []
     for seed in range(60):
         drive = simulate_drive(np.random.default_rng([4, seed]), 12)
-        found = smooth(Observations.of(drive.estimates, HEIGHT_SIGMA_M), drive.steps)
+        found = smooth(Observations.of(drive.estimates), drive.steps)
         alone = [replace(e, noise=e.covariance, post=e.post[:0], by_post=e.by_post[:, :0]) for e in drive.estimates]
-        plain = smooth(Observations.of(alone, HEIGHT_SIGMA_M), drive.steps)
+        plain = smooth(Observations.of(alone), drive.steps)
         errors.append(found.position_m - drive.position_m)
         covariances.append(found.covariance_m2)
         plain_errors.append(plain.position_m - drive.position_m)
@@ -127,13 +127,13 @@ def test_slipped_moves_are_found_and_cost_no_more_than_their_loss():
         drive = simulate_drive(np.random.default_rng([5, seed]), 30)
         which = np.array([2, 12, 22]) + np.random.default_rng([6, seed]).integers(0, 5, 3)
         modes = [(e,) for e in drive.estimates]
-        slipped = smooth_robustly(modes, with_slips(drive.steps, which, 20.0), HEIGHT_SIGMA_M)
+        slipped = smooth_robustly(modes, with_slips(drive.steps, which, 20.0))
         found += int(slipped.slipped[which].sum())
         assert slipped.slipped.sum() <= 4
-        assert not smooth_robustly(modes, drive.steps, HEIGHT_SIGMA_M).slipped.any()
+        assert not smooth_robustly(modes, drive.steps).slipped.any()
         without = np.where(np.isin(np.arange(29), which), np.inf, drive.steps.sigma_m)
         unslipped = smooth(
-            Observations.of(drive.estimates, HEIGHT_SIGMA_M), replace(drive.steps, sigma_m=without)
+            Observations.of(drive.estimates), replace(drive.steps, sigma_m=without)
         )  # fmt: skip
         lost.append(np.linalg.norm(slipped.smoothed.position_m - drive.position_m, axis=1).mean())
         known.append(np.linalg.norm(unslipped.position_m - drive.position_m, axis=1).mean())
@@ -146,10 +146,10 @@ def test_a_frame_that_contradicts_is_left_out_by_both_estimates():
     estimates = list(drive.estimates)
     estimates[8] = shifted(estimates[8], np.array([120.0, -90.0]))
     modes = [(e,) for e in estimates]
-    found = smooth_robustly(modes, drive.steps, HEIGHT_SIGMA_M)
+    found = smooth_robustly(modes, drive.steps)
     assert found.mode.tolist() == [0] * 8 + [-1] + [0] * 11
     assert not found.slipped.any()
-    online, _, _, _ = filter_positions(modes, drive.steps, 1, HEIGHT_SIGMA_M)
+    online, _, _, _ = filter_positions(modes, drive.steps, 1)
     assert np.linalg.norm(online - drive.position_m, axis=1).max() < 15.0
 
 
@@ -157,17 +157,17 @@ def test_a_wrong_first_frame_does_not_hold_the_filter():
     drive = simulate_drive(np.random.default_rng(8), 12)
     modes = [(e,) for e in drive.estimates]
     modes[0] = (shifted(drive.estimates[0], np.array([300.0, 400.0])),)
-    online, _, _, _ = filter_positions(modes, drive.steps, 1, HEIGHT_SIGMA_M)
+    online, _, _, _ = filter_positions(modes, drive.steps, 1)
     assert np.linalg.norm(online[4:] - drive.position_m[4:], axis=1).max() < 15.0
-    assert smooth_robustly(modes, drive.steps, HEIGHT_SIGMA_M).mode[0] == -1
+    assert smooth_robustly(modes, drive.steps).mode[0] == -1
 
 
 def test_three_refused_frames_are_bridged_with_growing_errors():
     drive = simulate_drive(np.random.default_rng(9), 12)
     modes = [() if k in (5, 6, 7) else (e,) for k, e in enumerate(drive.estimates)]
-    found = smooth_robustly(modes, drive.steps, HEIGHT_SIGMA_M)
+    found = smooth_robustly(modes, drive.steps)
     assert found.mode.tolist() == [-1 if k in (5, 6, 7) else 0 for k in range(12)]
-    online = OnlineTrack(1, HEIGHT_SIGMA_M)
+    online = OnlineTrack(1)
     traces = []
     for of in modes:
         online.add(of, [Moves.of(drive.steps)])
@@ -185,16 +185,16 @@ def test_the_sequence_chooses_the_mode_of_an_ambiguous_frame():
     wrong, right = shifted(drive.estimates[4], np.array([200.0, 0.0])), drive.estimates[4]
     modes[4] = (replace(wrong, weight=0.7), replace(right, weight=0.3))
     modes[6] = (replace(shifted(wrong, np.array([0.0, 500.0])), weight=0.6), replace(wrong, weight=0.4))  # neither
-    found = smooth_robustly(modes, drive.steps, HEIGHT_SIGMA_M)
+    found = smooth_robustly(modes, drive.steps)
     assert found.mode[4] == 1
     assert found.mode[6] == -1
 
 
 def test_without_odometry_only_the_shared_errors_connect_the_frames():
     drive = simulate_drive(np.random.default_rng(11), 8)
-    alone = smooth(Observations.of([drive.estimates[3]], HEIGHT_SIGMA_M), Steps.unknown(1))
+    alone = smooth(Observations.of([drive.estimates[3]]), Steps.unknown(1))
     modes = [(e,) for e in drive.estimates]
-    found = smooth_robustly(modes, Steps.unknown(8), HEIGHT_SIGMA_M)
+    found = smooth_robustly(modes, Steps.unknown(8))
     assert found.mode.tolist() == [0] * 8
     assert not found.slipped.any()
     assert np.trace(found.smoothed.covariance_m2[3]) < np.trace(alone.covariance_m2[0])
@@ -204,4 +204,4 @@ def test_without_odometry_only_the_shared_errors_connect_the_frames():
 
 def test_a_track_needs_one_frame_with_a_position():
     with pytest.raises(ValueError, match="no frame has a single position"):
-        smooth_robustly([(), ()], Steps.unknown(2), HEIGHT_SIGMA_M)
+        smooth_robustly([(), ()], Steps.unknown(2))

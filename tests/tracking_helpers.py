@@ -60,7 +60,7 @@ def simulate_drive(rng: np.random.Generator, frames: int, shared_count: int = 1)
         noise = np.linalg.cholesky(covariance) @ rng.normal(size=p)
         mean = response @ truth + by_post @ heights[post] + noise
         whole = covariance + HEIGHT_SIGMA_M**2 * by_post @ by_post.T
-        estimates.append(FrameEstimate(mean, whole, response, covariance, post, by_post))
+        estimates.append(FrameEstimate(mean, whole, response, covariance, post, HEIGHT_SIGMA_M * by_post))
     moves = np.diff(position, axis=0) + STEP_SIGMA_M * rng.normal(size=(frames - 1, 2))
     return Drive(position, shared, heights, estimates, Steps(moves, np.full(frames - 1, STEP_SIGMA_M)))
 

@@ -1,7 +1,7 @@
 """Observations of a camera's positions by its exposures, with the errors that they share, and the moves between them.
 
 Unknowns of a track are the positions and the shared errors. The errors of the map's posts are not among them: they make
-the observations' noise correlated, with the covariance G S G^T.
+the observations' noise correlated, with the covariance G G^T.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class FrameEstimate:
     response: Array  # (2 + k, 2 + k) of the mean to the true parameters: K
     noise: Array  # (2 + k, 2 + k) of the mean, of this frame alone
     post: Ints  # (c,) numbers of the posts with a measurable effect
-    by_post: Array  # (2 + k, c) of the mean to the error [m] of each: G
+    by_post: Array  # (2 + k, c) of the mean to the error of each, in its standard deviation: G
     weight: float = 1.0  # probability of this mode of the frame's posterior
 
     @property
@@ -113,13 +113,12 @@ class Observations:
     frames: tuple[int, ...]
     estimates: tuple[FrameEstimate, ...]
     count: int  # n
-    height_sigma_m: float
 
     @classmethod
-    def of(cls, estimates: Sequence[FrameEstimate | None], height_sigma_m: float) -> Observations:
+    def of(cls, estimates: Sequence[FrameEstimate | None]) -> Observations:
         """Those of the frames that have an estimate."""
         used = [(k, e) for k, e in enumerate(estimates) if e is not None]
-        return cls(tuple(k for k, _ in used), tuple(e for _, e in used), len(estimates), height_sigma_m)
+        return cls(tuple(k for k, _ in used), tuple(e for _, e in used), len(estimates))
 
     @property
     def size(self) -> int:
@@ -157,7 +156,7 @@ class Observations:
         each = [len(e.post) for e in self.estimates]
         row = np.repeat(np.arange(len(self.value)), np.repeat(each, self.size))
         column = np.concatenate([np.tile(np.searchsorted(self.posts, e.post), self.size) for e in self.estimates])
-        values = self.height_sigma_m * np.concatenate([e.by_post.ravel() for e in self.estimates])
+        values = np.concatenate([e.by_post.ravel() for e in self.estimates])
         return csr_array((values, (row, column)), shape=(len(self.value), len(self.posts)))
 
     @cached_property

@@ -29,7 +29,6 @@ class TrackFilter:
     """
 
     shared_count: int
-    height_sigma_m: float
     moves_count: int = 0  # of errors that all moves share, and then of the last leg
     mean: Array = field(init=False)
     covariance: Array = field(init=False)
@@ -105,7 +104,7 @@ class TrackFilter:
             grown[:size, :size] = self.covariance
             self.covariance = grown
         place = np.array([self.posts[number] for number in estimate.post.tolist()], dtype=np.int64)
-        p, by_post = estimate.parameters, self.height_sigma_m * estimate.by_post
+        p, by_post = estimate.parameters, estimate.by_post
         cross = self.covariance[:, :p] @ estimate.response.T + self.covariance[:, place] @ by_post.T
         predicted = estimate.response @ self.mean[:p] + by_post @ self.mean[place]
         covariance = estimate.response @ cross[:p] + by_post @ cross[place] + estimate.noise
@@ -121,8 +120,8 @@ class Smoothed:
     shared: Array  # (k,) in standard deviations of their priors
     shared_covariance: Array  # (k, k)
     post: Ints  # (c,) numbers of the posts that the observations depend on
-    post_error_m: Array  # (c,)
-    post_sigma_m: Array  # (c,)
+    post_error: Array  # (c,) in their standard deviations
+    post_sigma: Array  # (c,) of these
 
 
 def mixed_normal(means: Sequence[Array], covariances: Sequence[Array], share: Array) -> tuple[Array, Array]:
@@ -136,8 +135,8 @@ def mix_smoothed(parts: Sequence[Smoothed], share: Array) -> Smoothed:
     """The estimate by several explanations of the same observations, with their shares (m,)."""
     position = mixed_normal([one.position_m for one in parts], [one.covariance_m2 for one in parts], share)
     shared = mixed_normal([one.shared for one in parts], [one.shared_covariance for one in parts], share)
-    errors = [one.post_error_m[:, None] for one in parts]
-    post = mixed_normal(errors, [np.square(one.post_sigma_m)[:, None, None] for one in parts], share)
+    errors = [one.post_error[:, None] for one in parts]
+    post = mixed_normal(errors, [np.square(one.post_sigma)[:, None, None] for one in parts], share)
     return Smoothed(*position, *shared, parts[0].post, post[0][:, 0], np.sqrt(post[1][:, 0, 0]))
 
 
@@ -174,13 +173,12 @@ def smooth(observations: Observations, steps: Steps) -> Smoothed:
 
 
 def _posts(observations: Observations, pull: Array, covariance: Array) -> tuple[Array, Array]:
-    """Errors (c,) of the posts and their standard deviations (c,) [m]."""
+    """Errors (c,) of the posts and what is left of them (c,), in standard deviations before."""
     G = observations.by_post
     weighted = np.asarray(G.T @ observations.weighted_design)
     gain = np.asarray((G.T @ observations.inverse_covariance) * G.T.toarray()).sum(axis=1)
     gain -= np.einsum("ci,ij,cj->c", weighted, covariance, weighted, optimize=True)
-    sigma = observations.height_sigma_m
-    return sigma * np.asarray(G.T @ pull), sigma * np.sqrt(np.maximum(1.0 - gain, 0.0))
+    return np.asarray(G.T @ pull), np.sqrt(np.maximum(1.0 - gain, 0.0))
 
 
 def radius_holding(covariance_m2: Array, probability: float) -> Array:

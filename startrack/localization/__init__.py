@@ -8,6 +8,7 @@ from startrack.localization.conclusion import AMBIGUOUS_MASS
 from startrack.localization.convex_hull import Hull, hull_position
 from startrack.localization.importance_sampling import ENOUGH, Gaussian, WeightedPoints, moments, sample
 from startrack.localization.integrity import RISK, clear_logs
+from startrack.localization.linear_errors import LinearErrors
 from startrack.localization.posterior import MIN_ROW_NATS, ExactPosterior
 from startrack.localization.profile_cells import HIGH_RAD, LOW_RAD
 from startrack.localization.pseudo_gradient import PseudoGradient, descend
@@ -70,8 +71,8 @@ def require_localizer(given: Any) -> Localizer:
 
 __all__ = [
     "AMBIGUOUS_MASS", "DEFAULT_LOCALIZER", "ENOUGH", "HIGH_RAD", "LOCALIZERS", "LOW_RAD", "MIN_ROW_NATS", "RISK",
-    "ROW_NATS", "ErrorBasis", "ExactPosterior", "Gaussian", "Hull", "Localizer", "PseudoGradient", "SharedErrors",
-    "SkylineModel", "WeightedPoints", "camera_at", "clear_logs", "clock_at", "clock_matters", "descend", "duration",
-    "has_posterior", "hull_position", "localizer_name", "moments", "require_localizer", "sample", "settle_steepness",
-    "solve_linear",
+    "ROW_NATS", "ErrorBasis", "ExactPosterior", "Gaussian", "Hull", "LinearErrors", "Localizer", "PseudoGradient",
+    "SharedErrors", "SkylineModel", "WeightedPoints", "camera_at", "clear_logs", "clock_at", "clock_matters",
+    "descend", "duration", "has_posterior", "hull_position", "localizer_name", "moments", "require_localizer", "sample",
+    "settle_steepness", "solve_linear",
 ]  # fmt: skip

@@ -1,6 +1,6 @@
 """Errors that raise the skyline at all azimuths together, of terrain and clock, and the directions that rows show.
 
-Waves of the horizon's error over azimuth are linear at any size: they are integrated in closed form, see `linear_errors`.
+Waves of the horizon's error over azimuth are linear at any size, and integrated in closed form: see `linear_errors`.
 
 In standard deviations of their prior, the errors have information by the rows once the position is free. Along a
 direction with next to none the errors keep their prior, and the position moves by what leaves the skyline as it is:

@@ -135,7 +135,7 @@ class SkylineModel:
         return np.asarray(self.basis.mean @ self.error_slopes_rad + self.around.expected_rise_rad)
 
     def rise_rad(self, parameters: Array) -> Array | None:
-        """Rise (SECTORS,) of the skyline above the map's by the errors of the ground at parameters (2 + a,); None of none.
+        """Rise (SECTORS,) of the skyline above the map's by errors of the ground at parameters (2 + a,); None of none.
 
         On real ground without that of the clock: the sky is turned to the time that it shows.
         """
@@ -180,9 +180,9 @@ class SkylineModel:
         return LinearErrors.of(self.seen, self.errors, self.gross, self.clear)
 
     def with_linear_errors(self, shifts: Array) -> tuple[Array, Array]:
-        """The `shifts` (n, SECTORS) with the likeliest linear errors, and the logarithm (n,) of the integral over these.
+        """The `shifts` (n, SECTORS) with the likeliest linear errors, and a logarithm (n,).
 
-        It is that of the integral in the likelihood at the shifts.
+        It is that of the integral of the likelihood over these errors, in the likelihood at the shifts.
         """
         linear = self.linear
         if not len(linear):

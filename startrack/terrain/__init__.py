@@ -29,7 +29,8 @@ __all__ = [
     "ExpectedCrests", "ForwardingTerrain", "Grid", "HeightMap", "Projection", "Raster", "ShapeError", "StateableError",
     "Terrain", "can_write_maps", "files_of_terrain", "import_maps", "is_geotiff", "load_terrain", "map_of_array",
     "read_map", "require_bounds", "require_horizons", "require_place", "require_site", "require_terrain",
-    "site_of_terrain", "state_errors", "stateable_errors", "terrain_from_dict", "wave_slopes_rad", "write_bands", "write_map",
+    "site_of_terrain", "state_errors", "stateable_errors", "terrain_from_dict", "wave_slopes_rad",
+    "write_bands", "write_map",
 ]  # fmt: skip
 _LAZY_MODULES = {  # of names that few programs use: imported at the first use
     "EarthProjection": "earth_projection", "Grid": "array_map", "HeightMap": "height_map",

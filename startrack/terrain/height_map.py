@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.types import Array, Bools, Ints
+from startrack.core.types import MIDDLES_RAD, Array, Bools, Ints
 from startrack.terrain import shape
 from startrack.terrain.crest_kernel import POSTS, crests
 from startrack.terrain.derived_maps import DeformedMap, HorizonInterpolator
@@ -62,6 +62,11 @@ class HeightMap(TracedMap):
             own = float(np.median(self._sigma.blocks_rad[0].reshape(-1, AZIMUTH_BINS)[cells]))
         known = self.horizon_sigma_common_rad
         return float(np.hypot(own, COMMON_PER_POST * own if known is None else known))
+
+    @cached_property
+    def crest_distance_m(self) -> float:  # type: ignore[override]
+        """The median over azimuth, from the origin [m]."""
+        return float(np.median(self.horizons(np.zeros(2), MIDDLES_RAD)[1]))
 
     @cached_property
     def shape_errors(self) -> tuple[shape.ShapeError, ...]:  # type: ignore[override]

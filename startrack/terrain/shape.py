@@ -146,8 +146,9 @@ WAVES = Fact(
 )
 WAVES_LIMITS = Either(
     kinds=(WAVES.limits, List(each=WAVES.limits, count=WAVE_COUNT)),
-    description="of smooth errors of the horizon over azimuth, the cosine and the sine of waves 1 to 8 each; one number "
-                "is of wave 1, and wave m has it over the root of m; if absent 0.003, and with probability 1 % 0.04",
+    description="of smooth errors of the horizon over azimuth, the cosine and the sine of waves 1 to 8 each; one "
+                "number is of wave 1, and wave m has it over the root of m; if absent 0.003, and with probability "
+                "1 % 0.04",
 )  # fmt: skip
 CYLINDER_FACTS = (DEPTH, DIAMETER, ELLIPSE, RIM_TILT)
 MAP_FACTS = (BIAS, STRETCH, VERTICAL, WAVES, CAMERA_ERROR)

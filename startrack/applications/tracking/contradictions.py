@@ -39,7 +39,6 @@ class RobustTrack:
 def smooth_robustly(
     modes: Sequence[Sequence[FrameEstimate]],
     moves: Steps | Sequence[Moves],
-    height_sigma_m: float,
     *,
     may_slip: bool = True,
     names: Sequence[str] = (),
@@ -49,7 +48,6 @@ def smooth_robustly(
     Args:
         modes: of n frames, in the order of time.
         moves: between them; several for odometry with a fault as a whole, that as stated first.
-        height_sigma_m: of the map's posts.
         may_slip: whether moves may slip; at rest they do not.
         names: of the frames, for messages; empty: their numbers from 1.
 
@@ -60,12 +58,12 @@ def smooth_robustly(
     if not any(modes):
         raise ValueError("no frame has a single position")
     kinds = [Moves.of(moves)] if isinstance(moves, Steps) else moves
-    compared = Explanations(next(of[0].parameters for of in modes if of) - 2, height_sigma_m, may_slip)
+    compared = Explanations(next(of[0].parameters for of in modes if of) - 2, may_slip)
     for of in modes:
         compared.add(of, kinds)
     best, *others = compared.ranked()
-    found = _smooth(modes, best, best.mode, height_sigma_m)
-    doubt, rival = _doubt(modes, best, found, others, height_sigma_m)
+    found = _smooth(modes, best, best.mode)
+    doubt, rival = _doubt(modes, best, found, others)
     vouched = doubt <= AMBIGUOUS_MASS
     mode = np.where(vouched, best.mode, -1)
     if found is None or (mode < 0).all():
@@ -74,7 +72,7 @@ def smooth_robustly(
         why = "" if may_slip else ": has the camera moved? Then leave --at-rest out"
         raise BadInput("inconsistent_evidence", f"{' and '.join(texts)} {what}, and neither is clearly right{why}")
     if (mode != best.mode).any():
-        found = _smooth(modes, best, mode, height_sigma_m) or found
+        found = _smooth(modes, best, mode) or found
     turns = np.append(best.anchor == np.arange(1, len(mode)), True)
     return RobustTrack(found, mode, best.steps, best.leg, vouched, turns, best.moves.fault)
 
@@ -89,7 +87,7 @@ def disagrees(position_m: Array, covariance_m2: Array, other_m: Array, other_m2:
 
 def _doubt(
     modes: Sequence[Sequence[FrameEstimate]], best: Explanation, found: Smoothed | None,
-    others: Sequence[Explanation], height_sigma_m: float,
+    others: Sequence[Explanation],
 ) -> tuple[Array, Explanation | None]:  # fmt: skip
     """Probability (n,) of explanations of another position of each frame, and the likeliest of these explanations."""
     doubt, rival = np.zeros(len(best.mode)), None
@@ -99,7 +97,7 @@ def _doubt(
     if found is None or not open_frames.any():
         return doubt, None
     for one in (one for one in others if one.share > AMBIGUOUS_MASS / len(others)):
-        other = _smooth(modes, one, one.mode, height_sigma_m)
+        other = _smooth(modes, one, one.mode)
         away = np.ones(len(doubt), dtype=bool) if other is None else disagrees(
             found.position_m, found.covariance_m2, other.position_m, other.covariance_m2
         )  # fmt: skip
@@ -108,14 +106,12 @@ def _doubt(
     return doubt, rival
 
 
-def _smooth(
-    modes: Sequence[Sequence[FrameEstimate]], one: Explanation, mode: Ints, height_sigma_m: float
-) -> Smoothed | None:
+def _smooth(modes: Sequence[Sequence[FrameEstimate]], one: Explanation, mode: Ints) -> Smoothed | None:
     """The estimate by the modes (n,) with the moves of an explanation and its variants; None where no frame has one."""
     chosen = [of[k] if k >= 0 else None for of, k in zip(modes, mode, strict=True)]
     if all(estimate is None for estimate in chosen):
         return None
-    observations, others = Observations.of(chosen, height_sigma_m), [each.share for each in one.variants]
+    observations, others = Observations.of(chosen), [each.share for each in one.variants]
     share = np.array([1.0 - sum(others), *others])
     return mix_smoothed([smooth(observations, each.steps) for each in (one, *one.variants)], share)
 

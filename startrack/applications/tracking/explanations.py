@@ -62,7 +62,6 @@ class Explanations:
     """The likeliest explanations of the frames so far; `add` in the order of time."""
 
     shared_count: int
-    height_sigma_m: float
     may_slip: bool = True
     _frames: list[Sequence[FrameEstimate]] = field(default_factory=list)
     _moves: Sequence[Moves] = ()
@@ -225,7 +224,7 @@ class Explanations:
 
     def _innovation(self, one: Branches, mode: FrameEstimate) -> tuple[Array, Array, Array]:
         """Observation less prediction (b, p), its covariance (b, p, p), and the part by the frame itself (p, p)."""
-        noise = mode.noise + self.height_sigma_m**2 * mode.by_post @ mode.by_post.T
+        noise = mode.noise + mode.by_post @ mode.by_post.T
         p = mode.parameters
         covariance = mode.response @ one.covariance[:, :p, :p] @ mode.response.T + noise
         return mode.mean - one.mean[:, :p] @ mode.response.T, covariance, noise
@@ -253,7 +252,7 @@ class Explanations:
         out = best.history[0, :, 0] < 0
         if best.wrong[0] < 2:
             return None
-        alone = Explanations(self.shared_count, self.height_sigma_m, self.may_slip)
+        alone = Explanations(self.shared_count, self.may_slip)
         moves = self._moves[best.odometry[0]]
         turn = moves.turn.copy()
         turn[1 : len(out) + 1][~out] = np.nan

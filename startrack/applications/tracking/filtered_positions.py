@@ -38,10 +38,10 @@ Modes = Sequence[FrameEstimate]
 class OnlineTrack:
     """Positions at the time of each frame; `add` in the order of time. Without contradictions a Kalman filter."""
 
-    def __init__(self, shared_count: int, height_sigma_m: float) -> None:
-        self.filter = TrackFilter(shared_count, height_sigma_m, FREEDOMS + LEG_FREEDOMS)
+    def __init__(self, shared_count: int) -> None:
+        self.filter = TrackFilter(shared_count, FREEDOMS + LEG_FREEDOMS)
         self.is_vouched = True  # whether explanations of another position of the last frame are unlikely together
-        self._explanations = Explanations(shared_count, height_sigma_m)
+        self._explanations = Explanations(shared_count)
         self._modes: list[Modes] = []
         self._decided: list[tuple[object, ...]] = []  # of each frame that the filter has
 
@@ -87,7 +87,7 @@ class OnlineTrack:
         moved = [(), *zip(best.kind.tolist(), best.anchor.tolist(), [best.number] * (n - 1), strict=True)]
         decided = [(mode, *move) for mode, move in zip(best.mode.tolist(), moved, strict=True)]
         if decided[:-1] != self._decided:  # another explanation of the frames before is likelier now
-            self.filter = TrackFilter(self.filter.shared_count, self.filter.height_sigma_m, FREEDOMS + LEG_FREEDOMS)
+            self.filter = TrackFilter(self.filter.shared_count, FREEDOMS + LEG_FREEDOMS)
             self._decided = []
         for k in range(len(self._decided), n):
             if k:
@@ -101,14 +101,14 @@ class OnlineTrack:
 
 
 def filter_positions(
-    modes: Sequence[Modes], moves: Steps | Sequence[Moves], shared_count: int, height_sigma_m: float
+    modes: Sequence[Modes], moves: Steps | Sequence[Moves], shared_count: int
 ) -> tuple[Array, Array, Ints, list[int]]:
     """Positions (n, 2) and covariances (n, 2, 2), each by the frames up to its own, and the mode (n,) used then.
 
     Also the frames whose position is by their image alone. `moves` are those of `smooth_robustly`. A position about
     which explanations differ is not known.
     """
-    track, position, covariance, alone, mode = OnlineTrack(shared_count, height_sigma_m), [], [], [], []
+    track, position, covariance, alone, mode = OnlineTrack(shared_count), [], [], [], []
     kinds = [Moves.of(moves)] if isinstance(moves, Steps) else moves
     for k, of in enumerate(modes):
         track.add(of, kinds)
@@ -133,7 +133,7 @@ def positions_at_rest(
     terrain = terrain.with_steepness(next((frame.steepness_1 for frame in frames if frame.modes), 1.0))
     errors, modes = errors.on(terrain), [[errors.place(one) for one in frame.modes] for frame in frames]
     names = [frame.name for frame in frames]
-    agreeing = smooth_robustly(modes, still, terrain.height_sigma_m, may_slip=False, names=names)
+    agreeing = smooth_robustly(modes, still, may_slip=False, names=names)
     single = np.array([len(frame.modes) == 1 for frame in frames])
     agree, count = np.count_nonzero(single & (agreeing.mode >= 0)), np.count_nonzero(single)
     if count > 1 and 2 * agree <= count:
@@ -144,10 +144,10 @@ def positions_at_rest(
     position, covariance = np.zeros((n, 2)), np.repeat([UNKNOWN_M**2 * np.eye(2)], n, axis=0)
 
     def take(k: int, estimate: FrameEstimate) -> Smoothed:
-        found = smooth(Observations.of([errors.place(estimate)], terrain.height_sigma_m), Steps.unknown(1))
+        found = smooth(Observations.of([errors.place(estimate)]), Steps.unknown(1))
         for _ in range(SIZE_ROUNDS if errors.bends else 0):
             placed = errors.place(estimate, found.position_m[0], found.shared)
-            found = smooth(Observations.of([placed], terrain.height_sigma_m), Steps.unknown(1))
+            found = smooth(Observations.of([placed]), Steps.unknown(1))
         position[k:], covariance[k:] = found.position_m[0], found.covariance_m2[0]
         return found
 

@@ -2,7 +2,7 @@
 
 The likelihood of one image in the parameters of a track gives points of the posterior by images of one position. The
 posterior mean m of position and shared errors by one frame, with its prior, depends on the true ones p and on the
-errors h of the map's posts as m = K p + G h + noise. K is what the evidence adds to the prior. G is the covariance of
+errors h of the map's posts and waves as m = K p + G h + noise. K is what the evidence adds to the prior. G is that of
 the parameters with the slopes of the log-likelihood: the derivative of a posterior mean.
 """
 
@@ -22,6 +22,7 @@ from startrack.localization import (
     ENOUGH,
     ErrorBasis,
     Gaussian,
+    LinearErrors,
     SkylineModel,
     WeightedPoints,
     clear_logs,
@@ -36,6 +37,11 @@ LEAST_FRAME_HALF_M = 40.0  # of the neighbourhood
 MAX_NEIGHBOURHOODS = 3  # after so many the posterior is taken as it is
 MIN_NOISE_SHARE = 0.3  # of the evidence's covariance: the least noise that a frame has of its own
 NEGLIGIBLE_POST = 1e-4  # part of the variance of a position, by all posts that are left out together
+FIRST_WAVE, WAVE_NODES = (
+    2**40,
+    4096,
+)  # number of the first wave, behind all posts; of nodes along each side of their grid
+NODE_SPACING = 2.0  # of a wave's nodes, in the crests' distance over the wave's number
 ROUNDING = 1e-9  # of the covariance, added to the noise so that it can be inverted
 STEP_SIGMAS, LEAST_STEP_RAD = 0.5, 1e-7  # of the skyline's spread, to each side: where the change with it is taken
 LEAST_SHARE = float(np.sqrt(2.0 / ENOUGH))  # of the information along a parameter: a variance by points errs by that
@@ -106,19 +112,19 @@ class FrameModel:
 
         Positions are relative to the reference. Sets how much each sector counts for the errors of the image.
         """
-        seen, around, image = self.model.seen, self.model.around, self.model.seen.image_errors
-        design, own = np.hstack([around.slopes.T, self.rise_rad]), seen.image_rise
-        known, d = np.asarray(np.linalg.inv(image.covariance)), design.shape[1]
+        seen, around, linear = self.model.seen, self.model.around, self.model.linear
+        design, own = np.hstack([around.slopes.T, self.rise_rad]), linear.rise_rad
+        known, d = linear.inverse, design.shape[1]
         height = seen.moments.mean_rad - self.shifts(np.r_[around.reference_m, np.zeros(d - 2)][None])[0]
         prior = np.diag(np.r_[np.full(2, UNKNOWN_M**-2), np.ones(d - 2), np.zeros(len(known))])
         prior[d:, d:] = known
-        left, mean = seen.moments._replace(mean_rad=height), np.append(np.zeros(d), image.mean)
+        left, mean = seen.moments._replace(mean_rad=height), np.append(np.zeros(d), linear.mean)
         _, _, clear = solve_linear(left, np.hstack([design, own]), mean, prior)
         self.model = replace(self.model, clear=clear)
         weight = clear / seen.moments.variance_rad2
         explained = np.linalg.solve((own.T * weight) @ own + known, own.T * weight)  # by the image's own errors
         weighted = np.asarray(design.T * weight - ((design.T * weight) @ own) @ explained)
-        return weighted @ design, weighted @ (height - own @ image.mean)
+        return weighted @ design, weighted @ (height - linear.expected_rad)
 
 
 def sample_together(models: Sequence[FrameModel], position_m: Array, covariance_m2: Array) -> WeightedPoints:
@@ -197,6 +203,7 @@ def observe_together(models: Sequence[FrameModel], found: WeightedPoints) -> Fra
     by_evidence = response @ covariance  # of the mean at given true parameters
     plain, spread = moments(points, share)
     by_horizon, counted = np.zeros((len(mean), len(MIDDLES_RAD))), np.zeros_like(covariance)
+    position = models[0].model.around.reference_m
     for model in models:
         model.settle(mean)
         slopes = model.slopes(points, share)
@@ -204,11 +211,13 @@ def observe_together(models: Sequence[FrameModel], found: WeightedPoints) -> Fra
         own = shown @ covariance @ np.linalg.solve(spread, common)
         by_posts = model.model.around.post_sigma_rad  # other errors of the ground are this frame's own noise
         counted += 0.0 if by_posts is None else (own * np.square(by_posts)) @ own.T
+        by_wave = own @ waves_at(position, model.model.terrain, model.model.linear)[1]
+        counted += by_wave @ by_wave.T
         by_horizon += own
     noise = clipped_noise(by_evidence - counted, by_evidence) + ROUNDING * covariance
     noise += UNSEEN_NOISE * (covariance - shown @ covariance @ shown.T)
     post, by_post = _posts(models[0], by_horizon, covariance)
-    shared_by_posts = models[0].model.terrain.height_sigma_m ** 2 * by_post @ by_post.T
+    shared_by_posts = by_post @ by_post.T
     estimate = FrameEstimate(
         shown @ mean, covariance - by_evidence + noise + shared_by_posts, response, noise, post, by_post,
     )  # fmt: skip
@@ -243,22 +252,45 @@ def clipped_noise(noise: Array, whole: Array) -> Array:
 
 
 def _posts(model: FrameModel, by_horizon: Array, covariance: Array) -> tuple[Ints, Array]:
-    """Posts (c,) of the crests and of the camera's ground, and the response (d, c) of the mean to their heights."""
+    """Posts and waves (c,) of the map's errors, and the response (d, c) of the mean to each.
+
+    They are those of the crests, and of the camera's ground. Waves have numbers from FIRST_WAVE on.
+    """
     terrain, around = model.model.terrain, model.model.around
-    if around.crests is None:
-        return np.zeros(0, dtype=np.int64), np.zeros((len(by_horizon), 0))
-    crests = around.crests.post, around.crests.rad_per_m
-    parts = [crests, terrain.ground_posts(around.reference_m, MIDDLES_RAD)]
+    parts = [waves_at(around.reference_m, terrain, model.model.linear)]
+    if around.crests is not None:
+        parts.append((around.crests.post, terrain.height_sigma_m * around.crests.rad_per_m))
+        post, rad_per_m = terrain.ground_posts(around.reference_m, MIDDLES_RAD)
+        parts.append((post, terrain.height_sigma_m * rad_per_m))
     every = np.concatenate([posts.ravel() for posts, _ in parts])
     # Ground higher than the map acts on the evidence as a map lower than the ground.
     response = np.concatenate(
-        [(-by_horizon[:, :, None] * rad_per_m).reshape(len(by_horizon), -1) for _, rad_per_m in parts], axis=1
+        [(-by_horizon[:, :, None] * rises_rad).reshape(len(by_horizon), -1) for _, rises_rad in parts], axis=1
     )
     known = every != NO_POST
     post, of = np.unique(every[known], return_inverse=True)
     by_post: Array = np.stack([np.bincount(of, weights=row[known], minlength=len(post)) for row in response])
-    scale = terrain.height_sigma_m / np.sqrt(np.diag(covariance))
-    effect = np.square(by_post * scale[:, None]).max(axis=0, initial=0.0)
+    effect = np.square(by_post / np.sqrt(np.diag(covariance))[:, None]).max(axis=0, initial=0.0)
     order = np.argsort(effect)
     kept = np.sort(order[np.cumsum(effect[order]) > NEGLIGIBLE_POST])
     return post[kept], by_post[:, kept]
+
+
+def waves_at(position_m: Array, terrain: Terrain, linear: LinearErrors) -> tuple[Ints, Array]:
+    """Numbers (SECTORS, c) of waves of the map's error, and the rise (SECTORS, c) [rad] by one sigma of each.
+
+    A wave changes with the place, since the crests stand in other directions there: its error is that of the four
+    nodes about the position (2,) of a square grid, independent of each other, in parts whose squares add up to 1.
+    """
+    own = np.arange(len(linear) - linear.waves, len(linear))
+    rise = linear.rise_rad[:, own] * np.sqrt(np.diag(linear.covariance)[own])
+    spacing_m = NODE_SPACING * terrain.crest_distance_m / (1 + np.arange(linear.waves) // 2)
+    at = position_m / spacing_m[:, None]
+    low = np.floor(at)
+    number, part = [], []
+    for corner in np.stack(np.meshgrid([0, 1], [0, 1]), axis=-1).reshape(-1, 2):
+        node = (low + corner).astype(np.int64) + WAVE_NODES // 2
+        number.append(FIRST_WAVE + (node[:, 0] * WAVE_NODES + node[:, 1]) * linear.waves + np.arange(linear.waves))
+        part.append(np.sqrt(np.prod(1.0 - np.abs(at - low - corner), axis=1)))
+    rises = np.concatenate([rise * one for one in part], axis=1)
+    return np.broadcast_to(np.concatenate(number), rises.shape), rises

@@ -144,21 +144,21 @@ class TrackSession:
         for k in range(len(self._filtered), len(self.frames)):
             if not (has_ended or _is_reached(self.frames[k], odometry)):
                 return
-            online = self._online = self._filter_to(k, odometry, shared, terrain.height_sigma_m)
+            online = self._online = self._filter_to(k, odometry, shared)
             self._filtered.append(self.frames[k])
             is_outside = odometry is not None and not odometry.covers(times_s(self.frames[k : k + 1]))[0]
             yield track_of_newest(self.frames[k], online, terrain, shared, is_outside=is_outside)
 
-    def _filter_to(self, k: int, odometry: Odometry | None, shared: TrackErrors, height_sigma_m: float) -> OnlineTrack:
+    def _filter_to(self, k: int, odometry: Odometry | None, shared: TrackErrors) -> OnlineTrack:
         """The filter with frame k; where positions are not linear in `shared`, of all frames about what they show."""
         frames = self.frames[: k + 1]
         moves = odometry_moves(frames, odometry, self.odometry_errors, shows_scale=not shared.bends)
         modes = [frame.modes for frame in frames]
         if shared.bends:
-            online, placed = None, smooth_placed(modes, moves, shared, height_sigma_m)[0] if any(modes) else modes
+            online, placed = None, smooth_placed(modes, moves, shared)[0] if any(modes) else modes
         else:
             online, placed = self._online, [[shared.place(one) for one in modes[k]]]
-        online = online or OnlineTrack(len(shared), height_sigma_m)
+        online = online or OnlineTrack(len(shared))
         for of in placed:
             online.add(of, moves)
         return online
@@ -187,7 +187,7 @@ class TrackSession:
         files = input_hashes(path, [exposure.camera], exposure.terrain, exposure.mask, exposure.obstacles)
         alone = replace(shared, gross=frozenset())  # with the facts that the image itself shows
         clock = None if shared.listed.clock is None else shared.listed.clock.turn_rad_s.tolist()
-        errors = [repr(shared.listed.listed), alone.names, alone.sigma.tolist(), clock]
+        errors = [repr((shared.listed.listed, shared.listed.waves)), alone.names, alone.sigma.tolist(), clock]
         others = self.settings.evidence_sources, self.settings.near_attitude, sorted(files.items()), errors
         job = job_sha256(path, exposure.sha256, self.facts, *others)
         return hashlib.sha256(f"{exposure.name} {job}".encode()).hexdigest()[:32]

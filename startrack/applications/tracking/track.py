@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions, positions_at_rest
+from startrack.applications.tracking.frame_estimate import FIRST_WAVE
 from startrack.applications.tracking.legs import SlippedLeg, images_outside, legs_about, slipped_legs
 from startrack.applications.tracking.observed_frame import ImageFix, ObservedFrame
 from startrack.applications.tracking.odometry import Odometry
@@ -154,8 +155,8 @@ def estimate_track(
     else:
         moves = odometry_moves(frames, odometry, odometry_errors, shows_scale=not shared.bends)
         names = [frame.name for frame in frames]
-        placed, robust = smooth_placed(modes, moves, shared, terrain.height_sigma_m, names)
-        filtered = filter_positions(placed, moves, len(shared), terrain.height_sigma_m)
+        placed, robust = smooth_placed(modes, moves, shared, names)
+        filtered = filter_positions(placed, moves, len(shared))
         position_m, covariance_m2, used_then, by_one = filtered
         covariance_m2[(used_then >= 0) & (robust.mode < 0)] = UNKNOWN_M**2 * np.eye(2)  # taken back since
         by_one += images_outside(frames, used_then, position_m, shared)
@@ -174,9 +175,10 @@ def estimate_track(
     crater = terrain.with_shape(_shape_values(found, shared, terrain)) if shared.size_sigma_1 else terrain
     depth, width = (_size_error(found, shared, name, crater.facts().get(key, np.nan)) for name, key in SIZES.items())
     crests = None
-    if len(found.post):
-        places_m = terrain.post_positions_m(found.post)
-        crests = CrestHeights(found.post, places_m, found.post_error_m, found.post_sigma_m)
+    if len(posts := np.flatnonzero(found.post < FIRST_WAVE)):
+        number, sigma_m = found.post[posts], terrain.height_sigma_m
+        errors_m = sigma_m * found.post_error[posts], sigma_m * found.post_sigma[posts]
+        crests = CrestHeights(number, terrain.post_positions_m(number), *errors_m)
     return Track(
         tuple(
             _track_frame(*one)

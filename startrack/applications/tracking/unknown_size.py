@@ -24,7 +24,6 @@ def smooth_placed(
     modes: Sequence[Sequence[FrameEstimate]],
     moves: Sequence[Moves],
     shared: TrackErrors,
-    height_sigma_m: float,
     names: Sequence[str] = (),
 ) -> tuple[list[list[FrameEstimate]], RobustTrack]:
     """The modes with their positions in the crater of the errors `shared` that all show, and the track by them.
@@ -35,11 +34,11 @@ def smooth_placed(
     """
     placed = [[shared.place(one) for one in of] for of in modes]
     if not shared.bends:
-        return placed, smooth_robustly(placed, moves, height_sigma_m, names=names)
+        return placed, smooth_robustly(placed, moves, names=names)
 
     def expand(placed: list[list[FrameEstimate]], kinds: Sequence[Moves]) -> tuple[Any, RobustTrack, float]:
         """The modes and the track by `kinds` of moves, and by how much [m] the last expansion moved it."""
-        robust = smooth_robustly(placed, kinds, height_sigma_m, names=names)
+        robust = smooth_robustly(placed, kinds, names=names)
         rounds, moved_m = 0, np.inf
         while moved_m > STILL_MOVES_M and rounds < SIZE_ROUNDS:
             before = robust.smoothed
@@ -47,7 +46,7 @@ def smooth_placed(
                 [shared.place(one, position_m, before.shared) for one in of]
                 for of, position_m in zip(modes, before.position_m, strict=True)
             ]
-            robust = smooth_robustly(placed, kinds, height_sigma_m, names=names)
+            robust = smooth_robustly(placed, kinds, names=names)
             rounds, moved_m = rounds + 1, float(np.abs(robust.smoothed.position_m - before.position_m).max())
         return placed, robust, moved_m
 

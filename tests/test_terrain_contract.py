@@ -16,6 +16,7 @@ from startrack.frames import Site
 from startrack.localization import ExactPosterior
 from startrack.terrain import Cylinder, ForwardingTerrain, Terrain, load_terrain
 from startrack.terrain.crater import DeformedCrater
+from startrack.terrain.shape import EXACT_WAVES
 
 SITE = Site("moon", np.radians(-89.66), np.radians(129.78))
 AZIMUTHS = np.linspace(0.01, 2 * np.pi, 12, endpoint=False)
@@ -99,7 +100,10 @@ def deformed_crater() -> Terrain:
 
 @cache
 def height_map() -> Terrain:
-    return replace(load_terrain("shackleton"), search_radius_m=300.0, height_sigma_m=0.0, horizon_sigma_common_rad=0.0)
+    return replace(
+        load_terrain("shackleton-rendered"), search_radius_m=300.0, height_sigma_m=0.0, horizon_sigma_common_rad=0.0,
+        waves_sigma_rad=EXACT_WAVES,
+    )  # fmt: skip
 
 
 MAKERS: dict[str, Callable[[], Any]] = {

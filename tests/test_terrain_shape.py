@@ -19,6 +19,7 @@ from startrack.simulation import draw_ground
 from startrack.simulation.ground_errors import ErringGround
 from startrack.terrain import Cylinder, ForwardingTerrain, HeightMap, Terrain, load_terrain, terrain_from_dict
 from startrack.terrain.crater import DeformedCrater
+from startrack.terrain.shape import WAVES
 
 CRATER = {
     "format": 1, "name": "pit", "body": "moon", "origin": {"latitude_deg": -89.0, "longitude_deg": 0.0},
@@ -186,29 +187,46 @@ def hill_terrain() -> HeightMap:
 def test_errors_of_a_map_by_file(tmp_path: Path):
     path = terrain_file(tmp_path, dem={"height_sigma_m": 0.0, "horizon_sigma_deg": 0.1})
     errors = {error.name: error for error in load_terrain(path).shape_errors}
-    assert list(errors) == ["bias_rad", "stretch_1", "vertical_east_rad", "vertical_north_rad", "camera_height_m"]
-    bias, stretch, vertical, _, camera = errors.values()
+    assert list(errors) == [
+        "bias_rad",
+        "stretch_1",
+        "vertical_east_rad",
+        "vertical_north_rad",
+        *WAVES.errors,
+        "camera_height_m",
+    ]
+    bias, stretch, vertical, _, *waves, camera = errors.values()
     assert (bias.fact, bias.sigma, bias.is_stated) == ("horizon_sigma_deg", pytest.approx(np.radians(0.1)), True)
     assert (stretch.fact, stretch.sigma, stretch.gross_probability, stretch.gross_sigma) == (
         "stretch_sigma_1", 0.0, 0.005, 0.005,
     )  # fmt: skip
     assert (vertical.fact, vertical.gross_probability) == ("vertical_sigma_deg", 0.005)
     assert np.degrees([vertical.sigma, vertical.gross_sigma]) == pytest.approx([0.0005, 0.02])
+    assert [wave.wave for wave in waves] == [m for m in range(1, 9) for _ in range(2)]
+    assert {wave.fact for wave in waves} == {"horizon_waves_sigma_deg"} and not any(wave.is_stated for wave in waves)
+    assert (waves[0].sigma, waves[0].gross_probability) == (0.0, 0.01)
     assert (camera.fact, camera.sigma, camera.is_stated) == ("camera_height_sigma_m", 0.02, True)
     stated = {"height_sigma_m": 0.0, "horizon_sigma_deg": 0.0, "stretch_sigma_1": 0.0, "vertical_sigma_deg": 0.01}
+    stated["horizon_waves_sigma_deg"] = [0.01 * k for k in range(8)]
     path = terrain_file(tmp_path, dem=stated, rover={"camera_height_sigma_m": 0.0})
     errors = load_terrain(path).shape_errors
-    assert [error.sigma for error in errors] == pytest.approx([0.0, 0.0, *np.radians([0.01, 0.01])])
+    waves = [0.01 * k for k in range(8) for _ in range(2)]
+    assert [error.sigma for error in errors] == pytest.approx([0.0, 0.0, *np.radians([0.01, 0.01, *waves])])
     assert all(error.is_stated for error in errors)
+    path = terrain_file(tmp_path, dem=stated | {"horizon_waves_sigma_deg": 0.02}, rover={"camera_height_sigma_m": 0.0})
+    assert np.degrees([error.sigma for error in load_terrain(path).shape_errors if error.wave == 4]) == pytest.approx(
+        0.01
+    )
 
 
 def test_slopes_of_a_map_are_the_differences_of_its_horizon():
     terrain, points = map_with(), np.array([[100.0, -200.0], [400.0, 350.0]])
     slopes = terrain.shape_slopes_rad(points[:, None], AZIMUTHS)
-    assert slopes.shape == (5, 2, 40)
+    assert slopes.shape == (21, 2, 40)
     plain = terrain.horizon_rad(points[:, None], AZIMUTHS)
-    for k, (error, step) in enumerate(zip(terrain.shape_errors, (1e-5, 1e-4, 1e-5, 1e-5, 0.01), strict=True)):
-        change = step * (np.arange(5) == k)
+    steps = (1e-5, 1e-4, 1e-5, 1e-5, *np.full(16, 1e-5), 0.01)
+    for k, (error, step) in enumerate(zip(terrain.shape_errors, steps, strict=True)):
+        change = step * (np.arange(21) == k)
         found = terrain.with_shape(change).horizon_rad(points[:, None], AZIMUTHS)
         left_out = 0.3 if error.fact == "vertical_sigma_deg" else 2e-3  # tan H times the slope of the skyline
         assert (found - plain) / step == pytest.approx(slopes[k], abs=left_out * np.abs(slopes[k]).max()), error.name
@@ -231,12 +249,15 @@ def test_a_tilt_turns_the_skyline_exactly():
     slow = np.interp(
         AZIMUTHS, np.arctan2(turned[:, 0], turned[:, 1]) % (2 * np.pi), np.arcsin(turned[:, 2]), period=2 * np.pi
     )
-    ground = terrain.with_shape(np.array([0.0, 0.0, east, north]))
+    ground = terrain.with_shape(np.array([0.0, 0.0, east, north, *np.zeros(16)]))
     assert ground.horizon_rad(point, AZIMUTHS) == pytest.approx(slow, abs=2e-6)
 
 
 def test_bounds_of_a_deformed_map_hold():
-    ground, rng = map_with().with_shape(np.array([1e-3, 0.01, 2e-3, -1e-3, 0.2])), np.random.default_rng(2)
+    ground, rng = (
+        map_with().with_shape(np.array([1e-3, 0.01, 2e-3, -1e-3, *np.linspace(-1e-3, 1e-3, 16), 0.2])),
+        np.random.default_rng(2),
+    )
     assert ground.camera_height_m == pytest.approx(1.7) and ground.shape_errors == ()
     centres, azimuths = rng.uniform(-400, 400, (20, 2)), rng.uniform(0, 2 * np.pi, 20)
     for half_m, turn_rad in ((5.0, 0.0), (100.0, 0.05)):
@@ -254,7 +275,7 @@ def test_an_interpolator_has_the_slopes_of_its_map():
     assert near.shape_errors == terrain.shape_errors
     found, own = near.shape_slopes_rad(point, AZIMUTHS), terrain.shape_slopes_rad(point, AZIMUTHS)
     scale = np.abs(own).max(axis=1, keepdims=True)
-    assert np.abs(found - own).max(axis=1) == pytest.approx(np.zeros(5), abs=0.05 * scale.max())
+    assert np.abs(found - own).max(axis=1) == pytest.approx(np.zeros(21), abs=0.05 * scale.max())
     assert np.abs(near.shape_slopes_rad(point, AZIMUTHS + 0.01) - terrain.shape_slopes_rad(point, AZIMUTHS + 0.01)
                   ).max() == 0.0  # fmt: skip
 

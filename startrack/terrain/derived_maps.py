@@ -28,8 +28,9 @@ class DeformedMap(ForwardingTerrain):
     """The ground of a height map with errors of its shape, given by the names of `shape_errors`.
 
     In this order: the camera stands higher, sight lines bend more, tan of the horizon is stretched, the horizon rises
-    by the bias and by waves (by name), and the skyline is turned about a horizontal axis. It has no further errors of its shape. Its bounds need the table of a map with the camera at the changed height and such lines; the
-    horizon does without.
+    by the bias and by waves (by name), and the skyline is turned about a horizontal axis. It has no further errors of
+    its shape. Its bounds need the table of a map with the camera at the changed height and such lines; the horizon does
+    without.
     """
 
     whole: TracedMap

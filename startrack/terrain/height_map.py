@@ -56,12 +56,16 @@ class HeightMap(TracedMap):
         """
         if not self.height_sigma_m and not self.horizon_sigma_common_rad:
             return 0.0
-        own = 0.0
-        if self.height_sigma_m:
-            cells = np.hypot(*self.square.centres_m.T) < self.search_radius_m
-            own = float(np.median(self._sigma.blocks_rad[0].reshape(-1, AZIMUTH_BINS)[cells]))
-        known = self.horizon_sigma_common_rad
+        own, known = self.post_rad, self.horizon_sigma_common_rad
         return float(np.hypot(own, COMMON_PER_POST * own if known is None else known))
+
+    @cached_property
+    def post_rad(self) -> float:
+        """What the error of single posts makes of the horizon [rad]: the median over search area and azimuth."""
+        if not self.height_sigma_m:
+            return 0.0
+        cells = np.hypot(*self.square.centres_m.T) < self.search_radius_m
+        return float(np.median(self._sigma.blocks_rad[0].reshape(-1, AZIMUTH_BINS)[cells]))
 
     @cached_property
     def crest_distance_m(self) -> float:  # type: ignore[override]
@@ -77,7 +81,7 @@ class HeightMap(TracedMap):
         return (
             *shape.BIAS.shape_errors(self.common_sigma_rad), *shape.STRETCH.shape_errors(self.stretch_sigma_1),
             *shape.vertical_fact(self.site.body).shape_errors(self.vertical_sigma_rad),
-            *shape.wave_errors(self.waves_sigma_rad),
+            *shape.wave_errors(self.waves_sigma_rad, 0.0 if self.waves_sigma_rad else self.post_rad),
             *shape.CAMERA_ERROR.shape_errors(self.camera_height_sigma_m, beside=BETWEEN_POSTS * self.height_sigma_m),
             *shape.REFRACTION.shape_errors(self.terrestrial_refraction_sigma_1), *refraction_errors(self.air),
         )  # fmt: skip

@@ -134,21 +134,19 @@ EARTH_HIGHEST_M = 8850.0  # the highest ground of the Earth
 # docs/terrain.md, and a seam of 20 m over half of a horizon 9 km away, whose first wave is 0.08 degrees.
 WAVE_COUNT = 8
 EXACT_WAVES = (EXACT,) * WAVE_COUNT
+WAVE_PER_POST = 0.3  # sigma of wave 1, in the horizon's by single posts: 0.14 to 0.42 on the shipped maps
 WAVE_FALL = -0.5  # power of the number of the wave with which sigmas fall where one number states them
 WAVES = Fact(
-    key="horizon_waves_sigma_deg",
-    sigma=float(np.radians(0.003)),
-    gross_probability=0.01,
-    gross_sigma=float(np.radians(0.04)),
+    key="horizon_waves_sigma_deg", sigma=0.0, gross_probability=0.01, gross_sigma=float(np.radians(0.04)),
     errors=tuple(f"wave_{m}_{part}_rad" for m in range(1, WAVE_COUNT + 1) for part in ("cos", "sin")),
     meaning="smooth error of the horizon over azimuth: waves 1 to 8, each of the cosine and of the sine [deg]",
     limits=Number(low=0.0, high=9.99),
-)
+)  # fmt: skip
 WAVES_LIMITS = Either(
     kinds=(WAVES.limits, List(each=WAVES.limits, count=WAVE_COUNT)),
     description="of smooth errors of the horizon over azimuth, the cosine and the sine of waves 1 to 8 each; one "
-                "number is of wave 1, and wave m has it over the root of m; if absent 0.003, and with probability "
-                "1 % 0.04",
+                "number is of wave 1, and wave m has it over the root of m; if absent 0.3 of what height_sigma_m makes "
+                "of the horizon, and with probability 1 % 0.04",
 )  # fmt: skip
 CYLINDER_FACTS = (DEPTH, DIAMETER, ELLIPSE, RIM_TILT)
 MAP_FACTS = (BIAS, STRETCH, VERTICAL, WAVES, CAMERA_ERROR)
@@ -164,9 +162,12 @@ def sigmas_of_waves(sigma: float) -> tuple[float, ...]:
     return tuple(sigma * m**WAVE_FALL for m in range(1, WAVE_COUNT + 1))
 
 
-def wave_errors(stated: tuple[float, ...] | None) -> list[ShapeError]:
-    """The errors of WAVES; `stated` holds the sigmas of the waves [rad], None where the file is silent."""
-    sigmas, gross = stated or sigmas_of_waves(WAVES.sigma), sigmas_of_waves(WAVES.gross_sigma)
+def wave_errors(stated: tuple[float, ...] | None, post_rad: float) -> list[ShapeError]:
+    """The errors of WAVES; `stated` holds the sigmas of the waves [rad], None where the file is silent.
+
+    `post_rad` is what the error of the posts makes of the horizon.
+    """
+    sigmas, gross = stated or sigmas_of_waves(WAVE_PER_POST * post_rad), sigmas_of_waves(WAVES.gross_sigma)
     return [
         ShapeError(
             name=name, fact=WAVES.key, sigma=sigmas[k // 2], gross_sigma=gross[k // 2], wave=k // 2 + 1,

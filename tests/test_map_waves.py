@@ -1,0 +1,124 @@
+"""Waves of a map's horizon error over azimuth: the closed form, the posterior, and exposures that share them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from map_helpers import basin
+from startrack.applications.tracking.frame_estimate import estimate_frame, waves_at
+from startrack.applications.tracking.track_errors import TrackErrors
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence
+from startrack.estimation.observations import Observations, Steps
+from startrack.estimation.trajectory import smooth
+from startrack.localization import ExactPosterior, LinearErrors
+from startrack.terrain import HeightMap, Terrain
+from startrack.terrain.shape import EXACT_WAVES, WAVES
+
+SIGMA_RAD = tuple(np.radians(0.15) / m**0.5 for m in range(1, 9))
+AT_M = np.array([60.0, -40.0])
+
+
+def errors_of(rng: np.random.Generator, count: int = 3) -> LinearErrors:
+    """Of a few waves, seen by sectors of different weights."""
+    rise = np.column_stack([np.cos(m * MIDDLES_RAD) for m in range(1, count + 1)])
+    return LinearErrors(
+        rise, np.zeros(count), np.diag([1e-6, 4e-6, 9e-6][:count]), rng.uniform(0.0, 2e5, SECTORS), count
+    )
+
+
+def test_the_closed_form_is_the_integral():
+    """Against a sum over a fine grid of both errors."""
+    rng = np.random.default_rng(1)
+    linear = errors_of(rng, 2)
+    left = rng.normal(0.0, 3e-3, SECTORS)
+    errors, log = linear.fit(left[None])
+
+    def log_likelihood(values: Array) -> Array:
+        return -0.5 * np.square(left - values @ linear.rise_rad.T) @ linear.weight
+
+    axes = [np.linspace(-6 * s, 6 * s, 801) for s in (1e-3, 2e-3)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    prior = -0.5 * np.square(grid / [1e-3, 2e-3]).sum(axis=1) - np.log(2 * np.pi * 1e-3 * 2e-3)
+    cell = float(np.prod([a[1] - a[0] for a in axes]))
+    slow = np.logaddexp.reduce(log_likelihood(grid) + prior) + np.log(cell)
+    assert log_likelihood(errors)[0] + log[0] == pytest.approx(slow, abs=1e-3)
+    assert grid[np.argmax(log_likelihood(grid) + prior)] == pytest.approx(errors[0], abs=2e-5)
+
+
+def rays_at(ground: Terrain, rng: np.random.Generator, count: int = 5000) -> Evidence:
+    """Rays near the horizon of `ground` at AT_M, visible or hidden, each with 3 nats."""
+    azimuth = rng.uniform(0.0, 2 * np.pi, count)
+    horizon = np.asarray(ground.horizon_rad(AT_M[None], azimuth)).ravel()
+    above = rng.uniform(-0.03, 0.03, count)
+    return Evidence(
+        azimuth_rad=azimuth, elevation_rad=horizon + above, llr=np.where(above > 0.0, 3.0, -3.0),
+        edge_sigma_rad=np.full(count, 2e-4),
+    )  # fmt: skip
+
+
+def drawn(stated: HeightMap, rng: np.random.Generator) -> Terrain:
+    """The ground below AT_M: the map with waves as stated and no other error."""
+    values = np.array([rng.normal() * one.sigma if one.wave else 0.0 for one in stated.shape_errors])
+    return stated.with_shape(values)
+
+
+def test_the_circle_holds_what_waves_do():
+    stated = replace(basin(height_sigma_m=0.3), waves_sigma_rad=SIGMA_RAD)
+    exact = replace(stated, waves_sigma_rad=EXACT_WAVES)
+    nees, without = [], []
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        rows = rays_at(drawn(stated, rng), rng)
+        for terrain, found in (stated, nees), (exact, without):
+            try:
+                fix = ExactPosterior()(rows, terrain)
+            except Exception as refusal:  # noqa: BLE001 - a refusal of the exact map is an answer too
+                assert terrain is exact, refusal
+                continue
+            off = fix.position_enu_m[:2] - AT_M
+            found.append(off @ np.linalg.solve(fix.covariance_m2, off))
+    assert len(nees) == 16 and 0.7 < np.mean(nees) < 4.0
+    assert len(without) < 16 or np.mean(without) > 3 * np.mean(nees)
+
+
+def test_silent_files_name_the_waves():
+    silent = replace(basin(height_sigma_m=0.3), waves_sigma_rad=None)
+    fix = ExactPosterior()(rays_at(silent, np.random.default_rng(3)), silent)
+    widened = {one.fact: one.radius999_m_if_exact for one in fix.unstated}
+    assert widened[WAVES.key] < fix.radius999_m
+
+
+def test_exposures_of_one_place_share_the_waves():
+    """Ten of them state hardly less than one: with exact waves they would state a third."""
+    stated = replace(basin(height_sigma_m=0.3), waves_sigma_rad=SIGMA_RAD)
+    sizes = {}
+    for terrain in stated, replace(stated, waves_sigma_rad=EXACT_WAVES):
+        errors = TrackErrors.of(terrain, None)
+        frames = [
+            estimate_frame(rays_at(stated, np.random.default_rng(k), 600), terrain, errors, AT_M, np.eye(2))
+            for k in range(10)
+        ]
+        still = Steps(np.zeros((9, 2)), np.full(9, 1e-3))
+        one = smooth(Observations.of(frames[:1]), Steps.unknown(1)).covariance_m2[0]
+        every = smooth(Observations.of(frames), still).covariance_m2[-1]
+        sizes[terrain.waves_sigma_rad == EXACT_WAVES] = np.sqrt(np.trace(every) / np.trace(one))
+    assert sizes[False] > 0.8 and sizes[True] < 0.6
+
+
+def test_waves_of_places_far_apart_are_independent():
+    terrain = replace(basin(), waves_sigma_rad=SIGMA_RAD)
+    linear = errors_of(np.random.default_rng(2))
+
+    def common(apart_m: float) -> float:
+        """Correlation of wave 1 at two places."""
+        (one, rise), (other, rise_there) = (waves_at(AT_M + [x, 0.0], terrain, linear) for x in (0.0, apart_m))
+        of = {int(n): r for n, r in zip(one[0], rise[0], strict=True)}
+        parts = [of.get(int(n), 0.0) * r for n, r in zip(other[0], rise_there[0], strict=True)]
+        return float(np.sum(parts)) / float(np.square(rise[0]).sum())
+
+    assert common(0.0) == pytest.approx(1.0)
+    assert common(0.05 * terrain.crest_distance_m) > 0.9
+    assert common(20.0 * terrain.crest_distance_m) == 0.0

@@ -6,19 +6,26 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from localization_helpers import locate_or_refuse
 
-from map_helpers import basin
-from startrack.applications.tracking.frame_estimate import estimate_frame, waves_at
+from startrack.applications.tracking.frame_estimate import FIRST_WAVE, estimate_frame, waves_at
 from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence
 from startrack.estimation.observations import Observations, Steps
 from startrack.estimation.trajectory import smooth
 from startrack.localization import ExactPosterior, LinearErrors
-from startrack.terrain import HeightMap, Terrain
+from startrack.terrain import HeightMap, Terrain, load_terrain
 from startrack.terrain.shape import EXACT_WAVES, WAVES
 
-SIGMA_RAD = tuple(np.radians(0.15) / m**0.5 for m in range(1, 9))
+SIGMA_RAD = tuple(np.radians(0.012) / m**0.5 for m in range(1, 9))
 AT_M = np.array([60.0, -40.0])
+
+
+def floor() -> HeightMap:
+    """The middle of Shackleton's floor, whose map has errors of its posts."""
+    whole = load_terrain("shackleton-rendered")
+    assert isinstance(whole, HeightMap)
+    return replace(whole, search_radius_m=300.0, height_sigma_m=1.0, horizon_sigma_common_rad=0.0)
 
 
 def errors_of(rng: np.random.Generator, count: int = 3) -> LinearErrors:
@@ -48,11 +55,11 @@ def test_the_closed_form_is_the_integral():
     assert grid[np.argmax(log_likelihood(grid) + prior)] == pytest.approx(errors[0], abs=2e-5)
 
 
-def rays_at(ground: Terrain, rng: np.random.Generator, count: int = 5000) -> Evidence:
+def rays_at(ground: Terrain, rng: np.random.Generator, count: int = 4000) -> Evidence:
     """Rays near the horizon of `ground` at AT_M, visible or hidden, each with 3 nats."""
     azimuth = rng.uniform(0.0, 2 * np.pi, count)
     horizon = np.asarray(ground.horizon_rad(AT_M[None], azimuth)).ravel()
-    above = rng.uniform(-0.03, 0.03, count)
+    above = rng.uniform(-0.003, 0.003, count)
     return Evidence(
         azimuth_rad=azimuth, elevation_rad=horizon + above, llr=np.where(above > 0.0, 3.0, -3.0),
         edge_sigma_rad=np.full(count, 2e-4),
@@ -66,42 +73,41 @@ def drawn(stated: HeightMap, rng: np.random.Generator) -> Terrain:
 
 
 def test_the_circle_holds_what_waves_do():
-    stated = replace(basin(height_sigma_m=0.3), waves_sigma_rad=SIGMA_RAD)
+    stated = replace(floor(), waves_sigma_rad=SIGMA_RAD)
     exact = replace(stated, waves_sigma_rad=EXACT_WAVES)
     nees, without = [], []
-    for seed in range(16):
+    for seed in range(10):
         rng = np.random.default_rng(seed)
         rows = rays_at(drawn(stated, rng), rng)
         for terrain, found in (stated, nees), (exact, without):
-            try:
-                fix = ExactPosterior()(rows, terrain)
-            except Exception as refusal:  # noqa: BLE001 - a refusal of the exact map is an answer too
-                assert terrain is exact, refusal
+            fix, reason = locate_or_refuse(rows, terrain)
+            assert fix is not None or terrain is exact, reason
+            if fix is None:
                 continue
             off = fix.position_enu_m[:2] - AT_M
             found.append(off @ np.linalg.solve(fix.covariance_m2, off))
-    assert len(nees) == 16 and 0.7 < np.mean(nees) < 4.0
-    assert len(without) < 16 or np.mean(without) > 3 * np.mean(nees)
+    assert len(nees) == 10 and 0.7 < np.mean(nees) < 4.0
+    assert len(without) < 10 or np.mean(without) > 3 * np.mean(nees)
 
 
 def test_silent_files_name_the_waves():
-    silent = replace(basin(height_sigma_m=0.3), waves_sigma_rad=None)
+    silent = replace(floor(), waves_sigma_rad=None)
     fix = ExactPosterior()(rays_at(silent, np.random.default_rng(3)), silent)
     widened = {one.fact: one.radius999_m_if_exact for one in fix.unstated}
     assert widened[WAVES.key] < fix.radius999_m
 
 
 def test_exposures_of_one_place_share_the_waves():
-    """Ten of them state hardly less than one: with exact waves they would state a third."""
-    stated = replace(basin(height_sigma_m=0.3), waves_sigma_rad=SIGMA_RAD)
+    """Six of them state hardly less than one; with exact waves they state less than a half of it."""
+    stated = replace(floor(), waves_sigma_rad=SIGMA_RAD)
     sizes = {}
     for terrain in stated, replace(stated, waves_sigma_rad=EXACT_WAVES):
         errors = TrackErrors.of(terrain, None)
         frames = [
-            estimate_frame(rays_at(stated, np.random.default_rng(k), 600), terrain, errors, AT_M, np.eye(2))
-            for k in range(10)
+            estimate_frame(rays_at(stated, np.random.default_rng(k)), terrain, errors, AT_M, np.eye(2))
+            for k in range(6)
         ]
-        still = Steps(np.zeros((9, 2)), np.full(9, 1e-3))
+        still = Steps(np.zeros((5, 2)), np.full(5, 1e-3))
         one = smooth(Observations.of(frames[:1]), Steps.unknown(1)).covariance_m2[0]
         every = smooth(Observations.of(frames), still).covariance_m2[-1]
         sizes[terrain.waves_sigma_rad == EXACT_WAVES] = np.sqrt(np.trace(every) / np.trace(one))
@@ -109,15 +115,17 @@ def test_exposures_of_one_place_share_the_waves():
 
 
 def test_waves_of_places_far_apart_are_independent():
-    terrain = replace(basin(), waves_sigma_rad=SIGMA_RAD)
+    terrain = replace(floor(), waves_sigma_rad=SIGMA_RAD)
     linear = errors_of(np.random.default_rng(2))
 
     def common(apart_m: float) -> float:
         """Correlation of wave 1 at two places."""
-        (one, rise), (other, rise_there) = (waves_at(AT_M + [x, 0.0], terrain, linear) for x in (0.0, apart_m))
-        of = {int(n): r for n, r in zip(one[0], rise[0], strict=True)}
-        parts = [of.get(int(n), 0.0) * r for n, r in zip(other[0], rise_there[0], strict=True)]
-        return float(np.sum(parts)) / float(np.square(rise[0]).sum())
+        (one, rise), (other, rise_there) = (
+            waves_at(AT_M + np.array([x, 0.0]), terrain, linear) for x in (0.0, apart_m)
+        )
+        of = {int(n): r for n, r in zip(one, rise[0], strict=True) if (n - FIRST_WAVE) % 3 == 0}
+        parts = [of.get(int(n), 0.0) * r for n, r in zip(other, rise_there[0], strict=True)]
+        return float(np.sum(parts)) / float(np.square(list(of.values())).sum())
 
     assert common(0.0) == pytest.approx(1.0)
     assert common(0.05 * terrain.crest_distance_m) > 0.9

@@ -107,10 +107,11 @@ class FrameModel:
         higher, lower = (clear_logs(self.model.seen.profiles, shifts + sign * step, all_clear) for sign in (1.0, -1.0))
         return np.asarray(self.clear * (higher - lower) / (2 * step))
 
-    def information(self) -> tuple[Array, Array]:
-        """Of a linear model of the sectors: (2 + k, 2 + k), and its product (2 + k,) with the best parameters.
+    def information(self) -> tuple[Array, Array, Array]:
+        """Of a linear model of the sectors: (2 + k, 2 + k), its product (2 + k,) with the best parameters, and a score.
 
-        Positions are relative to the reference. Sets how much each sector counts for the errors of the image.
+        Positions are relative to the reference. The score (2 + k, SECTORS) is by how much the gradient grows with the
+        heights that the sectors see. Sets how much each sector counts for the linear errors.
         """
         seen, around, linear = self.model.seen, self.model.around, self.model.linear
         design, own = np.hstack([around.slopes.T, self.rise_rad]), linear.rise_rad
@@ -124,13 +125,13 @@ class FrameModel:
         weight = clear / seen.moments.variance_rad2
         explained = np.linalg.solve((own.T * weight) @ own + known, own.T * weight)  # by the image's own errors
         weighted = np.asarray(design.T * weight - ((design.T * weight) @ own) @ explained)
-        return weighted @ design, weighted @ (height - linear.expected_rad)
+        return weighted @ design, weighted @ (height - linear.expected_rad), weighted
 
 
 def sample_together(models: Sequence[FrameModel], position_m: Array, covariance_m2: Array) -> WeightedPoints:
     """Points of the posterior by exposures of one position, with one reference, from near a position (2,)."""
     # The position as it is given, and the errors that a linear model gives for it.
-    information, weighted = (np.sum(parts, axis=0) for parts in zip(*(m.information() for m in models), strict=True))
+    information, weighted, _ = (np.sum(parts, axis=0) for parts in zip(*(m.information() for m in models), strict=True))
     information += np.diag(np.r_[np.full(2, UNKNOWN_M**-2), np.ones(len(information) - 2)])
     covariance = np.linalg.inv(information)
     best = covariance @ weighted
@@ -203,7 +204,8 @@ def observe_together(models: Sequence[FrameModel], found: WeightedPoints) -> Fra
     by_evidence = response @ covariance  # of the mean at given true parameters
     plain, spread = moments(points, share)
     by_horizon, counted = np.zeros((len(mean), len(MIDDLES_RAD))), np.zeros_like(covariance)
-    position = models[0].model.around.reference_m
+    wave, rises = waves_at(models[0].model.around.reference_m, models[0].model.terrain, models[0].model.linear)
+    by_wave = np.zeros((len(mean), len(wave)))
     for model in models:
         model.settle(mean)
         slopes = model.slopes(points, share)
@@ -211,12 +213,14 @@ def observe_together(models: Sequence[FrameModel], found: WeightedPoints) -> Fra
         own = shown @ covariance @ np.linalg.solve(spread, common)
         by_posts = model.model.around.post_sigma_rad  # other errors of the ground are this frame's own noise
         counted += 0.0 if by_posts is None else (own * np.square(by_posts)) @ own.T
-        by_wave = own @ waves_at(position, model.model.terrain, model.model.linear)[1]
-        counted += by_wave @ by_wave.T
         by_horizon += own
+        of_waves = shown @ covariance @ model.information()[2] @ rises  # sampled ones would be noise of the points
+        counted += of_waves @ of_waves.T
+        by_wave += of_waves
     noise = clipped_noise(by_evidence - counted, by_evidence) + ROUNDING * covariance
     noise += UNSEEN_NOISE * (covariance - shown @ covariance @ shown.T)
     post, by_post = _posts(models[0], by_horizon, covariance)
+    post, by_post = np.append(post, wave), np.hstack([by_post, by_wave])
     shared_by_posts = by_post @ by_post.T
     estimate = FrameEstimate(
         shown @ mean, covariance - by_evidence + noise + shared_by_posts, response, noise, post, by_post,
@@ -252,24 +256,21 @@ def clipped_noise(noise: Array, whole: Array) -> Array:
 
 
 def _posts(model: FrameModel, by_horizon: Array, covariance: Array) -> tuple[Ints, Array]:
-    """Posts and waves (c,) of the map's errors, and the response (d, c) of the mean to each.
-
-    They are those of the crests, and of the camera's ground. Waves have numbers from FIRST_WAVE on.
-    """
+    """Posts (c,) of the crests and of the camera's ground, and the response (d, c) of the mean to the error of each."""
     terrain, around = model.model.terrain, model.model.around
-    parts = [waves_at(around.reference_m, terrain, model.model.linear)]
-    if around.crests is not None:
-        parts.append((around.crests.post, terrain.height_sigma_m * around.crests.rad_per_m))
-        post, rad_per_m = terrain.ground_posts(around.reference_m, MIDDLES_RAD)
-        parts.append((post, terrain.height_sigma_m * rad_per_m))
+    if around.crests is None:
+        return np.zeros(0, dtype=np.int64), np.zeros((len(by_horizon), 0))
+    crests = around.crests.post, around.crests.rad_per_m
+    parts = [crests, terrain.ground_posts(around.reference_m, MIDDLES_RAD)]
     every = np.concatenate([posts.ravel() for posts, _ in parts])
     # Ground higher than the map acts on the evidence as a map lower than the ground.
     response = np.concatenate(
-        [(-by_horizon[:, :, None] * rises_rad).reshape(len(by_horizon), -1) for _, rises_rad in parts], axis=1
+        [(-by_horizon[:, :, None] * rad_per_m).reshape(len(by_horizon), -1) for _, rad_per_m in parts], axis=1
     )
     known = every != NO_POST
     post, of = np.unique(every[known], return_inverse=True)
     by_post: Array = np.stack([np.bincount(of, weights=row[known], minlength=len(post)) for row in response])
+    by_post *= terrain.height_sigma_m
     effect = np.square(by_post / np.sqrt(np.diag(covariance))[:, None]).max(axis=0, initial=0.0)
     order = np.argsort(effect)
     kept = np.sort(order[np.cumsum(effect[order]) > NEGLIGIBLE_POST])
@@ -277,7 +278,7 @@ def _posts(model: FrameModel, by_horizon: Array, covariance: Array) -> tuple[Int
 
 
 def waves_at(position_m: Array, terrain: Terrain, linear: LinearErrors) -> tuple[Ints, Array]:
-    """Numbers (SECTORS, c) of waves of the map's error, and the rise (SECTORS, c) [rad] by one sigma of each.
+    """Numbers (c,) of waves of the map's error, from FIRST_WAVE on, and the rise (SECTORS, c) [rad] by a sigma of each.
 
     A wave changes with the place, since the crests stand in other directions there: its error is that of the four
     nodes about the position (2,) of a square grid, independent of each other, in parts whose squares add up to 1.
@@ -292,5 +293,4 @@ def waves_at(position_m: Array, terrain: Terrain, linear: LinearErrors) -> tuple
         node = (low + corner).astype(np.int64) + WAVE_NODES // 2
         number.append(FIRST_WAVE + (node[:, 0] * WAVE_NODES + node[:, 1]) * linear.waves + np.arange(linear.waves))
         part.append(np.sqrt(np.prod(1.0 - np.abs(at - low - corner), axis=1)))
-    rises = np.concatenate([rise * one for one in part], axis=1)
-    return np.broadcast_to(np.concatenate(number), rises.shape), rises
+    return np.concatenate(number), np.concatenate([rise * one for one in part], axis=1)

@@ -16,6 +16,7 @@ from startrack.core.types import Array, Evidence
 from startrack.frames import enu_from_latlon
 from startrack.localization import ExactPosterior
 from startrack.terrain import STEREOGRAPHIC, HeightMap, Projection, Raster, load_terrain, read_map, write_map
+from startrack.terrain.crest_errors import measure_waves
 from startrack.terrain.map_comparison import MapComparison, compare_maps
 from startrack.terrain.projection import ORTHOGRAPHIC
 
@@ -61,6 +62,16 @@ def test_horizon_elevations_differ_by_the_stated_errors():
     assert terrain.horizon_sigma_common_rad == pytest.approx(higher.mean(), rel=0.15)
     sigma = terrain.height_sigma_m / ((1 + tan**2) * distance)
     assert 0.7 < np.std((higher - higher.mean()) / sigma) < 1.1
+    coefficients_rad = np.fft.rfft(higher)[1:9] * 2 / len(higher)  # of the waves: two of each, 16 degrees of freedom
+    stated_rad = [error.sigma for error in terrain.shape_errors if error.name.startswith("wave_")][::2]
+    assert 0.2 < np.mean(np.abs(coefficients_rad / stated_rad) ** 2) / 2 < 1.5
+
+
+@pytest.mark.parametrize("name", [*POLAR, "kepler"])
+def test_files_state_the_waves_that_their_map_shows(name):
+    stated = tomllib.loads((data_dir("terrain") / f"{name}.toml").read_text())["dem"]["horizon_waves_sigma_deg"]
+    waves_rad, _ = measure_waves(load_terrain(name), None)
+    np.testing.assert_allclose(stated, np.degrees(waves_rad), rtol=0.05, atol=5e-5)
 
 
 @pytest.mark.parametrize("name", MAPS)
@@ -75,10 +86,16 @@ def test_files_for_rendered_pictures_share_the_ground_and_state_it_as_exact(name
     )
     assert rendered == ground
     assert errors["height_sigma_m"] == 1.0 < stated["height_sigma_m"]
-    assert errors["stretch_sigma_1"] == errors["vertical_sigma_deg"] == errors["camera"] == 0.0
+    assert (
+        errors["horizon_waves_sigma_deg"]
+        == errors["stretch_sigma_1"]
+        == errors["vertical_sigma_deg"]
+        == errors["camera"]
+        == 0.0
+    )
 
 
-ERRORS = ("height_sigma_m", "horizon_sigma_deg", "stretch_sigma_1", "vertical_sigma_deg")
+ERRORS = ("height_sigma_m", "horizon_sigma_deg", "horizon_waves_sigma_deg", "stretch_sigma_1", "vertical_sigma_deg")
 
 
 def fractal(posts: int, seed: int) -> Array:
@@ -125,7 +142,11 @@ def test_import_measures_the_errors_against_a_finer_map(ground_files, tmp_path, 
     assert facts["height_sigma_m"] == pytest.approx(true_m, rel=0.05)
     text = made.read_text()
     assert "# coarse.tif compared with fine.tif" in text
-    assert tomllib.loads(text)["dem"]["horizon_sigma_deg"] == facts["horizon_sigma_deg"] > 0.05
+    dem = tomllib.loads(text)["dem"]
+    assert dem["horizon_sigma_deg"] == facts["horizon_sigma_deg"] > 0.05
+    assert "horizon_waves_sigma_deg:" in text.replace("\n# ", " ")
+    assert len(dem["horizon_waves_sigma_deg"]) == 8
+    assert 0.0 < dem["horizon_waves_sigma_deg"][0] < dem["horizon_sigma_deg"]
 
     assert main([*words, "-O"]) == 0
     facts = json.loads(capsys.readouterr().out)

@@ -16,18 +16,18 @@ from startrack.core.files import check_output, data_dir, printable, write_atomic
 from startrack.core.types import BadInput
 from startrack.frames import Site
 from startrack.terrain.array_map import SUFFIX, Grid, map_of_array, read_array
+from startrack.terrain.crest_errors import Correlation, crest_angle_rad_per_m, map_of_rim, measure_waves
 from startrack.terrain.earth_projection import geoid_at
 from startrack.terrain.height_map import HeightMap
 from startrack.terrain.horizon_table import AZIMUTH_BINS
 from startrack.terrain.io import terrain_from_dict
-from startrack.terrain.map_comparison import compare_with_finest, crest_angle_rad_per_m
+from startrack.terrain.map_comparison import compare_with_finest
 from startrack.terrain.map_error import carried_spacing, error_between_posts_m, find_product
 from startrack.terrain.map_reading import read_map, require_origin
 from startrack.terrain.map_writing import write_map
 from startrack.terrain.raster import Raster
-from startrack.terrain.shape import CAMERA_ERROR, REFRACTION, REFRACTION_1, STRETCH, vertical_fact
+from startrack.terrain.shape import CAMERA_ERROR, REFRACTION, REFRACTION_1, STRETCH, WAVES, vertical_fact
 
-RIM_RADII = 1.5  # of the search area: most of the rim is nearer
 MAX_POST_RADII = 0.2  # of the search area: with posts further apart its shape is not resolved
 MEASURED_PER_ESTIMATE = 1.6  # of the 240 m map on the ground of site01-10m.tif: 5.4 m measured, 3.3 m by its roughness
 COMMENT_CHARS = 118
@@ -49,18 +49,21 @@ class StatedErrors:
 
     height_sigma_m: float
     common_crest_sigma_m: float | None = None  # of heights, shared by the crests about a position; None: not measured
+    correlation: Correlation | None = None  # of the heights of crests against a finer map
     origin: str
     comment: str
     warnings: tuple[str, ...] = ()
 
-    def comment_lines(self, body: str) -> str:
-        """The comment of a terrain file on its errors; `body` is that of the map."""
+    def comment_lines(self, body: str, waves: str) -> str:
+        """The comment of a terrain file on its errors; `body` is that of the map, `waves` the source of the waves."""
         text = f"{self.comment}."
         if self.common_crest_sigma_m is not None:
             text += (
                 f" horizon_sigma_deg: crests wrong by {length_text(self.common_crest_sigma_m)} all around, at their "
                 "median distance; at least three times the error of heights, as at the sharp rim of Shackleton."
             )
+        if waves:
+            text += f" {WAVES.key}: {waves}."
         text += f" {OTHER_FACTS.format(place=IN_ITS_PLACE[body])}"
         return textwrap.fill(text, COMMENT_CHARS, initial_indent="# ", subsequent_indent="# ") + "\n"
 
@@ -123,8 +126,7 @@ def import_maps(
         if min(crop.heights_m.shape) < 2:
             raise BadInput("bad_terrain", f"{source}: it does not reach {latitude_deg:g}, {longitude_deg:g}")
         crops.append(replace(crop, source=Path(source).name))
-    rims = [one for one in crops if 0.5 * min(one.heights_m.shape) * one.post_m >= RIM_RADII * radius_m]
-    rim = (rims or crops[-1:])[0]  # the finest map that may hold the rim, or the last
+    rim = map_of_rim(crops, radius_m)
     if height_sigma_m is None:
         errors = measure_errors(rim, [*crops, *(read_map(one, unusual_heights=unusual_heights) for one in compare)])
     else:
@@ -196,7 +198,10 @@ def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, c
         if errors.common_crest_sigma_m is not None:
             angle_rad = errors.common_crest_sigma_m * crest_angle_rad_per_m(terrain)
             values["dem"]["horizon_sigma_deg"] = float(f"{np.degrees(angle_rad):.2g}")
-        text = errors.comment_lines(values["body"]) + tomli_w.dumps(values)
+        waves_rad, source = measure_waves(terrain, errors.correlation)
+        if source:
+            values["dem"][WAVES.key] = [float(f"{sigma:.2g}") for sigma in np.degrees(waves_rad)]
+        text = errors.comment_lines(values["body"], source) + tomli_w.dumps(values)
         write_atomically(folder / output.name, text.encode("utf-8"), overwrite=True, reason="bad_terrain")
         try:
             for path in (*crops, output):
@@ -224,7 +229,8 @@ def measure_errors(rim: Raster, others: Sequence[Raster]) -> StatedErrors:
     if comparison is not None and comparison.same_ground:
         return StatedErrors(
             height_sigma_m=float(f"{comparison.height_sigma_m:.2g}"), origin="comparison",
-            common_crest_sigma_m=comparison.common_crest_sigma_m, comment=f"{rim.source} {comparison.line()}",
+            common_crest_sigma_m=comparison.common_crest_sigma_m, correlation=comparison.correlation,
+            comment=f"{rim.source} {comparison.line()}",
         )  # fmt: skip
     warnings: tuple[str, ...] = ()
     if comparison is not None:

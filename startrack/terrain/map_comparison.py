@@ -5,12 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from startrack.core.errors import length_text
 from startrack.core.types import Array, BadInput
 from startrack.frames import Site
+from startrack.terrain.crest_errors import (
+    CREST_POSTS,
+    MIN_CRESTS,
+    Correlation,
+    CrestErrors,
+    correlate,
+    measure_crest_errors,
+    spread_positions,
+)
 from startrack.terrain.height_map import COMMON_PER_POST, HeightMap
 from startrack.terrain.raster import Raster
 
@@ -19,11 +29,7 @@ MIN_POSTS_ACROSS = 20.0  # of the map, in the overlap
 SAMPLES_ACROSS = 400  # posts of the finer map at which heights are compared
 SMALLER = 0.8  # from one size of the compared square to the next, where maps have holes or edges
 OTHER_GROUND = 0.5  # s.d. of the differences, relative to that of the heights: above it the maps show other ground
-CREST_POSITIONS, CREST_AZIMUTHS = 150, 90  # from which, and in which, horizons are compared
-CREST_POSTS = 4.0  # least distance of the crests compared; crests farther apart than this on the two maps are two
-MIN_CRESTS = 15  # of one position, for its mean
 SAME_RAD = 1e-6  # latitudes that differ by more are two: an orthographic map holds places on its far side, too
-SEED = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +45,7 @@ class MapComparison:
     crest_bias_m: float  # by which crests stand higher in the finer map; NaN where too few are in the overlap
     crest_bias_sigma_m: float  # of the positions' means
     crest_sigma_m: float  # of the crests about the mean of their position
+    correlation: Correlation | None = None  # of the crests' errors; None where too few are in the overlap
 
     @property
     def same_ground(self) -> bool:
@@ -94,18 +101,13 @@ def compare_maps(height_map: Raster, finer: Raster) -> MapComparison | None:
     if pair is None:
         return None
     off = (coarse_m - fine_m)[both]
+    radius_m = pair[0].search_radius_m
+    errors = measure_crest_errors(*pair, spread_positions(radius_m), CREST_POSTS * height_map.post_m, radius_m)
     return MapComparison(
-        finer=finer.source, finer_post_m=finer.post_m, across_m=2 * pair[0].search_radius_m,
+        finer=finer.source, finer_post_m=finer.post_m, across_m=2 * radius_m,
         height_bias_m=float(off.mean()), height_sigma_m=float(off.std()), heights_sigma_m=float(fine_m[both].std()),
-        **_crest_errors(*pair, CREST_POSTS * height_map.post_m),
+        **_crest_errors(errors, height_map.post_m),
     )  # fmt: skip
-
-
-def crest_angle_rad_per_m(terrain: HeightMap) -> float:
-    """Elevation that a metre of a crest's height makes, cos^2 H / distance: the median over the search area."""
-    positions = _positions(terrain.search_radius_m)
-    tan, distance, _ = terrain.horizons(positions[:, None], _azimuths())
-    return float(np.median(1.0 / ((1.0 + tan**2) * distance)))
 
 
 def _terrains_of(height_map: Raster, finer: Raster, overlap: Array) -> tuple[HeightMap, HeightMap] | None:
@@ -124,37 +126,13 @@ def _terrains_of(height_map: Raster, finer: Raster, overlap: Array) -> tuple[Hei
     return None
 
 
-def _crest_errors(coarse: HeightMap, fine: HeightMap, apart_m: float) -> dict[str, float]:
-    """How much higher crests inside the search area stand on the finer map; without the error of the camera's ground.
-
-    tan H d is the height of the crest above the camera: the difference is that of the crests' heights.
-    """
-    positions, azimuths = _positions(coarse.search_radius_m), _azimuths()
-    tan, distance, _ = coarse.horizons(positions[:, None], azimuths)
-    fine_tan, fine_distance, _ = fine.horizons(positions[:, None], azimuths)
-    rise = (fine.ground_m(positions) - coarse.ground_m(positions))[:, None]
-    higher = fine_distance * (fine_tan - tan) + rise
-    u = np.stack([np.sin(azimuths), np.cos(azimuths)], axis=-1)
-    inside = (fine_distance > apart_m) & (np.abs(distance - fine_distance) < apart_m)
-    for d in (distance, fine_distance):
-        inside &= np.hypot(*np.moveaxis(positions[:, None] + d[..., None] * u, -1, 0)) < coarse.search_radius_m
-    enough = inside.sum(axis=1) >= MIN_CRESTS
-    means = np.array([row[which].mean() for row, which in zip(higher[enough], inside[enough], strict=True)])
-    about = [row[which] - mean for row, which, mean in zip(higher[enough], inside[enough], means, strict=True)]
-    if len(means) < MIN_CRESTS:
+def _crest_errors(errors: CrestErrors, post_m: float) -> dict[str, Any]:
+    """What a comparison states of crests: their bias, its spread, the rest, and how it correlates."""
+    means_m = errors.means_m[np.isfinite(errors.means_m)]
+    if len(means_m) < MIN_CRESTS:
         return dict.fromkeys(("crest_bias_m", "crest_bias_sigma_m", "crest_sigma_m"), float("nan"))
+    about_m = (errors.higher_m - errors.means_m[:, None])[errors.inside]
     return {
-        "crest_bias_m": float(means.mean()), "crest_bias_sigma_m": float(means.std()),
-        "crest_sigma_m": float(np.concatenate(about).std()),
+        "crest_bias_m": float(means_m.mean()), "crest_bias_sigma_m": float(means_m.std()),
+        "crest_sigma_m": float(np.nanstd(about_m)), "correlation": correlate(errors, post_m),
     }  # fmt: skip
-
-
-def _positions(radius_m: float) -> Array:
-    """Positions (n, 2) spread evenly over a circle."""
-    rng = np.random.default_rng(SEED)
-    azimuth, distance = rng.uniform(0, 2 * np.pi, CREST_POSITIONS), radius_m * np.sqrt(rng.random(CREST_POSITIONS))
-    return distance[:, None] * np.stack([np.sin(azimuth), np.cos(azimuth)], axis=-1)
-
-
-def _azimuths() -> Array:
-    return np.arange(CREST_AZIMUTHS) * 2 * np.pi / CREST_AZIMUTHS

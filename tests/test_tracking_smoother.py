@@ -4,7 +4,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from tracking_helpers import HEIGHT_SIGMA_M, STEP_SIGMA_M, Drive, mean_nees, shifted, simulate_drive, with_slips
+from tracking_helpers import STEP_SIGMA_M, Drive, mean_nees, shifted, simulate_drive, with_slips
 
 from startrack.applications.tracking.contradictions import smooth_robustly
 from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions
@@ -35,7 +35,7 @@ def least_squares(drive: Drive, frames: int) -> tuple[np.ndarray, np.ndarray]:
         design = np.zeros((2 + k, size))
         design[:, 2 * i : 2 * i + 2] = e.response[:, :2]
         design[:, 2 * frames : 2 * frames + k] = e.response[:, 2:]
-        design[:, 2 * frames + k + e.post] = e.by_post / HEIGHT_SIGMA_M
+        design[:, 2 * frames + k + e.post] = e.by_post
         add(design, e.mean, e.noise)
     for i in range(frames - 1):
         design = np.zeros((2, size))
@@ -43,8 +43,8 @@ def least_squares(drive: Drive, frames: int) -> tuple[np.ndarray, np.ndarray]:
         if moves:
             design[:, -moves:] = -drive.steps.by_shared_m[i]
         add(design, drive.steps.move_m[i], STEP_SIGMA_M**2 * np.eye(2))
-    priors = np.concatenate([np.ones(k), np.full(posts), np.ones(moves)])
-    add(np.eye(size)[2 * frames :], np.zeros(len(priors)), np.diag(priors**2))
+    priors = np.ones(k + posts + moves)
+    add(np.eye(size)[2 * frames :], np.zeros(len(priors)), np.eye(len(priors)))
     A, b = np.vstack(rows), np.concatenate(values)
     solution = np.linalg.lstsq(A, b, rcond=None)[0]
     return solution, np.linalg.inv(A.T @ A)
@@ -59,8 +59,8 @@ def test_the_smoother_is_least_squares_with_all_unknowns(shared_count, by_moves)
     posts = 14 + shared_count + found.post
     np.testing.assert_allclose(found.position_m.ravel(), solution[:14], atol=1e-6)
     np.testing.assert_allclose(found.shared, solution[14 : 14 + shared_count], atol=1e-7)
-    np.testing.assert_allclose(HEIGHT_SIGMA_M * found.post_error, solution[posts], atol=1e-6)
-    np.testing.assert_allclose(HEIGHT_SIGMA_M * found.post_sigma, np.sqrt(np.diag(covariance)[posts]), atol=1e-6)
+    np.testing.assert_allclose(found.post_error, solution[posts], atol=1e-6)
+    np.testing.assert_allclose(found.post_sigma, np.sqrt(np.diag(covariance)[posts]), atol=1e-6)
     for i in range(7):
         part = slice(2 * i, 2 * i + 2)
         np.testing.assert_allclose(found.covariance_m2[i], covariance[part, part], atol=1e-6)

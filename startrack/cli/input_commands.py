@@ -25,6 +25,7 @@ CAMERA_OUTPUT = (flags.FILE, NAME, flags.DIR, flags.OVERWRITE, flags.NO_PLOTS, f
 STATED_ERRORS = {  # keys of the file, and the unit of each
     "depth_sigma_m": "M", "diameter_sigma_m": "M", "ellipse_sigma_1": "X", "rim_tilt_sigma_deg": "DEG",
     "height_sigma_m": "M", "horizon_sigma_deg": "DEG", "stretch_sigma_1": "X", "vertical_sigma_deg": "DEG",
+    "horizon_waves_sigma_deg": "DEG", "map_offset_sigma_m": "M",
     "camera_height_sigma_m": "M", "terrestrial_refraction_sigma": "X",
 }  # fmt: skip
 

@@ -214,7 +214,7 @@ def _clock(whole: Posterior) -> ClockError | None:
 def _unstated_facts(whole: Posterior) -> tuple[UnstatedFact, ...]:
     """The facts that no file states, the one that widens the 99.9 % circle most first."""
     found = []
-    for fact in whole.best.model.errors.facts:
+    for fact in whole.best.model.errors.unstated_facts:
         parts = [(_positions_without_fact(one, fact), one.log_weight) for one in whole.hypotheses if one.gross != fact]
         if not parts:
             continue

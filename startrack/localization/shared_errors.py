@@ -61,17 +61,25 @@ class SharedErrors:
     def doubtable(terrain: Terrain, clock: Clock | None) -> tuple[str, ...]:
         """Stated facts of a `terrain` and a `clock` whose errors would be larger if the statement were wrong."""
         known = _known_errors(terrain, clock)
-        return tuple(dict.fromkeys(one.fact for one in known if one.is_stated and one.gross_sigma > one.sigma))
+        return tuple(
+            dict.fromkeys(one.fact for one in known if one.gross_probability == 0.0 and one.gross_sigma > one.sigma)
+        )
 
     def __len__(self) -> int:
         return len(self.listed)
 
     @cached_property
     def facts(self) -> tuple[str, ...]:
-        """Facts with a gross part, which no file states."""
+        """Facts with a gross part."""
         return tuple(
             dict.fromkeys(error.fact for error in (*self.listed, *self.waves) if error.gross_probability > 0.0)
         )
+
+    @property
+    def unstated_facts(self) -> tuple[str, ...]:
+        """Those of the `facts` that no file states."""
+        stated = {one.fact for one in (*self.listed, *self.waves) if one.is_stated}
+        return tuple(fact for fact in self.facts if fact not in stated)
 
     def is_of_fact(self, fact: str) -> Bools:
         """(k,) which errors are those of a fact."""

@@ -217,6 +217,13 @@ def cell_posts(site: Site, maps: Sequence[Raster], points_enu_m: Array) -> tuple
     return post, weight
 
 
+def number_of_maps(site: Site, maps: Sequence[Raster], points_enu_m: Array) -> Ints:
+    """Number (n,) of the map that has the ground below points (n, 3) in enu, the finest first; -1 where none has."""
+    post, _ = cell_posts(site, maps, points_enu_m)
+    first = np.cumsum([0, *(one.heights_m.size for one in maps)])
+    return np.where(post[:, 0] == NO_POST, -1, np.searchsorted(first, post[:, 0], side="right") - 1)
+
+
 def post_positions(site: Site, maps: Sequence[Raster], posts: Ints) -> Array:
     """East, north and up (n, 3) in enu of posts (n,), by the map."""
     found, first = np.zeros((len(posts), 3)), 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -13,7 +13,7 @@ from startrack.core.types import MIDDLES_RAD, Array, Bools, Ints
 from startrack.terrain import shape
 from startrack.terrain.crest_kernel import POSTS, crests
 from startrack.terrain.derived_maps import DeformedMap, HorizonInterpolator
-from startrack.terrain.ground import cell_posts, post_positions
+from startrack.terrain.ground import cell_posts, number_of_maps, post_positions
 from startrack.terrain.horizon_table import AZIMUTH_BINS, HorizonSigma
 from startrack.terrain.map_ends import circular_runs, facts_of_ends, unknown_elevations_rad
 from startrack.terrain.protocol import ExpectedCrests, Terrain
@@ -36,6 +36,7 @@ class HeightMap(TracedMap):
     stretch_sigma_1: float | None = shape.EXACT  # of the factor of tan H, less 1; None: not stated, see `terrain.shape`
     vertical_sigma_rad: float | None = shape.EXACT  # of a tilt of the whole map, of each of two axes
     waves_sigma_rad: tuple[float, ...] | None = shape.EXACT_WAVES  # of waves 1 to 8 of the horizon's error over azimuth
+    map_offset_sigma_m: float | None = shape.EXACT  # of the heights of each further map against the first one
     camera_height_sigma_m: float | None = shape.EXACT
     terrestrial_refraction_sigma_1: float | None = shape.EXACT
     most_slope_rad: float = np.pi / 2  # a rover does not stand on steeper ground
@@ -74,7 +75,7 @@ class HeightMap(TracedMap):
 
     @cached_property
     def shape_errors(self) -> tuple[shape.ShapeError, ...]:  # type: ignore[override]
-        """Bias, stretch, tilt, waves, height of the camera, refraction. The bias needs the table of horizons.
+        """Bias, stretch, tilt, waves, offsets of maps, camera, refraction. The bias needs the table of horizons.
 
         The camera stands as much too high as the ground between four posts is.
         """
@@ -82,6 +83,7 @@ class HeightMap(TracedMap):
             *shape.BIAS.shape_errors(self.common_sigma_rad), *shape.STRETCH.shape_errors(self.stretch_sigma_1),
             *shape.vertical_fact(self.site.body).shape_errors(self.vertical_sigma_rad),
             *shape.wave_errors(self.waves_sigma_rad, 0.0 if self.waves_sigma_rad else self.post_rad),
+            *replace(shape.OFFSETS, errors=shape.offset_names(len(self.maps))).shape_errors(self.map_offset_sigma_m),
             *shape.CAMERA_ERROR.shape_errors(self.camera_height_sigma_m, beside=BETWEEN_POSTS * self.height_sigma_m),
             *shape.REFRACTION.shape_errors(self.terrestrial_refraction_sigma_1), *refraction_errors(self.air),
         )  # fmt: skip
@@ -98,17 +100,38 @@ class HeightMap(TracedMap):
             "bias_rad": np.ones(1), "stretch_1": tan * flat, "vertical_east_rad": np.sin(azimuths_rad),
             "vertical_north_rad": np.cos(azimuths_rad), "camera_height_m": -(1.0 / distance) * flat,
             "terrestrial_refraction_1": distance / (2 * self.ground.radius_m) * flat,
-            **shape.wave_slopes_rad(azimuths_rad),
+            **shape.wave_slopes_rad(azimuths_rad), **self._offset_slopes_rad(points_m, azimuths_rad, tan, distance),
         }  # fmt: skip
         return shape.select_slopes(
             self.shape_errors, slopes | refraction_slopes_rad(self.air, np.arctan(tan)), np.shape(tan)
         )
 
+    def _offset_slopes_rad(self, points_m: Array, azimuths_rad: Array, tan: Array, distance: Array) -> dict[str, Array]:
+        """Rise (...) of the horizon by a metre of each further map, below its crests less below the camera."""
+        if len(self.maps) == 1:
+            return {}
+        away = distance[..., None] * np.stack([np.sin(azimuths_rad), np.cos(azimuths_rad)], axis=-1)
+        camera_up_m = np.asarray(self.ground_m(points_m))
+        crest_m = np.concatenate([points_m + away, (camera_up_m + tan * distance)[..., None]], axis=-1)
+        camera_m = np.concatenate([points_m, camera_up_m[..., None]], axis=-1)
+        of_crest, of_camera = (
+            number_of_maps(self.site, self.maps, at.reshape(-1, 3)).reshape(at.shape[:-1]) for at in (crest_m, camera_m)
+        )
+        per_m = 1.0 / ((1.0 + np.square(tan)) * distance)
+        names = shape.offset_names(len(self.maps))
+        return {name: per_m * (1.0 * (of_crest == k) - (of_camera == k)) for k, name in enumerate(names, 1)}
+
     def with_shape(self, values: Array) -> Terrain:
         """The ground with these errors; see `Terrain`."""
         errors = shape.errors_by_name(self.shape_errors, values)
+        offsets_m = [errors.pop(name, 0.0) for name in shape.offset_names(len(self.maps))]
         refraction_1 = errors.pop("refraction_1", 0.0)
-        return with_refraction_error(DeformedMap(self, **errors), refraction_1)
+        whole = self
+        if any(offsets_m):
+            risen = zip(self.maps, [0.0, *offsets_m], strict=True)
+            maps = (replace(one, heights_m=one.heights_m + np.float32(rise)) for one, rise in risen)
+            whole = replace(self, maps=tuple(maps))
+        return with_refraction_error(DeformedMap(whole, **errors), refraction_1)
 
     def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """From the height of the single post that makes the horizon: sigma cos^2 H / its distance."""

@@ -39,11 +39,12 @@ class ShapeError(Prior):
     fact: str  # the key of the terrain file that states it, such as "depth_sigma_m"
     mean: float = 0.0  # before: not 0 of a ground whose errors are counted from another one than the stated
     wave: int = 0  # of the horizon's error: how often it rises around the compass; 0: another error
+    keeps_gross: bool = False  # what a file states does not exclude a gross error: a seam in its map
 
     @property
     def is_stated(self) -> bool:
-        """Whether `sigma` is the whole prior."""
-        return self.gross_probability == 0.0
+        """Whether a file states `sigma`."""
+        return self.gross_probability == 0.0 or self.keeps_gross
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,14 +131,14 @@ REFRACTION_1 = (
     0.13  # mean coefficient of terrestrial refraction (Gauss 1826; Bomford, Geodesy: 0.13 by day, more at night)
 )
 EARTH_HIGHEST_M = 8850.0  # the highest ground of the Earth
-# The rest of the horizon's error as a series over azimuth, from north through east. Default and gross part: see
-# docs/terrain.md, and a seam of 20 m over half of a horizon 9 km away, whose first wave is 0.08 degrees.
+# The rest of the horizon's error as a series over azimuth, from north through east. Default: see docs/terrain.md. Gross
+# part: a seam of 5 to 20 m over half of a horizon 9 km away, 0.020 to 0.081 degrees in wave 1, over m in wave m.
 WAVE_COUNT = 8
 EXACT_WAVES = (EXACT,) * WAVE_COUNT
 WAVE_PER_POST = 0.3  # sigma of wave 1, in the horizon's by single posts: 0.14 to 0.42 on the shipped maps
 WAVE_FALL = -0.5  # power of the number of the wave with which sigmas fall where one number states them
 WAVES = Fact(
-    key="horizon_waves_sigma_deg", sigma=0.0, gross_probability=0.01, gross_sigma=float(np.radians(0.04)),
+    key="horizon_waves_sigma_deg", sigma=0.0, gross_probability=0.01, gross_sigma=float(np.radians(0.05)),
     errors=tuple(f"wave_{m}_{part}_rad" for m in range(1, WAVE_COUNT + 1) for part in ("cos", "sin")),
     meaning="smooth error of the horizon over azimuth: waves 1 to 8, each of the cosine and of the sine [deg]",
     limits=Number(low=0.0, high=9.99),
@@ -146,15 +147,27 @@ WAVES_LIMITS = Either(
     kinds=(WAVES.limits, List(each=WAVES.limits, count=WAVE_COUNT)),
     description="of smooth errors of the horizon over azimuth, the cosine and the sine of waves 1 to 8 each; one "
                 "number is of wave 1, and wave m has it over the root of m; if absent 0.3 of what height_sigma_m makes "
-                "of the horizon, and with probability 1 % 0.04",
+                "of the horizon, and with probability 1 % 0.05",
+)  # fmt: skip
+# Of the further maps of a file against its first one. The polar cap and Site01, two products, differ by 0.5 m.
+OFFSETS = Fact(
+    key="map_offset_sigma_m", errors=(), sigma=1.0, gross_probability=0.01, gross_sigma=15.0,
+    meaning="offset of the heights of each further map of the file against its first one [m]",
+    limits=replace(AMOUNT, description="of the heights of each further map against the first one; if absent 1, and "
+                   "with probability 1 % 15"),
 )  # fmt: skip
 CYLINDER_FACTS = (DEPTH, DIAMETER, ELLIPSE, RIM_TILT)
-MAP_FACTS = (BIAS, STRETCH, VERTICAL, WAVES, CAMERA_ERROR)
+MAP_FACTS = (BIAS, STRETCH, VERTICAL, WAVES, OFFSETS, CAMERA_ERROR)
 
 
 def vertical_fact(body: str) -> Fact:
     """The fact of a tilt of the whole map, on the Moon or the Earth."""
     return VERTICAL_EARTH if body == "earth" else VERTICAL
+
+
+def offset_names(maps: int) -> tuple[str, ...]:
+    """Names of the errors of OFFSETS in a file of so many `maps`."""
+    return tuple(f"map_{k}_offset_m" for k in range(2, maps + 1))
 
 
 def sigmas_of_waves(sigma: float) -> tuple[float, ...]:
@@ -165,13 +178,15 @@ def sigmas_of_waves(sigma: float) -> tuple[float, ...]:
 def wave_errors(stated: tuple[float, ...] | None, post_rad: float) -> list[ShapeError]:
     """The errors of WAVES; `stated` holds the sigmas of the waves [rad], None where the file is silent.
 
+    A map with stated waves may have a seam, but not one whose waves are stated as 0: pictures are rendered from it.
     `post_rad` is what the error of the posts makes of the horizon.
     """
-    sigmas, gross = stated or sigmas_of_waves(WAVE_PER_POST * post_rad), sigmas_of_waves(WAVES.gross_sigma)
+    sigmas = stated or sigmas_of_waves(WAVE_PER_POST * post_rad)
+    gross = tuple(max(WAVES.gross_sigma / m, sigma) for m, sigma in enumerate(sigmas, 1))  # a seam's fall so
     return [
         ShapeError(
             name=name, fact=WAVES.key, sigma=sigmas[k // 2], gross_sigma=gross[k // 2], wave=k // 2 + 1,
-            gross_probability=0.0 if stated else WAVES.gross_probability,
+            gross_probability=WAVES.gross_probability if any(sigmas) or not stated else 0.0, keeps_gross=bool(stated),
         )
         for k, name in enumerate(WAVES.errors)
     ]  # fmt: skip

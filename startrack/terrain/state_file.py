@@ -18,8 +18,11 @@ from startrack.terrain.shape import (
     CYLINDER_FACTS,
     DEPTH,
     DIAMETER,
+    OFFSETS,
     REFRACTION,
     STRETCH,
+    WAVE_PER_POST,
+    WAVES,
     Fact,
     vertical_fact,
 )
@@ -55,6 +58,8 @@ def stateable_errors(text: str) -> list[StateableError]:
         rows = [
             ("dem", BIAS, f"three times what {HEIGHT_KEY} makes of the horizon", BIAS.key not in dem),
             *(("dem", fact, _default_text(fact), fact.key not in dem) for fact in (STRETCH, vertical)),
+            ("dem", WAVES, _waves_text(), WAVES.key not in dem),
+            ("dem", OFFSETS, _default_text(OFFSETS), OFFSETS.key not in dem and not isinstance(dem["file"], str)),
             ("rover", CAMERA_ERROR, _default_text(CAMERA_ERROR), CAMERA_ERROR.key not in rover),
         ]
         if keys["body"] == "earth":
@@ -67,6 +72,12 @@ def stateable_errors(text: str) -> list[StateableError]:
         return found
     meaning, default = "error of single heights of the map [m]", "0, with a warning"
     return [StateableError("dem", HEIGHT_KEY, meaning, default, is_missing=HEIGHT_KEY not in dem), *found]
+
+
+def _waves_text() -> str:
+    """What counts where a file leaves the waves out."""
+    gross = f"with probability {100 * WAVES.gross_probability:g} % {np.degrees(WAVES.gross_sigma):.4g}"
+    return f"{WAVE_PER_POST:g} of what {HEIGHT_KEY} makes of the horizon, and {gross}"
 
 
 def _default_text(fact: Fact, size_m: float | None = None) -> str:

@@ -114,6 +114,41 @@ def test_exposures_of_one_place_share_the_waves():
     assert sizes[False] > 0.8 and sizes[True] < 0.6
 
 
+def halves(sigma_m: float | None) -> HeightMap:
+    """The floor with a map of its east, as far as 500 m off, above one of everything."""
+    whole = floor()
+    one = whole.maps[0]
+    _, column = one.row_column(whole.site.latitude_rad, whole.site.longitude_rad)
+    east = np.arange(one.heights_m.shape[1]) > column + 2
+    part = replace(one, heights_m=np.where(east, one.heights_m, np.nan).astype(np.float32))
+    return replace(whole, maps=(part, one), height_sigma_m=0.0, map_offset_sigma_m=sigma_m)
+
+
+def test_slopes_of_an_offset_are_the_differences_of_the_horizon():
+    terrain, azimuth = halves(1.0), np.linspace(0.1, 6.2, 40)
+    names = [one.name for one in terrain.shape_errors]
+    at = names.index("map_2_offset_m")
+    for place in AT_M, AT_M - 300.0:
+        slopes = terrain.shape_slopes_rad(place, azimuth)[at]
+        risen = terrain.with_shape(3.0 * (np.arange(len(names)) == at))
+        change = (risen.horizon_rad(place, azimuth) - terrain.horizon_rad(place, azimuth)) / 3.0
+        assert change == pytest.approx(slopes, abs=0.02 * np.abs(slopes).max())
+        assert 10 < np.count_nonzero(slopes) < 30
+
+
+def test_an_offset_between_two_maps_of_a_file_is_found():
+    silent, rng = halves(None), np.random.default_rng(5)
+    values = np.array([15.0 if one.name == "map_2_offset_m" else 0.0 for one in silent.shape_errors])
+    rows = rays_at(silent.with_shape(values), rng)
+    fix = ExactPosterior()(rows, silent)
+    assert np.linalg.norm(fix.position_enu_m[:2] - AT_M) < fix.radius999_m
+    shown = {one.name: (one.value, one.sigma) for one in fix.shown}
+    mean, sigma = shown["map_2_offset_m"]
+    assert abs(mean - 15.0) < 4.0 * sigma
+    found, reason = locate_or_refuse(rows, halves(0.01))
+    assert found is None and reason == "inconsistent_evidence"
+
+
 def test_waves_of_places_far_apart_are_independent():
     terrain = replace(floor(), waves_sigma_rad=SIGMA_RAD)
     linear = errors_of(np.random.default_rng(2))

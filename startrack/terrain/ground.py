@@ -219,9 +219,12 @@ def cell_posts(site: Site, maps: Sequence[Raster], points_enu_m: Array) -> tuple
 
 def number_of_maps(site: Site, maps: Sequence[Raster], points_enu_m: Array) -> Ints:
     """Number (n,) of the map that has the ground below points (n, 3) in enu, the finest first; -1 where none has."""
-    post, _ = cell_posts(site, maps, points_enu_m)
-    first = np.cumsum([0, *(one.heights_m.size for one in maps)])
-    return np.where(post[:, 0] == NO_POST, -1, np.searchsorted(first, post[:, 0], side="right") - 1)
+    latitude, longitude = latlon_from_enu(site, *points_enu_m.T)
+    found = np.full(len(points_enu_m), -1)
+    for number in reversed(range(len(maps))):
+        known = np.isfinite(maps[number].sample(maps[number].row_column(latitude, longitude)))
+        found[known] = number
+    return found
 
 
 def post_positions(site: Site, maps: Sequence[Raster], posts: Ints) -> Array:

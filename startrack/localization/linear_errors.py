@@ -69,7 +69,7 @@ class LinearErrors:
         return np.asarray(np.linalg.inv(self._information))
 
     @cached_property
-    def _log_volume(self) -> float:
+    def log_volume(self) -> float:
         """Logarithm of the integral over the errors, the norm of their prior in it, over the integrand at the best."""
         return 0.5 * float(np.linalg.slogdet(self.inverse)[1] - np.linalg.slogdet(self._information)[1])
 
@@ -79,7 +79,7 @@ class LinearErrors:
         `left_rad` (n, SECTORS) are the heights that the sectors see above the skyline with the expected errors.
         """
         errors = left_rad @ self._gain.T
-        return errors, self._log_volume - 0.5 * np.einsum("ni,ij,nj->n", errors, self.inverse, errors)
+        return errors, self.log_volume - 0.5 * np.einsum("ni,ij,nj->n", errors, self.inverse, errors)
 
     def waves_rad(self, left_rad: Array) -> Array:
         """(SECTORS,) rise of the skyline by the likeliest waves at heights (SECTORS,) that are left; see `fit`."""

@@ -34,7 +34,8 @@ def with_own_edge(plain: Hypothesis, half_m: float) -> SkylineModel | None:
     nats = edge_log_likelihood(light, model.shift_of(plain.found.share @ plain.found.points))
     stars = rows.take(np.flatnonzero(~is_light))
     apart = SkylineModel.of(model.terrain, stars, model.around.reference_m, half_m, model.errors)
-    return replace(apart, gross=OWN_EDGE, seen=replace(apart.seen, apart_nats=nats + light.log_offset))
+    by_waves = model.linear.log_volume - apart.linear.log_volume  # which the light would tell in either hypothesis
+    return replace(apart, gross=OWN_EDGE, seen=replace(apart.seen, apart_nats=nats + by_waves + light.log_offset))
 
 
 def edge_log_likelihood(seen: SectorRows, shift: Array) -> float:

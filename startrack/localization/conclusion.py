@@ -147,7 +147,8 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
         modes=modes, ambiguous=ambiguous, search=explored.search,
         dropped_probability=dropped_probability if dropped_probability < 1.0 else None,
         horizon_error_rad=bias_rad, clock=_clock(whole), blocked=blocked if blocked else None,
-        integrity=integrity, unstated=_unstated_facts(whole), raised_rad=best.model.rise_rad(parameters),
+        integrity=integrity, unstated=_unstated_facts(whole),
+        radius999_m_by_exact_map=_radius_by_exact_map(whole), raised_rad=best.model.rise_rad(parameters),
         at_time_m=parameters[:2], shown=_shown_errors(best),
         own_edge_probability=float(whole.share[whole.is_gross(OWN_EDGE)].sum()),
         samples=_restart_points(whole, explored, dropped_probability),
@@ -237,6 +238,15 @@ def _positions_without_fact(one: Hypothesis, fact: str) -> Array:
     values = one.values.copy()
     values[:, own] = 0.0
     return one.model.errors.true_positions(one.unturned_m - one.values[:, own] @ drift, values)
+
+
+def _radius_by_exact_map(whole: Posterior) -> float | None:
+    """Radius [m] of the 99.9 % circle if the map had no waves, by the heaviest hypothesis; None where it has none."""
+    best = whole.best
+    if not best.model.errors.waves:
+        return None
+    positions, share = _positions_without_waves(best), shares(best.log_weight)
+    return whole.radii(positions, share, share @ positions)[1]
 
 
 def _positions_without_waves(one: Hypothesis) -> Array:

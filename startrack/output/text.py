@@ -145,6 +145,8 @@ def _needs_of(outcome: Outcome) -> Iterator[str]:
 def _needs_of_located(located: Located) -> Iterator[str]:
     fix, radius_m = located.fix, located.fix.radius999_m
     by_a_fact = any(DOMINANT * one.radius999_m_if_exact < radius_m for one in fix.unstated)
+    by_map = [*_finer_map(located)]
+    yield from by_map
     if not (fix.ambiguous or by_a_fact or not fix.radius95_m < WIDE_PART * located.terrain.search_radius_m):
         return
     if fix.ambiguous:
@@ -160,8 +162,24 @@ def _needs_of_located(located: Located) -> Iterator[str]:
                 f"a fact: with {one.fact} stated and exact the 99.9 % circle would be "
                 f"{one.radius999_m_if_exact:.1f} m, not {radius_m:.1f} m ({_statement_of(one.fact)})"
             )
-    yield from _longer_exposure(located)
+    if not by_map:
+        yield from _longer_exposure(located)
     yield from _more_skyline(located)
+
+
+def _finer_map(located: Located) -> Iterator[str]:
+    """How much a map without smooth errors would gain, and which of its crests decide: those along the ellipse."""
+    fix, exact_m = located.fix, located.fix.radius999_m_by_exact_map
+    if exact_m is None or not DOMINANT * exact_m < fix.radius999_m:
+        return
+    east, north = np.linalg.eigh(fix.covariance_m2)[1][:, -1]
+    along = np.degrees(np.arctan2(east, north)) % 180.0
+    yield (
+        f"a finer map: the smooth errors of this one make the 99.9 % circle {fix.radius999_m:.1f} m, not "
+        f"{exact_m:.1f} m, and neither light nor more exposures help; crests "
+        f"at azimuths {along:.0f} and {along + 180.0:.0f}, about "
+        f"{length_text(located.terrain.crest_distance_m)} away, count most"
+    )
 
 
 def _statement_of(fact: str) -> str:

@@ -173,7 +173,6 @@ class Explored(NamedTuple):
     log_dropped: float  # logarithm of a bound of the mass [m2] that was dropped
     search: str  # "proven" or "beam"
     dropped_probability: float | None = None  # of the whole search, known before; None: by `log_dropped`
-    has_tried_times: bool = False  # whether an earlier fix with these points tried other times
 
 
 UNPROVEN = (

@@ -27,7 +27,6 @@ TRACKED_NATS = 30.0  # less than the best: a time is not looked at more closely
 BOXES_APART = 4.0  # halves of boxes between the positions that neighbouring times see of one solution
 TIME_ROUNDS = 6  # in which the rows are turned to the time that they show, at most
 LINEAR_TURN_RAD = np.radians(0.05)  # of the sky: up to it the skyline of a map changes linearly with the time
-GROSS_REACH_SIGMAS = 3.0  # of a gross error of the clock, to the last time that is tried
 MOST_TIMES, TIME_NATS = 3, 12.0  # that are sampled; less likely ones than the best by more are not
 
 
@@ -193,27 +192,10 @@ def explore_times(evidence: Evidence, terrain: Terrain, clock: Clock) -> list[tu
     ]
 
 
-def turned_model(model: SkylineModel, later_s: float, is_rough: bool = False) -> SkylineModel:
-    """The model with its rows turned to a later time; see `SectorRows.is_rough`."""
+def turned_model(model: SkylineModel, later_s: float) -> SkylineModel:
+    """The model with its rows turned to a later time."""
     check_time()
-    return model.with_rows(turn_evidence(model.seen.rows, later_s, model.terrain.air), is_rough)
-
-
-def turned_models(model: SkylineModel, clock: Clock) -> list[SkylineModel]:
-    """The model at the likeliest times of a gross error of its `clock`, far enough from the stated one."""
-    turn = float(np.linalg.norm(clock.turn_rad_s))
-    count = int(np.ceil(GROSS_REACH_SIGMAS * clock.gross_sigma_s * turn / (0.5 * TIME_STEP_RAD)))
-    count = min(count, MOST_SCANNED // 2)  # 16 degrees to each side: beyond any on the Moon, an hour on the Earth
-    later_s = np.arange(-count, count + 1) * 0.5 * TIME_STEP_RAD / turn
-    fits = np.array([_fit(turned_model(model, later, is_rough=True)) for later in later_s])
-    fits -= 0.5 * np.square(later_s / clock.gross_sigma_s)
-    likely = [float(later_s[at]) for at in _peaks(later_s, fits, clock)]
-    return [turned_model(model, later) for later in likely if later != 0.0]
-
-
-def _fit(model: SkylineModel) -> float:
-    """Log-likelihood of the rows where position and shared errors suit them, by the linear model of the sectors."""
-    return float(model.log_likelihood(model.solve()[0][None])[0]) + model.seen.log_offset
+    return model.with_rows(turn_evidence(model.seen.rows, later_s, model.terrain.air))
 
 
 def _peaks(later_s: Array, fits: Array, clock: Clock) -> list[int]:

@@ -24,7 +24,7 @@ from startrack.core.types import (
 from startrack.localization.hypothesis import Hypothesis
 from startrack.localization.importance_sampling import moments
 from startrack.localization.integrity import assess_integrity
-from startrack.localization.shared_errors import CLOCK_FACT, OWN_EDGE
+from startrack.localization.shared_errors import OWN_EDGE
 from startrack.localization.summary import camera_at, link_points, require_inside
 from startrack.localization.wrong_files import require_files, require_map_in_view
 from startrack.terrain import DIAMETER, Terrain
@@ -200,16 +200,17 @@ def _list_modes(whole: Posterior) -> tuple[Mode, ...]:
 
 
 def _clock(whole: Posterior) -> ClockError | None:
-    """The error of the clock by the points of the best hypothesis."""
-    best = whole.best
-    stated, errors = best.model.seen.rows.clock, best.model.errors
+    """The error of the clock by the points of the core."""
+    stated = whole.best.model.seen.rows.clock
     if stated is None:
         return None
-    if errors.clock is None:
+    if whole.best.model.errors.clock is None:
         return ClockError(stated.offset_s, stated.sigma_s)
-    later, share = best.values[:, -1], shares(best.log_weight)
+    core = [one for one in whole.hypotheses if one.gross == whole.best.gross]
+    later = np.concatenate([one.model.errors.later_s + one.values[:, -1] for one in core])
+    share = shares(np.concatenate([one.log_weight for one in core]))
     mean = float(share @ later)
-    return ClockError(stated.offset_s + mean, float(np.sqrt(share @ np.square(later - mean))))
+    return ClockError(mean, float(np.sqrt(share @ np.square(later - mean))))
 
 
 def _unstated_facts(whole: Posterior) -> tuple[UnstatedFact, ...]:
@@ -259,11 +260,12 @@ def _positions_without_waves(one: Hypothesis) -> Array:
 
 def _shown_errors(best: Hypothesis) -> tuple[ShownError, ...]:
     """The errors that nobody states and that the image shows to be larger than their default."""
-    mean, covariance = moments(best.values - best.model.errors.mean, shares(best.log_weight))
+    errors = best.model.errors
+    mean, covariance = moments(best.values - errors.stated_values, shares(best.log_weight))
     sigma = np.sqrt(np.diag(covariance))
     return tuple(
         ShownError(one.name, one.fact, float(mean[k]), float(sigma[k]))
-        for k, one in enumerate(best.model.errors.listed)
+        for k, one in enumerate(errors.listed)
         if not one.is_stated and abs(mean[k]) - SHOWN_SIGMAS * sigma[k] > one.sigma
     )
 
@@ -274,10 +276,6 @@ def _restart_points(whole: Posterior, explored: Explored, dropped_probability: f
     order = np.argsort(-one.found.log_weight)[:SUPPORT]
     points, log = one.found.points[order, :2], one.found.log_weight[order]
     spread = np.sqrt(max(float(np.linalg.eigvalsh(moments(points, relative_weights(log))[1])[1]), 1e-6))
-    has_tried = explored.has_tried_times or any(
-        plain.tries_times and CLOCK_FACT in plain.model.errors.facts for plain in whole.hypotheses if not plain.gross
-    )
     return explored._replace(
         centres_m=points, half_m=0.5 * spread, log_likelihood=log, dropped_probability=dropped_probability,
-        has_tried_times=has_tried,
     )  # fmt: skip

@@ -9,16 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from startrack.core.types import Array, Clock
-from startrack.localization.clock import TIME_ROUNDS, is_linear, turned_model, turned_models
-from startrack.localization.free_skyline import free_log_likelihood
+from startrack.core.types import Array
 from startrack.localization.importance_sampling import FEW, Gaussian, WeightedPoints, moments, normal_sequence, sample
+from startrack.localization.shared_errors import CLOCK_FACT
 from startrack.localization.skyline_model import SkylineModel
 
 HIDDEN_COPIES = 6  # of each point, with values of the errors that the rows do not show
-DOUBTFUL_NATS = 8.0  # by which a map beats a free skyline, right ones by 11 to 16; below, other times are tried too
 WIDER, LINEAR_PART = 2.0, 0.01  # variance of the first points, in that of the plain and of the linear solution
 GROSS_ROUNDS = (120, 160, 200, 300, 400, 500)  # points; FEW effective ones end them
+FEW_ROUNDS = GROSS_ROUNDS[:1]  # by which hypotheses are screened: of 34 refused with GROSS_ROUNDS it leaves 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,28 +65,15 @@ class Hypothesis:
         """(n, 2)."""
         return self.model.errors.true_positions(self.unturned_m, self.values)
 
-    @property
-    def later_s(self) -> float:
-        """How much later the true time is than the stated one, in the mean."""
-        return float(self.found.share @ self.values[:: self.copies, -1]) + self.model.errors.later_s
 
-    @cached_property
-    def suits_map(self) -> bool:
-        """Whether the map's skyline explains the rows far better than any other one does, so that no time does."""
-        shift = self.model.shift_of(self.found.share @ self.found.points)
-        by_map = float(self.model.log_likelihood_of(shift[None])[0])
-        return free_log_likelihood(self.model.seen.profiles, shift) < by_map - DOUBTFUL_NATS
+def first_group(found: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The hypotheses about the reference of the first one."""
+    return [one for one in found if one.model.around.reference_m is found[0].model.around.reference_m]
 
-    @property
-    def tries_times(self) -> bool:
-        """Whether times are tried that are apart from each other, unless an earlier fix from the image tried them.
 
-        That is on real ground, where the skyline is not linear in the clock's error, and where the map does not explain
-        the rows so well that no time does better.
-        """
-        support = self.model.seen.rows.support
-        has_tried = support is not None and support.has_tried_times
-        return not (has_tried or self.model.terrain.axisymmetric or self.suits_map)
+def first_plain(found: Sequence[Hypothesis]) -> Hypothesis:
+    """The one of the first group without a gross error."""
+    return min(first_group(found), key=lambda one: one.gross != "")
 
 
 def sample_hypothesis(model: SkylineModel, references_m: Array, modes: Sequence[Gaussian], **how: Any) -> Hypothesis:
@@ -112,59 +98,26 @@ def sample_hypothesis(model: SkylineModel, references_m: Array, modes: Sequence[
 
 
 def sample_gross_errors(plain: Hypothesis, references_m: Array) -> list[Hypothesis]:
-    """The hypotheses of one gross error each."""
+    """The hypotheses of one gross error each; for the clock on real ground see `sample_other_times`."""
     model, found = plain.model, []
     for gross in model.errors.facts:
+        if gross == CLOCK_FACT and not model.terrain.axisymmetric:
+            continue
         other, slopes = model.with_gross(gross), model.error_slopes_rad[model.errors.is_of_fact(gross)]
         if not slopes.any() and not model.errors.are_waves(gross):  # nothing shows it: the points are the same
             less = other.basis.log_probability - model.basis.log_probability
             found.append(Hypothesis(other, replace(plain.found, log_weight=plain.found.log_weight + less)))
         else:
-            found.extend(sample_gross_error(plain, other, references_m))
+            found.append(sample_gross_error(plain, other, references_m))
     return found
 
 
 def sample_gross_error(
     plain: Hypothesis, other: SkylineModel, references_m: Array, rounds: Sequence[int] = GROSS_ROUNDS
-) -> list[Hypothesis]:
-    """The hypothesis `other` of one gross error; of the clock on real ground there may be several times.
-
-    Those are sampled in rounds of their own; see `clock_of_other_times`.
-    """
-    clock = clock_of_other_times(plain, other)
-    if clock is not None:
-        return _sample_other_times(plain, other, clock, references_m)
+) -> Hypothesis:
+    """The hypothesis `other` of one gross error."""
     modes = _gross_modes(plain, other)
-    rounds = [len(modes) * count for count in rounds]
-    return [sample_hypothesis(other, references_m, modes, rounds=rounds, enough=FEW)]
-
-
-def _sample_other_times(plain: Hypothesis, model: SkylineModel, clock: Clock, references_m: Array) -> list[Hypothesis]:
-    """The hypotheses of a gross error of the clock at times that are apart from each other."""
-    found: list[Hypothesis] = []
-    for turned in turned_models(model, clock):
-        one = _sample_settled_time(plain, turned, clock, references_m)
-        at_s, others_s = one.later_s, [other.later_s for other in found]
-        if not any(is_linear(clock, at_s - other_s) for other_s in others_s):
-            found.append(one)
-    return found
-
-
-def clock_of_other_times(plain: Hypothesis, other: SkylineModel) -> Clock | None:
-    """The clock where the gross error of `other` is its, and times are tried that are apart from each other."""
-    clock, listed = other.errors.clock, other.errors.listed
-    return clock if listed[-1].fact == other.gross and plain.tries_times else None
-
-
-def _sample_settled_time(plain: Hypothesis, model: SkylineModel, clock: Clock, references_m: Array) -> Hypothesis:
-    """The hypothesis of a gross error of the clock, with the rows turned to the time that it shows."""
-    for _ in range(TIME_ROUNDS):
-        found = sample_hypothesis(model, references_m, _gross_modes(plain, model))
-        off_s = found.later_s - model.errors.later_s
-        if is_linear(clock, off_s):
-            break
-        model = turned_model(model, off_s)
-    return found
+    return sample_hypothesis(other, references_m, modes, rounds=[len(modes) * count for count in rounds], enough=FEW)
 
 
 def _gross_modes(plain: Hypothesis, other: SkylineModel) -> list[Gaussian]:

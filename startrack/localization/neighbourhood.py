@@ -121,7 +121,6 @@ class SectorRows:
     around: Neighbourhood
     rows: Evidence
     image_errors: ImageErrors = NO_IMAGE_ERRORS
-    is_rough: bool = False  # rows are compared with samples of the skyline alone
     apart_nats: float = 0.0  # log-likelihood of further rows of the image, which the skyline does not explain
 
     @cached_property
@@ -129,7 +128,7 @@ class SectorRows:
         """(n,) how far the rows stand above the skyline at the reference."""
         rows, terrain = self.rows, self.around.terrain
         above = rows.elevation_rad - interpolate_circle(self.around.skyline_rad, rows.azimuth_rad)
-        if not terrain.axisymmetric and not self.is_rough:  # crests are narrower than the samples
+        if not terrain.axisymmetric:  # crests are narrower than the samples
             near = np.flatnonzero(np.abs(above) < TRACED_RAD)
             traced = terrain.horizon_rad(self.around.reference_m[None], rows.azimuth_rad[near])
             above[near] = rows.elevation_rad[near] - np.asarray(traced).ravel()

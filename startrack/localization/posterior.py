@@ -11,6 +11,7 @@ from startrack.core.types import Evidence, Explored, Fix, NotLocated, PositionPr
 from startrack.localization.clock import explore_times, is_wide
 from startrack.localization.conclusion import conclude
 from startrack.localization.joint_posterior import sample_posterior
+from startrack.localization.other_times import sample_other_times
 from startrack.localization.position_prior import SearchedNear, name_prior, require_agreement, require_prior_inside
 from startrack.localization.search import NATS, dropped_probability, explore
 from startrack.localization.search_profiles import SLACK_NATS
@@ -52,6 +53,7 @@ class ExactPosterior:
             parts = self._explore_times(rows, terrain)
             found = [one for turned, explored in parts for one in sample_posterior(explored, turned, terrain)]
             found.sort(key=lambda one: -one.found.log_evidence)
+            found = sorted([*found, *sample_other_times(found)], key=lambda one: -one.found.log_evidence)
             return conclude(found, terrain, parts[0][1], dropped_probability(parts[0][1]))
         except NotLocated as refusal:
             raise name_prior(refusal, near) from refusal

@@ -61,6 +61,12 @@ def _fill_moments(profiles, reach, mean, variance):
         variance[s] = second / total - mean[s] * mean[s]
 
 
+def heavy_log_likelihood(moments: SectorMoments, rise_rad: Array) -> float:
+    """Log-likelihood of the heights where the skyline rises by `rise_rad` (SECTORS,), with far tails."""
+    residual = np.square(moments.mean_rad - rise_rad) / moments.variance_rad2
+    return -0.5 * (FREEDOM + 1.0) * float(np.log1p(residual / FREEDOM).sum())
+
+
 def solve_linear(moments: SectorMoments, design: Array, mean: Array, prior: Array) -> tuple[Array, Array, Array]:
     """Parameters (d,) that explain the heights, their covariance (d, d), and weights (SECTORS,) of the sectors.
 

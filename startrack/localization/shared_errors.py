@@ -58,9 +58,9 @@ class SharedErrors:
         return cls(listed, clock if has_clock else None, waves, terrain.axisymmetric)
 
     @staticmethod
-    def doubtable(terrain: Terrain, clock: Clock | None) -> tuple[str, ...]:
-        """Stated facts of a `terrain` and a `clock` whose errors would be larger if the statement were wrong."""
-        known = _known_errors(terrain, clock)
+    def doubtable(terrain: Terrain) -> tuple[str, ...]:
+        """Stated facts of a `terrain` whose errors would be larger if the statement were wrong."""
+        known = terrain.shape_errors
         return tuple(
             dict.fromkeys(one.fact for one in known if one.gross_probability == 0.0 and one.gross_sigma > one.sigma)
         )
@@ -107,6 +107,14 @@ class SharedErrors:
         """(k,) expected values: not zero for rows turned to another time, or a ground of another shape, than stated."""
         found = np.array([one.mean for one in self.listed])
         found[-1:] -= self.later_s
+        return found
+
+    @property
+    def stated_values(self) -> Array:
+        """(k,) `mean`, that of the clock as stated, also where another time is expected."""
+        found = self.mean.copy()
+        if self.clock is not None:
+            found[-1] = -self.later_s
         return found
 
     def log_probability(self, gross: str = "") -> float:

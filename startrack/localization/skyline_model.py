@@ -114,9 +114,9 @@ class SkylineModel:
         errors = SharedErrors.of(self.terrain, self.seen.rows.clock, gross)
         return replace(self, gross=gross, errors=errors, error_slopes_rad=self.around.error_slopes_rad(errors))
 
-    def with_rows(self, rows: Evidence, is_rough: bool) -> SkylineModel:
-        """The same neighbourhood with other `rows` and their clock; see `SectorRows.is_rough`."""
-        seen = replace(self.seen, rows=rows, is_rough=is_rough)
+    def with_rows(self, rows: Evidence) -> SkylineModel:
+        """The same neighbourhood with other `rows` and their clock."""
+        seen = replace(self.seen, rows=rows)
         errors = replace(self.errors, clock=rows.clock)
         return SkylineModel(seen, errors, self.error_slopes_rad, self.gross, self.stated_basis)
 

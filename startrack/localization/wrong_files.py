@@ -6,17 +6,24 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from startrack.core.statistics import shares
 from startrack.core.types import Array, Blocked, NotLocated
 from startrack.localization.free_skyline import free_log_likelihood
-from startrack.localization.hypothesis import GROSS_ROUNDS, Hypothesis, clock_of_other_times, sample_gross_error
+from startrack.localization.hypothesis import (
+    FEW_ROUNDS,
+    GROSS_ROUNDS,
+    Hypothesis,
+    first_group,
+    first_plain,
+    sample_gross_error,
+)
 from startrack.localization.own_edge import edge_log_likelihood
-from startrack.localization.shared_errors import OWN_EDGE, SharedErrors
+from startrack.localization.shared_errors import CLOCK_FACT, OWN_EDGE, SharedErrors
 from startrack.localization.skyline_model import SkylineModel
 
 WRONG_FACT_NATS = 3.0  # by which a gross error of a stated fact must explain the rows better: 1 of 100 clean skies
 MOST_BLOCKED = 0.5  # of the skyline that the rows show: where more is on no map, another place may explain them as well
 WIDE_SHAPE = 0.4  # relative range of a wrong map's steepness: a free skyline is compared with a map of any of them
-FEW_ROUNDS = GROSS_ROUNDS[:1]  # points by which facts are screened: of 34 frames refused with GROSS_ROUNDS it leaves 32
 
 
 def require_map_in_view(model: SkylineModel, clear: Array) -> None:
@@ -40,7 +47,7 @@ def require_files(found: Sequence[Hypothesis], parameters: Array) -> None:
         found: the hypotheses, the heaviest first.
         parameters: (2 + a,) of the likeliest position and errors.
     """
-    model, whole = found[0].model, _plain(found).model
+    model, whole = found[0].model, first_plain(found).model
     shift = model.shift_of(parameters)
     free = free_log_likelihood(whole.seen.profiles, shift)
     if model.gross == OWN_EDGE:  # which the stars must not have too
@@ -54,22 +61,20 @@ def require_files(found: Sequence[Hypothesis], parameters: Array) -> None:
             "or camera file, or something on no map?",
             reason="inconsistent_evidence",
         )
+    share = shares(np.array([one.found.log_evidence for one in found]))
+    wrong_time = float(share @ [_is_wrong_time(one) for one in found])
+    if wrong_time > 0.5:
+        raise NotLocated(
+            f"an error of the time beyond what {CLOCK_FACT} states is likelier than the stated time, with "
+            f"{100.0 * wrong_time:.0f} %: is it right?",
+            reason="inconsistent_evidence",
+        )
     better, fact = max(((nats, fact) for fact, nats in weigh_wrong_facts(found)), default=(0.0, ""))
     if better > WRONG_FACT_NATS:
         raise NotLocated(
             f"an error beyond what {fact} states explains the image better, by {better:.0f} nats: is it right?",
             reason="inconsistent_evidence",
         )
-
-
-def _near(found: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """The hypotheses about the reference of the first one."""
-    return [one for one in found if one.model.around.reference_m is found[0].model.around.reference_m]
-
-
-def _plain(found: Sequence[Hypothesis]) -> Hypothesis:
-    """The one of them without a gross error."""
-    return min(_near(found), key=lambda one: one.gross != "")
 
 
 def _log_map(best: Hypothesis, parameters: Array) -> float:
@@ -86,23 +91,29 @@ def _log_map(best: Hypothesis, parameters: Array) -> float:
 
 
 def weigh_wrong_facts(found: Sequence[Hypothesis]) -> Iterator[tuple[str, float]]:
-    """Stated facts, and by how many nats a gross error of each explains the rows better than the files.
+    """Stated facts of the terrain, and by how many nats a gross error of each explains the rows better than the files.
 
     Both are integrals over position and errors. Facts that are certainly right are left out.
     """
     best = found[0].model
-    near, plain = _near(found), _plain(found)
+    near, plain = first_group([one for one in found if not _is_wrong_time(one)]), first_plain(found)
     by_files = _log_evidence(near)
-    for fact in SharedErrors.doubtable(best.terrain, best.seen.rows.clock):
+    for fact in SharedErrors.doubtable(best.terrain):
         other = plain.model.with_gross(fact)
         better = -np.inf
         for rounds in FEW_ROUNDS, GROSS_ROUNDS:
             if len(other.basis):
                 doubted = sample_gross_error(plain, other, best.around.reference_m[None], rounds)
-                better = _log_evidence(doubted) - by_files
-            if better < 0.0 or clock_of_other_times(plain, other) is not None:  # times have rounds of their own
+                better = _log_evidence([doubted]) - by_files
+            if better < 0.0:
                 break
         yield fact, better
+
+
+def _is_wrong_time(one: Hypothesis) -> bool:
+    """Whether a stated time is wrong by a hypothesis."""
+    clock = one.model.errors.clock
+    return one.gross == CLOCK_FACT and clock is not None and clock.gross_probability == 0.0
 
 
 def _log_evidence(found: Sequence[Hypothesis]) -> float:

@@ -73,7 +73,7 @@ class OtherTimes:
     def times_s(self) -> Array:
         """(2 n + 1,) [s later than stated], the stated one in the middle."""
         count = min(int(np.ceil(REACH_SIGMAS * self.clock.gross_sigma_s / self.step_s)), MOST_STEPS)
-        return self.step_s * np.arange(-count, count + 1)
+        return self.step_s * np.arange(-count, count + 1.0)
 
     @cached_property
     def log_part(self) -> Array:

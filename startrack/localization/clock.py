@@ -55,13 +55,19 @@ def duration(seconds: float) -> str:
 
 
 def turn_evidence(evidence: Evidence, later_s: float, air: Air | None) -> Evidence:
-    """The rows as they stand if the true time is later by that much, with the refraction in the `air` there."""
+    """The rows as they stand if the true time is later by that much, with the refraction in the `air` there.
+
+    Rows of the sky's light that have one azimuth keep one: they stand or fall together.
+    """
     clock = evidence.clock
     if clock is None or later_s == 0.0:
         return evidence
     moved = replace(clock, offset_s=clock.offset_s + later_s)
     R = R_from_rotvec(later_s * clock.turn_rad_s)
     azimuth, elevation = turn_sky(evidence.azimuth_rad, evidence.elevation_rad, R, air)
+    light = np.flatnonzero(evidence.extended_nats > 0.0)
+    _, first, of = np.unique(evidence.azimuth_rad[light], return_index=True, return_inverse=True)
+    azimuth[light] = azimuth[light[first]][of]
     return replace(evidence, azimuth_rad=azimuth, elevation_rad=elevation, clock=moved)
 
 

@@ -33,7 +33,7 @@ from startrack.localization.skyline_model import SkylineModel
 
 WRONG_TIME_PROBABILITY = 0.005  # of a stated time; see docs/method.md, section 8
 REACH_SIGMAS, MOST_STEPS = 3.0, 60  # of a gross error, to the last time: 16 degrees of turn at most
-FIRST_NATS, MOST_FIRST = 6.0, 2  # of times by the heights alone: worse than the best by more; begun with besides zero
+FIRST_NATS, MOST_FIRST = 3.0, 2  # of times by the heights alone: worse than the best by more; begun with besides zero
 LEAST_SHARE, FULL_SHARE = 5e-5, 1e-2  # of the probability: next times are sampled too; with more points
 
 

@@ -10,16 +10,18 @@ import pytest
 from test_localization_ground import simulate_rays
 from test_localization_shape import evidence_at
 
-from startrack.core.types import Array, Clock, Evidence, Fix, NotLocated
+from startrack.core.types import Array, Clock, Evidence, Fix, NotLocated, PositionPrior
 from startrack.frames import R_enu_icrs, Site, azel_from_rays, sky_rotvec_rad, ut1_sigma_s
 from startrack.frames.orientation import _earth_orientation
-from startrack.localization import ExactPosterior, hypothesis
+from startrack.localization import ExactPosterior
 from startrack.localization.clock import clock_at as clock_of_site
 from startrack.localization.clock import clock_matters, turn_evidence
+from startrack.localization.joint_posterior import sample_posterior
+from startrack.localization.other_times import WRONG_TIME_PROBABILITY, sample_other_times
 from startrack.terrain import HeightMap, Terrain, load_terrain
 
 TIME = datetime(2030, 6, 3, 4, 5, 6, tzinfo=UTC)
-HOUR_S = 3600.0
+HOUR_S, FEW_STARS = 3600.0, 3000
 SITES = {
     "shackleton": Site("moon", np.radians(-89.66), np.radians(129.78)),
     "kepler": Site("moon", np.radians(8.12), np.radians(-38.0)),
@@ -147,20 +149,73 @@ def test_a_time_beyond_its_stated_error_is_refused(ground: HeightMap, hours: flo
     assert refusal.value.reason == "inconsistent_evidence"
 
 
-def test_other_times_are_tried_once_an_image(ground: HeightMap, monkeypatch: pytest.MonkeyPatch) -> None:
-    tried: list[Clock] = []
-    monkeypatch.setattr(hypothesis, "DOUBTFUL_NATS", np.inf)  # no map explains the rows well enough
-    monkeypatch.setattr(hypothesis, "turned_models", lambda model, clock: tried.append(clock) or [])
-    place_m = np.array([120.0, -80.0])
-    clock = clock_of_site(SITES["shackleton"], TIME, 1.0, is_stated=False)
-    rows = replace(simulate_rays(ground, place_m, np.random.default_rng(3), 3000, 0.0), clock=clock)
-    first = ExactPosterior()(rows, ground)
-    assert len(tried) == 1
-    again = ExactPosterior()(replace(rows, support=first.samples), ground)
-    assert len(tried) == 1
-    off_m = np.linalg.norm(again.position_enu_m - first.position_enu_m)
-    assert off_m < 0.1 * first.radius95_m
-    assert again.radius95_m == pytest.approx(first.radius95_m, rel=0.1)
+@pytest.mark.parametrize("is_stated", [True, False])
+def test_other_times_are_hypotheses_of_a_map_and_of_the_last_look(ground: HeightMap, is_stated: bool) -> None:
+    """A stated clock has them unless the image is first looked at, a silent one at each look."""
+    clock = clock_of_site(SITES["shackleton"], TIME, 1.0, is_stated=is_stated)
+    rows = replace(simulate_rays(ground, np.array([120.0, -80.0]), np.random.default_rng(3), 3000, 0.0), clock=clock)
+    localizer = ExactPosterior()
+    found = sample_posterior(localizer.explore(rows, ground), rows, ground)
+    times = sample_other_times(found)
+    stated = min(times, key=lambda one: abs(one.model.errors.later_s))
+    assert {one.gross for one in times} == {"time_sigma_s"} and stated.model.errors.later_s == 0.0
+    probability = WRONG_TIME_PROBABILITY if is_stated else clock.gross_probability
+    of_prior = np.logaddexp.reduce([one.found.log_evidence for one in times]) - found[0].found.log_evidence
+    assert -12.0 < of_prior < np.log(probability)  # the true time is the stated one
+    first = sample_posterior(localizer.explore(rows, ground), replace(rows, is_first_look=True), ground)
+    assert bool(sample_other_times(first)) == (not is_stated)
+
+
+def test_a_round_crater_has_no_other_times() -> None:
+    terrain = load_terrain("shackleton-thesis")
+    rows = replace(evidence_at((3000.0, -2000.0), 5), clock=clock_of_site(SITES["shackleton"], TIME, 1.0))
+    localizer = ExactPosterior()
+    assert sample_other_times(sample_posterior(localizer.explore(rows, terrain), rows, terrain)) == []
+
+
+@pytest.mark.slow
+def test_a_turned_map_with_few_stars_is_refused_or_within_its_circle() -> None:
+    """The map is turned by 0.9 to 1.8 degrees and the clock stated to 1 s: a wrong time is in the circle, or refused.
+
+    Circles without other times, those of a first look, miss 3 of the 6.
+    """
+    terrain, site = load_terrain("shackleton-rendered"), SITES["shackleton"]
+    beyond, without = 0, 0
+    for seed in range(6):
+        rng = np.random.default_rng([41, seed])
+        place_m, hours = rng.uniform(-2500.0, 2500.0, 2), rng.uniform(1.7, 3.3) * rng.choice([-1.0, 1.0])
+        rows = stated_early(simulate_rays(terrain, place_m, rng, FEW_STARS, 0.0), site, hours * HOUR_S, 1.0)
+        near = PositionPrior(east_m=float(place_m[0]), north_m=float(place_m[1]), sigma_m=100.0)
+        rows = replace(rows, clock=clock_of_site(site, TIME, 1.0), near=near)
+        for number, fix in enumerate(
+            [fix_or_none(rows, terrain), fix_or_none(replace(rows, is_first_look=True), terrain)]
+        ):
+            is_beyond = fix is not None and not fix.ambiguous and not is_inside(fix, place_m)
+            beyond, without = beyond + (is_beyond and number == 0), without + (is_beyond and number == 1)
+    assert beyond <= 1
+    assert without >= 3
+
+
+def fix_or_none(rows: Evidence, terrain: Terrain) -> Fix | None:
+    try:
+        return ExactPosterior()(rows, terrain)
+    except NotLocated:
+        return None
+
+
+def test_a_turn_keeps_light_of_one_azimuth_together() -> None:
+    """Rows of the sky's light at one azimuth stand or fall together; the Moon's axis is not the vertical."""
+    azimuth, elevation = np.repeat([0.3, 2.1], 4), np.tile(np.radians([10.0, 10.2, 10.4, 10.6]), 2)
+    light = Evidence(
+        azimuth_rad=azimuth, elevation_rad=elevation, llr=np.ones(8), extended_nats=np.ones(8),
+        edge_sigma_rad=np.full(8, 1e-3), clock=clock_at(SITES["shackleton"], 1.0),
+    )  # fmt: skip
+    turned = turn_evidence(light, HOUR_S, None)
+    assert len(np.unique(turned.azimuth_rad)) == 2
+    stars = turn_evidence(replace(light, extended_nats=np.zeros(8), edge_sigma_rad=np.zeros(8)), HOUR_S, None)
+    assert len(np.unique(stars.azimuth_rad)) == 8
+    np.testing.assert_allclose(turned.azimuth_rad, stars.azimuth_rad, atol=np.radians(0.01))
+    np.testing.assert_array_equal(turned.elevation_rad, stars.elevation_rad)
 
 
 def is_inside(fix: Fix, place_m: Array) -> bool:

@@ -32,7 +32,7 @@ from startrack.localization.shared_errors import CLOCK_FACT, is_noticeable
 from startrack.localization.skyline_model import SkylineModel
 
 WRONG_TIME_PROBABILITY = 0.005  # of a stated time; see docs/method.md, section 8
-REACH_SIGMAS, MOST_STEPS = 3.0, 60  # of a gross error, to the last time: 16 degrees of turn at most
+GROSS_REACH_SIGMAS, MOST_TIME_STEPS = 3.0, 60  # of a gross error, to the last time: 16 degrees of turn at most
 FIRST_NATS, MOST_FIRST = 3.0, 2  # of times by the heights alone: worse than the best by more; begun with besides zero
 LEAST_SHARE, FULL_SHARE = 5e-5, 1e-2  # of the probability: next times are sampled too; with more points
 
@@ -72,7 +72,7 @@ class OtherTimes:
     @cached_property
     def times_s(self) -> Array:
         """(2 n + 1,) [s later than stated], the stated one in the middle."""
-        count = min(int(np.ceil(REACH_SIGMAS * self.clock.gross_sigma_s / self.step_s)), MOST_STEPS)
+        count = min(int(np.ceil(GROSS_REACH_SIGMAS * self.clock.gross_sigma_s / self.step_s)), MOST_TIME_STEPS)
         return self.step_s * np.arange(-count, count + 1.0)
 
     @cached_property

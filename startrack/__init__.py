@@ -3,7 +3,8 @@
     import startrack
     print(startrack.locate("image.png"))
 
-`locate` takes a path or an array and returns a `Solution`; `identify` and `detect` stop earlier. `track` makes a
+`locate` takes a path or an array and returns a `Solution`; `identify` and `detect` stop earlier; `locate_skyline` takes
+a skyline that was measured elsewhere. `track` makes a
 trajectory of many images, `calibrate` a camera, `render` an image, `predict` the expected accuracy, `measure_horizon`
 the skyline of a fixed camera. The packages (`startrack.detection`, `startrack.identification`,
 `startrack.localization`, ...) have the stages one by one. Every name is loaded at its first use: importing startrack
@@ -15,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 _MODULES = {  # public name to the module that has it
-    "detect": "api.solve", "identify": "api.solve", "locate": "api.solve", "track": "api.solve",
+    "detect": "api.solve", "identify": "api.solve", "locate": "api.solve", "locate_skyline": "api.solve",
+    "track": "api.solve",
     "calibrate": "api.applications", "measure_horizon": "api.applications",
     "predict": "api.applications", "render": "api.applications",
     "Solution": "api.solution",
@@ -29,13 +31,13 @@ _MODULES = {  # public name to the module that has it
 __all__ = [
     "BadInput", "Camera", "Cylinder", "Detections", "Evidence", "ExactPosterior", "Fix", "HeightMap", "NoSolution",
     "Solution", "Terrain", "__version__", "calibrate", "detect", "identify", "load_camera", "load_catalog",
-    "load_terrain", "locate", "measure_horizon", "predict", "render", "track",
+    "load_terrain", "locate", "locate_skyline", "measure_horizon", "predict", "render", "track",
 ]  # fmt: skip
 
 if TYPE_CHECKING:
     from startrack.api.applications import calibrate, measure_horizon, predict, render
     from startrack.api.solution import Solution
-    from startrack.api.solve import detect, identify, locate, track
+    from startrack.api.solve import detect, identify, locate, locate_skyline, track
     from startrack.camera import Camera, load_camera
     from startrack.catalog import load_catalog
     from startrack.core.errors import BadInput, NoSolution

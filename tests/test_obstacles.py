@@ -80,7 +80,7 @@ def test_rows_without_an_elevation_are_gaps(tmp_path):
     ("text", "cause"),
     [
         ("", "columns azimuth_deg and elevation_deg"), ("azimuth,elevation\n1,2\n", "columns azimuth_deg"),
-        (HEAD, "0 rows with an elevation"), (HEAD + "1,2\n", "1 rows"), (HEAD + "1,2\n3\n", "line 3: two finite"),
+        (HEAD, "0 rows with an elevation"), (HEAD + "1,2\n", "1 rows"), (HEAD + "1,2\n3\n", "line 3: finite"),
         (HEAD + "1,2\nnorth,2\n", "line 3"), (HEAD + "1,2\n3,nan\n", "line 3"), (HEAD + "1,2\n3,91\n", "elevation 91"),
         (HEAD + "1,2\n1e5,3\n", "azimuth 100000"), (HEAD + "1,2\n,3\n", "line 3"),
     ],

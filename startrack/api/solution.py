@@ -14,7 +14,7 @@ import numpy as np
 
 from startrack import output
 from startrack.api.values import ClockOffset, Orientation, Position, html_table
-from startrack.chain import Located, Measured, Oriented, Outcome, last_value
+from startrack.chain import Located, Measured, Oriented, Outcome, Positioned, last_value
 from startrack.frames import heading_pitch_roll_from_R_body_enu, latlon_from_enu
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class Solution:
     def position(self) -> Position | None:
         """East, north, up, their sigma and ellipse, latitude and longitude, with units; None unless located."""
         result = self.result
-        if not isinstance(result, Located) or result.fix.ambiguous:
+        if not isinstance(result, Positioned) or result.fix.ambiguous:
             return None
         from astropy import units as u
         from astropy.coordinates import Angle
@@ -127,7 +127,7 @@ class Solution:
 
     @property
     def _fix(self) -> Fix | None:
-        return self.result.fix if isinstance(self.result, Located) and self else None
+        return self.result.fix if isinstance(self.result, Positioned) and self else None
 
     def _shown(self, *groups: str) -> output.Rows:
         """The rows of the notebook's table of these groups of quantities."""
@@ -139,7 +139,7 @@ class Solution:
 
         The circles hold their part of that mode alone; they are infinite where none is stated.
         """
-        if not isinstance(self.result, Located):
+        if not isinstance(self.result, Positioned):
             return None
         from astropy import units as u
         from astropy.table import QTable
@@ -182,7 +182,7 @@ class Solution:
     @cached_property
     def skyline(self) -> QTable | None:
         """The skyline that the image shows: azimuth, elevation, sigma [deg] and source; None unless located."""
-        if not isinstance(self.result, Located) or self.result.skyline is None:
+        if not isinstance(self.result, Positioned) or self.result.skyline is None:
             return None
         from astropy.table import QTable
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from startrack import chain
 from startrack.api.solution import Solution
@@ -15,7 +17,7 @@ from startrack.catalog import apparent_stars, load_catalog
 from startrack.chain import Image, NearAttitude, Outcome, Refused, Settings, Time
 from startrack.core import MAX_SPEED_M_S, ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.errors import BAD_INPUT_REASONS, BadInput
-from startrack.core.types import Exposure
+from startrack.core.types import Exposure, PositionPrior
 from startrack.estimation.observations import OdometryErrors
 from startrack.identification import Identifier, NearSky
 from startrack.terrain import Terrain
@@ -60,6 +62,57 @@ def locate(
     exposure = chain.exposure_input(image, time, time_sigma)
     known = chain.camera_input(camera, exposure), chain.terrain_input(terrain, exposure)
     return _solution(chain.locate(exposure, *known, load_catalog(), settings), "fix")
+
+
+def locate_skyline(
+    skyline: str | ArrayLike,
+    *,
+    terrain: str | Terrain,
+    camera: str | Camera | None = None,
+    attitude: str | Sequence[float] | None = None,
+    heading_sigma: float | Quantity = 0.0,
+    tilt_sigma: float | Quantity = 0.0,
+    correlation: float | Quantity | None = None,
+    near: ArrayLike | None = None,
+    time: Time = None,
+) -> Solution:
+    """Position from a skyline that was measured elsewhere: traced on a photograph, or with a theodolite.
+
+    Args:
+        skyline: a file with the columns azimuth_deg, elevation_deg and sigma_deg (as NAME.skyline.ecsv of `locate`),
+            or a polyline x_px, y_px[, sigma_px] on a picture; or rows (n, 3) of azimuth, elevation and sigma [deg].
+        terrain: as for `locate`.
+        camera: of a polyline, as for `locate`.
+        attitude: of a polyline: a result file of startrack; or azimuth and elevation of the optical axis, and a
+            clockwise turn of the camera about it [deg].
+        heading_sigma: standard deviation of the attitude's error about the vertical: an angle or degrees; 180: it is
+            not known at all.
+        tilt_sigma: likewise of the vertical, about each of two level axes.
+        correlation: of azimuth, over which errors of heights are alike: an angle or degrees. None: 1 degree.
+        near: east, north and sigma (3,) [m] of a prior of the position. None: anywhere in the search area.
+        time: only for an `attitude` file without a time.
+
+    Returns:
+        The solution; its attitude is None. It is false, with reason and message, where the skyline gives no position.
+
+    Raises:
+        BadInput: something is missing or cannot be used (bad_image, no_calibration, bad_terrain, no_time).
+        ValueError: sigmas that are no angles.
+    """
+    when, ground = chain.time_input(time), chain.terrain_input(terrain, None)
+    given = {"heading_sigma": heading_sigma, "tilt_sigma": tilt_sigma, "correlation": correlation}
+    errors = {f"{name}_rad": chain.angle_rad(one, name) for name, one in given.items() if one is not None}
+    stated = None
+    if isinstance(attitude, str | os.PathLike):
+        stated = chain.StatedAttitude.of_file(attitude, ground.site, when)
+    elif attitude is not None:
+        azimuth, pitch, roll = (chain.angle_rad(one, "attitude") for one in attitude)
+        stated = chain.StatedAttitude.of_angles(azimuth, pitch, roll)
+    lens = None if camera is None else chain.load_camera_input(camera)
+    prior = None if near is None else PositionPrior(*np.asarray(near, dtype=float).tolist())
+    points = chain.skyline_points(skyline, chain.SkylineErrors(**errors), lens, stated, prior)
+    name = os.fspath(terrain) if isinstance(terrain, str | os.PathLike) else None
+    return _solution(chain.locate_skyline(chain.skyline_exposure(skyline, when, name), points, ground), "fix")
 
 
 def track(

@@ -15,6 +15,15 @@ from startrack.chain.inputs import (
     terrain_input,
     time_input,
 )
+from startrack.chain.measured_skyline import (
+    CORRELATION_RAD,
+    PlacedBySkyline,
+    SkylineErrors,
+    StatedAttitude,
+    locate_skyline,
+    skyline_exposure,
+    skyline_points,
+)
 from startrack.chain.measurement import CERTAIN_PROBABILITY, COMPLETE_V_MAG, locate_rays, mask_unpredictable
 from startrack.chain.near_attitude import NearAttitude, read_near_attitude
 from startrack.chain.orientation import fit_orientation
@@ -27,6 +36,7 @@ from startrack.chain.pipeline import (
     locate_exposure,
     locate_measured,
 )  # fmt: skip
+from startrack.chain.positioned import Positioned
 from startrack.chain.run import add_timing
 from startrack.chain.second_pass import EDGE_SIGMA_PX
 from startrack.chain.sky_state import stating_sky
@@ -48,11 +58,13 @@ from startrack.chain.stages import (
 )
 
 __all__ = [
-    "CERTAIN_PROBABILITY", "COMPLETE_V_MAG", "EDGE_SIGMA_PX", "MISSING", "STAGES", "Detected", "Identified", "Image",
-    "Inputs", "Located", "Measured", "NearAttitude", "Oriented", "Outcome", "Refused", "Settings", "StarFix",
-    "StarRays", "Time", "add_timing", "angle_rad", "are_unchanged", "camera_input", "content_sha256", "detect",
-    "duration_s", "exposure_input", "field_of_view_rad", "fit_orientation", "identified_names", "identify",
-    "identify_blind", "input_hashes", "is_list_of_centroids", "job_sha256", "last_value", "load_camera_input",
-    "load_named", "locate", "locate_exposure", "locate_measured", "locate_rays", "mask_unpredictable",
-    "read_near_attitude", "settings_input", "stating_sky", "terrain_input", "time_input",
+    "CERTAIN_PROBABILITY", "COMPLETE_V_MAG", "CORRELATION_RAD", "EDGE_SIGMA_PX", "MISSING", "STAGES", "Detected",
+    "Identified", "Image", "Inputs", "Located", "Measured", "NearAttitude", "Oriented", "Outcome",
+    "PlacedBySkyline", "Positioned", "Refused", "Settings", "SkylineErrors", "StarFix", "StarRays",
+    "StatedAttitude", "Time", "add_timing", "angle_rad", "are_unchanged", "camera_input", "content_sha256",
+    "detect", "duration_s", "exposure_input", "field_of_view_rad", "fit_orientation", "identified_names",
+    "identify", "identify_blind", "input_hashes", "is_list_of_centroids", "job_sha256", "last_value",
+    "load_camera_input", "load_named", "locate", "locate_exposure", "locate_measured", "locate_rays",
+    "locate_skyline", "mask_unpredictable", "read_near_attitude", "settings_input", "skyline_exposure",
+    "skyline_points", "stating_sky", "terrain_input", "time_input",
 ]  # fmt: skip

@@ -18,6 +18,7 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.catalog import daylight_warnings
 from startrack.chain.near_attitude import NearAttitude
+from startrack.chain.positioned import Positioned
 from startrack.chain.source_names import SourceNames
 from startrack.core.errors import Reason
 from startrack.core.types import (
@@ -218,7 +219,7 @@ class SkyEvidence(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Located(StarFix, Measured):
+class Located(Positioned, StarFix, Measured):
     """The whole solution: evidence and the position that explains it."""
 
     sky: SkyEvidence | None = None  # None: not used for the fix
@@ -228,19 +229,9 @@ class Located(StarFix, Measured):
     sky_brightness_mag_arcsec2: float | None = None  # beyond that of the ground; None: no step, no zero point
 
     @property
-    def position_at_time_m(self) -> Array:
-        """East and north (2,) at the time of `R_enu_icrs`: where the skyline and the stars are compared.
-
-        In a round crater the error of the clock spreads the position over an arc, whose mean lies beside it.
-        """
-        return np.asarray(self.fix.at_time_m)
-
-    @property
     def warnings(self) -> list[str]:
         """Those of `Measured`, what blocks the view, and errors beyond the defaults of facts that no file states."""
-        blocked = [f"not the map's skyline, and left out: {self.fix.blocked.text}"] if self.fix.blocked else []
-        shown = [f"the image shows {one.text}, which no file states: it is estimated" for one in self.fix.shown]
-        return [*super().warnings, *blocked, *shown, *self.fix.cautions]
+        return [*super().warnings, *self.position_warnings]
 
     @property
     def evidence_source(self) -> str:
@@ -248,16 +239,6 @@ class Located(StarFix, Measured):
         if self.sky is None:
             return "stars"
         return "both" if self.by_stars else "sky"
-
-    @property
-    def reason(self) -> Reason | None:
-        """`ambiguous` where several positions fit."""
-        return Reason.AMBIGUOUS if self.fix.ambiguous else None
-
-    @property
-    def message(self) -> str:
-        """Number of positions that fit, if there are several."""
-        return f"{len(self.fix.modes)} positions fit the stars" if self.fix.ambiguous else ""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -153,6 +153,7 @@ def check_cluster(args: argparse.Namespace) -> None:
 
 
 IMAGES = flag("images IMAGE", "PNG, TIFF, FITS, JPEG, camera raw, ROS bag, or BAG#NUMBER", nargs="+")
+SOME_IMAGES = IMAGES._replace(options={**IMAGES.options, "nargs": "*"})
 PHOTOGRAPHS = flag("images IMAGE", "PNG, TIFF, FITS, JPEG or camera raw", nargs="+")
 TOPIC = flag("--image-topic TOPIC", "of a ROS bag with several")
 CAMERA = flag(

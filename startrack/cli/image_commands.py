@@ -5,20 +5,49 @@ from __future__ import annotations
 import argparse
 
 from startrack.cli import flags
-from startrack.cli.flag_types import cluster_address, count, fields_of_view_rad, geo_formats, seconds
+from startrack.cli.flag_types import (
+    attitude,
+    cluster_address,
+    count,
+    fields_of_view_rad,
+    geo_formats,
+    half_turn,
+    seconds,
+)
 from startrack.cli.flags import Command, Either, flag, function_at
 from startrack.core import NARROWEST_DEG, REPORTED_IMAGES, WIDEST_DEG
 
 INPUT = (flags.IMAGES, flags.TOPIC, *flags.FACTS)
+SKYLINE = (
+    flag(
+        "--skyline FILE",
+        "in place of images: columns azimuth_deg, elevation_deg, sigma_deg (as NAME.skyline.ecsv has them), or a "
+        "polyline x_px, y_px[, sigma_px] with -c and --attitude",
+    ),
+    flag(
+        "--attitude FILE|AZ,PITCH,ROLL",
+        "of the camera of a polyline: a result of startrack, or degrees: azimuth and elevation of the optical axis, "
+        "and a clockwise turn about it (--attitude=-10,...)",
+        attitude,
+    ),
+    flag("--heading-sigma DEG", "error of the attitude about the vertical; 180: not known", half_turn),
+    flag("--tilt-sigma DEG", "error of the vertical, about each of two level axes", half_turn),
+    flag("--correlation DEG", "of azimuth, over which errors of heights are alike (1)", half_turn),
+)
 SHARED = {"output": flags.OUTPUT, "more": (flags.NO_SEED, *flags.MORE)}
 COMMANDS = (
     Command(
         "locate", function_at("locate.locate"), "image to position and attitude",
         "Locate the camera in each image: detect, identify, attitude, evidence, position. Camera, terrain and time "
         "come from flags, else from NAME.json beside the image, else from its header. Writes NAME.fix.json, "
-        "NAME.stars.ecsv, NAME.skyline.ecsv, NAME.wcs, NAME.corr, NAME.annotated.png and NAME.skyline.png.",
+        "NAME.stars.ecsv, NAME.skyline.ecsv, NAME.wcs, NAME.corr, NAME.annotated.png and NAME.skyline.png. With "
+        "--skyline the position is by a skyline that was measured elsewhere, without stars and time.",
         {
-            "input": (*INPUT, flags.TERRAIN, flag("--fov DEG", argparse.SUPPRESS)),  # a flag of identify and calibrate
+            "input": (
+                flags.SOME_IMAGES, flags.TOPIC, *flags.FACTS, flags.TERRAIN,
+                flag("--fov DEG", argparse.SUPPRESS),  # a flag of identify and calibrate
+            ),
+            "a measured skyline": SKYLINE,
             "method": (*flags.METHOD, flags.TIME_LIMIT),
             "output": (
                 *flags.OUTPUT,

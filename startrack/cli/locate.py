@@ -40,6 +40,12 @@ def locate(args: argparse.Namespace) -> int:
             "a position needs the lens better than --fov finds it: make a camera file with startrack calibrate "
             f"--fov {args.fov} IMAGE... -o CAMERA.toml, then startrack locate -c CAMERA.toml"
         )
+    if args.skyline is not None:
+        from startrack.cli.skyline import locate_skyline
+
+        return locate_skyline(args)
+    if not args.images:
+        args.usage_error("give an image, or --skyline FILE")
     check_localizer(args)
     settings = settings_of(args)
     code = _run_images(args, "fix", lambda exposure, _: chain.locate_exposure(exposure, settings), args.time_limit)

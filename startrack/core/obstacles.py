@@ -19,12 +19,25 @@ MOST_GAP_RAD = np.radians(10.0)  # between rows farther apart nothing was scanne
 LEAST_ROWS = 2
 
 
-def read_columns(path: FilePath, names: Sequence[str], reason: str, *, gaps_in: str = "") -> Array:
-    """Numbers (n, columns) of the columns `names` in a CSV file at `path` with a header line; others are ignored.
+def column_names(path: FilePath, reason: str) -> list[str]:
+    """The names of the columns in a CSV or ECSV file at `path`. Raises BadInput `reason` where it cannot be read."""
+    first = next((line for line in _lines(path, reason) if line.strip()), "")
+    return [word.strip() for word in first.split(",")]
 
-    A field of the column `gaps_in` may be empty: nan. Raises BadInput `reason` with the file and the cause.
+
+def _lines(path: FilePath, reason: str) -> list[str]:
+    """Lines of the file at `path`; those of comments, as of ECSV, are empty, so that the others keep their numbers."""
+    lines = read_text(path, reason).removeprefix("\ufeff").splitlines()
+    return ["" if line.startswith("#") else line for line in lines]
+
+
+def read_columns(path: FilePath, names: Sequence[str], reason: str, *, gaps_in: Sequence[str] = ()) -> Array:
+    """Numbers (n, columns) of the columns `names` in a CSV or ECSV file at `path` with a header line.
+
+    Other columns are ignored. A field of the columns `gaps_in` may be empty: nan. Raises BadInput `reason` with the
+    file and the cause.
     """
-    lines = csv.reader(read_text(path, reason).removeprefix("\ufeff").splitlines())
+    lines = csv.reader(_lines(path, reason))
     try:
         rows = [(lines.line_num, [word.strip() for word in row]) for row in lines if any(word.strip() for word in row)]
         if not rows or any(rows[0][1].count(name) != 1 for name in names):
@@ -33,13 +46,13 @@ def read_columns(path: FilePath, names: Sequence[str], reason: str, *, gaps_in: 
         for k, (number, row) in enumerate(rows[1:]):
             try:
                 words = [row[column] for column in columns]
-                is_gap = np.array([name == gaps_in and not word for name, word in zip(names, words, strict=True)])
+                is_gap = np.array([name in gaps_in and not word for name, word in zip(names, words, strict=True)])
                 found[k] = [np.nan if gap else float(word) for gap, word in zip(is_gap, words, strict=True)]
                 is_wrong = not (np.isfinite(found[k]) | is_gap).all()
             except (ValueError, IndexError):
                 is_wrong = True
             if is_wrong:
-                raise ValueError(f"line {number}: two finite numbers are expected for {' and '.join(names)}")
+                raise ValueError(f"line {number}: finite numbers are expected for {' and '.join(names)}")
         return found
     except (ValueError, csv.Error) as cause:
         raise BadInput(reason, f"{printable(path)}: {cause}") from cause
@@ -67,7 +80,7 @@ def read_obstacles(path: FilePath, reason: str) -> Obstacles:
 
     Raises BadInput `reason` for a file without both columns, with words, with angles that are none, or without rows.
     """
-    found = read_columns(path, OBSTACLE_COLUMNS, reason, gaps_in=OBSTACLE_COLUMNS[1])
+    found = read_columns(path, OBSTACLE_COLUMNS, reason, gaps_in=OBSTACLE_COLUMNS[1:])
     azimuth, elevation = found.T
     wrong = (np.abs(azimuth) > MOST_TURN_DEG) | (np.abs(elevation) > 90.0)
     cause = ""

@@ -15,9 +15,11 @@ from startrack.localization.pseudo_gradient import PseudoGradient, descend
 from startrack.localization.sector_moments import solve_linear
 from startrack.localization.shared_errors import ErrorBasis, SharedErrors
 from startrack.localization.skyline_model import SkylineModel
+from startrack.localization.skyline_points import SkylinePoints
 from startrack.localization.skyline_profiles import ROW_NATS
 from startrack.localization.steepness import settle_steepness
 from startrack.localization.summary import camera_at
+from startrack.localization.turned_skylines import locate_points
 from startrack.terrain import Terrain
 
 
@@ -72,7 +74,7 @@ def require_localizer(given: Any) -> Localizer:
 __all__ = [
     "AMBIGUOUS_MASS", "DEFAULT_LOCALIZER", "ENOUGH", "HIGH_RAD", "LOCALIZERS", "LOW_RAD", "MIN_ROW_NATS", "RISK",
     "ROW_NATS", "ErrorBasis", "ExactPosterior", "Gaussian", "Hull", "LinearErrors", "Localizer", "PseudoGradient",
-    "SharedErrors", "SkylineModel", "WeightedPoints", "camera_at", "clear_logs", "clock_at", "clock_matters",
-    "descend", "duration", "has_posterior", "hull_position", "localizer_name", "moments", "require_localizer", "sample",
-    "settle_steepness", "solve_linear",
+    "SharedErrors", "SkylineModel", "SkylinePoints", "WeightedPoints", "camera_at", "clear_logs", "clock_at",
+    "clock_matters", "descend", "duration", "has_posterior", "hull_position", "localizer_name", "locate_points",
+    "moments", "require_localizer", "sample", "settle_steepness", "solve_linear",
 ]  # fmt: skip

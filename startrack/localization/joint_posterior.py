@@ -31,11 +31,14 @@ MOST_GROUPS, MOST_MODES = 6, 4  # groups of boxes, and modes of a group
 MOST_BOXES = 160  # of a group, that the chain is computed at; and the points drawn from them
 FIRST_ROUNDS = ROUNDS[:4]  # that show whether a group of boxes is likely, and how wide the posterior is
 APART_BOXES = 3.0  # between two modes that sampling begins with
+NO_OTHERS = np.zeros((0, 2))  # positions of other parts of the posterior
 FEW_BOXES = 6.0  # that count at least, of the distribution of boxes
 
 
-def sample_posterior(explored: Explored, rows: Evidence, terrain: Terrain) -> list[Hypothesis]:
-    """Hypotheses with their weighted points, the heaviest first.
+def sample_posterior(
+    explored: Explored, rows: Evidence, terrain: Terrain, others_m: Array = NO_OTHERS
+) -> list[Hypothesis]:
+    """Hypotheses with their weighted points, the heaviest first; none nearer to a position of `others_m` (n, 2).
 
     Raises NotLocated (outside_search_area) where no box is left.
     """
@@ -43,7 +46,7 @@ def sample_posterior(explored: Explored, rows: Evidence, terrain: Terrain) -> li
     if not groups:
         raise NotLocated("no position in the search area is possible: widen [search] radius_m in the terrain file?")
     errors = SharedErrors.of(terrain, rows.clock)
-    references_m = np.array([centres_m[0] for centres_m, _ in groups])
+    references_m = np.vstack([[centres_m[0] for centres_m, _ in groups], others_m])
     found: list[Hypothesis] = []
     for number, (centres_m, reach_m) in enumerate(groups):
         start = _begin_group(terrain, rows, errors, centres_m, max(reach_m, FIT_M), explored.half_m)

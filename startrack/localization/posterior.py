@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from startrack.core.compilation import announce_compilation
-from startrack.core.types import Evidence, Explored, Fix, NotLocated, PositionPrior
+from startrack.core.types import Array, Evidence, Explored, Fix, NotLocated, PositionPrior
 from startrack.localization.clock import explore_times, is_wide
 from startrack.localization.conclusion import conclude
-from startrack.localization.joint_posterior import sample_posterior
+from startrack.localization.joint_posterior import NO_OTHERS, sample_posterior
 from startrack.localization.other_times import sample_other_times
 from startrack.localization.position_prior import SearchedNear, name_prior, require_agreement, require_prior_inside
 from startrack.localization.search import NATS, dropped_probability, explore
@@ -48,15 +50,10 @@ class ExactPosterior:
         if count < MIN_ROWS:
             raise NotLocated(f"only {count} rays carry information about the skyline: expose longer")
         rows = evidence if count == len(evidence) else evidence.take(informative)
-        near = rows.near
         try:
-            parts = self._explore_times(rows, terrain)
-            found = [one for turned, explored in parts for one in sample_posterior(explored, turned, terrain)]
-            found.sort(key=lambda one: -one.found.log_evidence)
-            found = sorted([*found, *sample_other_times(found)], key=lambda one: -one.found.log_evidence)
-            return conclude(found, terrain, parts[0][1], dropped_probability(parts[0][1]))
+            return weigh_parts([Part(*one) for one in self._explore_times(rows, terrain)], terrain)
         except NotLocated as refusal:
-            raise name_prior(refusal, near) from refusal
+            raise name_prior(refusal, rows.near) from refusal
 
     def _explore_times(self, rows: Evidence, terrain: Terrain) -> list[tuple[Evidence, Explored]]:
         """The rows at each likely time, and the boxes that may matter there."""
@@ -91,3 +88,22 @@ class ExactPosterior:
             nearby = wider
         require_agreement(places, near)
         return found._replace(log_likelihood=found.log_likelihood + near.log_density(found.centres_m))
+
+
+class Part(NamedTuple):
+    """Rows as they stand at a likely time or attitude, and the boxes that may matter there."""
+
+    rows: Evidence
+    explored: Explored
+    others_m: Array = NO_OTHERS  # positions (n, 2) of other parts; what is nearer to one of them belongs to it
+
+
+def weigh_parts(parts: Sequence[Part], terrain: Terrain) -> Fix:
+    """The fix by all `parts` together, the likeliest first.
+
+    Raises NotLocated: insufficient_geometry, outside_search_area, inconsistent_evidence.
+    """
+    found = [one for part in parts for one in sample_posterior(part.explored, part.rows, terrain, part.others_m)]
+    found.sort(key=lambda one: -one.found.log_evidence)
+    found = sorted([*found, *sample_other_times(found)], key=lambda one: -one.found.log_evidence)
+    return conclude(found, terrain, parts[0].explored, dropped_probability(parts[0].explored))

@@ -17,7 +17,7 @@ from startrack.frames import Site, latlon_from_enu
 from startrack.output.record import result_dict
 
 if TYPE_CHECKING:
-    from startrack.chain import Located
+    from startrack.chain import Located, PlacedBySkyline
     from startrack.core.types import Array
 
 
@@ -29,20 +29,20 @@ POSITION_KEYS = ("east_m", "north_m", "up_m", "radius95_m", "radius999_m", "prot
 KML_HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"{hint}>\n<Document>\n'
 
 
-def geo_text(value: Located, kind: str) -> str:
+def geo_text(value: Located | PlacedBySkyline, kind: str) -> str:
     """The text of a file of the `kind` geojson or kml with the fix of a located `value`."""
     found = features(value)
     return _kml(value, found) if kind == "kml" else geojson_text(found, value.site.body)
 
 
-def features(value: Located) -> list[dict[str, Any]]:
+def features(value: Located | PlacedBySkyline) -> list[dict[str, Any]]:
     """GeoJSON features: one point for the position and one polygon for its circle, or these of each mode.
 
     A circle is left out where it holds a pole, where longitudes make no polygon, and where none is stated.
     """
     record, site = result_dict(value), value.site
     common = {key: record[key] for key in ("image", "status")} | {"time_utc": record["provenance"]["time_utc"]}
-    common |= {key: record["attitude"].get(key) for key in ATTITUDE_KEYS}
+    common |= {key: (record["attitude"] or {}).get(key) for key in ATTITUDE_KEYS}
     position, up_m, found = record.get("position"), float(value.fix.position_enu_m[2]), list[dict[str, Any]]()
     for at in record["modes"] if position is None else [{key: position.get(key) for key in POSITION_KEYS}]:
         middle_m, radius_m = np.array([at["east_m"], at["north_m"], up_m]), at["radius95_m"]
@@ -92,7 +92,7 @@ def escape(text: str) -> str:
     return html.escape(one_line(text), quote=False)
 
 
-def _kml(value: Located, found: list[dict[str, Any]]) -> str:
+def _kml(value: Located | PlacedBySkyline, found: list[dict[str, Any]]) -> str:
     """KML has no frame for other bodies: Google Earth reads the hint, other programs draw the fix on the Earth."""
     on_moon = value.site.body == "moon"
     note = "On the Moon: planetocentric, sphere of 1737.4 km, east positive. " if on_moon else ""

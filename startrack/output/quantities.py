@@ -7,7 +7,7 @@ and a table of docs/formats.md are made from `QUANTITIES`. A new quantity is one
 from __future__ import annotations
 
 from startrack import __version__
-from startrack.chain import Detected, Identified, Inputs, Located, Measured, Oriented
+from startrack.chain import Detected, Identified, Inputs, Located, Measured, Oriented, Positioned
 from startrack.core.ecsv import Column
 from startrack.frames import format_utc
 from startrack.output.quantities_pose import ATTITUDE_QUANTITIES, MIDDLE_QUANTITIES, POSITION_QUANTITIES
@@ -59,7 +59,7 @@ LIGHT_QUANTITIES: tuple[Quantity, ...] = (
       "list of `name`, `v_mag`, `x_px`, `y_px`: planets, Sun, Moon and Earth in the frame, at their predicted places; "
       "without a site those that have a source there, the Moon as from the middle of the Earth (up to 1 degree off), "
       "without a time none", list_schema(BODY), before=[]),
-    Q("evidence.blocked", "deg", Located, blocked_deg,
+    Q("evidence.blocked", "deg", Positioned, blocked_deg,
       "list of [from, to]: azimuths in which the skyline is more likely not the map's: hidden by something on no map, "
       "or below it; across north `to` is the smaller", list_schema(list_schema("number", count=2)), before=[],
       optional=True,
@@ -100,7 +100,8 @@ RUN_QUANTITIES: tuple[Quantity, ...] = (
     Q("provenance.localizer", "", Inputs, lambda v: v.localizer_name or None,
       "method of localization, by its name for `--localizer`; of one of your own the name of its class or function; "
       "null: of `identify` and `detect`", "text", before=None, optional=True),
-    Q("provenance.near", "m", Measured, lambda v: None if v.near is None else str(v.near),
+    Q("provenance.near", "m", lambda v: isinstance(v, Measured | Positioned),
+      lambda v: None if v.near is None else str(v.near),
       "`EAST,NORTH,SIGMA` of the prior of the position that the posterior contains; null: none was given", "text",
       before=None, nullable=True, optional=True),
     Q("provenance.time_utc", "", Inputs,

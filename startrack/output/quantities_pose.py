@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from startrack.chain import Located, Measured, Oriented
+from startrack.chain import Measured, Oriented, Positioned
 from startrack.frames import quat_xyzw_from_R
 from startrack.localization import RISK
 from startrack.output import values
@@ -40,17 +40,18 @@ POSITION_QUANTITIES: tuple[Quantity, ...] = (
       "up of the camera's centre from the terrain's origin", "number", form="%.4f",
       shown=(Show("text", "position", ", U {:.2f} m"), Show("notebook", "up", "{:.2f} m"),
              Show("page", "Up", "{:,.2f} m"))),
-    Q("position.on", "", Located, lambda at: at("position.terrain"), "the terrain, after the coordinates", derived=True,
+    Q("position.on", "", Positioned, lambda at: at("position.terrain"), "the terrain, after the coordinates",
+      derived=True,
       shown=(Show("text", "position", " on {}"), Show("notebook", "on", "{}"))),
     Q("position.covariance_m2", "m^2", values.has_position, lambda v: values.finite_or_none(v.fix.covariance_m2),
       "2 x 2, (east, north); this and the circles are null of a method that states none",
       list_schema(list_schema("number", count=2), count=2), nullable=True, form="%.6g",
       columns={"cov_east_east_m2": (0, 0), "cov_east_north_m2": (0, 1), "cov_north_north_m2": (1, 1)}),
-    Q("position.sigma_east_m", "m", Located, lambda at: values.sigma_m(at, 0), "standard deviation of east",
+    Q("position.sigma_east_m", "m", Positioned, lambda at: values.sigma_m(at, 0), "standard deviation of east",
       derived=True, shown=(Show("notebook", "east", " ± {:.2f} m"),)),
-    Q("position.sigma_north_m", "m", Located, lambda at: values.sigma_m(at, 1), "standard deviation of north",
+    Q("position.sigma_north_m", "m", Positioned, lambda at: values.sigma_m(at, 1), "standard deviation of north",
       derived=True, shown=(Show("notebook", "north", " ± {:.2f} m"),)),
-    Q("position.ellipse", "m, m, deg", Located, values.ellipse, "one sigma: semi-axes, azimuth of the larger",
+    Q("position.ellipse", "m, m, deg", Positioned, values.ellipse, "one sigma: semi-axes, azimuth of the larger",
       derived=True, shown=(Show("text", "error", "sigma {0[0]:.2f} m by {0[1]:.2f} m"),
              Show("notebook", "one sigma", "{0[0]:.2f} m by {0[1]:.2f} m, long axis at azimuth {0[2]:.1f}°"),
              Show("page", "Sigma", "{0[0]:.2f} m by {0[1]:.2f} m"))),
@@ -83,7 +84,8 @@ POSITION_QUANTITIES: tuple[Quantity, ...] = (
           {"fact": one.fact, "radius999_m_if_exact": round(one.radius999_m_if_exact, 6)} for one in v.fix.unstated],
       "list of `fact`, `radius999_m_if_exact`: facts that nobody states, each with the 99.9 % circle if it were stated "
       "and exact, the largest effect first", list_schema(UNSTATED), optional=True),
-    Q("position.unstated_text", "", Located, values.dominant_fact, "the fact whose statement gains most", derived=True,
+    Q("position.unstated_text", "", Positioned, values.dominant_fact, "the fact whose statement gains most",
+      derived=True,
       shown=(Show("text", "error", " ({})"), Show("page", "99.9 % within, if stated", "{}"))),
     Q("position.latitude_deg", "deg", values.has_position, values.latlon_deg(0), "of the same point", "latitude",
       form="%.8f", shown=(Show("text", "position", "; latitude {:.6f}°"), Show("panel", "Lat, lon", "{:.5f}°"),
@@ -94,7 +96,8 @@ POSITION_QUANTITIES: tuple[Quantity, ...] = (
              Show("notebook page", "longitude", "{:.6f}°"))),
     Q("position.evidence", "", values.has_position, lambda v: v.evidence_source,
       "what the position is from: `stars`; `both`, the stars and the light of the sky that stops at the skyline; "
-      "`sky`, that light alone", {"enum": ["stars", "both", "sky"]}, optional=True, form="%s",
+      "`sky`, that light alone; `skyline`, a skyline that was measured elsewhere",
+      {"enum": ["stars", "both", "sky", "skyline"]}, optional=True, form="%s",
       shown=(Show("text", "error", "; evidence {}"), Show("notebook page", "evidence", "{}"))),
     Q("position.search", "", values.has_position, lambda v: v.fix.search,
       "`proven`: the search has excluded every other position; "
@@ -105,25 +108,26 @@ POSITION_QUANTITIES: tuple[Quantity, ...] = (
     Q("position.dropped_probability", "", values.has_position, lambda v: v.fix.dropped_probability,
       "upper bound of the probability of the positions that the search left out; null: no bound below 1 is known, as "
       "of most searches that end as `beam`, or a method without a posterior", "chance", nullable=True, optional=True),
-    Q("position.lacking", "", Located, values.lacking_circle, "the circle that is not stated", derived=True,
+    Q("position.lacking", "", Positioned, values.lacking_circle, "the circle that is not stated", derived=True,
       shown=(Show("text", "error", "; {}"), Show("notebook page", "95 % within", "{}"))),
-    Q("position.caution", "", Located, values.caution_text, "of a method without a posterior", derived=True,
+    Q("position.caution", "", Positioned, values.caution_text, "of a method without a posterior", derived=True,
       shown=(Show("summary", "caution", "{}"), Show("panel", "Caution", "{}"))),
-    Q("modes", "", Located, lambda v: values.modes_record(v.fix),
+    Q("modes", "", Positioned, lambda v: values.modes_record(v.fix),
       "list of `east_m`, `north_m`, `weight`, `radius95_m`, `radius999_m`: the positions that fit, heaviest first; "
       "weights sum to 1. The circles about each hold 95 and 99.9 % of that mode: the true position is in them if it is "
       "in this mode; null: not stated. Ambiguous: modes outside the main mode's 99.9 % circle hold more than 1 %",
       {"type": "array", "items": MODE}, before=[]),
-    Q("modes.text", "", Located, lambda at: (at("modes") or None) if at("position.east_m") is None else None,
+    Q("modes.text", "", Positioned, lambda at: (at("modes") or None) if at("position.east_m") is None else None,
       "the positions that fit", derived=True,
       shown=(Show("summary", "modes", lambda m: f"{len(m)} positions fit: {values.modes_text(m)}"),
              Show("text", "places", values.modes_text))),
-    Q("search.outcome", "", Located, lambda v: v.fix.search, "as `position.search`; also where several positions fit: "
-      "`proven` is then the proof that no further position fits", SEARCHES,
+    Q("search.outcome", "", Positioned, lambda v: v.fix.search,
+      "as `position.search`; also where several positions fit: `proven` is then the proof that no further position "
+      "fits", SEARCHES,
       shown=(Show("summary", "search", lambda search: "search: beam" if search == "beam" else ""),
              Show("text", "places", "; search {}", unless="position.search"),
              Show("page", "Search", "{}", unless="position.search"))),
-    Q("search.dropped_probability", "", Located, lambda v: v.fix.dropped_probability,
+    Q("search.dropped_probability", "", Positioned, lambda v: v.fix.dropped_probability,
       "as `position.dropped_probability`", "chance", nullable=True),
 )  # fmt: skip
 _ARCSEC = "{0[0]:.2f}, {0[1]:.2f}, {0[2]:.2f} arcsec about"

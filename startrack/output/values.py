@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.chain import Located, Measured, Oriented
+from startrack.chain import Located, Measured, Oriented, Positioned
 from startrack.core.files import is_path
 from startrack.core.statistics import error_ellipse
 from startrack.core.types import Array, Fix
@@ -35,10 +35,10 @@ class Angle(float):
 
 def has_position(value: Any) -> bool:
     """Whether a `value` of the pipeline states a position: the only one that fits."""
-    return isinstance(value, Located) and not value.fix.ambiguous
+    return isinstance(value, Positioned) and not value.fix.ambiguous
 
 
-def skyline_position_m(value: Located) -> tuple[float, float]:
+def skyline_position_m(value: Positioned) -> tuple[float, float]:
     """East and north [m] of the position whose skyline a located `value` is compared with."""
     if value.fix.ambiguous:
         return value.fix.modes[0].east_m, value.fix.modes[0].north_m
@@ -66,7 +66,7 @@ def turn_rad(y: float, x: float) -> float:
     return angle if angle < 2 * np.pi else 0.0  # a tiny negative angle leaves the modulo as 2 pi itself
 
 
-def carrying_azimuths(value: Located) -> list[list[float]] | None:
+def carrying_azimuths(value: Positioned) -> list[list[float]] | None:
     """First and last azimuth [deg] of the groups of directions that carry the fix of a `value`, the strongest first."""
     if value.fix.integrity is None:
         return None
@@ -131,7 +131,7 @@ def body_deg(axis: int) -> Callable[[Measured], float]:
     return lambda v: float(np.degrees(heading_pitch_roll_from_R_body_enu(R_body_enu(v))[axis]))
 
 
-def latlon_deg(axis: int) -> Callable[[Located], float]:
+def latlon_deg(axis: int) -> Callable[[Positioned], float]:
     """Latitude or longitude (`axis` 0, 1) of the position [deg]."""
     return lambda v: float(np.degrees(latlon_from_enu(v.site, *v.fix.position_enu_m)[axis]))
 
@@ -194,7 +194,7 @@ def exact_lens_text(included: bool) -> str:
     return "" if included else ", the lens taken as exact"
 
 
-def blocked_deg(value: Located) -> list[list[float]]:
+def blocked_deg(value: Positioned) -> list[list[float]]:
     """Ranges [from, to] of azimuth [deg] in which something on no map more likely blocks the view than not."""
     ranges = [] if value.fix.blocked is None else value.fix.blocked.ranges_rad
     return [[round(float(edge), 6) for edge in np.degrees(one)] for one in ranges]

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from startrack.chain import Located, Measured, Oriented, Outcome, last_value
+from startrack.chain import Located, Measured, Oriented, Outcome, PlacedBySkyline, Positioned, last_value
 from startrack.core.errors import BadInput
 from startrack.core.files import check_regular, make_folder, printable, remove_file, write_atomically
 from startrack.core.types import MeasuredSkyline
@@ -106,8 +106,9 @@ def _write_companions(outcome: Outcome, path: Path, *, plots: bool, catalog_tabl
     """Write tables, WCS and pictures beside each other: pictures are drawn and packed while tables are written."""
     value = last_value(outcome)
     with ThreadPoolExecutor() as pool:
-        files = [pool.submit(write_annotated, companion(path, ANNOTATED), outcome)] if plots else []
-        if isinstance(value, Located) and value.skyline is not None:
+        has_image = plots and value.exposure.pixels_adu.size > 1  # not of a skyline's file
+        files = [pool.submit(write_annotated, companion(path, ANNOTATED), outcome)] if has_image else []
+        if isinstance(value, Positioned) and value.skyline is not None:
             table = skyline_table_text(value.skyline).encode("utf-8")
             write_atomically(companion(path, SKYLINE_TABLE), table, overwrite=True)
             if plots:
@@ -119,7 +120,7 @@ def _write_companions(outcome: Outcome, path: Path, *, plots: bool, catalog_tabl
         file.result()
 
 
-def _write_panorama(path: Path, value: Located, skyline: MeasuredSkyline) -> None:
+def _write_panorama(path: Path, value: Positioned, skyline: MeasuredSkyline) -> None:
     write_atomically(path, png_bytes(located_picture(value, skyline)), overwrite=True)
 
 
@@ -130,7 +131,7 @@ def write_geo(record: Path, outcome: Outcome, kinds: Sequence[str]) -> None:
     """
     for kind in GEO_FORMATS:
         path = record.with_name(f"{_stem_and_kind(record)[0]}.{kind}")
-        if kind in kinds and isinstance(outcome, Located):
+        if kind in kinds and isinstance(outcome, Located | PlacedBySkyline):
             write_atomically(path, geo_text(outcome, kind).encode("utf-8"), overwrite=True)
         else:
             remove_file(path)

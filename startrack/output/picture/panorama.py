@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.chain import Located
+from startrack.chain import Measured, Positioned
 from startrack.core.types import Array, MeasuredSkyline
 from startrack.evidence import Skyline
 from startrack.output.picture.axes import GAP_PX, Axes, known_runs, multiples, nice_step
 from startrack.output.picture.canvas import TEXT_PX, Canvas, Colour, Ink, mix_colours, text_width
-from startrack.output.picture.maps import MARGIN_PX
+from startrack.output.picture.maps import MARGIN_PX, draw_overview, draw_zoom
 from startrack.output.picture.marks import COMPASS
 from startrack.output.record import image_name
 from startrack.output.tables import half_range_rad, status_of
@@ -20,6 +20,7 @@ from startrack.terrain import Terrain
 
 WIDTH_PX = 90 * round(TEXT_PX)
 HEIGHT_PX, ENLARGED_PX = 3 * WIDTH_PX // 10, 2 * WIDTH_PX // 10  # of both plots
+MAPS_PX = 4 * WIDTH_PX // 10  # of two maps below them
 ABOVE_PX, RIGHT_PX = 2 * TEXT_PX, TEXT_PX  # about a plot
 AZIMUTHS_RAD = np.radians(np.linspace(0.0, 360.0, 3601))
 MAX_STARS = 1500  # the brightest
@@ -28,10 +29,11 @@ LEGEND: dict[str, tuple[str, str, float, Colour]] = {  # words, mark, half its s
     "hidden": ("hidden star", "cross", 2.5, Ink.HIDDEN),
     "sky light": ("skyline by the light of the sky", "disc", 1.5, Ink.MEASURED),
     "stars": ("by stars seen and missing", "diamond", 4.0, Ink.MEASURED),
+    "file": ("measured skyline", "disc", 1.5, Ink.MEASURED),
     "both": ("by both", "square", 4.0, Ink.MEASURED),
     "varies": ("differs between the pictures", "cross", 2.5, Ink.HIDDEN),
 }
-BANDS = {"sky light": Ink.MEASURED, "stars": Ink.IDENTIFIED, "both": Ink.SKYLINE}
+BANDS = {"sky light": Ink.MEASURED, "file": Ink.MEASURED, "stars": Ink.IDENTIFIED, "both": Ink.SKYLINE}
 
 
 @dataclass(frozen=True)
@@ -95,13 +97,21 @@ def skyline_picture(skyline: MeasuredSkyline) -> NDArray[np.uint8]:
     return canvas.rendered_pixels()
 
 
-def located_picture(value: Located, skyline: MeasuredSkyline) -> NDArray[np.uint8]:
-    """The `skyline` (H, W, 3) of a located image on the horizon of its terrain, and its height above that, enlarged."""
-    canvas = Canvas(WIDTH_PX, HEIGHT_PX + ENLARGED_PX)
+def located_picture(value: Positioned, skyline: MeasuredSkyline) -> NDArray[np.uint8]:
+    """The `skyline` (H, W, 3) of a located image on the horizon of its terrain, and its height above that, enlarged.
+
+    Without stars maps of the position stand below.
+    """
+    has_stars = isinstance(value, Measured)
+    canvas = Canvas(WIDTH_PX, HEIGHT_PX + ENLARGED_PX + (0 if has_stars else MAPS_PX))
     horizon = Skyline.trace(value.position_at_time_m, value.terrain)
-    light, status = value.light, status_of(value.light)
-    decided = np.isin(status, ("seen", "hidden"))  # brightest first
-    azimuth_rad, elevation_rad, status = light.azimuth_rad[decided], light.elevation_rad[decided], status[decided]
+    if isinstance(value, Measured):
+        light, status = value.light, status_of(value.light)
+        decided = np.isin(status, ("seen", "hidden"))  # brightest first
+        azimuth_rad, elevation_rad, status = light.azimuth_rad[decided], light.elevation_rad[decided], status[decided]
+    else:
+        azimuth_rad, elevation_rad, status = np.zeros(0), np.zeros(0), np.zeros(0, dtype="U1")
+        _draw_maps(canvas, value)
     title = f"{image_name(value.exposure)}: horizon of {value.terrain.name} at the position found, skyline of the image"
     plot = _draw_horizon(canvas, title, AZIMUTHS_RAD, horizon(AZIMUTHS_RAD))
     near = np.flatnonzero(elevation_rad < plot.y[1])[:MAX_STARS]
@@ -131,6 +141,15 @@ def located_picture(value: Located, skyline: MeasuredSkyline) -> NDArray[np.uint
         canvas.mark((x, y), *LEGEND[kind][1:], width=1)
         x -= TEXT_PX
     return canvas.rendered_pixels()
+
+
+def _draw_maps(canvas: Canvas, value: Positioned) -> None:
+    """The search area and, of a single position with a circle, its surroundings, below the plots."""
+    top, side = HEIGHT_PX + ENLARGED_PX, MAPS_PX - GAP_PX
+    draw_overview(canvas, (MARGIN_PX, top, MARGIN_PX + side, top + side), value.terrain, value.fix)
+    if not value.fix.ambiguous:
+        right = WIDTH_PX - RIGHT_PX
+        draw_zoom(canvas, (right - side, top, right, top + side), value.fix, None)
 
 
 def _draw_horizon(canvas: Canvas, title: str, azimuth_rad: Array, elevation_rad: Array) -> Plot:

@@ -1,0 +1,51 @@
+"""What every value with a position states of it, whatever it is from."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from startrack.core.errors import Reason
+from startrack.core.types import Array, Exposure, Fix, MeasuredSkyline, PositionPrior
+from startrack.frames import Site
+from startrack.terrain import Terrain
+
+
+class Positioned:
+    """The position of a camera above a terrain: a base of the values that have one."""
+
+    exposure: Exposure
+    fix: Fix
+    site: Site
+    terrain: Terrain
+    skyline: MeasuredSkyline | None
+    near: PositionPrior | None
+
+    @property
+    def position_at_time_m(self) -> Array:
+        """East and north (2,) at the time of `R_enu_icrs`: where the skyline and the stars are compared.
+
+        In a round crater the error of the clock spreads the position over an arc, whose mean lies beside it.
+        """
+        return np.asarray(self.fix.at_time_m)
+
+    @property
+    def status(self) -> str:
+        """ok, or ambiguous where several positions fit."""
+        return "ambiguous" if self.fix.ambiguous else "ok"
+
+    @property
+    def reason(self) -> Reason | None:
+        """`ambiguous` where several positions fit."""
+        return Reason.AMBIGUOUS if self.fix.ambiguous else None
+
+    @property
+    def message(self) -> str:
+        """Number of positions that fit, if there are several."""
+        return f"{len(self.fix.modes)} positions fit" if self.fix.ambiguous else ""
+
+    @property
+    def position_warnings(self) -> list[str]:
+        """What blocks the view, and errors beyond the defaults of facts that no file states."""
+        blocked = [f"not the map's skyline, and left out: {self.fix.blocked.text}"] if self.fix.blocked else []
+        shown = [f"the image shows {one.text}, which no file states: it is estimated" for one in self.fix.shown]
+        return [*blocked, *shown, *self.fix.cautions]

@@ -124,7 +124,7 @@ def test_the_command_prints_and_writes_it(tmp_path: Path, capsys: pytest.Capture
 
 def test_a_map_that_dominates_asks_for_a_finer_one(located: Any) -> None:
     wide = np.array([[400.0, 0.0], [0.0, 4.0]])
-    dominated = with_fix(located, radius999_m=60.0, covariance_m2=wide, radius999_m_by_exact_map=9.0)
+    dominated = with_fix(located, radius999_m=60.0, covariance_m2=wide, exact_map_radius999_m=9.0)
     (text,) = explain(dominated)
     assert "make the 99.9 % circle 60.0 m, not 9.0 m" in text and "azimuths 90 and 270" in text
-    assert explain(with_fix(located, radius999_m=60.0, radius999_m_by_exact_map=50.0)) == []
+    assert explain(with_fix(located, radius999_m=60.0, exact_map_radius999_m=50.0)) == []

@@ -19,6 +19,7 @@ from startrack.localization.clock import clock_matters, turn_evidence
 from startrack.localization.joint_posterior import sample_posterior
 from startrack.localization.other_times import WRONG_TIME_PROBABILITY, sample_other_times
 from startrack.terrain import HeightMap, Terrain, load_terrain
+from startrack.terrain.shape import EXACT_WAVES
 
 TIME = datetime(2030, 6, 3, 4, 5, 6, tzinfo=UTC)
 HOUR_S, FEW_STARS = 3600.0, 3000
@@ -43,7 +44,9 @@ def stated_early(evidence: Evidence, site: Site, offset_s: float, sigma_s: float
 def ground() -> HeightMap:
     terrain = load_terrain("shackleton")
     assert isinstance(terrain, HeightMap)
-    terrain = replace(terrain, search_radius_m=300.0, height_sigma_m=0.0, horizon_sigma_common_rad=0.0)
+    terrain = replace(
+        terrain, search_radius_m=300.0, height_sigma_m=0.0, horizon_sigma_common_rad=0.0, waves_sigma_rad=EXACT_WAVES
+    )
     terrain.prepare()
     return replace(terrain, height_sigma_m=1.0)
 

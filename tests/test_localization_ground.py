@@ -15,6 +15,7 @@ from startrack.localization.places import BoxModel
 from startrack.localization.search import BEAMS
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import HeightMap, load_terrain
+from startrack.terrain.shape import EXACT_WAVES
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
@@ -23,7 +24,9 @@ pytestmark = pytest.mark.usefixtures("own_cache")
 def shackleton() -> HeightMap:
     terrain = load_terrain("shackleton")
     assert isinstance(terrain, HeightMap)
-    terrain = replace(terrain, search_radius_m=300.0, height_sigma_m=0.0, horizon_sigma_common_rad=0.0)
+    terrain = replace(
+        terrain, search_radius_m=300.0, height_sigma_m=0.0, horizon_sigma_common_rad=0.0, waves_sigma_rad=EXACT_WAVES
+    )
     terrain.prepare()
     return terrain
 

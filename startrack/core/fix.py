@@ -201,7 +201,7 @@ class Fix(Value):
     raised_rad: Array | None = None  # (sectors,) rise of the skyline above the map's by the shared errors
     unstated: tuple[UnstatedFact, ...] = ()  # the one that widens the circle most first
     shown: tuple[ShownError, ...] = ()  # errors beyond the defaults
-    radius999_m_by_exact_map: float | None = None  # if the map had no waves; None: it has none
+    exact_map_radius999_m: float | None = None  # if the map had no waves; None: it has none
     own_edge_probability: float = 0.0  # that the edge of the sky's light is not the skyline
     samples: Explored | None = None  # of the posterior, for a later fix by more rows of the image; None: there are none
 

@@ -82,6 +82,6 @@ class LinearErrors:
         return errors, self.log_volume - 0.5 * np.einsum("ni,ij,nj->n", errors, self.inverse, errors)
 
     def waves_rad(self, left_rad: Array) -> Array:
-        """(SECTORS,) rise of the skyline by the likeliest waves at heights (SECTORS,) that are left; see `fit`."""
+        """(SECTORS,) rise of the skyline by the likeliest waves at `left_rad` (SECTORS,); see `fit`."""
         own = slice(len(self) - self.waves, None)
         return np.asarray(self.rise_rad[:, own] @ self.fit(left_rad[None])[0][0, own])

@@ -169,7 +169,7 @@ def _needs_of_located(located: Located) -> Iterator[str]:
 
 def _finer_map(located: Located) -> Iterator[str]:
     """How much a map without smooth errors would gain, and which of its crests decide: those along the ellipse."""
-    fix, exact_m = located.fix, located.fix.radius999_m_by_exact_map
+    fix, exact_m = located.fix, located.fix.exact_map_radius999_m
     if exact_m is None or not DOMINANT * exact_m < fix.radius999_m:
         return
     east, north = np.linalg.eigh(fix.covariance_m2)[1][:, -1]

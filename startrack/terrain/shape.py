@@ -193,7 +193,7 @@ def wave_errors(stated: tuple[float, ...] | None, post_rad: float) -> list[Shape
 
 
 def wave_slopes_rad(azimuths_rad: Array) -> dict[str, Array]:
-    """Rise (...) of the horizon at azimuths (...) by one unit of each of the WAVES, by name."""
+    """Rise (...) of the horizon at `azimuths_rad` (...) by one unit of each of the WAVES, by name."""
     turns = [m * np.asarray(azimuths_rad) for m in range(1, WAVE_COUNT + 1)]
     return dict(zip(WAVES.errors, [part(turn) for turn in turns for part in (np.cos, np.sin)], strict=True))
 

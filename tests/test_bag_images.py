@@ -59,7 +59,19 @@ def drive(located, tmp_path_factory) -> Path:
 def flags(drive: Path, out: Path, located: Any) -> list[str]:
     camera = drive.parent.parent / "camera.toml"
     seconds = str(located.result.exposure.exposure_s)
-    return ["-c", str(camera), "-t", "shackleton-thesis", "--exposure", seconds, "-D", str(out), "--no-plots"]
+    by_light = ["--evidence", "sky"]  # the fixture's sky has no stars fainter than V 7
+    return [
+        "-c",
+        str(camera),
+        "-t",
+        "shackleton-thesis",
+        "--exposure",
+        seconds,
+        "-D",
+        str(out),
+        "--no-plots",
+        *by_light,
+    ]
 
 
 @pytest.mark.parametrize("log_step_ns", [1, 0])  # 0: all messages are recorded at one time

@@ -18,7 +18,7 @@ from startrack.localization.hypothesis import (
     sample_gross_error,
 )
 from startrack.localization.own_edge import edge_log_likelihood
-from startrack.localization.shared_errors import CLOCK_FACT, OWN_EDGE, SharedErrors
+from startrack.localization.shared_errors import CLOCK_FACT, OWN_EDGE, OWN_EDGE_PROBABILITY, SharedErrors
 from startrack.localization.skyline_model import SkylineModel
 
 WRONG_FACT_NATS = 3.0  # by which a gross error of a stated fact must explain the rows better: 1 of 100 clean skies
@@ -117,5 +117,14 @@ def _is_wrong_time(one: Hypothesis) -> bool:
 
 
 def _log_evidence(found: Sequence[Hypothesis]) -> float:
-    """Logarithm of the evidence, whatever the prior probabilities of the gross errors are."""
-    return float(np.logaddexp.reduce([one.found.log_evidence - one.model.basis.log_probability for one in found]))
+    """Logarithm of the evidence, whatever the prior probabilities of the gross errors are.
+
+    That the light has an edge of its own is no statement of a file: it keeps its probability, so that it does not
+    stand for a fact that is wrong.
+    """
+    kept = {OWN_EDGE: float(np.log(OWN_EDGE_PROBABILITY))}
+    return float(
+        np.logaddexp.reduce(
+            [one.found.log_evidence - one.model.basis.log_probability + kept.get(one.gross, 0.0) for one in found]
+        )
+    )

@@ -31,6 +31,7 @@ from startrack.terrain.derived_maps import DeformedMap, HorizonInterpolator
 from startrack.terrain.ground import ground_up_m
 from startrack.terrain.map_ends import facts_of_ends
 from startrack.terrain.projection import ORTHOGRAPHIC
+from startrack.terrain.shape import EXACT_WAVES
 
 DATA = Path(__file__).parent / "data"
 pytestmark = pytest.mark.usefixtures("own_cache")
@@ -338,7 +339,7 @@ def evidence_at(terrain, place, rng, error_rad=0.0, rays=4000) -> Evidence:
 
 
 def test_a_position_is_found_within_its_stated_error(shackleton):
-    exact = replace(shackleton, height_sigma_m=0.0, horizon_sigma_common_rad=0.0)
+    exact = replace(shackleton, height_sigma_m=0.0, horizon_sigma_common_rad=0.0, waves_sigma_rad=EXACT_WAVES)
     rng, nees = np.random.default_rng(4), []
     for _ in range(4):
         place = rng.uniform(-300, 300, 2)

@@ -27,6 +27,10 @@ class Hypothesis:
     model: SkylineModel
     found: WeightedPoints  # the weights include the prior probability of the hypothesis
 
+    def less_likely(self, nats: float) -> Hypothesis:
+        """The same with a smaller weight."""
+        return replace(self, found=replace(self.found, log_weight=self.found.log_weight - nats))
+
     @property
     def gross(self) -> str:
         """The fact; "": none."""

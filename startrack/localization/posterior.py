@@ -98,12 +98,19 @@ class Part(NamedTuple):
     others_m: Array = NO_OTHERS  # positions (n, 2) of other parts; what is nearer to one of them belongs to it
 
 
-def weigh_parts(parts: Sequence[Part], terrain: Terrain) -> Fix:
+def weigh_parts(parts: Sequence[Part], terrain: Terrain, of_one_sky: bool = True) -> Fix:
     """The fix by all `parts` together, the likeliest first.
+
+    `of_one_sky`: all have the same rows, turned. Else a part counts by how much better its rows suit the map than a
+    skyline that is anywhere: it may have rows in more sectors than another one.
 
     Raises NotLocated: insufficient_geometry, outside_search_area, inconsistent_evidence.
     """
     found = [one for part in parts for one in sample_posterior(part.explored, part.rows, terrain, part.others_m)]
+    if not of_one_sky:
+        anywhere = [float(one.model.seen.profiles.free.sum()) for one in found]
+        best = int(np.argmax([one.found.log_evidence - nats for one, nats in zip(found, anywhere, strict=True)]))
+        found = [one.less_likely(nats - anywhere[best]) for one, nats in zip(found, anywhere, strict=True)]
     found.sort(key=lambda one: -one.found.log_evidence)
     found = sorted([*found, *sample_other_times(found)], key=lambda one: -one.found.log_evidence)
     return conclude(found, terrain, parts[0].explored, dropped_probability(parts[0].explored))

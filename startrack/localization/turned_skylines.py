@@ -77,7 +77,7 @@ def locate_points(points: SkylinePoints, terrain: Terrain) -> tuple[Fix, SeenSky
             linked = [k for k in range(len(at)) if k != number and one.covers(at[k])]
             turned.append(seen)
             parts.append(Part(seen.rows(), boxes_about([one.place], ground), at[linked]))
-        fix = weigh_parts(parts, ground)
+        fix = weigh_parts(parts, ground, of_one_sky=False)
     except NotLocated as refusal:
         raise name_prior(refusal, points.near) from refusal
     if not terrain.axisymmetric:  # in a round crater a heading spreads the position over an arc

@@ -100,17 +100,13 @@ def locate_skyline(
         ValueError: sigmas that are no angles.
     """
     when, ground = chain.time_input(time), chain.terrain_input(terrain, None)
-    given = {"heading_sigma": heading_sigma, "tilt_sigma": tilt_sigma, "correlation": correlation}
-    errors = {f"{name}_rad": chain.angle_rad(one, name) for name, one in given.items() if one is not None}
-    stated = None
-    if isinstance(attitude, str | os.PathLike):
-        stated = chain.StatedAttitude.of_file(attitude, ground.site, when)
-    elif attitude is not None:
-        azimuth, pitch, roll = (chain.angle_rad(one, "attitude") for one in attitude)
-        stated = chain.StatedAttitude.of_angles(azimuth, pitch, roll)
+    errors = chain.SkylineErrors.of_inputs(
+        heading_sigma=heading_sigma, tilt_sigma=tilt_sigma, correlation=correlation
+    )  # fmt: skip
+    stated = chain.StatedAttitude.of_input(attitude, ground.site, when)
     lens = None if camera is None else chain.load_camera_input(camera)
     prior = None if near is None else PositionPrior(*np.asarray(near, dtype=float).tolist())
-    points = chain.skyline_points(skyline, chain.SkylineErrors(**errors), lens, stated, prior)
+    points = chain.skyline_points(skyline, errors, lens, stated, prior)
     name = os.fspath(terrain) if isinstance(terrain, str | os.PathLike) else None
     return _solution(chain.locate_skyline(chain.skyline_exposure(skyline, when, name), points, ground), "fix")
 

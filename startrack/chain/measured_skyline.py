@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from startrack.camera import Camera
+from startrack.chain.inputs import angle_rad
 from startrack.chain.near_attitude import REASON, read_near_attitude
 from startrack.chain.positioned import Positioned
 from startrack.chain.run import Run
@@ -52,6 +55,21 @@ class StatedAttitude:
         return cls(R_from_rotvec([0.0, 0.0, -roll_rad]) @ np.stack([right, np.cross(ahead, right), ahead]))
 
     @classmethod
+    def of_input(
+        cls, given: FilePath | Sequence[Any] | None, site: Site | None, when: datetime | None
+    ) -> StatedAttitude | None:
+        """Of a file, or of azimuth, pitch and roll (3,), angles or degrees; None where nothing is `given`.
+
+        See `of_file`, for `site` and `when` too, and `of_angles`. Raises ValueError for what are no angles.
+        """
+        if given is None:
+            return None
+        if isinstance(given, str | os.PathLike):
+            return cls.of_file(given, site, when)
+        azimuth, pitch, roll = (angle_rad(one, "attitude") for one in given)
+        return cls.of_angles(azimuth, pitch, roll)
+
+    @classmethod
     def of_file(cls, path: FilePath, site: Site | None, when: datetime | None) -> StatedAttitude:
         """Of the NAME.fix.json or NAME.identification.json at `path`, on the ground of a `site`.
 
@@ -76,6 +94,14 @@ class SkylineErrors:
     heading_sigma_rad: float = 0.0
     tilt_sigma_rad: float = 0.0
     correlation_rad: float = CORRELATION_RAD
+
+    @classmethod
+    def of_inputs(cls, **stated: Any) -> SkylineErrors:
+        """Of heading_sigma, tilt_sigma and correlation, angles or degrees; None: not stated.
+
+        Raises ValueError for what is no angle.
+        """
+        return cls(**{f"{name}_rad": angle_rad(one, name) for name, one in stated.items() if one is not None})
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

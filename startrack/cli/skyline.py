@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import time
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from startrack.core.memory import refusing_shortage
 from startrack.core.types import PositionPrior
 from startrack.frames import parse_utc
 from startrack.localization import DEFAULT_LOCALIZER
-from startrack.terrain import Terrain, load_terrain
+from startrack.terrain import load_terrain
 
 
 def locate_skyline(args: argparse.Namespace) -> int:
@@ -46,7 +45,8 @@ def _solve(args: argparse.Namespace) -> Outcome:
     when = None if args.time is None else parse_utc(args.time)
     camera = None if args.camera is None else load_camera(args.camera)
     near = None if args.near is None else PositionPrior(*args.near)
-    points = chain.skyline_points(args.skyline, _errors_of(args), camera, _attitude_of(args, terrain), near)
+    attitude = chain.StatedAttitude.of_input(args.attitude, terrain.site, when)
+    points = chain.skyline_points(args.skyline, _errors_of(args), camera, attitude, near)
     exposure = chain.skyline_exposure(args.skyline, when, args.terrain)
     out = Path(args.dir) / f"{Path(args.skyline).stem}.fix.json"
     try:
@@ -69,14 +69,6 @@ def _errors_of(args: argparse.Namespace) -> chain.SkylineErrors:
     """What flags state; the errors of an attitude in degrees must be stated, and those of a result count as none."""
     if isinstance(args.attitude, tuple) and None in (args.heading_sigma, args.tilt_sigma):
         args.usage_error("--attitude AZ,PITCH,ROLL needs its errors: --heading-sigma DEG and --tilt-sigma DEG")
-    given = {"heading_sigma": args.heading_sigma, "tilt_sigma": args.tilt_sigma, "correlation": args.correlation}
-    return chain.SkylineErrors(**{f"{name}_rad": math.radians(one) for name, one in given.items() if one is not None})
-
-
-def _attitude_of(args: argparse.Namespace, terrain: Terrain) -> chain.StatedAttitude | None:
-    if args.attitude is None:
-        return None
-    if isinstance(args.attitude, str):
-        when = None if args.time is None else parse_utc(args.time)
-        return chain.StatedAttitude.of_file(args.attitude, terrain.site, when)
-    return chain.StatedAttitude.of_angles(*map(math.radians, args.attitude))
+    return chain.SkylineErrors.of_inputs(
+        heading_sigma=args.heading_sigma, tilt_sigma=args.tilt_sigma, correlation=args.correlation
+    )

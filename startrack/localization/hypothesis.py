@@ -27,9 +27,9 @@ class Hypothesis:
     model: SkylineModel
     found: WeightedPoints  # the weights include the prior probability of the hypothesis
 
-    def less_likely(self, nats: float) -> Hypothesis:
-        """The same with a smaller weight."""
-        return replace(self, found=replace(self.found, log_weight=self.found.log_weight - nats))
+    def weighed(self, nats: float) -> Hypothesis:
+        """The same with weights that are greater by so many `nats`."""
+        return replace(self, found=replace(self.found, log_weight=self.found.log_weight + nats))
 
     @property
     def gross(self) -> str:
@@ -110,7 +110,7 @@ def sample_gross_errors(plain: Hypothesis, references_m: Array) -> list[Hypothes
         other, slopes = model.with_gross(gross), model.error_slopes_rad[model.errors.is_of_fact(gross)]
         if not slopes.any() and not model.errors.are_waves(gross):  # nothing shows it: the points are the same
             less = other.basis.log_probability - model.basis.log_probability
-            found.append(Hypothesis(other, replace(plain.found, log_weight=plain.found.log_weight + less)))
+            found.append(replace(plain, model=other).weighed(less))
         else:
             found.append(sample_gross_error(plain, other, references_m))
     return found

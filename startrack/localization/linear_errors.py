@@ -43,6 +43,12 @@ class LinearErrors:
     def __len__(self) -> int:
         return len(self.mean)
 
+    @property
+    def sigma_of_waves_rad(self) -> Array:
+        """(SECTORS, w) rise of the skyline by one standard deviation of each wave."""
+        own = slice(len(self) - self.waves, None)
+        return np.asarray(self.rise_rad[:, own] * np.sqrt(np.diag(self.covariance)[own]))
+
     @cached_property
     def inverse(self) -> Array:
         """(j, j) of the covariance."""
@@ -59,14 +65,9 @@ class LinearErrors:
         return np.asarray((self.rise_rad.T * self.weight) @ self.rise_rad + self.inverse)
 
     @cached_property
-    def _gain(self) -> Array:
+    def gain(self) -> Array:
         """(j, SECTORS) from heights that are left to the likeliest errors."""
         return np.asarray(np.linalg.solve(self._information, self.rise_rad.T * self.weight))
-
-    @cached_property
-    def covariance_seen(self) -> Array:
-        """(j, j) of the errors by the sectors and the prior, at one position."""
-        return np.asarray(np.linalg.inv(self._information))
 
     @cached_property
     def log_volume(self) -> float:
@@ -78,7 +79,7 @@ class LinearErrors:
 
         `left_rad` (n, SECTORS) are the heights that the sectors see above the skyline with the expected errors.
         """
-        errors = left_rad @ self._gain.T
+        errors = left_rad @ self.gain.T
         return errors, self.log_volume - 0.5 * np.einsum("ni,ij,nj->n", errors, self.inverse, errors)
 
     def waves_rad(self, left_rad: Array) -> Array:

@@ -129,7 +129,7 @@ class OtherTimes:
             modes.append((linear, WIDER * covariance))
         for rounds in FEW_ROUNDS, GROSS_ROUNDS:
             one = sample_hypothesis(model, model.around.reference_m[None], modes, rounds=rounds, enough=FEW)
-            one = replace(one, found=replace(one.found, log_weight=one.found.log_weight + self.log_part[at]))
+            one = one.weighed(self.log_part[at])
             if one.found.log_evidence < self.log_evidence + np.log(FULL_SHARE):
                 break
         return one

@@ -110,7 +110,7 @@ def weigh_parts(parts: Sequence[Part], terrain: Terrain, of_one_sky: bool = True
     if not of_one_sky:
         anywhere = [float(one.model.seen.profiles.free.sum()) for one in found]
         best = int(np.argmax([one.found.log_evidence - nats for one, nats in zip(found, anywhere, strict=True)]))
-        found = [one.less_likely(nats - anywhere[best]) for one, nats in zip(found, anywhere, strict=True)]
+        found = [one.weighed(anywhere[best] - nats) for one, nats in zip(found, anywhere, strict=True)]
     found.sort(key=lambda one: -one.found.log_evidence)
     found = sorted([*found, *sample_other_times(found)], key=lambda one: -one.found.log_evidence)
     return conclude(found, terrain, parts[0].explored, dropped_probability(parts[0].explored))

@@ -68,17 +68,20 @@ class SharedErrors:
     def __len__(self) -> int:
         return len(self.listed)
 
+    @property
+    def every(self) -> tuple[ShapeError, ...]:
+        """(k + w,) the listed errors and the waves."""
+        return (*self.listed, *self.waves)
+
     @cached_property
     def facts(self) -> tuple[str, ...]:
         """Facts with a gross part."""
-        return tuple(
-            dict.fromkeys(error.fact for error in (*self.listed, *self.waves) if error.gross_probability > 0.0)
-        )
+        return tuple(dict.fromkeys(error.fact for error in self.every if error.gross_probability > 0.0))
 
     @property
     def unstated_facts(self) -> tuple[str, ...]:
         """Those of the `facts` that no file states."""
-        stated = {one.fact for one in (*self.listed, *self.waves) if one.is_stated}
+        stated = {one.fact for one in self.every if one.is_stated}
         return tuple(fact for fact in self.facts if fact not in stated)
 
     def is_of_fact(self, fact: str) -> Bools:
@@ -119,7 +122,7 @@ class SharedErrors:
 
     def log_probability(self, gross: str = "") -> float:
         """Logarithm of the prior probability that the fact `gross` alone has a gross error; "": that none has."""
-        each = {one.fact: one.gross_probability for one in (*self.listed, *self.waves)}
+        each = {one.fact: one.gross_probability for one in self.every}
         own_edge = np.log(OWN_EDGE_PROBABILITY) if gross == OWN_EDGE else 0.0
         return float(sum(np.log(p if fact == gross else 1.0 - p) for fact, p in each.items()) + own_edge)
 

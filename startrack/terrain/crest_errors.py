@@ -72,8 +72,8 @@ class Correlation:
     def waves_rad(self, terrain: HeightMap) -> Array:
         """Standard deviations [rad] of the horizon's waves, (WAVE_COUNT,), at the median distance of its crests."""
         positions = standing_positions(terrain)
-        _tan, distance, _ = terrain.horizons(positions[:, None], _azimuths())
-        return crest_angle_rad_per_m(terrain) * self.waves_m(_places(positions, distance))
+        tan, distance, _ = terrain.horizons(positions[:, None], _azimuths())
+        return _median_angle(tan, distance) * self.waves_m(_places(positions, distance))
 
 
 def map_of_rim(maps: Sequence[Raster], radius_m: float) -> Raster:
@@ -189,7 +189,12 @@ def average_posts(one: Raster, step: int) -> Raster:
 def crest_angle_rad_per_m(terrain: HeightMap) -> float:
     """Elevation that a metre of a crest's height makes, cos^2 H / distance: the median over the search area."""
     tan, distance, _ = terrain.horizons(standing_positions(terrain)[:, None], _azimuths())
-    return float(np.median(1.0 / ((1.0 + tan**2) * distance)))
+    return _median_angle(tan, distance)
+
+
+def _median_angle(tan: Array, distance_m: Array) -> float:
+    """Elevation [rad] that a metre of a crest's height makes, the median of horizons (p, a)."""
+    return float(np.median(1.0 / ((1.0 + tan**2) * distance_m)))
 
 
 def standing_positions(terrain: HeightMap) -> Array:

@@ -55,9 +55,7 @@ class Terrain(ABC):
     axisymmetric: bool = False  # whether a turn of the sky about the vertical only turns the position
     horizon_cost: float = 1.0  # of one horizon, beside one traced on a height map: the search has a budget of these
     shape_errors: tuple[ShapeError, ...] = ()  # errors that all azimuths share, those that are stated as zero too
-    crest_distance_m: float = (
-        10_000.0  # of the skyline from about the origin: over it the waves of the map's error change
-    )
+    crest_distance_m: float = 10_000.0  # of the skyline from about the origin: over it waves of the map's error change
     unknown_steepness_1: float = 0.0  # relative sigma of the horizon's tangent, where a search must find it; 0: known
     steepness_1: float = 1.0  # the horizon's tangent that errors are counted from, over that of the stated shape
     rim_radius_m: float | None = None  # of a circular rim about the origin, drawn on maps instead of the relief

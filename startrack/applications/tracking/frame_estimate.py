@@ -2,8 +2,9 @@
 
 The likelihood of one image in the parameters of a track gives points of the posterior by images of one position. The
 posterior mean m of position and shared errors by one frame, with its prior, depends on the true ones p and on the
-errors h of the map's posts and waves as m = K p + G h + noise. K is what the evidence adds to the prior. G is that of
-the parameters with the slopes of the log-likelihood: the derivative of a posterior mean.
+errors h of the map's posts and waves as m = K p + G h + noise. K is what the evidence adds to the prior. G is the
+covariance of the parameters with the slopes of the log-likelihood, which is the derivative of a posterior mean; for the
+waves these slopes are those of a linear model.
 """
 
 from __future__ import annotations
@@ -37,10 +38,8 @@ LEAST_FRAME_HALF_M = 40.0  # of the neighbourhood
 MAX_NEIGHBOURHOODS = 3  # after so many the posterior is taken as it is
 MIN_NOISE_SHARE = 0.3  # of the evidence's covariance: the least noise that a frame has of its own
 NEGLIGIBLE_POST = 1e-4  # part of the variance of a position, by all posts that are left out together
-FIRST_WAVE, WAVE_NODES = (
-    2**40,
-    4096,
-)  # number of the first wave, behind all posts; of nodes along each side of their grid
+FIRST_WAVE = 2**40  # number of the first wave, behind those of all posts
+WAVE_NODES = 4096  # along each side of their grid
 NODE_SPACING = 2.0  # of a wave's nodes, in the crests' distance over the wave's number
 ROUNDING = 1e-9  # of the covariance, added to the noise so that it can be inverted
 STEP_SIGMAS, LEAST_STEP_RAD = 0.5, 1e-7  # of the skyline's spread, to each side: where the change with it is taken
@@ -107,31 +106,38 @@ class FrameModel:
         higher, lower = (clear_logs(self.model.seen.profiles, shifts + sign * step, all_clear) for sign in (1.0, -1.0))
         return np.asarray(self.clear * (higher - lower) / (2 * step))
 
-    def information(self) -> tuple[Array, Array, Array]:
-        """Of a linear model of the sectors: (2 + k, 2 + k), its product (2 + k,) with the best parameters, and a score.
+    @cached_property
+    def design(self) -> Array:
+        """(SECTORS, 2 + k) rise of the skyline by a metre east and north, and by each shared error."""
+        return np.hstack([self.model.around.slopes.T, self.rise_rad])
 
-        Positions are relative to the reference. The score (2 + k, SECTORS) is by how much the gradient grows with the
-        heights that the sectors see. Sets how much each sector counts for the linear errors.
+    def information(self) -> tuple[Array, Array]:
+        """Of a linear model of the sectors: (2 + k, 2 + k), and its product (2 + k,) with the best parameters.
+
+        Positions are relative to the reference. Sets how much each sector counts for the linear errors.
         """
-        seen, around, linear = self.model.seen, self.model.around, self.model.linear
-        design, own = np.hstack([around.slopes.T, self.rise_rad]), linear.rise_rad
-        known, d = linear.inverse, design.shape[1]
-        height = seen.moments.mean_rad - self.shifts(np.r_[around.reference_m, np.zeros(d - 2)][None])[0]
-        prior = np.diag(np.r_[np.full(2, UNKNOWN_M**-2), np.ones(d - 2), np.zeros(len(known))])
-        prior[d:, d:] = known
+        seen, linear, design, d = self.model.seen, self.model.linear, self.design, self.design.shape[1]
+        at_reference = np.r_[self.model.around.reference_m, np.zeros(d - 2)]
+        height = seen.moments.mean_rad - self.shifts(at_reference[None])[0]
+        prior = np.diag(np.r_[np.full(2, UNKNOWN_M**-2), np.ones(d - 2), np.zeros(len(linear))])
+        prior[d:, d:] = linear.inverse
         left, mean = seen.moments._replace(mean_rad=height), np.append(np.zeros(d), linear.mean)
-        _, _, clear = solve_linear(left, np.hstack([design, own]), mean, prior)
+        _, _, clear = solve_linear(left, np.hstack([design, linear.rise_rad]), mean, prior)
         self.model = replace(self.model, clear=clear)
-        weight = clear / seen.moments.variance_rad2
-        explained = np.linalg.solve((own.T * weight) @ own + known, own.T * weight)  # by the image's own errors
-        weighted = np.asarray(design.T * weight - ((design.T * weight) @ own) @ explained)
-        return weighted @ design, weighted @ (height - linear.expected_rad), weighted
+        growth = self.gradient_by_height()
+        return growth @ design, growth @ (height - linear.expected_rad)
+
+    def gradient_by_height(self) -> Array:
+        """(2 + k, SECTORS) growth of the gradient with heights that sectors see, which count as `information` set."""
+        linear = self.model.linear
+        weighted = self.design.T * linear.weight
+        return np.asarray(weighted - (weighted @ linear.rise_rad) @ linear.gain)
 
 
 def sample_together(models: Sequence[FrameModel], position_m: Array, covariance_m2: Array) -> WeightedPoints:
     """Points of the posterior by exposures of one position, with one reference, from near a position (2,)."""
     # The position as it is given, and the errors that a linear model gives for it.
-    information, weighted, _ = (np.sum(parts, axis=0) for parts in zip(*(m.information() for m in models), strict=True))
+    information, weighted = (np.sum(parts, axis=0) for parts in zip(*(m.information() for m in models), strict=True))
     information += np.diag(np.r_[np.full(2, UNKNOWN_M**-2), np.ones(len(information) - 2)])
     covariance = np.linalg.inv(information)
     best = covariance @ weighted
@@ -214,7 +220,7 @@ def observe_together(models: Sequence[FrameModel], found: WeightedPoints) -> Fra
         by_posts = model.model.around.post_sigma_rad  # other errors of the ground are this frame's own noise
         counted += 0.0 if by_posts is None else (own * np.square(by_posts)) @ own.T
         by_horizon += own
-        of_waves = shown @ covariance @ model.information()[2] @ rises  # sampled ones would be noise of the points
+        of_waves = shown @ covariance @ model.gradient_by_height() @ rises  # sampled ones would be noise of the points
         counted += of_waves @ of_waves.T
         by_wave += of_waves
     noise = clipped_noise(by_evidence - counted, by_evidence) + ROUNDING * covariance
@@ -283,14 +289,10 @@ def waves_at(position_m: Array, terrain: Terrain, linear: LinearErrors) -> tuple
     A wave changes with the place, since the crests stand in other directions there: its error is that of the four
     nodes about the position (2,) of a square grid, independent of each other, in parts whose squares add up to 1.
     """
-    own = np.arange(len(linear) - linear.waves, len(linear))
-    rise = linear.rise_rad[:, own] * np.sqrt(np.diag(linear.covariance)[own])
     spacing_m = NODE_SPACING * terrain.crest_distance_m / (1 + np.arange(linear.waves) // 2)
     at = position_m / spacing_m[:, None]
-    low = np.floor(at)
-    number, part = [], []
-    for corner in np.stack(np.meshgrid([0, 1], [0, 1]), axis=-1).reshape(-1, 2):
-        node = (low + corner).astype(np.int64) + WAVE_NODES // 2
-        number.append(FIRST_WAVE + (node[:, 0] * WAVE_NODES + node[:, 1]) * linear.waves + np.arange(linear.waves))
-        part.append(np.sqrt(np.prod(1.0 - np.abs(at - low - corner), axis=1)))
-    return np.concatenate(number), np.concatenate([rise * one for one in part], axis=1)
+    low, corner = np.floor(at), np.array([[0, 0], [1, 0], [0, 1], [1, 1]])[:, None]
+    part = np.sqrt(np.prod(1.0 - np.abs(at - low - corner), axis=-1))
+    node = np.moveaxis((low + corner).astype(np.int64) + WAVE_NODES // 2, -1, 0)
+    number = FIRST_WAVE + (node[0] * WAVE_NODES + node[1]) * linear.waves + np.arange(linear.waves)
+    return number.ravel(), np.concatenate([linear.sigma_of_waves_rad * one for one in part], axis=1)

@@ -84,6 +84,7 @@ def test_files_for_rendered_pictures_share_the_ground_and_state_it_as_exact(name
         {key: d["dem"].pop(key) for key in ERRORS} | {"camera": d["rover"].pop("camera_height_sigma_m")}
         for d in (rendered, ground)
     )
+    assert rendered["dem"].pop("map_offset_sigma_m") == 0.0
     assert rendered == ground
     assert errors["height_sigma_m"] == 1.0 < stated["height_sigma_m"]
     assert (

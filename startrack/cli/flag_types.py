@@ -69,11 +69,8 @@ limited_count = limit_type(count, lambda value: value <= MAX_COUNT, f"{{}} is mo
 half_turn = limit_type(number, lambda value: 0.0 <= value <= 180.0, "{!r} is not from 0 to 180 degrees")
 
 
-def attitude(text: str) -> str | tuple[float, float, float]:
-    """Azimuth, pitch and roll [deg], or the path of a file."""
-    words = text.split(",")
-    if len(words) != 3:
-        return text
+def attitude(words: list[str]) -> tuple[float, float, float]:
+    """Azimuth, pitch and roll [deg] of three `words`."""
     azimuth, pitch, roll = (number(word) for word in words)
     if abs(pitch) >= 90.0:
         raise argparse.ArgumentTypeError(f"the pitch {pitch:g} is not between -90 and 90 degrees")

@@ -6,7 +6,6 @@ import argparse
 
 from startrack.cli import flags
 from startrack.cli.flag_types import (
-    attitude,
     cluster_address,
     count,
     fields_of_view_rad,
@@ -28,7 +27,6 @@ SKYLINE = (
         "--attitude FILE|AZ,PITCH,ROLL",
         "of the camera of a polyline: a result of startrack, or degrees: azimuth and elevation of the optical axis, "
         "and a clockwise turn about it (--attitude=-10,...)",
-        attitude,
     ),
     flag("--heading-sigma DEG", "error of the attitude about the vertical; 180: not known", half_turn),
     flag("--tilt-sigma DEG", "error of the vertical, about each of two level axes", half_turn),

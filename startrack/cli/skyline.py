@@ -9,6 +9,7 @@ from pathlib import Path
 from startrack import chain, output
 from startrack.camera import load_camera
 from startrack.cli.console import Outcome, print_outcome, print_warnings, wait_lines
+from startrack.cli.flag_types import attitude
 from startrack.cli.flags import check_localizer
 from startrack.cli.images import prepare
 from startrack.core.errors import BadInput, BadOutput
@@ -45,8 +46,9 @@ def _solve(args: argparse.Namespace) -> Outcome:
     when = None if args.time is None else parse_utc(args.time)
     camera = None if args.camera is None else load_camera(args.camera)
     near = None if args.near is None else PositionPrior(*args.near)
-    attitude = chain.StatedAttitude.of_input(args.attitude, terrain.site, when)
-    points = chain.skyline_points(args.skyline, _errors_of(args), camera, attitude, near)
+    stated = _stated_attitude(args)
+    known = chain.StatedAttitude.of_input(stated, terrain.site, when)
+    points = chain.skyline_points(args.skyline, _errors_of(args, stated), camera, known, near)
     exposure = chain.skyline_exposure(args.skyline, when, args.terrain)
     out = Path(args.dir) / f"{Path(args.skyline).stem}.fix.json"
     try:
@@ -65,9 +67,19 @@ def _solve(args: argparse.Namespace) -> Outcome:
     return record, line + ("\n" + output.verbose_text(result) if args.verbose else "")
 
 
-def _errors_of(args: argparse.Namespace) -> chain.SkylineErrors:
-    """What flags state; the errors of an attitude in degrees must be stated, and those of a result count as none."""
-    if isinstance(args.attitude, tuple) and None in (args.heading_sigma, args.tilt_sigma):
+def _stated_attitude(args: argparse.Namespace) -> str | tuple[float, float, float] | None:
+    """Azimuth, pitch and roll [deg] of --attitude, or the path of a file."""
+    words = [] if args.attitude is None else args.attitude.split(",")
+    try:
+        return attitude(words) if len(words) == 3 else args.attitude
+    except argparse.ArgumentTypeError as cause:
+        args.usage_error(f"argument --attitude: {cause}")
+        raise  # the line above ends the program
+
+
+def _errors_of(args: argparse.Namespace, stated: str | tuple[float, ...] | None) -> chain.SkylineErrors:
+    """What flags state; the errors of a `stated` attitude in degrees must be, and those of a result count as none."""
+    if isinstance(stated, tuple) and None in (args.heading_sigma, args.tilt_sigma):
         args.usage_error("--attitude AZ,PITCH,ROLL needs its errors: --heading-sigma DEG and --tilt-sigma DEG")
     return chain.SkylineErrors.of_inputs(
         heading_sigma=args.heading_sigma, tilt_sigma=args.tilt_sigma, correlation=args.correlation

@@ -125,7 +125,8 @@ def test_an_error_of_the_width_scales_the_position_with_the_crater() -> None:
     silent = replace(TRUE, depth_sigma_m=1.0, diameter_sigma_m=1.0, ellipse_sigma_1=0.0, rim_tilt_sigma_rad=0.0)
     errors, azimuth, place = SharedErrors.of(silent, None), np.linspace(0.0, 6.0, 50), np.array([4000.0, -5000.0])
     level = silent.horizon_rad(place[None], azimuth).ravel()
-    slopes = errors.slopes_rad(silent, place, azimuth, level)
+    by_name = dict(zip((one.name for one in silent.shape_errors), silent.shape_slopes_rad(place, azimuth), strict=True))
+    slopes = errors.slopes_rad(silent, place, azimuth, level, by_name)
     for number, one in enumerate(errors.listed):
         values = 1e-3 * (np.arange(len(errors)) == number)
         (moved,) = errors.true_positions(place[None], values[None])

@@ -11,10 +11,9 @@ from functools import cached_property
 
 import numpy as np
 
-from startrack.core.types import MIDDLES_RAD, Array
+from startrack.core.types import Array
 from startrack.localization.neighbourhood import SectorRows
 from startrack.localization.shared_errors import SharedErrors
-from startrack.terrain import wave_slopes_rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,11 +32,11 @@ class LinearErrors:
 
         `gross` names the fact with a gross error, "" none. `clear` (SECTORS,) is how much each sector counts.
         """
-        image, slopes = seen.image_errors, wave_slopes_rad(MIDDLES_RAD)
+        image, slopes = seen.image_errors, seen.around.wave_slopes_rad(errors)
         w, j = len(errors.waves), len(image.mean)
         covariance = np.zeros((j + w, j + w))
         covariance[:j, :j], covariance[j:, j:] = image.covariance, np.diag(np.square(errors.waves_sigma_rad(gross)))
-        rise = np.column_stack([seen.image_rise, *(slopes[one.name] for one in errors.waves)])
+        rise = np.column_stack([seen.image_rise, slopes.T])
         return cls(rise, np.r_[image.mean, np.zeros(w)], covariance, clear / seen.moments.variance_rad2, w)
 
     def __len__(self) -> int:

@@ -56,7 +56,17 @@ class Neighbourhood:
 
     def error_slopes_rad(self, errors: SharedErrors) -> Array:
         """(k, SECTORS) rise of the skyline by one unit of each of the shared `errors`."""
-        return errors.slopes_rad(self.terrain, self.reference_m, MIDDLES_RAD, self.horizon_rad)
+        return errors.slopes_rad(self.terrain, self.reference_m, MIDDLES_RAD, self.horizon_rad, self._shape_slopes_rad)
+
+    def wave_slopes_rad(self, errors: SharedErrors) -> Array:
+        """(w, SECTORS) rise of the skyline by one unit of each of the waves among the shared `errors`."""
+        return np.array([self._shape_slopes_rad[one.name] for one in errors.waves]).reshape(-1, SECTORS)
+
+    @cached_property
+    def _shape_slopes_rad(self) -> dict[str, Array]:
+        """Rise (SECTORS,) of the skyline by one unit of each error of the terrain's shape, by name."""
+        slopes = np.reshape(self.terrain.shape_slopes_rad(self.reference_m, MIDDLES_RAD), (-1, SECTORS))
+        return {one.name: slope for one, slope in zip(self.terrain.shape_errors, slopes, strict=True)}
 
     @cached_property
     def skyline_rad(self) -> Array:
@@ -80,30 +90,23 @@ class Neighbourhood:
     def map_sigma_rad(self) -> Array:
         """(SECTORS,) error of the map's skyline, as if independent between the sectors.
 
-        Posts that make the skyline at several azimuths err there together: each azimuth is given the variance that the
-        sum over its neighbours has, which is right for errors that go far around the compass, as of a position. What
-        follows no post is common to neighbours as the square of their correlation by posts; where the skyline follows
-        none at all it is that azimuth's alone. Ground of which facts are not stated is rough by ROUGH_RAD besides.
+        Posts that make the skyline at several azimuths err there together: see `independent_sigma`. What follows no
+        post is common to neighbours as the square of their correlation by posts; where the skyline follows none at all
+        it is that azimuth's alone. Ground of which facts are not stated is rough by ROUGH_RAD besides.
         """
         rough = 0.0 if all(one.is_stated for one in self.terrain.shape_errors) else ROUGH_RAD
         if self.crests is None:
             by_posts = np.asarray(self.terrain.horizon_sigma_rad(self.reference_m[None], MIDDLES_RAD)).ravel()
             return np.hypot(by_posts, rough)
         of_posts, own = self._covariance_by_posts(self.crests), self.crests.own_sigma_rad
-        sigma = np.sqrt(np.diag(of_posts))
-        sigma[sigma == 0.0] = np.inf
-        correlation = of_posts / np.outer(sigma, sigma)
-        np.fill_diagonal(correlation, 1.0)
-        total = of_posts + np.outer(own, own) * np.square(correlation)
-        return np.sqrt(np.maximum(total.sum(axis=1), np.diag(total)) + rough**2)
+        likeness = correlation_of(of_posts)
+        np.fill_diagonal(likeness, 1.0)
+        return np.hypot(independent_sigma(of_posts + np.outer(own, own) * np.square(likeness)), rough)
 
     @cached_property
     def post_sigma_rad(self) -> Array | None:
         """(SECTORS,) the part of `map_sigma_rad` that follows the posts; None of a ground without their errors."""
-        if self.crests is None:
-            return None
-        by_posts = self._covariance_by_posts(self.crests)
-        return np.sqrt(np.maximum(by_posts.sum(axis=1), np.diag(by_posts)))
+        return None if self.crests is None else independent_sigma(self._covariance_by_posts(self.crests))
 
     def _covariance_by_posts(self, crests: ExpectedCrests) -> Array:
         """(SECTORS, SECTORS) of the skyline's elevations, as far as they follow the posts."""
@@ -112,6 +115,24 @@ class Neighbourhood:
         response = np.zeros((SECTORS, len(numbers)))
         np.add.at(response, (np.nonzero(used)[0], of), crests.rad_per_m[used])
         return np.asarray(self.terrain.height_sigma_m**2 * response @ response.T)
+
+
+def correlation_of(covariance: Array) -> Array:
+    """Correlations (n, n) of errors with a `covariance` (n, n); 0 of those without variance."""
+    sigma = np.sqrt(np.diag(covariance))
+    scale = np.divide(1.0, sigma, out=np.zeros(len(sigma)), where=sigma > 0.0)
+    return np.asarray(covariance * np.outer(scale, scale))
+
+
+def independent_sigma(covariance: Array) -> Array:
+    """Standard deviations (n,) of independent errors that tell as much as errors with a `covariance` (n, n).
+
+    Each variance counts as often as errors are alike: by the sum of its correlations. That is right for what changes
+    little between errors that are alike, as a position does. A sum of covariances would give the crest of a far
+    mountain the errors of near ground that may hide it.
+    """
+    alike = np.maximum(correlation_of(covariance).sum(axis=1), 1.0)
+    return np.asarray(np.sqrt(np.diag(covariance) * alike))
 
 
 @dataclass(frozen=True, eq=False)

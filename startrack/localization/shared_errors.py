@@ -126,14 +126,15 @@ class SharedErrors:
         own_edge = np.log(OWN_EDGE_PROBABILITY) if gross == OWN_EDGE else 0.0
         return float(sum(np.log(p if fact == gross else 1.0 - p) for fact, p in each.items()) + own_edge)
 
-    def slopes_rad(self, terrain: Terrain, position_m: Array, azimuth_rad: Array, horizon_rad: Array) -> Array:
+    def slopes_rad(
+        self, terrain: Terrain, position_m: Array, azimuth_rad: Array, horizon_rad: Array, by_name: dict[str, Array]
+    ) -> Array:
         """Rise (k, n) of the skyline `horizon_rad` (n,) at `azimuth_rad` (n,) by one unit of each error.
 
-        The skyline is that of the `terrain` at `position_m` (2,).
+        The skyline is that of the `terrain` at `position_m` (2,); `by_name` holds the rises (n,) by its shape's errors.
         """
-        known = {one.name: number for number, one in enumerate(terrain.shape_errors)}
-        shape = np.reshape(terrain.shape_slopes_rad(position_m, azimuth_rad), (-1, len(azimuth_rad)))
-        shape = shape[[known[one.name] for one in self.listed if one.fact != CLOCK_FACT]]
+        own = [by_name[one.name] for one in self.listed if one.fact != CLOCK_FACT]
+        shape = np.array(own).reshape(len(own), len(azimuth_rad))
         if len(self._scales):
             farther, nearer = (position_m * (1.0 + sign * SCALE_STEP) for sign in (1.0, -1.0))
             horizon = np.asarray(terrain.horizon_rad(np.array([farther, nearer])[:, None], azimuth_rad))

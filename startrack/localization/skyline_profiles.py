@@ -25,6 +25,7 @@ SOFT_BINS = np.linspace(-3.5, 3.5, 15)  # of a normal error of the map, whose me
 SOFT_REACH_RAD = np.radians(0.3)  # beside EDGE_SIGMAS, about the map's skyline, where its error is averaged over
 LEAST_MEAN = 1e-8  # of exp (F - R) over such an error: differences of the integral have no more digits
 SOFT_STEP, MOST_SOFT_CELLS = 0.5, 120.0  # of the error: cells of the average; at most, to each side
+LEAST_SOFT_CELLS = 32  # together: as many as an error has that the window does not cut off
 
 
 def profiles_of(
@@ -152,12 +153,13 @@ def _average_over_map(profiles, sigma, bins):
     for q in range(len(weights)):
         weights[q] /= whole
     sectors, room = len(sigma), len(profiles.x)
-    low, high, step = np.zeros(sectors), np.zeros(sectors), np.zeros(sectors)
+    low, high, counts = np.zeros(sectors), np.zeros(sectors), np.zeros(sectors, dtype=np.int64)
     for s in range(sectors):
         reach = SOFT_REACH_RAD + EDGE_SIGMAS * sigma[s]
         low[s], high[s] = max(-reach, LOW_RAD), min(reach, HIGH_RAD)
-        step[s] = max(SOFT_STEP * sigma[s], reach / MOST_SOFT_CELLS)
-        room += int((high[s] - low[s]) / step[s]) + 4
+        step = max(SOFT_STEP * sigma[s], reach / MOST_SOFT_CELLS)
+        counts[s] = max(int((high[s] - low[s]) / step), LEAST_SOFT_CELLS)
+        room += counts[s] + 4
     first = np.zeros(sectors + 1, dtype=np.int64)
     x, left, right, bend = np.zeros(room), np.zeros(room), np.zeros(room), np.zeros(room)
     n = 0
@@ -173,25 +175,24 @@ def _average_over_map(profiles, sigma, bins):
             x[n], left[n], right[n], bend[n] = profiles.x[k], profiles.left[k], profiles.right[k], profiles.bend[k]
             n += 1
             k += 1
-        count = int((high[s] - low[s]) / step[s])
+        step = (high[s] - low[s]) / counts[s]
         cells[:] = profiles.first[s]
         before = _mean_over(profiles, s, low[s], sigma[s], bins, weights, cells)
-        for i in range(count):
-            at = low[s] + i * step[s]
-            middle = _mean_over(profiles, s, at + 0.5 * step[s], sigma[s], bins, weights, cells)
-            after = _mean_over(profiles, s, at + step[s], sigma[s], bins, weights, cells)
+        for i in range(counts[s]):
+            at = low[s] + i * step
+            middle = _mean_over(profiles, s, at + 0.5 * step, sigma[s], bins, weights, cells)
+            after = _mean_over(profiles, s, at + step, sigma[s], bins, weights, cells)
             rise = abs(after - before)
             x[n], left[n], right[n], bend[n] = at, before, after, 4.0 * (middle - 0.5 * (before + after))
             if min(before, after) <= middle <= max(before, after):  # the parabola has no peak either
                 bend[n] = min(max(bend[n], -rise), rise)
             before = after
             n += 1
-        end = low[s] + count * step[s]
-        k = cell_at(profiles.x, profiles.guide, s, end)
-        x[n] = end
-        left[n] = log_at(profiles, s, end) + profiles.free[s]
-        right[n] = profiles.right[k]
-        n += 1
+        k = last - 1
+        if high[s] < HIGH_RAD:
+            k = cell_at(profiles.x, profiles.guide, s, high[s])
+            x[n], left[n], right[n] = high[s], log_at(profiles, s, high[s]) + profiles.free[s], profiles.right[k]
+            n += 1
         for j in range(k + 1, last + 1):
             x[n], left[n], right[n], bend[n] = profiles.x[j], profiles.left[j], profiles.right[j], profiles.bend[j]
             n += 1

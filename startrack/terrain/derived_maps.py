@@ -28,8 +28,8 @@ class DeformedMap(ForwardingTerrain):
     """The ground of a height map with errors of its shape, given by the names of `shape_errors`.
 
     In this order: the camera stands higher, sight lines bend more, tan of the horizon is stretched, the horizon rises
-    by the bias and by waves (by name), and the skyline is turned about a horizontal axis. It has no further errors of
-    its shape. Its bounds need the table of a map with the camera at the changed height and such lines; the horizon does
+    by the bias and by waves (by name), as crests of a wrong height do, and the skyline is turned about a horizontal
+    axis. It has no further errors of its shape. Its bounds need the table of a map with the camera at the changed height and such lines; the horizon does
     without.
     """
 
@@ -46,7 +46,8 @@ class DeformedMap(ForwardingTerrain):
         self._raised_m, self._refraction_1 = camera_height_m, terrestrial_refraction_1
         self._bias_rad, self._stretch_1 = bias_rad, stretch_1
         self._waves_rad = {name: value for name, value in waves_rad.items() if value}
-        self._most_wave_rad = float(np.abs(list(self._waves_rad.values())).sum())
+        risen_rad = abs(bias_rad) + np.abs(list(self._waves_rad.values())).sum()
+        self._most_risen_rad = float(risen_rad * whole.crest_share(0.0, 0.0)) if risen_rad else 0.0
         self._tilt_rad = float(np.hypot(vertical_east_rad, vertical_north_rad))
         self._R_turned_map = R_from_rotvec([vertical_north_rad, -vertical_east_rad, 0.0])
 
@@ -73,14 +74,17 @@ class DeformedMap(ForwardingTerrain):
         return other
 
     def _level_rad(self, horizon_rad: Array) -> Array:
-        """A horizon [rad] of the raised camera, stretched and with the bias."""
-        return np.asarray(np.arctan((1.0 + self._stretch_1) * np.tan(horizon_rad)) + self._bias_rad)
+        """A horizon [rad] of the raised camera, stretched."""
+        return np.asarray(np.arctan((1.0 + self._stretch_1) * np.tan(horizon_rad)))
 
     def _before_turn_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """The horizon [rad] with all errors but the turn; see `horizon_rad`."""
-        found = self._level_rad(self._raised.horizon_rad(points_m, azimuths_rad))
+        if not self._most_risen_rad:
+            return self._level_rad(self._raised.horizon_rad(points_m, azimuths_rad))
+        tan, distance_m, _ = self._raised.horizons(points_m, azimuths_rad)
         slopes = wave_slopes_rad(azimuths_rad) if self._waves_rad else {}
-        return np.asarray(found + sum(value * slopes[name] for name, value in self._waves_rad.items()))
+        risen_rad = self._bias_rad + sum(value * slopes[name] for name, value in self._waves_rad.items())
+        return self._level_rad(np.arctan(tan)) + risen_rad * self.whole.crest_share(tan, distance_m)
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation [rad], traced; see `Terrain`."""
@@ -110,7 +114,7 @@ class DeformedMap(ForwardingTerrain):
         self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
     ) -> tuple[Array, Array]:
         """Bounds [rad] from those of the raised camera's map, over azimuths that hold what the turn brings in."""
-        turn, around_rad = np.asarray(azimuth_half_rad), self._tilt_rad + self._most_wave_rad
+        turn, around_rad = np.asarray(azimuth_half_rad), self._tilt_rad + self._most_risen_rad
         if self._tilt_rad:
             high = self._level_rad(
                 self._raised.horizon_bounds_rad(centres_m, half_m, azimuths_rad, turn + WIDER_RAD)[1]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from startrack.core.types import MIDDLES_RAD, Array, Bools, Ints
 from startrack.terrain import shape
+from startrack.terrain.block_kernel import NUDGE_M
 from startrack.terrain.crest_kernel import POSTS, crests
 from startrack.terrain.derived_maps import DeformedMap, HorizonInterpolator
 from startrack.terrain.ground import cell_posts, number_of_maps, post_positions
@@ -50,7 +51,7 @@ class HeightMap(TracedMap):
 
     @cached_property
     def common_sigma_rad(self) -> float:  # type: ignore[override]
-        """Standard deviation [rad] of the error that all azimuths share, with that of the camera's own ground.
+        """Standard deviation [rad] of the crests' common error at their median distance, with the camera's ground's.
 
         If it is not known, three times the horizon's sigma from `height_sigma_m`: crests clipped by the grid of posts
         stand too low by some such amount all around.
@@ -91,16 +92,18 @@ class HeightMap(TracedMap):
     def shape_slopes_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """From the traced horizon and the distance of its crest; see `Terrain`.
 
-        Of a tilt the change of elevation alone: that of azimuth moves the skyline by its slope times tan H times the
+        The bias and the waves are errors of the crests' heights, see `crest_share`. Of a tilt the change of elevation alone: that of azimuth moves the skyline by its slope times tan H times the
         tilt, which is left out.
         """
         tan, distance, _ = self.horizons(points_m, azimuths_rad)
         flat = 1.0 / (1.0 + np.square(tan))  # cos^2 H
+        by_crest = self.crest_share(tan, distance)
+        waves = {name: by_crest * wave for name, wave in shape.wave_slopes_rad(azimuths_rad).items()}
         slopes = {
-            "bias_rad": np.ones(1), "stretch_1": tan * flat, "vertical_east_rad": np.sin(azimuths_rad),
-            "vertical_north_rad": np.cos(azimuths_rad), "camera_height_m": -(1.0 / distance) * flat,
+            "bias_rad": by_crest, "stretch_1": tan * flat, "vertical_east_rad": np.sin(azimuths_rad),
+            "vertical_north_rad": np.cos(azimuths_rad), "camera_height_m": -flat / np.maximum(distance, NUDGE_M),
             "terrestrial_refraction_1": distance / (2 * self.ground.radius_m) * flat,
-            **shape.wave_slopes_rad(azimuths_rad), **self._offset_slopes_rad(points_m, azimuths_rad, tan, distance),
+            **waves, **self._offset_slopes_rad(points_m, azimuths_rad, tan, distance),
         }  # fmt: skip
         return shape.select_slopes(
             self.shape_errors, slopes | refraction_slopes_rad(self.air, np.arctan(tan)), np.shape(tan)

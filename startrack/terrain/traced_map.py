@@ -128,6 +128,21 @@ class TracedMap(Terrain):
         return Square(self.reach_m, across)
 
     @cached_property
+    def crest_rad_per_m(self) -> float:
+        """Rise of the horizon by a metre of its crest's height, cos^2 H / distance: the median from the origin."""
+        return float(np.median(self._rad_per_m(*self.horizons(np.zeros(2), SECTOR_AZIMUTHS_RAD[0])[:2])))
+
+    def crest_share(self, tan: Array, distance_m: Array) -> Array:
+        """Error of horizons (...) by an error of height that crests share, in that at the median crest.
+
+        Nearer than the spacing of the posts the ground below the camera errs with the crest.
+        """
+        return self._rad_per_m(tan, distance_m) / self.crest_rad_per_m
+
+    def _rad_per_m(self, tan: Array, distance_m: Array) -> Array:
+        return np.asarray(1.0 / ((1.0 + np.square(tan)) * np.maximum(distance_m, self.maps[0].post_m)))
+
+    @cached_property
     def table_key(self) -> str:
         """Name of the table of horizons, by all that it follows from."""
         return key_of_table(self)

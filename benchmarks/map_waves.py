@@ -23,7 +23,6 @@ from startrack.terrain.crest_errors import (
     Correlation,
     average_posts,
     correlate_with_coarser,
-    crest_angle_rad_per_m,
     map_of_rim,
 )
 from startrack.terrain.map_comparison import compare_maps
@@ -70,7 +69,7 @@ def _row(name: str, correlation: Correlation | None, terrain: HeightMap) -> list
     if correlation is None:
         return [name, "none beyond two posts", *["-"] * (WAVE_COUNT + 2)]
     waves_rad = correlation.waves_rad(terrain)
-    ratio = waves_rad[0] / (terrain.height_sigma_m * crest_angle_rad_per_m(terrain))
+    ratio = waves_rad[0] / (terrain.height_sigma_m * terrain.crest_rad_per_m)
     sizes = [f"{correlation.sigma_m:.1f}", f"{correlation.length_m / 1000:.1f}", f"{ratio:.2f}"]
     return [name, *sizes, *(f"{sigma:.4f}" for sigma in np.degrees(waves_rad))]
 

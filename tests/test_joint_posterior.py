@@ -184,9 +184,18 @@ def test_profiles_are_averaged_over_an_error_of_the_map(sigma_deg: float) -> Non
         assert at[near] == pytest.approx(plain[near], abs=0.25)
 
 
+def test_profiles_of_crests_that_may_stand_anywhere_are_level() -> None:
+    """Of a crest 20 m away whose height is known to 10 m, as of one that is known to nothing."""
+    rows, above = rows_of_both(np.random.default_rng(4))
+    for sigma_deg in (60.0, 200.0):
+        found = profiles_of(rows, above, np.full(SECTORS, np.radians(sigma_deg)))
+        level = [[log_at(found, sector, height) for height in HEIGHTS_RAD] for sector in range(SECTORS)]
+        assert np.ptp(level, axis=1).max() < 0.5
+
+
 def test_profiles_end_with_the_window_where_the_error_of_the_map_is_wider() -> None:
     rows, above = rows_of_both(np.random.default_rng(4))
-    found = profiles_of(rows, above, np.radians(np.linspace(0.0, 12.0, SECTORS)))
+    found = profiles_of(rows, above, np.radians(np.linspace(0.0, 90.0, SECTORS)))
     for sector in range(SECTORS):
         cells = slice(found.first[sector], found.first[sector + 1])
         assert found.x[cells][[0, -1]] == pytest.approx([LOW_RAD, HIGH_RAD])

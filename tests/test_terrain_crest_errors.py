@@ -18,7 +18,6 @@ from startrack.terrain.crest_errors import (
     average_posts,
     correlate,
     correlate_with_coarser,
-    crest_angle_rad_per_m,
     measure_waves,
     standing_positions,
 )
@@ -111,7 +110,7 @@ def test_waves_of_a_map_without_a_finer_one_scale_with_the_error_of_heights(crat
     waves_rad, source = measure_waves(crater, None)
     assert "made coarser" in source
     assert np.all(np.diff(waves_rad) < 0.0)
-    angle_rad = crater.height_sigma_m * crest_angle_rad_per_m(crater)
+    angle_rad = crater.height_sigma_m * crater.crest_rad_per_m
     assert 0.05 * angle_rad < waves_rad[0] < angle_rad
     twice_rad, _ = measure_waves(replace(crater, height_sigma_m=8.0), None)
     np.testing.assert_allclose(twice_rad, 2 * waves_rad)
@@ -137,6 +136,6 @@ def test_crests_that_show_no_correlation_state_the_least_waves(crater):
     flat = replace(crater.maps[0], heights_m=np.random.default_rng(2).normal(0.0, 30.0, (160, 160)).astype(np.float32))
     terrain = replace(crater, maps=(flat,))
     waves_rad, source = measure_waves(terrain, None)
-    least_rad = 0.15 * terrain.height_sigma_m * crest_angle_rad_per_m(terrain)
+    least_rad = 0.15 * terrain.height_sigma_m * terrain.crest_rad_per_m
     assert source
     assert least_rad <= waves_rad[0] < 1.5 * least_rad

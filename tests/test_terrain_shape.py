@@ -12,7 +12,7 @@ import pytest
 from test_terrain_files import HILL, hill, terrain_file
 
 from startrack.core.files import data_dir
-from startrack.core.types import BadInput
+from startrack.core.types import MIDDLES_RAD, BadInput
 from startrack.frames import Site
 from startrack.localization.shared_errors import SharedErrors
 from startrack.simulation import draw_ground
@@ -232,6 +232,20 @@ def test_slopes_of_a_map_are_the_differences_of_its_horizon():
         assert (found - plain) / step == pytest.approx(slopes[k], abs=left_out * np.abs(slopes[k]).max()), error.name
         if error.fact == "vertical_sigma_deg":
             assert np.median(np.abs((found - plain) / step - slopes[k])) < 0.05
+
+
+def test_crests_share_the_bias_as_a_height():
+    """The crest at the distance d rises by cos^2 H / d, and the median one seen from the origin by one radian."""
+    terrain, points = map_with(), np.array([[100.0, -200.0], [400.0, 350.0], [0.0, 0.0]])
+    names = [error.name for error in terrain.shape_errors]
+    tan, distance_m, _ = terrain.horizons(points[:, None], MIDDLES_RAD)
+    slopes = terrain.shape_slopes_rad(points[:, None], MIDDLES_RAD)
+    bias, wave = slopes[names.index("bias_rad")], slopes[names.index("wave_2_sin_rad")]
+    far = distance_m > terrain.maps[0].post_m
+    height = bias * distance_m * (1.0 + tan**2)
+    assert far.mean() > 0.5 and height[far] == pytest.approx(np.full(far.sum(), 1.0 / terrain.crest_rad_per_m))
+    assert np.median(bias[2]) == pytest.approx(1.0)
+    assert wave == pytest.approx(bias * np.sin(2 * MIDDLES_RAD))
 
 
 def test_a_tilt_turns_the_skyline_exactly():

@@ -70,10 +70,10 @@ class Correlation:
         return np.asarray(self.sigma_m * np.sqrt(np.median(variances, axis=0)))
 
     def waves_rad(self, terrain: HeightMap) -> Array:
-        """Standard deviations [rad] of the horizon's waves, (WAVE_COUNT,), at the median distance of its crests."""
+        """Standard deviations [rad] of the horizon's waves, (WAVE_COUNT,), at its median crest."""
         positions = standing_positions(terrain)
-        tan, distance, _ = terrain.horizons(positions[:, None], _azimuths())
-        return _median_angle(tan, distance) * self.waves_m(_places(positions, distance))
+        distance = terrain.horizons(positions[:, None], _azimuths())[1]
+        return terrain.crest_rad_per_m * self.waves_m(_places(positions, distance))
 
 
 def map_of_rim(maps: Sequence[Raster], radius_m: float) -> Raster:
@@ -93,7 +93,7 @@ def measure_waves(terrain: HeightMap, measured: Correlation | None) -> tuple[Arr
     shown = {source: one for source, one in found.items() if one is not None}
     if not shown:
         return np.zeros(0), ""
-    least_rad = np.array(sigmas_of_waves(LEAST_WAVE * terrain.height_sigma_m * crest_angle_rad_per_m(terrain)))
+    least_rad = np.array(sigmas_of_waves(LEAST_WAVE * terrain.height_sigma_m * terrain.crest_rad_per_m))
     waves_rad = {source: one.waves_rad(terrain) for source, one in shown.items()}
     source = max(shown, key=lambda source: waves_rad[source][0])
     comment = (
@@ -184,17 +184,6 @@ def average_posts(one: Raster, step: int) -> Raster:
         one, heights_m=blocks.mean(axis=(1, 3), dtype=np.float64).astype(np.float32), dx_m=one.dx_m * step,
         dy_m=one.dy_m * step, x0_m=one.x0_m + middle * one.dx_m, y0_m=one.y0_m + middle * one.dy_m,
     )  # fmt: skip
-
-
-def crest_angle_rad_per_m(terrain: HeightMap) -> float:
-    """Elevation that a metre of a crest's height makes, cos^2 H / distance: the median over the search area."""
-    tan, distance, _ = terrain.horizons(standing_positions(terrain)[:, None], _azimuths())
-    return _median_angle(tan, distance)
-
-
-def _median_angle(tan: Array, distance_m: Array) -> float:
-    """Elevation [rad] that a metre of a crest's height makes, the median of horizons (p, a)."""
-    return float(np.median(1.0 / ((1.0 + tan**2) * distance_m)))
 
 
 def standing_positions(terrain: HeightMap) -> Array:

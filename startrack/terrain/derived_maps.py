@@ -29,8 +29,8 @@ class DeformedMap(ForwardingTerrain):
 
     In this order: the camera stands higher, sight lines bend more, tan of the horizon is stretched, the horizon rises
     by the bias and by waves (by name), as crests of a wrong height do, and the skyline is turned about a horizontal
-    axis. It has no further errors of its shape. Its bounds need the table of a map with the camera at the changed height and such lines; the horizon does
-    without.
+    axis. It has no further errors of its shape. Its bounds need the table of a map with the camera at the changed
+    height and such lines; the horizon does without.
     """
 
     whole: TracedMap

@@ -92,8 +92,8 @@ class HeightMap(TracedMap):
     def shape_slopes_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """From the traced horizon and the distance of its crest; see `Terrain`.
 
-        The bias and the waves are errors of the crests' heights, see `crest_share`. Of a tilt the change of elevation alone: that of azimuth moves the skyline by its slope times tan H times the
-        tilt, which is left out.
+        The bias and the waves are errors of the crests' heights, see `crest_share`. Of a tilt the change of elevation
+        alone: that of azimuth moves the skyline by its slope times tan H times the tilt, which is left out.
         """
         tan, distance, _ = self.horizons(points_m, azimuths_rad)
         flat = 1.0 / (1.0 + np.square(tan))  # cos^2 H

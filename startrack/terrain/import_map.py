@@ -16,7 +16,7 @@ from startrack.core.files import check_output, data_dir, printable, write_atomic
 from startrack.core.types import BadInput
 from startrack.frames import Site
 from startrack.terrain.array_map import SUFFIX, Grid, map_of_array, read_array
-from startrack.terrain.crest_errors import Correlation, crest_angle_rad_per_m, map_of_rim, measure_waves
+from startrack.terrain.crest_errors import Correlation, map_of_rim, measure_waves
 from startrack.terrain.earth_projection import geoid_at
 from startrack.terrain.height_map import HeightMap
 from startrack.terrain.horizon_table import AZIMUTH_BINS
@@ -196,7 +196,7 @@ def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, c
             notes = [f"{crop.source}: {note}" for crop in crops.values() for note in crop.notes]
             raise BadInput(cause.reason, "; ".join([str(cause), *notes])) from cause
         if errors.common_crest_sigma_m is not None:
-            angle_rad = errors.common_crest_sigma_m * crest_angle_rad_per_m(terrain)
+            angle_rad = errors.common_crest_sigma_m * terrain.crest_rad_per_m
             values["dem"]["horizon_sigma_deg"] = float(f"{np.degrees(angle_rad):.2g}")
         waves_rad, source = measure_waves(terrain, errors.correlation)
         if source:

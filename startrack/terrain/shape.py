@@ -97,7 +97,7 @@ RIM_TILT = Fact(
 BIAS = Fact(
     key="horizon_sigma_deg", errors=("bias_rad",), sigma=0.0, gross_sigma=float(np.radians(1.0)),
     meaning="error of the horizon that all azimuths share [deg]",
-    limits=Number(low=0.0, high=9.99, description="of an error that all azimuths share"),
+    limits=Number(low=0.0, high=9.99, description="of an error of height that all crests share, at the median crest"),
 )  # fmt: skip
 STRETCH = Fact(
     key="stretch_sigma_1", errors=("stretch_1",), sigma=0.0, gross_probability=0.005, gross_sigma=5e-3,

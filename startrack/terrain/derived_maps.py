@@ -47,7 +47,7 @@ class DeformedMap(ForwardingTerrain):
         self._bias_rad, self._stretch_1 = bias_rad, stretch_1
         self._waves_rad = {name: value for name, value in waves_rad.items() if value}
         risen_rad = abs(bias_rad) + np.abs(list(self._waves_rad.values())).sum()
-        self._most_risen_rad = float(risen_rad * whole.crest_share(0.0, 0.0)) if risen_rad else 0.0
+        self._most_risen_rad = float(risen_rad * whole.crest_share(np.zeros(1), np.zeros(1))[0]) if risen_rad else 0.0
         self._tilt_rad = float(np.hypot(vertical_east_rad, vertical_north_rad))
         self._R_turned_map = R_from_rotvec([vertical_north_rad, -vertical_east_rad, 0.0])
 

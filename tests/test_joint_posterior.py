@@ -193,6 +193,23 @@ def test_profiles_of_crests_that_may_stand_anywhere_are_level() -> None:
         assert np.ptp(level, axis=1).max() < 0.5
 
 
+@pytest.mark.parametrize("map_deg", [0.0, 0.05])
+def test_the_edges_of_stars_do_not_blur_the_light_beside_them(map_deg: float) -> None:
+    both, above = rows_of_both(np.random.default_rng(4))
+    is_star, edge, map_rad = both.extended_nats == 0.0, np.radians(0.03), np.radians(map_deg)
+    rows = replace(both, edge_sigma_rad=np.where(is_star, edge, both.edge_sigma_rad))
+    found = profiles_of(rows, above, np.full(SECTORS, map_rad))
+    z = np.linspace(-3.5, 3.5, 281)
+    weight = np.exp(-0.5 * z**2) / np.exp(-0.5 * z**2).sum()
+    for sector in range(0, SECTORS, 48):
+        for height in np.radians([-0.1, -0.04, 0.0, 0.04, 0.1]):
+            heights = height + map_rad * z
+            stars = direct_log(both.take(is_star), above[is_star], sector, np.add.outer(heights, edge * z).ravel())
+            light = direct_log(both.take(~is_star), above[~is_star], sector, heights)
+            plain = np.log((np.exp(stars.reshape(len(z), -1)) @ weight * np.exp(light)) @ weight)
+            assert log_at(found, sector, height) + found.free[sector] == pytest.approx(plain, abs=0.25)
+
+
 def test_profiles_end_with_the_window_where_the_error_of_the_map_is_wider() -> None:
     rows, above = rows_of_both(np.random.default_rng(4))
     found = profiles_of(rows, above, np.radians(np.linspace(0.0, 90.0, SECTORS)))

@@ -84,6 +84,12 @@ def cell_at(x, guide, s, height):
     return k
 
 
+@njit(cache=True, inline="always")
+def value_in(profiles, k, u):
+    """F at a part u of the way through cell k."""
+    return profiles.left[k] + u * (profiles.right[k] - profiles.left[k]) + u * (1.0 - u) * profiles.bend[k]
+
+
 @njit(cache=True)
 def log_at(profiles, s, height):
     """F - R of a sector at a height."""
@@ -91,8 +97,7 @@ def log_at(profiles, s, height):
         return -profiles.free[s]
     k = cell_at(profiles.x, profiles.guide, s, height)
     u = min(max((height - profiles.x[k]) / (profiles.x[k + 1] - profiles.x[k]), 0.0), 1.0)
-    value = profiles.left[k] + u * (profiles.right[k] - profiles.left[k]) + u * (1.0 - u) * profiles.bend[k]
-    return value - profiles.free[s]
+    return value_in(profiles, k, u) - profiles.free[s]
 
 
 @njit(cache=True)

@@ -16,7 +16,7 @@ import numpy as np
 
 from startrack.core.kernels import njit
 from startrack.core.types import SECTORS, Array, Evidence, Ints, sector_of
-from startrack.localization.profile_cells import HIGH_RAD, LOW_RAD, Profiles, cell_at, integrate_cells, log_at
+from startrack.localization.profile_cells import HIGH_RAD, LOW_RAD, Profiles, cell_at, integrate_cells, log_at, value_in
 from startrack.localization.sky_profiles import EDGE_SIGMAS, SkyProfiles
 
 ROW_NATS = 6.0  # most that one star counts: one in 400 is variable, misnamed or not in the catalogue
@@ -40,20 +40,26 @@ def profiles_of(
     order = star[np.argsort(sector_of(rows.azimuth_rad[star]) * 100.0 + above_rad[star])]
     sector = sector_of(rows.azimuth_rad[order])
     llr = np.clip(rows.llr[order], -ROW_NATS, ROW_NATS)
-    starts = np.searchsorted(sector, np.arange(SECTORS + 1))
-    knots = _sky_knots(rows, above_rad, np.flatnonzero(extended))
-    cells = _fill_cells(above_rad[order], llr, starts, *knots, *window_rad)
-    sigma = map_sigma_rad
-    if len(star) and rows.edge_sigma_rad[star].any():
-        count = np.maximum(np.bincount(sector, minlength=SECTORS), 1)
-        own = np.bincount(sector, weights=np.square(rows.edge_sigma_rad[order]), minlength=SECTORS) / count
-        sigma = np.sqrt(np.square(sigma) + own)
+    cells = _fill_cells(above_rad[order], llr, np.searchsorted(sector, np.arange(SECTORS + 1)), *window_rad)
+    low, step, cell, sky = _sky_knots(rows, above_rad, np.flatnonzero(extended))
+    count = np.maximum(np.bincount(sector, minlength=SECTORS), 1)
+    own = np.bincount(sector, weights=np.square(rows.edge_sigma_rad[order]), minlength=SECTORS) / count
+    beside_light = np.where(step > 0.0, np.sqrt(own), 0.0)  # the edges of stars, which the light does not share
     is_high = ~extended & (above_rad >= window_rad[1])
     above = np.bincount(
         sector_of(rows.azimuth_rad[is_high]), weights=np.clip(rows.llr[is_high], -ROW_NATS, ROW_NATS), minlength=SECTORS
     )
-    hard = _with_stars_above(cells, above)
-    return _with_stars_above(_average_over_map(hard, sigma, SOFT_BINS), above) if sigma.any() else hard
+    found = _average_cells(_with_stars_above(cells, above), beside_light, above)
+    if step.any():
+        found = _with_stars_above(_add_sky(found, low, step, cell, sky), above)
+    return _average_cells(found, np.sqrt(np.square(map_sigma_rad) + np.where(step > 0.0, 0.0, own)), above)
+
+
+def _average_cells(profiles: Profiles, sigma_rad: Array, above: Array) -> Profiles:
+    """The profiles averaged over a normal error (SECTORS,) of the skyline; `above` as in `_with_stars_above`."""
+    if not sigma_rad.any():
+        return profiles
+    return _with_stars_above(_average_over_error(profiles, sigma_rad, SOFT_BINS), above)
 
 
 def _with_stars_above(cells: Any, above: Any) -> Profiles:
@@ -96,10 +102,35 @@ def _cubic(values, at):
 
 
 @njit(cache=True)
-def _fill_cells(above, llr, starts, sky_low, sky_step, cell, sky_values, lowest, highest):
-    """Cells between the stars of a sector, and of equal width where the sky's light shows the skyline."""
-    sectors, knots = len(starts) - 1, sky_values.shape[1]
-    room = len(above) + 3 * sectors
+def _fill_cells(above, llr, starts, lowest, highest):
+    """Cells between the stars of a sector."""
+    sectors = len(starts) - 1
+    room = len(above) + 2 * sectors
+    first = np.zeros(sectors + 1, dtype=np.int64)
+    x, left = np.zeros(room), np.zeros(room)
+    n = 0
+    for s in range(sectors):
+        total = 0.0
+        for k in range(starts[s], starts[s + 1]):
+            total += llr[k]
+        x[n], left[n] = lowest, total
+        for k in range(starts[s], starts[s + 1]):
+            if above[k] > x[n]:
+                n += 1
+                x[n] = above[k]
+            total -= llr[k]
+            left[n] = total
+        x[n + 1] = highest
+        n += 2
+        first[s + 1] = n
+    left, level = left[:n].copy(), np.zeros(n)
+    return integrate_cells(first, x[:n].copy(), left, left.copy(), level, highest - lowest)
+
+
+@njit(cache=True)
+def _add_sky(profiles, sky_low, sky_step, cell, sky_values):
+    """The cells divided, in equal widths, where the sky's light shows the skyline, with the values of that light."""
+    sectors, knots, room = len(sky_low), sky_values.shape[1], len(profiles.x)
     for s in range(sectors):
         if sky_step[s] > 0.0:
             room += int((knots - 1) * sky_step[s] / cell[s]) + 3
@@ -107,44 +138,38 @@ def _fill_cells(above, llr, starts, sky_low, sky_step, cell, sky_values, lowest,
     x, left, right, bend = np.zeros(room), np.zeros(room), np.zeros(room), np.zeros(room)
     n = 0
     for s in range(sectors):
-        total = 0.0
-        for k in range(starts[s], starts[s + 1]):
-            total += llr[k]
-        k, end = starts[s], starts[s + 1]
-        sky_at, sky_end = highest, lowest
-        if sky_step[s] > 0.0:
-            sky_at = max(sky_low[s], lowest + cell[s])
-            sky_end = min(sky_low[s] + (knots - 1) * sky_step[s], highest - cell[s])
-        at = lowest
-        while at < highest:
-            x[n], left[n] = at, total
-            following = highest
-            if k < end:
-                following = min(following, above[k])
-            if sky_at <= sky_end:
-                following = min(following, sky_at)
-            right[n] = total
-            if sky_step[s] > 0.0:
-                a, b = (at - sky_low[s]) / sky_step[s], (following - sky_low[s]) / sky_step[s]
-                left[n] += _cubic(sky_values[s], a)
-                right[n] += _cubic(sky_values[s], b)
-                middle = total + _cubic(sky_values[s], 0.5 * (a + b))
+        begin, last = profiles.first[s], profiles.first[s + 1] - 1
+        sky_at = max(sky_low[s], profiles.x[begin] + cell[s])
+        sky_end = min(sky_low[s] + (knots - 1) * sky_step[s], profiles.x[last] - cell[s])
+        for k in range(begin, last):
+            low, width, at = profiles.x[k], profiles.x[k + 1] - profiles.x[k], profiles.x[k]
+            while at < profiles.x[k + 1]:
+                following = profiles.x[k + 1]
+                if sky_step[s] > 0.0 and sky_at <= sky_end:
+                    following = min(following, sky_at)
+                x[n] = at
+                u, v = (at - low) / width, (following - low) / width
+                left[n], right[n] = value_in(profiles, k, u), value_in(profiles, k, v)
+                middle = value_in(profiles, k, 0.5 * (u + v))
+                if sky_step[s] > 0.0:
+                    a, b = (at - sky_low[s]) / sky_step[s], (following - sky_low[s]) / sky_step[s]
+                    left[n] += _cubic(sky_values[s], a)
+                    right[n] += _cubic(sky_values[s], b)
+                    middle += _cubic(sky_values[s], 0.5 * (a + b))
                 bend[n] = 4.0 * (middle - 0.5 * (left[n] + right[n]))
-            while k < end and above[k] <= following:
-                total -= llr[k]
-                k += 1
-            if sky_at <= following:
-                sky_at += cell[s]
-            at = following
-            n += 1
-        x[n], left[n], right[n] = highest, 0.0, 0.0
+                if sky_at <= following:
+                    sky_at += cell[s]
+                at = following
+                n += 1
+        x[n] = profiles.x[last]
         n += 1
         first[s + 1] = n
-    return integrate_cells(first, x[:n].copy(), left[:n].copy(), right[:n].copy(), bend[:n].copy(), highest - lowest)
+    width = profiles.x[profiles.first[1] - 1] - profiles.x[0]
+    return integrate_cells(first, x[:n].copy(), left[:n].copy(), right[:n].copy(), bend[:n].copy(), width)
 
 
 @njit(cache=True)
-def _average_over_map(profiles, sigma, bins):
+def _average_over_error(profiles, sigma, bins):
     """The cells with exp F averaged over a normal error of the map's skyline (SECTORS,); far off it stays as it is."""
     weights, whole, cells = np.empty(len(bins) - 1), 0.0, np.zeros(len(bins), dtype=np.int64)
     for q in range(len(weights)):

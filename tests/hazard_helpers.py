@@ -119,11 +119,16 @@ def small_camera() -> Camera:
 
 
 @cache
-def rendered(ground: Ground | None = None, sky_v_mag_arcsec2: float | None = 22.0) -> Exposure:
-    """An image of 1024 px of a `ground` made of the thesis's crater, 6.5 km off its middle."""
+def rendered(
+    ground: Ground | None = None, sky_v_mag_arcsec2: float | None = 22.0, faintest_v_mag: float = 7.0
+) -> Exposure:
+    """An image of 1024 px of a `ground` made of the thesis's crater, 6.5 km off its middle.
+
+    The sky has no fainter stars: a catalogue for locating it must end there too.
+    """
     heading, pitch, roll = np.radians([30.0, 2.0, -3.0]).tolist()
     series = Series(
-        camera=small_camera(), terrain=terrain_named("shackleton-thesis"), catalog=catalog_to(7.0), seed=7,
+        camera=small_camera(), terrain=terrain_named("shackleton-thesis"), catalog=catalog_to(faintest_v_mag), seed=7,
         time_utc=datetime(2030, 6, 1, tzinfo=UTC), east_m=6000.0, north_m=-2500.0, heading_rad=heading,
         pitch_rad=pitch, roll_rad=roll, faint_v_mag=None, hot_pixels=20, sky_v_mag_arcsec2=sky_v_mag_arcsec2,
     )  # fmt: skip

@@ -10,6 +10,7 @@ import pytest
 
 from startrack.applications.tracking.filtered_positions import positions_at_rest
 from startrack.applications.tracking.frame_estimate import (
+    FIRST_WAVE,
     MIN_NOISE_SHARE,
     balanced_moments,
     clipped_noise,
@@ -115,10 +116,11 @@ def test_the_response_to_the_bias_is_that_to_raised_rows(ground):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(1, 4))
 def test_the_response_to_posts_is_that_to_a_map_with_other_heights(ground, seed):
-    """The 40 posts that move the position most, a metre each, all to the same side: 5 to 16 % less than stated."""
+    """The 40 posts that move the position most, a metre each, all to the same side: 8 to 15 % less than stated."""
     evidence = rays_at(ground, PLACE_M, np.random.default_rng(seed))
     here = estimate(evidence, ground)
-    strongest = np.argsort(-np.abs(here.by_post[0]))[:40]
+    effect = np.where(here.post < FIRST_WAVE, np.abs(here.by_post[0]), 0.0)
+    strongest = np.argsort(-effect)[:40]
     sides, changed = np.sign(here.by_post[0, strongest]), ground
     for post, side in zip(here.post[strongest].tolist(), sides.tolist(), strict=True):
         changed = raise_post(changed, post, -side)

@@ -97,14 +97,17 @@ class FrameModel:
         """(n, SECTORS) change of the log-likelihood with the skyline [1/rad] at points with `share` (n,) of the weight.
 
         The edge of a single star is a step: the change is taken over a part of the skyline's spread. Sectors count by
-        their probability to show the map's skyline.
+        their probability to show the map's skyline. The likeliest linear errors follow the skyline.
         """
-        shifts, _ = self.model.with_linear_errors(self.shifts(parameters))
+        linear, unraised = self.model.linear, self.shifts(parameters)
+        shifts, _ = self.model.with_linear_errors(unraised)
+        errors, _ = linear.fit(self.model.seen.moments.mean_rad - unraised - linear.expected_rad)
         spread = np.sqrt(share @ np.square(shifts - share @ shifts))
         step = np.maximum(STEP_SIGMAS * np.hypot(spread, self.model.around.map_sigma_rad), LEAST_STEP_RAD)
         all_clear = np.ones(SECTORS)
         higher, lower = (clear_logs(self.model.seen.profiles, shifts + sign * step, all_clear) for sign in (1.0, -1.0))
-        return np.asarray(self.clear * (higher - lower) / (2 * step))
+        slopes = self.clear * (higher - lower) / (2 * step)
+        return np.asarray(slopes - (slopes @ linear.rise_rad - errors @ linear.inverse) @ linear.gain)
 
     @cached_property
     def design(self) -> Array:

@@ -14,6 +14,7 @@ from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence
 from startrack.estimation.observations import Observations, Steps
 from startrack.estimation.trajectory import smooth
 from startrack.localization import ExactPosterior, LinearErrors
+from startrack.localization.linear_errors import list_seams
 from startrack.terrain import HeightMap, Terrain, load_terrain
 from startrack.terrain.shape import EXACT_WAVES, WAVES
 
@@ -31,8 +32,9 @@ def floor() -> HeightMap:
 def errors_of(rng: np.random.Generator, count: int = 3) -> LinearErrors:
     """Of a few waves, seen by sectors of different weights."""
     rise = np.column_stack([np.cos(m * MIDDLES_RAD) for m in range(1, count + 1)])
+    covariance = np.diag([1e-6, 4e-6, 9e-6][:count])
     return LinearErrors(
-        rise, np.zeros(count), np.diag([1e-6, 4e-6, 9e-6][:count]), rng.uniform(0.0, 2e5, SECTORS), count
+        rise, np.zeros(count), covariance, covariance, rng.uniform(0.0, 2e5, SECTORS), count, np.zeros((SECTORS, 0))
     )
 
 
@@ -41,7 +43,8 @@ def test_the_closed_form_is_the_integral():
     rng = np.random.default_rng(1)
     linear = errors_of(rng, 2)
     left = rng.normal(0.0, 3e-3, SECTORS)
-    errors, log = linear.fit(left[None])
+    (risen,), log = linear.fit(left[None])
+    errors = np.linalg.lstsq(linear.rise_rad, risen)[0][None]
 
     def log_likelihood(values: Array) -> Array:
         return -0.5 * np.square(left - values @ linear.rise_rad.T) @ linear.weight
@@ -53,6 +56,25 @@ def test_the_closed_form_is_the_integral():
     slow = np.logaddexp.reduce(log_likelihood(grid) + prior) + np.log(cell)
     assert log_likelihood(errors)[0] + log[0] == pytest.approx(slow, abs=1e-3)
     assert grid[np.argmax(log_likelihood(grid) + prior)] == pytest.approx(errors[0], abs=2e-5)
+
+
+def test_the_integral_over_seams_is_a_sum_over_their_ends_and_sizes():
+    """Two waves are eliminated as noise that sectors share; the size of each seam is summed over a fine grid."""
+    rng = np.random.default_rng(2)
+    waves, seams = errors_of(rng, 2), 1.4e-3 * list_seams()[:, rng.choice(1128, 20, replace=False)]
+    linear = replace(waves, seams_rad=seams)
+    left = rng.normal(0.0, 3e-3, SECTORS) + 2.0 * seams[:, 7]
+    (risen,), (log,) = linear.fit(left[None])
+    noise = np.diag(1.0 / waves.weight) + waves.rise_rad @ waves.covariance @ waves.rise_rad.T
+    sizes = np.linspace(-8.0, 8.0, 4001)
+    each = np.linalg.inv(noise)
+    off = left @ each @ left - 2 * np.multiply.outer(left @ each @ seams, sizes)
+    off += np.multiply.outer(np.einsum("sc,st,tc->c", seams, each, seams), np.square(sizes))
+    slow = np.logaddexp.reduce(-0.5 * (off + np.square(sizes)).ravel())
+    slow += np.log((sizes[1] - sizes[0]) / np.sqrt(2 * np.pi) / 20)
+    slow -= 0.5 * np.linalg.slogdet(noise * waves.weight)[1]
+    assert log - 0.5 * np.square(left - risen) @ waves.weight == pytest.approx(slow, abs=1e-3)
+    assert np.corrcoef(risen, seams[:, 7])[0, 1] > 0.9
 
 
 def rays_at(ground: Terrain, rng: np.random.Generator, count: int = 4000) -> Evidence:

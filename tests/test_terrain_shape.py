@@ -204,7 +204,7 @@ def test_errors_of_a_map_by_file(tmp_path: Path):
     assert np.degrees([vertical.sigma, vertical.gross_sigma]) == pytest.approx([0.0005, 0.02])
     assert [wave.wave for wave in waves] == [m for m in range(1, 9) for _ in range(2)]
     assert {wave.fact for wave in waves} == {"horizon_waves_sigma_deg"} and not any(wave.is_stated for wave in waves)
-    assert (waves[0].sigma, waves[0].gross_probability) == (0.0, 0.01)
+    assert (waves[0].sigma, waves[0].gross_probability) == (0.0, 0.03)
     assert (camera.fact, camera.sigma, camera.is_stated) == ("camera_height_sigma_m", 0.02, True)
     stated = {"height_sigma_m": 0.0, "horizon_sigma_deg": 0.0, "stretch_sigma_1": 0.0, "vertical_sigma_deg": 0.01}
     stated["horizon_waves_sigma_deg"] = [0.01 * k for k in range(8)]

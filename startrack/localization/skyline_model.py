@@ -187,8 +187,8 @@ class SkylineModel:
         linear = self.linear
         if not len(linear):
             return np.ascontiguousarray(shifts), np.zeros(len(shifts))
-        errors, integral = linear.fit(self.seen.moments.mean_rad - shifts - linear.expected_rad)
-        return np.ascontiguousarray(shifts + linear.expected_rad + errors @ linear.rise_rad.T), integral
+        rise_rad, integral = linear.fit(self.seen.moments.mean_rad - shifts - linear.expected_rad)
+        return np.ascontiguousarray(shifts + linear.expected_rad + rise_rad), integral
 
     def solve(self) -> tuple[Array, Array, Array]:
         """Parameters (2 + a,) by the linear model of the sectors, their covariance, and weights (SECTORS,)."""
@@ -196,7 +196,7 @@ class SkylineModel:
         design = np.vstack([self.around.slopes, self.slopes_rad, linear.rise_rad.T]).T
         prior = np.zeros((design.shape[1], design.shape[1]))
         prior[:k, :k] = np.diag(np.r_[np.full(2, self.terrain.reach_m**-2.0), np.ones(k - 2)])
-        prior[k:, k:] = linear.inverse
+        prior[k:, k:] = np.linalg.inv(linear.wide_covariance)
         moments = self.seen.moments
         left = moments._replace(mean_rad=moments.mean_rad - self._expected_rise)
         found = solve_linear(left, design, np.r_[np.zeros(k), linear.mean], prior)

@@ -46,9 +46,8 @@ def profiles_of(
     own = np.bincount(sector, weights=np.square(rows.edge_sigma_rad[order]), minlength=SECTORS) / count
     beside_light = np.where(step > 0.0, np.sqrt(own), 0.0)  # the edges of stars, which the light does not share
     is_high = ~extended & (above_rad >= window_rad[1])
-    above = np.bincount(
-        sector_of(rows.azimuth_rad[is_high]), weights=np.clip(rows.llr[is_high], -ROW_NATS, ROW_NATS), minlength=SECTORS
-    )
+    above = np.zeros(SECTORS)
+    np.add.at(above, sector_of(rows.azimuth_rad[is_high]), np.clip(rows.llr[is_high], -ROW_NATS, ROW_NATS))
     found = _average_cells(_with_stars_above(cells, above), beside_light, above)
     if step.any():
         found = _with_stars_above(_add_sky(found, low, step, cell, sky), above)

@@ -84,7 +84,8 @@ def _log_map(best: Hypothesis, parameters: Array) -> float:
     if not best.gross:
         return value
     if model.errors.are_waves(best.gross):
-        return value + float(model.with_linear_errors(model.shifts(parameters[None]))[1][0])
+        seams = model.linear.seams_rad.shape[1]  # a free skyline steps anywhere too
+        return value + float(model.with_linear_errors(model.shifts(parameters[None]))[1][0] + np.log(seams))
     own = model.errors.is_of_fact(best.gross)
     sigma, z = model.errors.sigma(best.gross)[own], parameters[2:] @ model.basis.shown[own].T
     return value - float(np.sum(0.5 * np.square(z / sigma) + np.log(sigma * np.sqrt(2 * np.pi) / WIDE_SHAPE)))

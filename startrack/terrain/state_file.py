@@ -76,7 +76,7 @@ def stateable_errors(text: str) -> list[StateableError]:
 
 def _waves_text() -> str:
     """What counts where a file leaves the waves out."""
-    gross = f"with probability {100 * WAVES.gross_probability:g} % {np.degrees(WAVES.gross_sigma):.4g}"
+    gross = f"with probability {100 * WAVES.gross_probability:g} % a seam of {np.degrees(WAVES.gross_sigma):.4g}"
     return f"{WAVE_PER_POST:g} of what {HEIGHT_KEY} makes of the horizon, and {gross}"
 
 

@@ -101,7 +101,7 @@ class FrameModel:
         """
         linear, unraised = self.model.linear, self.shifts(parameters)
         shifts, _ = self.model.with_linear_errors(unraised)
-        errors, _ = linear.fit(self.model.seen.moments.mean_rad - unraised - linear.expected_rad)
+        errors = (self.model.seen.moments.mean_rad - unraised - linear.expected_rad) @ linear.gain.T
         spread = np.sqrt(share @ np.square(shifts - share @ shifts))
         step = np.maximum(STEP_SIGMAS * np.hypot(spread, self.model.around.map_sigma_rad), LEAST_STEP_RAD)
         all_clear = np.ones(SECTORS)

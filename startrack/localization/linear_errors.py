@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from startrack.core.types import MIDDLES_RAD, SECTORS, Array
+from startrack.core.types import SECTORS, Array
 from startrack.localization.neighbourhood import SectorRows
 from startrack.localization.shared_errors import SharedErrors
 from startrack.terrain import WAVES

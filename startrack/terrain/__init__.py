@@ -12,7 +12,7 @@ from startrack.terrain.io import MAKERS, files_of_terrain, load_terrain, site_of
 from startrack.terrain.projection import EQUIRECTANGULAR, STEREOGRAPHIC, Projection
 from startrack.terrain.protocol import NO_POST, ExpectedCrests, ForwardingTerrain, Terrain
 from startrack.terrain.raster import Raster
-from startrack.terrain.shape import DIAMETER, WAVES, ShapeError, wave_slopes_rad
+from startrack.terrain.shape import DIAMETER, WAVES, ShapeError
 
 if TYPE_CHECKING:
     from startrack.terrain.array_map import Grid, map_of_array
@@ -29,7 +29,7 @@ __all__ = [
     "EarthProjection", "ExpectedCrests", "ForwardingTerrain", "Grid", "HeightMap", "Projection", "Raster", "ShapeError",
     "StateableError", "Terrain", "can_write_maps", "files_of_terrain", "import_maps", "is_geotiff", "load_terrain",
     "map_of_array", "read_map", "require_bounds", "require_horizons", "require_place", "require_site",
-    "require_terrain", "site_of_terrain", "state_errors", "stateable_errors", "terrain_from_dict", "wave_slopes_rad",
+    "require_terrain", "site_of_terrain", "state_errors", "stateable_errors", "terrain_from_dict",
     "write_bands", "write_map",
 ]  # fmt: skip
 _LAZY_MODULES = {  # of names that few programs use: imported at the first use

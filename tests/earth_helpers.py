@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -45,14 +46,14 @@ def in_projection(code: str, step_m: float, posts: int = 280) -> Raster:
 
 
 def march(
-    raster: Raster, point_m: np.ndarray, eye_m: float, azimuths: np.ndarray, coefficient: float, s: np.ndarray
+    maps: Sequence[Raster], point_m: np.ndarray, eye_m: float, azimuths: np.ndarray, coefficient: float, s: np.ndarray
 ) -> np.ndarray:
-    """tan of the horizon, its distance, and that of the map's end (3, n), from points at distances `s` along each ray.
+    """tan of the horizon, its distance, and that of the maps' end (3, n), from points at distances `s` along each ray.
 
-    The points are found by pyproj, in the frame of the Earth's centre.
+    The points are found by pyproj, in the frame of the Earth's centre. At each the first of the `maps` holds.
     """
     to_fixed = pyproj.Transformer.from_crs(4979, 4978, always_xy=True)
-    to_map = pyproj.Transformer.from_crs(4326, raster.projection.wkt or 4326, always_xy=True)
+    to_maps = [pyproj.Transformer.from_crs(4326, one.projection.wkt or 4326, always_xy=True) for one in maps]
     lat, lon = SITE.latitude_rad, SITE.longitude_rad
     origin = np.array(to_fixed.transform(np.degrees(lon), np.degrees(lat), SITE.height_m))
     axes = np.array([
@@ -66,9 +67,12 @@ def march(
         for _ in range(6):
             points = np.stack([east, north, up], axis=-1) @ axes + origin
             x, y, height = to_fixed.transform(*points.T, direction="INVERSE")
-            column, row = to_map.transform(x, y)
-            where = np.stack([(row - raster.y0_m) / raster.dy_m, (column - raster.x0_m) / raster.dx_m], axis=-1)
-            up = up + raster.sample(where) - height
+            ground = np.full(np.shape(east), np.nan)
+            for one, to_map in zip(maps, to_maps, strict=True):
+                column, row = to_map.transform(x, y)
+                where = np.stack([(row - one.y0_m) / one.dy_m, (column - one.x0_m) / one.dx_m], axis=-1)
+                ground = np.where(np.isnan(ground), one.sample(where), ground)
+            up = up + ground - height
         return up
 
     eye = up_of(point_m[:1], point_m[1:])[0] + eye_m

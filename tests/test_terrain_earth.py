@@ -53,7 +53,7 @@ def test_horizons_are_those_of_points_in_the_frame_of_the_earths_centre(raster, 
     terrain = on_earth(one, terrestrial_refraction_1=coefficient, search_radius_m=3000.0)
     azimuths, off = np.arange(0.01, 2 * np.pi, 0.4), []
     for point in np.random.default_rng(3).uniform(-2500, 2500, (4, 2)):
-        tan, away, end = march(one, point, 10.0, azimuths, coefficient, FINE_M)
+        tan, away, end = march([one], point, 10.0, azimuths, coefficient, FINE_M)
         inside = (away > 50.0) & (away < end - EDGE_M)
         off.append((np.arctan(terrain.horizons(point, azimuths)[0]) - np.arctan(tan))[inside])
     worst = np.degrees(np.concatenate(off))
@@ -79,7 +79,7 @@ def test_mountains_100_km_away_stand_as_high_as_geodesy_says(code):
         y0_m=y + posts // 2 * step * per_y, dx_m=step * per_x, dy_m=-step * per_y, source=code,
     )  # fmt: skip
     azimuths, s = np.arange(0.1, 2 * np.pi, 0.7), np.arange(50.0, 115_000.0, 25.0)
-    tan, away_m, _ = march(one, np.array([3000.0, -2000.0]), 10.0, azimuths, 0.13, s)
+    tan, away_m, _ = march([one], np.array([3000.0, -2000.0]), 10.0, azimuths, 0.13, s)
     found, distance, _ = on_earth(one).horizons(np.array([3000.0, -2000.0]), azimuths)
     assert away_m.min() > 65_000.0
     assert distance == pytest.approx(away_m, abs=100.0)

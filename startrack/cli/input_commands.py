@@ -213,7 +213,8 @@ COMMANDS = (
                             "the Moon the highest of the maps)", number,
                         ),
                         flag("--geoid GRID", "of PROJ, above which the maps count heights: a name that it finds, as "
-                             "us_nga_egm96_15.tif, or a file"),
+                             "us_nga_egm96_15.tif, or a file; or one for each map, `ellipsoid` where heights are above "
+                             "it", nargs="+"),
                     ),
                     "output": (
                         flag("-o --output NAME.toml", "the terrain file", required=True), flags.OVERWRITE, flags.JSON,

@@ -169,6 +169,9 @@ def _lacking(group: Any, name: str) -> str:
     return text
 
 
+ELLIPSOID = "ellipsoid"  # in place of a grid of the geoid: heights are above the ellipsoid
+
+
 class Geoid(NamedTuple):
     """The geoid above the ellipsoid: its height at a site, and how it rises there to the east and to the north."""
 

@@ -8,8 +8,9 @@ the origin, and some metres 100 km away.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,16 +72,37 @@ def heights_above_sphere(raster: Raster, site: Site) -> NDArray[np.float32]:
     return np.asarray(raster.heights_m + above, dtype=np.float32)
 
 
-def above_ellipsoid(raster: Raster, site: Site, geoid_m: float, slope_arcsec: Sequence[float] | None) -> Raster:
+def above_ellipsoid(raster: Raster, site: Site, geoid_m: float, slope_arcsec: Sequence[float]) -> Raster:
     """The map with heights above the ellipsoid, of one with heights above a geoid that stands `geoid_m` at the site.
 
-    slope_arcsec: how the geoid rises there above the ellipsoid to the east and to the north; None: it does not.
+    slope_arcsec: how the geoid rises there above the ellipsoid to the east and to the north.
     """
-    if not geoid_m and slope_arcsec is None:
+    if not (geoid_m or any(slope_arcsec)):
         return raster
-    slope = np.tan(np.radians(np.array(slope_arcsec or (0.0, 0.0)) / 3600.0))
+    slope = np.tan(np.radians(np.array(slope_arcsec) / 3600.0))
     raised = _smooth_over_posts(raster, site, lambda points: geoid_m + points[..., :2] @ slope)
     return replace(raster, heights_m=np.asarray(raster.heights_m + raised, dtype=np.float32))
+
+
+def maps_above_ellipsoid(maps: Sequence[Raster], dem: Mapping[str, Any], site: Site) -> tuple[Raster, ...]:
+    """The `maps` with heights above the ellipsoid, by what the table `dem` of a terrain file states of their geoid.
+
+    Raises BadInput bad_terrain where it states it of another number of maps.
+    """
+    stated = (_of_each_map(dem, "geoid_m", 0.0, maps), _of_each_map(dem, "geoid_slope_arcsec", (0.0, 0.0), maps))
+    return tuple(above_ellipsoid(one, site, *geoid) for one, *geoid in zip(maps, *stated, strict=True))
+
+
+def _of_each_map(dem: Mapping[str, Any], key: str, absent: Any, maps: Sequence[Raster]) -> Sequence[Any]:
+    """The value of a `key` for each of the `maps`: one for all, or a list of them."""
+    value = dem.get(key, absent)
+    if np.ndim(value) == np.ndim(absent):
+        return [value] * len(maps)
+    if len(value) != len(maps):
+        raise BadInput(
+            "bad_terrain", f"dem.{key} has {len(value)} entries for {len(maps)} maps: give one, or one for each"
+        )
+    return tuple(value)
 
 
 def check_height(site: Site, maps: Sequence[Raster]) -> None:

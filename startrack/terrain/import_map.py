@@ -17,16 +17,17 @@ from startrack.core.types import BadInput
 from startrack.frames import Site
 from startrack.terrain.array_map import SUFFIX, Grid, map_of_array, read_array
 from startrack.terrain.crest_errors import Correlation, map_of_rim, measure_waves
-from startrack.terrain.earth_projection import geoid_at
+from startrack.terrain.earth_projection import ELLIPSOID, Geoid, geoid_at
+from startrack.terrain.ellipsoid_fit import maps_above_ellipsoid
 from startrack.terrain.height_map import HeightMap
 from startrack.terrain.horizon_table import AZIMUTH_BINS
-from startrack.terrain.io import terrain_from_dict
-from startrack.terrain.map_comparison import compare_with_finest
+from startrack.terrain.io import site_of_keys, terrain_from_dict
+from startrack.terrain.map_comparison import compare_with_finest, offsets_of_maps_m
 from startrack.terrain.map_error import carried_spacing, error_between_posts_m, find_product
 from startrack.terrain.map_reading import read_map, require_origin
 from startrack.terrain.map_writing import write_map
 from startrack.terrain.raster import Raster
-from startrack.terrain.shape import CAMERA_ERROR, REFRACTION, REFRACTION_1, STRETCH, WAVES, vertical_fact
+from startrack.terrain.shape import CAMERA_ERROR, OFFSETS, REFRACTION, REFRACTION_1, STRETCH, WAVES, vertical_fact
 
 MAX_POST_RADII = 0.2  # of the search area: with posts further apart its shape is not resolved
 MEASURED_PER_ESTIMATE = 1.6  # of the 240 m map on the ground of site01-10m.tif: 5.4 m measured, 3.3 m by its roughness
@@ -81,7 +82,7 @@ def import_maps(
     maps: Sequence[str | Path], output: str | Path, *, latitude_rad: float, longitude_rad: float,
     half_m: Sequence[float], radius_m: float, scale: Sequence[float] = (), offset_m: Sequence[float] = (),
     height_sigma_m: float | None = None, compare: Sequence[str | Path] = (), camera_height_m: float = 1.5,
-    highest_beyond_m: float | None = None, geoid_grid: str | None = None, grid: Grid | None = None,
+    highest_beyond_m: float | None = None, geoid_grid: str | Sequence[str] | None = None, grid: Grid | None = None,
     unusual_heights: bool = False, overwrite: bool = False,
 ) -> ImportedTerrain:  # fmt: skip
     """Write the terrain file `output` and, beside it, a crop of each map: NAME-1.tif, the finest, and so on.
@@ -92,8 +93,8 @@ def import_maps(
     `maps`, of the files `compare`, or a shipped one; else it is estimated from the map's roughness, with the published
     error of products that are known. camera_height_m: above the ground [m]. highest_beyond_m: ground off the maps is no
     higher; None: as `io.KEYS` says. geoid_grid: of PROJ, from which heights of the maps count (None: their geoid is not
-    known). grid: where the posts of arrays (`.npy`) stand. unusual_heights: see `read_map`. overwrite: replace existing
-    files.
+    known), or one for each map, ELLIPSOID where they are above the ellipsoid. grid: where the posts of arrays (`.npy`)
+    stand. unusual_heights: see `read_map`. overwrite: replace existing files.
 
     Raises BadInput bad_terrain, BadOutput of `output`; nothing is then written.
     """
@@ -150,26 +151,54 @@ def import_maps(
         values["origin"]["height_m"] = float(np.nan_to_num(np.round(crops[0].sample(at))))
         values["air"] = {"terrestrial_refraction": REFRACTION_1, REFRACTION.key: REFRACTION.sigma}
     if geoid_grid is not None:
-        values["dem"] |= _geoid_values(geoid_grid, values)
+        values["dem"] |= _geoid_values([geoid_grid] if isinstance(geoid_grid, str) else geoid_grid, values, len(crops))
+    seams = _state_offsets(values, crops)
     terrain = _write_terrain(output, values, errors, dict(zip(files, crops, strict=True)))
     shifts = [(one.source, one.projection.transformation_warning) for one in crops]
     warnings = [f"{one.source}: {note}" for one in crops for note in one.notes]
-    warnings += [*errors.warnings, *spacing_warnings(crops, radius_m), *(f"{a}: {b}" for a, b in shifts if b)]
+    warnings += [*errors.warnings, *spacing_warnings(crops, radius_m), *(f"{a}: {b}" for a, b in shifts if b), *seams]
     warnings += end_warnings(terrain)
     warnings += smoothness_warnings(rim, errors.height_sigma_m)
     return ImportedTerrain(path=output, errors=errors, warnings=warnings)
 
 
-def _geoid_values(grid: str, values: dict[str, Any]) -> dict[str, Any]:
-    """The keys of [dem] that state the geoid at the origin of a terrain file's `values`, by a `grid` of PROJ."""
+def _geoid_values(grids: Sequence[str], values: dict[str, Any], maps: int) -> dict[str, Any]:
+    """The keys of [dem] that state the geoid at the origin of a terrain file's `values`, by `grids` of PROJ."""
     if values["body"] != "earth":
         raise BadInput("bad_terrain", "heights above a geoid are those of maps of the Earth")
+    if len(grids) not in (1, maps):
+        raise BadInput("bad_terrain", f"{len(grids)} grids of the geoid for {maps} maps: give one, or one for each")
     at = values["origin"]
     latitude, longitude = (float(np.radians(at[name])) for name in ("latitude_deg", "longitude_deg"))
-    geoid = geoid_at(grid, Site("earth", latitude, longitude, at["height_m"]))
+    site = Site("earth", latitude, longitude, at["height_m"])
+    geoids = [Geoid(0.0, (0.0, 0.0)) if grid == ELLIPSOID else geoid_at(grid, site) for grid in grids]
+    heights = [round(one.height_m, 3) for one in geoids]
+    slopes = [[round(slope, 3) for slope in one.slope_arcsec] for one in geoids]
+    one_for_all = len(grids) == 1
     return {
-        "geoid_m": round(geoid.height_m, 3), "geoid_slope_arcsec": [round(slope, 3) for slope in geoid.slope_arcsec],
+        "geoid_m": heights[0] if one_for_all else heights, "geoid_slope_arcsec": slopes[0] if one_for_all else slopes,
     }  # fmt: skip
+
+
+def _state_offsets(values: dict[str, Any], crops: Sequence[Raster]) -> list[str]:
+    """State in a terrain file's `values` the offset of its maps where it is larger than usual; a warning of each map.
+
+    The file's own statement of the geoid counts.
+    """
+    on_earth = values["body"] == "earth"
+    offsets_m = offsets_of_maps_m(
+        maps_above_ellipsoid(crops, values["dem"], site_of_keys(values)) if on_earth else crops
+    )
+    if not offsets_m or max(map(abs, offsets_m)) <= OFFSETS.sigma:
+        return []
+    values["dem"][OFFSETS.key] = float(f"{max(map(abs, offsets_m)):.2g}")
+    return [
+        f"{one.source} stands {length_text(abs(off_m))} {'above' if off_m > 0 else 'below'} {crops[0].source} where "
+        f"both are (median): is one above the ellipsoid, the other above the geoid? State it (--geoid, --offset); now "
+        f"{OFFSETS.key} = {values['dem'][OFFSETS.key]:g} covers it"
+        for one, off_m in zip(crops[1:], offsets_m, strict=True)
+        if abs(off_m) > OFFSETS.sigma
+    ]
 
 
 def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, crops: dict[Path, Raster]) -> HeightMap:

@@ -24,6 +24,7 @@ from startrack.terrain.protocol import Terrain
 
 FILE = Text(max_chars=4000, is_path=True)
 HEIGHT = Number(low=-shape.MAX_LENGTH_M, high=shape.MAX_LENGTH_M)
+SLOPES = List(each=Number(low=-600.0, high=600.0), count=2)
 KEYS = Table(
     keys={
         "format": Choice(values=(1,), default=1),
@@ -58,10 +59,12 @@ KEYS = Table(
                                    description="height of value 0, in place of what the files state"),
                 "unusual_heights": Flag(description="the heights are right, though flatter, higher or lower than the "
                                         "body's ground; no value is taken for a void that the file does not state"),
-                "geoid_m": replace(HEIGHT, description="height of the geoid above the ellipsoid at the origin, if "
-                                   "heights are above the geoid; earth only"),
-                "geoid_slope_arcsec": List(each=Number(low=-600.0, high=600.0), count=2, description="rise of the "
-                                           "geoid above the ellipsoid to the east and to the north; earth only"),
+                "geoid_m": Either(kinds=(HEIGHT, List(each=HEIGHT, least=1, most=100)), description="height of the "
+                                  "geoid above the ellipsoid at the origin, if heights are above the geoid; a list: "
+                                  "of each map, 0 where they are above the ellipsoid; earth only"),
+                "geoid_slope_arcsec": Either(kinds=(SLOPES, List(each=SLOPES, least=1, most=100)), description="rise "
+                                             "of the geoid above the ellipsoid to the east and to the north; a list of "
+                                             "pairs: of each map; earth only"),
                 "highest_beyond_m": replace(HEIGHT, description="ground off the maps is no higher; if absent 8850 on "
                                             "the earth, and on the moon the highest of the maps"),
             },
@@ -128,10 +131,11 @@ def site_of_terrain(name_or_path: str | Path) -> Site:
     Raises BadInput bad_terrain.
     """
     path = resolve_named(name_or_path, "terrain", "bad_terrain")
-    return _site_of_keys(read_keys(read_text(path, "bad_terrain")))
+    return site_of_keys(read_keys(read_text(path, "bad_terrain")))
 
 
-def _site_of_keys(keys: dict[str, Any]) -> Site:
+def site_of_keys(keys: dict[str, Any]) -> Site:
+    """The site that the checked `keys` of a terrain file state."""
     origin = keys["origin"]
     site = Site(
         body=keys["body"],
@@ -185,7 +189,7 @@ def terrain_from_dict(values: dict[str, Any], default_name: str = "terrain", fol
     Raises BadInput bad_terrain with the key that is wrong.
     """
     keys = KEYS.read(values, "bad_terrain")
-    site = _site_of_keys(keys)
+    site = site_of_keys(keys)
     only_earth = [key for key in ("geoid_m", "geoid_slope_arcsec") if key in keys.get("dem", {})]
     if site.body != "earth" and only_earth:
         raise BadInput("bad_terrain", f"{only_earth[0]} is for the Earth, and the body is the {site.body.title()}")
@@ -251,11 +255,11 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
     require_origin(maps, *near)
     on_earth = {}
     if site.body == "earth":
-        from startrack.terrain.ellipsoid_fit import above_ellipsoid, check_height
+        from startrack.terrain.ellipsoid_fit import check_height, maps_above_ellipsoid
 
         check_height(site, maps)
         air = keys.get("air", {})
-        maps = tuple(above_ellipsoid(one, site, dem.get("geoid_m", 0.0), dem.get("geoid_slope_arcsec")) for one in maps)
+        maps = maps_above_ellipsoid(maps, dem, site)
         on_earth = {
             "terrestrial_refraction_1": air.get("terrestrial_refraction", shape.REFRACTION_1),
             "terrestrial_refraction_sigma_1": air.get(shape.REFRACTION.key),

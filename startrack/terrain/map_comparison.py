@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -26,6 +26,7 @@ from startrack.terrain.raster import Raster
 
 FINER = 2.0  # a finer map has at least so many posts to one of the map
 MIN_POSTS_ACROSS = 20.0  # of the map, in the overlap
+LEAST_POSTS = 9  # that two maps share, to compare their levels
 SAMPLES_ACROSS = 400  # posts of the finer map at which heights are compared
 SMALLER = 0.8  # from one size of the compared square to the next, where maps have holes or edges
 OTHER_GROUND = 0.5  # s.d. of the differences, relative to that of the heights: above it the maps show other ground
@@ -88,24 +89,46 @@ def compare_with_finest(height_map: Raster, others: Iterable[Raster]) -> MapComp
     return None
 
 
-def compare_maps(height_map: Raster, finer: Raster) -> MapComparison | None:
-    """Differences of a map and a finer one; None where the square that both cover is too small."""
+def heights_of_both(height_map: Raster, finer: Raster) -> tuple[Array, Array, Array]:
+    """Heights (n,) of a map and (n,) of a finer one at posts of the latter that both know, and these posts.
+
+    Row and column (n, 2) of posts that are spread over the finer map.
+    """
     lines = [np.arange(0, n, max(n // SAMPLES_ACROSS, 1), dtype=np.float64) for n in finer.heights_m.shape]
-    at = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)  # rows and columns of posts spread over the map
+    at = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
     lat, lon = finer.projection.latlon_from_xy(*finer.xy(at))
     where = height_map.row_column(lat, lon)
     fine_m, coarse_m = finer.sample(at), height_map.sample(where)
     both = np.isfinite(fine_m) & np.isfinite(coarse_m)
     both &= np.abs(height_map.projection.latlon_from_xy(*height_map.xy(where))[0] - lat) < SAME_RAD
-    pair = _terrains_of(height_map, finer, at[both]) if both.any() else None
+    return coarse_m[both], fine_m[both], at[both]
+
+
+def offsets_of_maps_m(maps: Sequence[Raster]) -> list[float]:
+    """By how much each further one of the `maps`, finest first, stands above the first one that it overlaps [m].
+
+    The median over the ground that both cover; 0 where none is.
+    """
+    found = []
+    for k, one in enumerate(maps[1:], 1):
+        pairs = (heights_of_both(one, finer) for finer in maps[:k])
+        off = next((coarse_m - fine_m for coarse_m, fine_m, _ in pairs if len(fine_m) >= LEAST_POSTS), np.zeros(1))
+        found.append(float(np.median(off)))
+    return found
+
+
+def compare_maps(height_map: Raster, finer: Raster) -> MapComparison | None:
+    """Differences of a map and a finer one; None where the square that both cover is too small."""
+    coarse_m, fine_m, at = heights_of_both(height_map, finer)
+    pair = _terrains_of(height_map, finer, at) if len(at) else None
     if pair is None:
         return None
-    off = (coarse_m - fine_m)[both]
+    off = coarse_m - fine_m
     radius_m = pair[0].search_radius_m
     errors = measure_crest_errors(*pair, spread_positions(radius_m), CREST_POSTS * height_map.post_m, radius_m)
     return MapComparison(
         finer=finer.source, finer_post_m=finer.post_m, across_m=2 * radius_m,
-        height_bias_m=float(off.mean()), height_sigma_m=float(off.std()), heights_sigma_m=float(fine_m[both].std()),
+        height_bias_m=float(off.mean()), height_sigma_m=float(off.std()), heights_sigma_m=float(fine_m.std()),
         **_crest_errors(errors, height_map.post_m),
     )  # fmt: skip
 

@@ -35,7 +35,7 @@ KEYS = {
     "heading_deg pitch_deg roll_body_deg sigma_heading_deg sigma_pitch_deg sigma_roll_body_deg",
     "middle": "x_px y_px ra_deg dec_deg sigma_deg scale_arcsec_per_px rotation_deg",
     "stars": "detected identified unexplained predicted_visible rms_px false_alarm_probability",
-    "evidence": "blocked damage",
+    "evidence": "blocked off_map damage",
     "sky": "brightness_mag_arcsec2 unused",
     "clock": "offset_s sigma_s",
     "timing_ms": "read detect identify attitude evidence locate",

@@ -150,6 +150,8 @@ def _site_of(terrain: Terrain) -> Site:
 
 def _view_facts(terrain: Terrain, position: tuple[float, float]) -> dict[str, Any]:
     """Ground and horizon at a position (east, north) [m]. Raises BadInput outside the terrain."""
+    from startrack.output import ranges_deg, sectors_off_map
+
     require_place(terrain, *position)
     point = np.array([position])
     ground = float(terrain.ground_m(point)[0])
@@ -159,6 +161,7 @@ def _view_facts(terrain: Terrain, position: tuple[float, float]) -> dict[str, An
         "east_m": position[0], "north_m": position[1], "ground_m": round(ground, 2),
         "place_latitude_deg": round(float(np.degrees(lat)), 6), "place_longitude_deg": round(float(np.degrees(lon)), 6),
         "horizon_min_deg": round(float(horizon.min()), 3), "horizon_max_deg": round(float(horizon.max()), 3),
+        "horizon_off_map_deg": ranges_deg(sectors_off_map(terrain, np.array(position))),
     }  # fmt: skip
 
 
@@ -208,6 +211,13 @@ def _lines_of(facts: dict[str, Any]) -> Iterator[str]:
             f"ground at {facts['ground_m']:g} m, "
             f"horizon {facts['horizon_min_deg']:g} to {facts['horizon_max_deg']:g} degrees"
         )
+        if facts["horizon_off_map_deg"]:
+            from startrack.output import ranges_text
+
+            yield (
+                f"  off map      azimuths {ranges_text(facts['horizon_off_map_deg'])}: the maps end, and ground beyond "
+                "could stand above this horizon"
+            )
     for file in facts.get("files", ()):
         yield f"  written   {file}"
 

@@ -13,11 +13,12 @@ from startrack.frames import format_utc
 from startrack.output.quantities_pose import ATTITUDE_QUANTITIES, MIDDLE_QUANTITIES, POSITION_QUANTITIES
 from startrack.output.quantity import Listed, Quantity, Show, list_schema, object_schema, show_everywhere
 from startrack.output.values import (
-    blocked_deg,
     bodies_record,
     chance_text,
     file_or_name,
+    off_map,
     predicted_visible,
+    ranges_deg,
     ranges_text,
 )
 
@@ -59,12 +60,18 @@ LIGHT_QUANTITIES: tuple[Quantity, ...] = (
       "list of `name`, `v_mag`, `x_px`, `y_px`: planets, Sun, Moon and Earth in the frame, at their predicted places; "
       "without a site those that have a source there, the Moon as from the middle of the Earth (up to 1 degree off), "
       "without a time none", list_schema(BODY), before=[]),
-    Q("evidence.blocked", "deg", Positioned, blocked_deg,
+    Q("evidence.blocked", "deg", Positioned, lambda v: ranges_deg(v.fix.blocked),
       "list of [from, to]: azimuths in which the skyline is more likely not the map's: hidden by something on no map, "
       "or below it; across north `to` is the smaller", list_schema(list_schema("number", count=2)), before=[],
       optional=True,
       shown=(Show("text", "evidence", lambda a: f"; blocked {ranges_text(a)}" if a else ""),
              Show("page", "Blocked azimuths", ranges_text))),
+    Q("evidence.off_map", "deg", Positioned, lambda v: ranges_deg(off_map(v)),
+      "list of [from, to]: azimuths in which the maps end, and ground beyond could stand above their skyline at the "
+      "position; no evidence is taken below that", list_schema(list_schema("number", count=2)), before=[],
+      optional=True,
+      shown=(Show("text", "evidence", lambda a: f"; the maps end {ranges_text(a)}" if a else ""),
+             Show("page", "Maps end", ranges_text))),
     Q("evidence.damage", "", Inputs, lambda v: None if v.damage is None else v.damage.cause,
       "what processing did to the pixels, where the evidence is measured on the frame itself; null: nothing shows",
       "text", nullable=True, optional=True),

@@ -13,7 +13,7 @@ from startrack.catalog import star_names
 from startrack.chain import Inputs, Measured, Oriented
 from startrack.core.ecsv import Column, ecsv_text
 from startrack.core.table_text import column_lines
-from startrack.core.types import Array, Ints, MeasuredSkyline
+from startrack.core.types import Array, Bools, Ints, MeasuredSkyline
 from startrack.evidence import SEEN_LLR
 from startrack.output.quantity import Quantity
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 IDENTIFIED = "identified", "predicted"  # without a terrain
 STAR_STATUSES = ("seen", "hidden", "uncertain", "unusable")
 FAINTER_THAN_FAINTEST_MATCH_MAG = 0.5
+OFF_MAP = "whether the maps end there, and ground beyond could stand above their skyline"
 LEAST_HALF_RAD, MOST_HALF_RAD = np.radians(0.02), np.radians(5.0)
 
 
@@ -111,8 +112,11 @@ def names_of(hips: Ints) -> list[str]:
     return [names.get(hip, "") for hip in hips.tolist()]
 
 
-def skyline_table_text(skyline: MeasuredSkyline) -> str:
-    """The table of a `skyline` as ECSV, from north through east; empty where the elevation is not known."""
+def skyline_table_text(skyline: MeasuredSkyline, off_map: Bools | None = None) -> str:
+    """The table of a `skyline` as ECSV, from north through east; empty where the elevation is not known.
+
+    `off_map` (n,): beside a map, where ground off it could stand above its skyline.
+    """
     azimuth, elevation, sigma = skyline_texts_deg(skyline)
     clouds = Column("cloud_probability", cloud_texts(skyline), description="that the edge is a cloud's")
     return ecsv_text([
@@ -121,6 +125,7 @@ def skyline_table_text(skyline: MeasuredSkyline) -> str:
         Column("sigma_deg", sigma, unit="deg", description="standard deviation of the elevation"),
         Column("source", skyline.source, "string", description="stars, sky light, both, varies"),
         *([clouds] if skyline.cloud_probability.any() else ()),
+        *(() if off_map is None else (Column("off_map", off_map, "bool", description=OFF_MAP),)),
     ])  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from startrack.chain import STAGES, Detected, Identified, Located, Measured, Outcome, Refused, last_value
+from startrack.chain import STAGES, Detected, Identified, Located, Measured, Outcome, Positioned, Refused, last_value
 from startrack.core.errors import Reason, length_text
 from startrack.core.files import printable
 from startrack.core.types import MIDDLES_RAD, Array, Blocked
@@ -17,7 +17,7 @@ from startrack.frames import rays_from_azel
 from startrack.localization import duration
 from startrack.output.quantities import QUANTITIES
 from startrack.output.record import image_name, stage_values
-from startrack.output.values import DOMINANT, Angle, At
+from startrack.output.values import DOMINANT, Angle, At, off_map
 
 if TYPE_CHECKING:
     from startrack.camera import Camera
@@ -118,6 +118,8 @@ def explain(outcome: Outcome) -> list[str]:
 
 def _needs_of(outcome: Outcome) -> Iterator[str]:
     value, reason = last_value(outcome), outcome.reason
+    if isinstance(outcome, Positioned):
+        yield from _wider_map(outcome)
     if isinstance(outcome, Located):
         yield from _needs_of_located(outcome)
     elif reason is Reason.INCONSISTENT_EVIDENCE and isinstance(value, Measured):
@@ -165,6 +167,15 @@ def _needs_of_located(located: Located) -> Iterator[str]:
     if not by_map:
         yield from _longer_exposure(located)
     yield from _more_skyline(located)
+
+
+def _wider_map(positioned: Positioned) -> Iterator[str]:
+    """The azimuths in which the maps end before the skyline may."""
+    if sectors := off_map(positioned):
+        yield (
+            f"a wider map: at azimuths {sectors.text} the maps end, and ground beyond could stand above their skyline; "
+            "where that is lower, state it (dem.highest_beyond_m)"
+        )
 
 
 def _finer_map(located: Located) -> Iterator[str]:

@@ -13,7 +13,7 @@ from startrack.camera import Camera
 from startrack.chain import Located, Measured, Oriented, Positioned
 from startrack.core.files import is_path
 from startrack.core.statistics import error_ellipse
-from startrack.core.types import Array, Fix
+from startrack.core.types import MIDDLES_RAD, Array, Blocked, Fix
 from startrack.frames import R_from_rotvec, heading_pitch_roll_from_R_body_enu, latlon_from_enu
 from startrack.terrain import Terrain
 
@@ -194,9 +194,19 @@ def exact_lens_text(included: bool) -> str:
     return "" if included else ", the lens taken as exact"
 
 
-def blocked_deg(value: Positioned) -> list[list[float]]:
-    """Ranges [from, to] of azimuth [deg] in which something on no map more likely blocks the view than not."""
-    ranges = [] if value.fix.blocked is None else value.fix.blocked.ranges_rad
+def off_map(value: Positioned) -> Blocked:
+    """The azimuths in which ground off the maps could stand above their skyline at the position found."""
+    return sectors_off_map(value.terrain, value.position_at_time_m)
+
+
+def sectors_off_map(terrain: Terrain, position_m: Array) -> Blocked:
+    """The azimuths in which ground off the maps of a `terrain` could stand above their skyline seen from `position_m` (2,)."""
+    return Blocked(np.where(terrain.ends_at(position_m, MIDDLES_RAD), 1.0, 0.0))
+
+
+def ranges_deg(sectors: Blocked | None) -> list[list[float]]:
+    """Ranges [from, to] of azimuth [deg] of the `sectors`; none of None."""
+    ranges = [] if sectors is None else sectors.ranges_rad
     return [[round(float(edge), 6) for edge in np.degrees(one)] for one in ranges]
 
 
@@ -209,7 +219,7 @@ def dominant_fact(at: At) -> str | None:
 
 
 def ranges_text(ranges: list[list[float]]) -> str:
-    """Ranges of azimuth [deg] in words; empty where there are none."""
+    """The `ranges` of azimuth [deg] in words; empty where there are none."""
     return ", ".join(f"{start:.0f}° to {end:.0f}°" for start, end in ranges)
 
 

@@ -20,6 +20,7 @@ from startrack.output.picture.canvas import png_bytes
 from startrack.output.picture.panorama import located_picture
 from startrack.output.record import record_of
 from startrack.output.tables import skyline_table_text, star_table_text
+from startrack.output.values import off_map
 from startrack.output.wcs import matches_bytes, wcs_bytes
 
 ANNOTATED = ".annotated.png"
@@ -109,7 +110,7 @@ def _write_companions(outcome: Outcome, path: Path, *, plots: bool, catalog_tabl
         has_image = plots and value.exposure.pixels_adu.size > 1  # not of a skyline's file
         files = [pool.submit(write_annotated, companion(path, ANNOTATED), outcome)] if has_image else []
         if isinstance(value, Positioned) and value.skyline is not None:
-            table = skyline_table_text(value.skyline).encode("utf-8")
+            table = skyline_table_text(value.skyline, off_map(value).whole).encode("utf-8")
             write_atomically(companion(path, SKYLINE_TABLE), table, overwrite=True)
             if plots:
                 files.append(pool.submit(_write_panorama, companion(path, SKYLINE_PICTURE), value, value.skyline))

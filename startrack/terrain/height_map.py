@@ -168,10 +168,14 @@ class HeightMap(TracedMap):
 
     def is_informative(self, azimuths_rad: Array, elevations_rad: Array) -> Bools:
         """Whether the map decides if the rays (...) are visible: outside glare, and above unmapped ground."""
-        azimuths = np.asarray(azimuths_rad) % (2 * np.pi)
-        b = (azimuths / (2 * np.pi) * AZIMUTH_BINS).astype(np.int64) % AZIMUTH_BINS
-        above = np.asarray(elevations_rad) > self.table.unknown_rad[b]
-        return np.asarray(above & ~are_in_sectors(azimuths, self.glare_rad))
+        self.prepare()  # which knows them
+        above = np.asarray(elevations_rad) > self.unknown_below_rad(azimuths_rad)
+        return np.asarray(above & ~are_in_sectors(azimuths_rad, self.glare_rad))
+
+    def unknown_below_rad(self, azimuths_rad: Array) -> Array:
+        """The same from everywhere in the search area; see `Terrain`."""
+        b = np.floor(np.asarray(azimuths_rad) / (2 * np.pi) * AZIMUTH_BINS).astype(np.int64) % AZIMUTH_BINS
+        return np.asarray(self.unknown_rad[b])
 
     def mask_reason(self, azimuths_rad: Array, elevations_rad: Array) -> NDArray[np.str_]:
         """Why rays (n,) are not informative; empty where they are."""

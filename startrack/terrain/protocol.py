@@ -137,6 +137,15 @@ class Terrain(ABC):
         """Whether the terrain decides if the rays (...) are visible, from everywhere in the search area."""
         return np.ones(np.broadcast_shapes(np.shape(azimuths_rad), np.shape(elevations_rad)), dtype=bool)
 
+    def unknown_below_rad(self, azimuths_rad: Array) -> Array:
+        """Elevations (...) below which ground off the maps could stand at the azimuths (...), or -pi/2."""
+        return np.full(np.shape(azimuths_rad), -np.pi / 2)
+
+    def ends_at(self, point_m: Array, azimuths_rad: Array) -> Bools:
+        """Whether ground off the maps could stand above the horizon seen from `point_m` (2,) at the azimuths (n,)."""
+        horizon = np.ravel(self.horizon_rad(np.asarray(point_m)[None], azimuths_rad))
+        return np.asarray(self.unknown_below_rad(azimuths_rad) > horizon)
+
     def mask_reason(self, azimuths_rad: Array, elevations_rad: Array) -> NDArray[np.str_]:
         """Why rays (n,) are not informative; empty where they are."""
         return np.where(self.is_informative(azimuths_rad, elevations_rad), "", "ground off the map")

@@ -134,10 +134,13 @@ def _join_files(names: Iterable[str]) -> str:
 def _detail(found: Found, terrains: Mapping[str, Terrain], size: tuple[int, int, int]) -> dict[str, Any]:
     longest_px, most_stars, azimuths = size
     shown, stars = star_table_of(found.companion(".stars.ecsv"), most_stars)
-    horizon, line = _horizon(found, terrains), None
+    horizon, line, unknown = _horizon(found, terrains), None, None
     if horizon is not None:
-        elevation_rad = horizon(np.linspace(0.0, 2 * np.pi, azimuths))  # both ends included
+        around_rad = np.linspace(0.0, 2 * np.pi, azimuths)  # both ends included
+        elevation_rad = horizon(around_rad)
         line = round_values(np.degrees(elevation_rad), 3) if np.isfinite(elevation_rad).all() else None
+        unknown_rad = terrains[found.at("provenance.terrain")].unknown_below_rad(around_rad)
+        unknown = round_values(np.degrees(np.where(unknown_rad > elevation_rad, unknown_rad, np.nan)), 2)
         horizon = None if line is None else horizon  # a position off the map
     files = (found.companion(end) for end in FILES)
     return {
@@ -146,6 +149,7 @@ def _detail(found: Found, terrains: Mapping[str, Terrain], size: tuple[int, int,
         "picture": picture_of(found.companion(".annotated.png"), longest_px),
         "stars": shown,
         "horizon": line,
+        "unknown": unknown,
         "skyline": skyline_of(found.companion(".skyline.ecsv"), horizon, shown),
         "sectors": None if horizon is None or shown is None else sectors_of(stars, horizon),
         "files": [found.path.name, *(file.name for file in files if file.is_file())],

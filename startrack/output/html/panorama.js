@@ -72,12 +72,14 @@ function panoramaView(detail, stars, name) {
     },
     draw(v, g) {
       if (horizon) drawGround(v, g, horizon, lowest);
+      if (horizon) drawUnknown(v, g, horizon, detail.unknown);
       drawStars(v, g, placed, 0.9);
       if (horizon) drawSkyline(v, g, horizon);
       drawMeasured(v, g, measured, 0.5);
     },
   });
   choices(view, chosen, placed, measured);
+  if (horizon && detail.unknown.some(known)) view.node.append(make("p", {}, "Shaded: the maps end there, and ground beyond could stand so high."));
   return view;
 }
 
@@ -119,6 +121,19 @@ function drawGround(v, g, horizon, lowest) {
   g.closePath();
   g.fillStyle = colour("ground");
   g.fill();
+}
+
+// Where the maps end: from the horizon up to where ground beyond them could stand.
+function drawUnknown(v, g, horizon, unknown) {
+  g.globalAlpha = 0.25;
+  g.fillStyle = colour("hidden");
+  unknown.forEach((elevation, k) => {
+    if (!known(elevation)) return;
+    const [left, top] = v.screen((360 * (k - 0.5)) / (horizon.length - 1), elevation);
+    const [right, bottom] = v.screen((360 * (k + 0.5)) / (horizon.length - 1), horizon[k]);
+    g.fillRect(left, top, right - left, bottom - top);
+  });
+  g.globalAlpha = 1;
 }
 
 function drawSkyline(v, g, horizon) {

@@ -23,6 +23,8 @@ HEIGHT_PX, ENLARGED_PX = 3 * WIDTH_PX // 10, 2 * WIDTH_PX // 10  # of both plots
 MAPS_PX = 4 * WIDTH_PX // 10  # of two maps below them
 ABOVE_PX, RIGHT_PX = 2 * TEXT_PX, TEXT_PX  # about a plot
 AZIMUTHS_RAD = np.radians(np.linspace(0.0, 360.0, 3601))
+UNKNOWN = mix_colours(Ink.HIDDEN, Ink.PAPER, 0.75)
+UNKNOWN_WORDS = "brown: the maps end, and ground beyond could stand so high"
 MAX_STARS = 1500  # the brightest
 LEGEND: dict[str, tuple[str, str, float, Colour]] = {  # words, mark, half its size, colour
     "seen": ("seen star", "disc", 2.3, Ink.IDENTIFIED),
@@ -55,6 +57,13 @@ class Plot(Axes):
             low = self.canvas_px(np.array([at[-1], at[0]]), self.y[0])
             self.window.area(np.concatenate([self.canvas_px(at, elevation_rad[run]), low]), Ink.FLOOR)
 
+    def draw_unknown(self, azimuth_rad: Array, low_rad: Array, high_rad: Array) -> None:
+        """Elevations from `low_rad` (n,) up to `high_rad` (n,), at ascending azimuths (n,), where that is higher."""
+        for run in known_runs(high_rad > low_rad):
+            at, top = azimuth_rad[run], np.minimum(high_rad[run], self.y[1])
+            below = self.canvas_px(at[::-1], np.minimum(low_rad[run][::-1], top[::-1]))
+            self.window.area(np.concatenate([self.canvas_px(at, top), below]), UNKNOWN)
+
     def draw_bands(self, elevation_rad: Array, skyline: MeasuredSkyline) -> None:
         """One sigma of a `skyline` to either side of `elevation_rad` (n,), coloured by its source."""
         half_rad, window = np.pi / max(len(skyline), 1), self.window
@@ -77,7 +86,9 @@ def horizon_picture(terrain: Terrain, position_m: tuple[float, float]) -> NDArra
     horizon_rad = terrain.horizon_rad(np.array(position_m)[None], AZIMUTHS_RAD)
     title = f"{terrain.name}: horizon seen from E {position_m[0]:.0f} m, N {position_m[1]:.0f} m"
     canvas = Canvas(WIDTH_PX, HEIGHT_PX)
-    _draw_horizon(canvas, title, AZIMUTHS_RAD, horizon_rad).draw_curve(AZIMUTHS_RAD, horizon_rad, Ink.SKYLINE)
+    unknown_rad = terrain.unknown_below_rad(AZIMUTHS_RAD)
+    plot = _draw_horizon(canvas, title, AZIMUTHS_RAD, horizon_rad, unknown_rad)
+    plot.draw_curve(AZIMUTHS_RAD, horizon_rad, Ink.SKYLINE)
     return canvas.rendered_pixels()
 
 
@@ -113,7 +124,8 @@ def located_picture(value: Positioned, skyline: MeasuredSkyline) -> NDArray[np.u
         azimuth_rad, elevation_rad, status = np.zeros(0), np.zeros(0), np.zeros(0, dtype="U1")
         _draw_maps(canvas, value)
     title = f"{image_name(value.exposure)}: horizon of {value.terrain.name} at the position found, skyline of the image"
-    plot = _draw_horizon(canvas, title, AZIMUTHS_RAD, horizon(AZIMUTHS_RAD))
+    unknown_rad = value.terrain.unknown_below_rad(AZIMUTHS_RAD)
+    plot = _draw_horizon(canvas, title, AZIMUTHS_RAD, horizon(AZIMUTHS_RAD), unknown_rad)
     near = np.flatnonzero(elevation_rad < plot.y[1])[:MAX_STARS]
     plot.draw_marks(azimuth_rad[near], elevation_rad[near], status[near])
     plot.draw_curve(AZIMUTHS_RAD, horizon(AZIMUTHS_RAD), Ink.SKYLINE)
@@ -126,6 +138,7 @@ def located_picture(value: Positioned, skyline: MeasuredSkyline) -> NDArray[np.u
     plot = _empty_plot(canvas, HEIGHT_PX, "enlarged: height above that horizon", -half, half)
     ends_rad = np.array([0.0, 2 * np.pi])
     plot.draw_ground(ends_rad, np.zeros(2))
+    plot.draw_unknown(AZIMUTHS_RAD, np.zeros(len(AZIMUTHS_RAD)), unknown_rad - horizon(AZIMUTHS_RAD))
     plot.draw_bands(raised_rad, skyline)
     plot.draw_degrees(step)
     plot.draw_curve(ends_rad, np.zeros(2), Ink.SKYLINE)
@@ -152,14 +165,23 @@ def _draw_maps(canvas: Canvas, value: Positioned) -> None:
         draw_zoom(canvas, (right - side, top, right, top + side), value.fix, None)
 
 
-def _draw_horizon(canvas: Canvas, title: str, azimuth_rad: Array, elevation_rad: Array) -> Plot:
-    """A plot at the canvas's top with the ground below elevations (n,) at ascending azimuths (n,)."""
+def _draw_horizon(
+    canvas: Canvas, title: str, azimuth_rad: Array, elevation_rad: Array, unknown_rad: Array | None = None
+) -> Plot:
+    """A plot at the canvas's top with the ground below elevations (n,) at ascending azimuths (n,).
+
+    Above it what ground off the maps could hide, up to `unknown_rad` (n,).
+    """
+    if unknown_rad is not None and (unknown_rad > elevation_rad).any():
+        title += f"; {UNKNOWN_WORDS}"
     known = np.degrees(elevation_rad[np.isfinite(elevation_rad)])
     low, high = min(float(known.min(initial=0.0)), 0.0), float(known.max(initial=0.0))
     step = nice_step(max(high - low, 2.0) / 3)
     low, high = np.floor(low / step) * step, np.ceil((high + 0.3 * step) / step) * step
     plot = _empty_plot(canvas, 0, title, low, high)
     plot.draw_ground(azimuth_rad, elevation_rad)
+    if unknown_rad is not None:
+        plot.draw_unknown(azimuth_rad, elevation_rad, unknown_rad)
     plot.draw_degrees(step)
     return plot
 

@@ -109,3 +109,36 @@ def test_import_names_the_offset_of_maps_and_states_it(tmp_path, capsys):
     assert "map_offset_sigma_m" not in stated
     assert main([*words, "-O", "--geoid", "ellipsoid", str(geoid), "ellipsoid"]) == 4
     assert "3 grids of the geoid for 2 maps" in capsys.readouterr().err
+
+
+def test_a_roof_that_is_cut_out_of_the_near_map_and_stated_hides_nothing(tmp_path, capsys):
+    """Beside the camera; a map of the far ground, 12 m lower, does not fill it in its place."""
+    bare, far = in_projection("EPSG:32616", 4.0, 260), replace(jacksboro(), heights_m=jacksboro().heights_m - 12.0)
+    roofed, cut = bare.heights_m.copy(), bare.heights_m.copy()
+    roof = (slice(118, 132), slice(125, 140))  # 56 m x 60 m about the origin
+    roofed[roof] += 25.0
+    cut[roof] = np.nan
+    cut[135, 131] = np.nan  # a tree
+    point, azimuths = np.zeros(2), np.radians(np.arange(0.0, 360.0, 2.0))
+
+    def horizon_of(heights: np.ndarray, dem: str) -> np.ndarray:
+        path = write_terrain(tmp_path, [replace(bare, heights_m=heights), far], dem)
+        return np.degrees(load_terrain(path).horizon_rad(point, azimuths))
+
+    true = horizon_of(bare.heights_m, "")
+    off = {
+        (name, dem): np.median(np.abs(horizon_of(heights, dem) - true))
+        for name, heights, dem in (
+            ("roofed", roofed, ""), ("cut", cut, ""), ("cut", cut, "cut_out_m = 50.0"),
+            ("cut", cut, "cut_out_m = 70.0"),
+        )
+    }  # fmt: skip
+    assert off.pop(("cut", "cut_out_m = 70.0")) < 0.02
+    assert min(off.values()) > 0.3  # also where the far map fills the void, which is wider than 50 m
+    write_map(tmp_path / "cut.tif", replace(bare, heights_m=cut))
+    words = ["terrain", "import", str(tmp_path / "cut.tif"), "-o", str(tmp_path / "t.toml"), "--radius", "300"]
+    place = ["--latitude", str(PLACE_DEG[0]), "--longitude", str(PLACE_DEG[1]), "-q"]
+    assert main([*words, *place, "--cut-out", "70"]) == 0
+    made = load_terrain(tmp_path / "t.toml")
+    assert made.ground_m(point) + made.site.height_m == pytest.approx(bare.sample(np.array([130.0, 130.0])), abs=30.0)
+    assert tomllib.loads((tmp_path / "t.toml").read_text())["dem"]["cut_out_m"] == 70.0

@@ -194,6 +194,8 @@ COMMANDS = (
                              "for integers without it", number, nargs="+"),
                         flag("--offset M", "height of value 0 of each map, in the place of what the files state",
                              number, nargs="+"),
+                        flag("--cut-out M", "voids up to so wide are roofs and trees that were cut out of the maps: "
+                             "the ground there is interpolated", amount),
                         flag("--unusual-heights", "the heights are right, though flatter, higher or lower than the "
                              "body's ground"),
                         flag("--post M", "of an array: between posts; rows from the north, columns to the east, its "

@@ -83,7 +83,8 @@ def import_map(args: argparse.Namespace) -> int:
         args.maps, args.output, latitude_rad=radians(args.latitude), longitude_rad=radians(args.longitude), half_m=half,
         radius_m=args.radius, scale=args.scale or (), offset_m=args.offset or (), height_sigma_m=args.sigma,
         compare=args.compare, camera_height_m=args.camera_height, highest_beyond_m=args.highest_beyond,
-        geoid_grid=args.geoid, grid=grid, unusual_heights=args.unusual_heights, overwrite=args.overwrite,
+        geoid_grid=args.geoid, grid=grid, cut_out_m=args.cut_out, unusual_heights=args.unusual_heights,
+        overwrite=args.overwrite,
     )  # fmt: skip
     facts = _facts_of(load_terrain(imported.path))
     facts |= {"sigma_from": imported.errors.origin, "sigma_comment": imported.errors.comment}

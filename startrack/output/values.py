@@ -200,7 +200,7 @@ def off_map(value: Positioned) -> Blocked:
 
 
 def sectors_off_map(terrain: Terrain, position_m: Array) -> Blocked:
-    """The azimuths in which ground off the maps of a `terrain` could stand above their skyline seen from `position_m` (2,)."""
+    """The azimuths in which ground off the maps could stand above the horizon of a `terrain` at `position_m` (2,)."""
     return Blocked(np.where(terrain.ends_at(position_m, MIDDLES_RAD), 1.0, 0.0))
 
 

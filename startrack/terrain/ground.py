@@ -99,6 +99,32 @@ def pack_maps(site: Site, maps: Sequence[Raster], *, keep_voids: bool = False) -
     )
 
 
+def fill_cut_out(raster: Raster, widest_m: float) -> Raster:
+    """The map without its voids that are no wider than `widest_m` [m], which known posts surround.
+
+    What was cut out of the map, such as roofs and trees: the ground is linear between the posts around.
+    """
+    from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+    from scipy.ndimage import binary_dilation, find_objects, label
+
+    voids = np.isnan(raster.heights_m)
+    labels, _ = label(voids)
+    heights, last = raster.heights_m.copy(), np.array(voids.shape) - 1
+    for number, where in enumerate(find_objects(labels), 1):
+        span = np.array([[part.start, part.stop - 1] for part in where])
+        wide_m = (span[:, 1] - span[:, 0] + 1) * raster.spacings_m
+        if (wide_m > widest_m).any() or (span[:, 0] == 0).any() or (span[:, 1] == last).any():
+            continue
+        around = tuple(slice(low - 1, high + 2) for low, high in span)
+        own = labels[around] == number
+        ring = np.argwhere(binary_dilation(own, np.ones((3, 3))) & ~voids[around])
+        at, known = np.argwhere(own), heights[around][tuple(ring.T)]
+        found = LinearNDInterpolator(ring * raster.spacings_m, known)(at * raster.spacings_m)
+        beside = NearestNDInterpolator(ring, known)(at)  # of a post that the ring's hull does not hold
+        heights[around][own] = np.where(np.isfinite(found), found, beside)
+    return replace(raster, heights_m=heights)
+
+
 def _fill_voids(
     h: NDArray[np.float32], voids: Bools, site: Site, height_map: Raster, coarser: Sequence[Raster]
 ) -> NDArray[np.float32]:

@@ -19,6 +19,7 @@ from startrack.terrain.array_map import SUFFIX, Grid, map_of_array, read_array
 from startrack.terrain.crest_errors import Correlation, map_of_rim, measure_waves
 from startrack.terrain.earth_projection import ELLIPSOID, Geoid, geoid_at
 from startrack.terrain.ellipsoid_fit import maps_above_ellipsoid
+from startrack.terrain.ground import fill_cut_out
 from startrack.terrain.height_map import HeightMap
 from startrack.terrain.horizon_table import AZIMUTH_BINS
 from startrack.terrain.io import site_of_keys, terrain_from_dict
@@ -83,7 +84,7 @@ def import_maps(
     half_m: Sequence[float], radius_m: float, scale: Sequence[float] = (), offset_m: Sequence[float] = (),
     height_sigma_m: float | None = None, compare: Sequence[str | Path] = (), camera_height_m: float = 1.5,
     highest_beyond_m: float | None = None, geoid_grid: str | Sequence[str] | None = None, grid: Grid | None = None,
-    unusual_heights: bool = False, overwrite: bool = False,
+    cut_out_m: float | None = None, unusual_heights: bool = False, overwrite: bool = False,
 ) -> ImportedTerrain:  # fmt: skip
     """Write the terrain file `output` and, beside it, a crop of each map: NAME-1.tif, the finest, and so on.
 
@@ -94,7 +95,8 @@ def import_maps(
     error of products that are known. camera_height_m: above the ground [m]. highest_beyond_m: ground off the maps is no
     higher; None: as `io.KEYS` says. geoid_grid: of PROJ, from which heights of the maps count (None: their geoid is not
     known), or one for each map, ELLIPSOID where they are above the ellipsoid. grid: where the posts of arrays (`.npy`)
-    stand. unusual_heights: see `read_map`. overwrite: replace existing files.
+    stand. cut_out_m: voids up to so wide are what was cut out of the maps, see `io.KEYS`. unusual_heights: see
+    `read_map`. overwrite: replace existing files.
 
     Raises BadInput bad_terrain, BadOutput of `output`; nothing is then written.
     """
@@ -148,8 +150,12 @@ def import_maps(
         values["dem"]["highest_beyond_m"] = float(highest_beyond_m)
     if body == "earth":
         at = crops[0].row_column(np.array(latitude_rad), np.array(longitude_rad))
-        values["origin"]["height_m"] = float(np.nan_to_num(np.round(crops[0].sample(at))))
+        values["origin"]["height_m"] = float(
+            np.nan_to_num(np.round(fill_cut_out(crops[0], cut_out_m or 0.0).sample(at)))
+        )
         values["air"] = {"terrestrial_refraction": REFRACTION_1, REFRACTION.key: REFRACTION.sigma}
+    if cut_out_m is not None:
+        values["dem"]["cut_out_m"] = float(cut_out_m)
     if geoid_grid is not None:
         values["dem"] |= _geoid_values([geoid_grid] if isinstance(geoid_grid, str) else geoid_grid, values, len(crops))
     seams = _state_offsets(values, crops)

@@ -59,6 +59,8 @@ KEYS = Table(
                                    description="height of value 0, in place of what the files state"),
                 "unusual_heights": Flag(description="the heights are right, though flatter, higher or lower than the "
                                         "body's ground; no value is taken for a void that the file does not state"),
+                "cut_out_m": replace(shape.AMOUNT, description="voids up to so wide are roofs and trees that were cut "
+                                     "out of the maps: the ground there is interpolated between the posts around"),
                 "geoid_m": Either(kinds=(HEIGHT, List(each=HEIGHT, least=1, most=100)), description="height of the "
                                   "geoid above the ellipsoid at the origin, if heights are above the geoid; a list: "
                                   "of each map, 0 where they are above the ellipsoid; earth only"),
@@ -253,6 +255,10 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
     scaling = {key: dem[key] for key in ("scale", "offset_m", "unusual_heights") if key in dem}
     maps = tuple(read_map(file, near=near, body=site.body, **scaling) for file in files)
     require_origin(maps, *near)
+    if "cut_out_m" in dem:
+        from startrack.terrain.ground import fill_cut_out
+
+        maps = tuple(fill_cut_out(one, dem["cut_out_m"]) for one in maps)
     on_earth = {}
     if site.body == "earth":
         from startrack.terrain.ellipsoid_fit import check_height, maps_above_ellipsoid

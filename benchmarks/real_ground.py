@@ -1,11 +1,11 @@
-"""A place from a photograph on real ground: Finse, Norway (the files: see RESULTS.md, "Real ground").
+"""Real pictures on real ground: Finse, Norway, by day, and Svalbard by night (the files: RESULTS.md, "Real ground").
 
     python benchmarks/real_ground.py FOLDER [--out OUT]
 
 FOLDER holds `finse/` with two pictures of a webcam, an elevation model of 4 m posts and one of 100 m, and 45 control
 points. Camera and attitude are fitted to the control points, the skyline is traced on the pictures, and
-`startrack.locate_skyline` finds the place, once with the attitude stated to 0.02 degrees and once with it left open.
-The true place is the one by the control points.
+`startrack.locate_skyline` finds the place, with heading and tilt stated to 0.02 degrees, or left open. The true place
+is the one by the control points. Of `svalbard/`: see `_real_night`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import rasterio
+from _real_night import compare_night, draw_skyline
 from pyproj import Transformer
 from scipy.ndimage import gaussian_filter, median_filter
 from scipy.optimize import least_squares
@@ -41,7 +42,7 @@ ABOVE, JUMP = 0.3, 3.0  # cost of a clear edge above the path, and of a step of 
 APART_PX = 5  # between two edges: a blurred one is so high
 PATCH_PX, ALIKE, AGREED_RAD = 80, 0.35, np.radians(0.1)  # of the comparison of two pictures
 SIGMA_PX, CORRELATION_DEG = 1.2, 10.0  # of the skyline: that of the lens, by the control points, is the largest error
-STATED_DEG = ((0.02, 0.02), (180.0, 3.0))  # errors of heading and tilt
+STATED_DEG = ((0.02, 0.02), (0.02, 3.0), (180.0, 3.0))  # errors of heading and tilt
 AXIS = (62.0, -7.0)  # azimuth and elevation with which the fit of the pose begins
 
 
@@ -51,6 +52,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("real-ground"))
     args = parser.parse_args()
     args.out.mkdir(exist_ok=True)
+    compare_night(args.folder / "svalbard", args.out)
     finse = args.folder / "finse"
     terrain = make_terrain(finse, args.out)
     camera, R_cam_enu, place_m = fit_pose(finse / "GCPs_pointagev4.csv", terrain)
@@ -62,6 +64,7 @@ def main() -> None:
         polyline = args.out / f"{name[:4]}.csv"
         traced_px = trace_skyline(finse / name, camera, R, place_m, terrain)
         np.savetxt(polyline, np.stack(traced_px, axis=1), "%.2f", ",", header="x_px,y_px,sigma_px", comments="")
+        draw_skyline(finse / name, model_px(camera, R, place_m, terrain), args.out / f"{name[:4]}.png")
         for heading_deg, tilt_deg in STATED_DEG:
             locate(str(polyline), camera, R, place_m, terrain, heading_deg, tilt_deg)
 
@@ -102,15 +105,15 @@ def make_terrain(finse: Path, out: Path) -> Terrain:
         heights, at = file.read(1), file.transform
     rows, columns = np.indices(heights.shape)
     away = np.hypot(at.c + 4 * (columns + 0.5) - STATED_M[0], at.f - 4 * (rows + 0.5) - STATED_M[1])
-    ground = median_filter(heights, 21)
-    cleared = np.where((away < ROOF_M) & (heights > ground + ABOVE_M), ground, heights)
+    roof = (away < ROOF_M) & (heights > median_filter(heights, 21) + ABOVE_M)
     size = {"height": len(heights), "width": heights.shape[1], "count": 1, "dtype": "float32"}
     with rasterio.open(out / "dsm.tif", "w", driver="GTiff", crs=UTM, transform=at, nodata=NO_DATA, **size) as file:
-        file.write(np.where(heights == NO_DATA, NO_DATA, cleared).astype(np.float32), 1)
+        file.write(np.where(roof, NO_DATA, heights).astype(np.float32), 1)
     command = [
         sys.executable, "-m", "startrack", "terrain", "import", out / "dsm.tif", finse / "ASTER_Finse.tif",
         "-o", out / "finse.toml", "-O", "-q", "--latitude", "60.594", "--longitude", "7.526", "--radius", "600",
-        "--offset", "0", f"{ASTER_LOWER_M:g}", "--highest-beyond", "1900", "--camera-height", "7.9",
+        "--offset", "0", f"{ASTER_LOWER_M:g}", "--highest-beyond", "1900", "--camera-height", "7.4",
+        "--cut-out", f"{2 * ROOF_M:g}",
     ]  # fmt: skip
     subprocess.run([str(word) for word in command], check=True)
     terrain = load_terrain(str(out / "finse.toml"))
@@ -190,6 +193,14 @@ def edge_strength(path: Path) -> np.ndarray:
     return np.minimum(np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)), 80.0)
 
 
+def model_px(camera: Camera, R_cam_enu: np.ndarray, place_m: np.ndarray, terrain: Terrain) -> np.ndarray:
+    """The model's skyline (n, 2) [px] in a picture."""
+    azimuth = np.radians(np.arange(0.0, 360.0, 0.02))
+    elevation = np.ravel(terrain.horizon_rad(place_m[None, :2], azimuth))
+    px, inside = camera.project(rays_from_azel(azimuth, elevation) @ R_cam_enu.T)
+    return px[inside]
+
+
 def trace_skyline(
     path: Path, camera: Camera, R_cam_enu: np.ndarray, place_m: np.ndarray, terrain: Terrain
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -199,10 +210,7 @@ def trace_skyline(
     found over all columns together, a step from row to row costing JUMP a pixel.
     """
     grey = gaussian_filter(cv2.imread(str(path)).astype(float).mean(axis=2), 1.0)
-    azimuth = np.radians(np.arange(0.0, 360.0, 0.02))
-    elevation = np.ravel(terrain.horizon_rad(place_m[None, :2], azimuth))
-    px, inside = camera.project(rays_from_azel(azimuth, elevation) @ R_cam_enu.T)
-    px = px[inside]
+    px = model_px(camera, R_cam_enu, place_m, terrain)
     order = np.argsort(px[:, 0])
     columns = np.arange(int(px[:, 0].min()) + 5, int(px[:, 0].max()) - 5)
     model = np.interp(columns, px[order, 0], px[order, 1])

@@ -11,7 +11,7 @@ from _sky_view import Rng, View, draw, smooth_noise, turn
 from startrack.camera import Camera
 from startrack.core.types import Array
 from startrack.rendering import Scene
-from startrack.terrain import Cylinder
+from startrack.terrain import Cylinder, GroundBrightness
 
 EIGHT_BITS = {"gain_e_per_adu": 4.0, "bias_adu": 12.0, "saturation_adu": 255.0}
 
@@ -49,7 +49,7 @@ def uneven_dark(view: View, rng: Rng) -> Array:
 
 def bright_wall(scene: Scene, rng: Rng) -> Scene:
     """A wall that reflects 20 to 60 % of the sky's light."""
-    return replace(scene, wall_reflectance=rng.uniform(0.2, 0.6))
+    return replace(scene, ground_brightness=GroundBrightness.of(rng.uniform(0.2, 0.6)))
 
 
 def low_ridge(scene: Scene, rng: Rng) -> Scene:

@@ -40,10 +40,11 @@ class View:
     def of(cls, scene: Scene) -> View:
         """All fields of a `scene` with a terrain."""
         assert scene.terrain is not None
-        camera, wall = scene.camera, scene.wall_reflectance
+        camera = scene.camera
         px = np.stack(np.meshgrid(*(np.arange(n, dtype=float) for n in camera.size_px)), axis=-1)
         azimuth, elevation = azel_from_rays(camera.unproject(px) @ scene.R_cam_enu)
         around = np.linspace(0.0, 2 * np.pi, HORIZON_SAMPLES)
+        wall = scene.ground_brightness(azimuth)
         horizon = np.interp(azimuth % (2 * np.pi), around, scene.terrain.horizon_rad(scene.position_enu_m[:2], around))
         open_sky = replace(scene, terrain=None, sky_v_mag_arcsec2=scene.sky_v_mag_arcsec2 or 22.0)
         sky, stars = diffuse_e(open_sky), np.zeros(azimuth.shape)
@@ -67,7 +68,7 @@ class View:
 
     def with_sky(self, factor: Array | float, stars: Array | float = 1.0) -> Array:
         """All light, that of the sky above the skyline multiplied by a `factor`, that of the stars by `stars`."""
-        wall = self.scene.wall_reflectance
+        wall = self.scene.ground_brightness(self.azimuth_rad)
         return np.asarray(stars * self.stars_e + self.sky_e * (wall + (1 - wall) * self.part * factor))
 
     def distance_rad(self, angle_rad: float, turn_rad: float) -> Array:

@@ -11,7 +11,7 @@ from startrack.camera import Camera, Sensor
 from startrack.core.types import Stars
 from startrack.frames import R_body_enu_from_heading_pitch_roll, Site, rays_from_azel
 from startrack.rendering import Scene
-from startrack.terrain import Cylinder
+from startrack.terrain import Cylinder, GroundBrightness
 
 SITE = Site("moon", np.radians(-89.66), np.radians(129.78))
 CRATER = Cylinder(
@@ -63,7 +63,7 @@ def make_scene(stars: Stars | None = None, *, heading_pitch_roll_deg: Any = (0.0
         sky_v_mag_arcsec2=None,
         sky_gradient=0.0,
         sky_gradient_azimuth_rad=0.0,
-        wall_reflectance=0.04,
+        ground_brightness=GroundBrightness.of(0.04),
         cosmic_rays=0,
     )
     return replace(scene, **changes)

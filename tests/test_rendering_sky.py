@@ -10,7 +10,7 @@ from startrack.camera import Decentring, KannalaBrandt
 from startrack.frames import azel_from_rays
 from startrack.rendering import light_e, render
 from startrack.rendering.sky import coverage, sky_e_per_s
-from startrack.terrain import load_terrain
+from startrack.terrain import GroundBrightness, load_terrain
 
 PLACE = np.array([5000.0, 3000.0, 1.5])
 
@@ -147,7 +147,9 @@ def test_a_ragged_skyline_against_brute_force():
 
 
 def test_the_wall_reflects_and_the_frame_is_dark_off_the_image_circle():
-    scene = make_scene(sky_v_mag_arcsec2=20.0, terrain=CRATER, position_enu_m=PLACE, wall_reflectance=0.1)
+    scene = make_scene(
+        sky_v_mag_arcsec2=20.0, terrain=CRATER, position_enu_m=PLACE, ground_brightness=GroundBrightness.of(0.1)
+    )
     image, sky = light_e(scene), light_e(replace(scene, terrain=None))
     rows = slice(255, 256)
     wall = image[rows, 255 - int(160 * np.radians(82))]  # east, 8 degrees up: the rim is far above

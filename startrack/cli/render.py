@@ -124,6 +124,7 @@ def _render_one(args: argparse.Namespace, series: Series, number: int, image: Pa
         exposure = replace(exposure, time_sigma_s=sigma_s, time_sigma_is_stated=args.time_sigma is not None)
     write_exposure(image, exposure, overwrite=args.overwrite)
     write_sidecar(image, exposure, overwrite=args.overwrite)
+    brightness = series.ground_brightness
     heading, pitch, roll = heading_pitch_roll_from_R_body_enu(scene.camera.R_body_cam @ scene.R_cam_enu)
     facts = {
         "time_utc": None if scene.time_utc is None else format_utc(scene.time_utc),
@@ -137,7 +138,7 @@ def _render_one(args: argparse.Namespace, series: Series, number: int, image: Pa
         "seed": args.seed,
         "number": number,
         "catalog": series.catalog.name,
-        "settings": {name: getattr(args, name) for name in SETTINGS},
+        "settings": {name: getattr(args, name) for name in SETTINGS} | {"wall_reflectance": brightness.value},
     }
     pose_path, table_path = rendering.write_truth(
         image, truth, facts, to_v_mag=args.truth_mag, overwrite=args.overwrite

@@ -71,7 +71,10 @@ COMMANDS = (
                 flag("--sky-mag V", "diffuse sky per arcsec^2", types.magnitude, default=SKY_V_MAG_ARCSEC2),
                 flag("--sky-gradient F", "its slope to the horizon", types.number, default=0.0),
                 flag("--sky-gradient-azimuth DEG", "where it rises to", types.number, default=0.0),
-                flag("--wall-reflectance F", "of the sky's light", types.amount, default=0.04),
+                flag(
+                    "--wall-reflectance F", "of the sky's light, by the ground; default: the terrain file's, or 0.04",
+                    types.amount,
+                ),
                 flag(
                     "--stars", "whose stars the sky has (auto: Gaia's where the extra `deep` is installed)",
                     choices=("auto", "hipparcos", "gaia"), default="auto",

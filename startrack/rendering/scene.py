@@ -11,7 +11,7 @@ import numpy as np
 from startrack.camera import Camera, Sensor
 from startrack.core.types import Array, BadInput, Body, Bools, Ints, Stars, Value, array, rotation, vector
 from startrack.frames import airmass, azel_from_rays
-from startrack.terrain import Terrain
+from startrack.terrain import GroundBrightness, Terrain
 
 AZIMUTHS = 1 << 16  # of the skyline: 0.0055 degrees, a sixteenth of a pixel of the widest fisheye
 
@@ -45,7 +45,7 @@ class Scene(Value):
     sky_v_mag_arcsec2: float | None  # diffuse light of the sky per square arcsecond; None: a black sky
     sky_gradient: float  # s: the sky is 1 + s cos(elevation) cos(azimuth - sky_gradient_azimuth_rad) of that
     sky_gradient_azimuth_rad: float
-    wall_reflectance: float  # light of the terrain, as a fraction of the sky's
+    ground_brightness: GroundBrightness
     hot_pixels: HotPixels = NO_HOT_PIXELS
     cosmic_rays: int  # tracks in this exposure
     name: str = ""

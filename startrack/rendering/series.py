@@ -21,13 +21,14 @@ from startrack.rendering.compose import draw_hot_pixels
 from startrack.rendering.drive import Drive, draw_odometry
 from startrack.rendering.scene import Scene
 from startrack.rendering.sources import draw_field_stars, draw_v_errors, exposure_for_snr
-from startrack.terrain import Terrain, require_place, require_site
+from startrack.terrain import GroundBrightness, Terrain, require_place, require_site
 
 if TYPE_CHECKING:
     from startrack.catalog import StarCatalog
 
 EXPOSURE_V_MAG = 6.0  # of a star on the axis that the default exposure just shows
 FAINTEST_V_MAG = 10.0  # of the stars in the sky
+WALL_REFLECTANCE_1 = 0.04  # of the sky's light, by ground of which nothing is stated
 RANDOM_TIMES = datetime(2024, 1, 1, tzinfo=UTC), datetime(2034, 1, 1, tzinfo=UTC)
 MAX_POSITION_TRIES = 1000
 # Streams of the seed. Sky and sensor are the same in every exposure of a series: errors that exposures share.
@@ -66,7 +67,7 @@ class Series:
     sky_v_mag_arcsec2: float | None = SKY_V_MAG_ARCSEC2
     sky_gradient: float = 0.0
     sky_gradient_azimuth_rad: float = 0.0
-    wall_reflectance: float = 0.04
+    wall_reflectance: float | None = None  # of the sky's light; None: as the terrain states, else WALL_REFLECTANCE_1
     faint_v_mag: float | None = FAINTEST_V_MAG  # random stars that Hipparcos lacks are added down to this; None: none
     flux_scatter_mag: float = 0.03  # beyond the catalogue's own errors; 0: neither
     hot_pixels: int = 200
@@ -102,6 +103,12 @@ class Series:
             raise BadInput("bad_calibration", f"camera {self.camera.name} has no [sensor]: nothing to render with")
         return exposure_for_snr(self.camera, self.sky_v_mag_arcsec2, v_mag=EXPOSURE_V_MAG)
 
+    @property
+    def ground_brightness(self) -> GroundBrightness:
+        """Light of the ground over that of the sky, given, the terrain's or default."""
+        stated = None if self.wall_reflectance is None else GroundBrightness.of(self.wall_reflectance)
+        return stated or self.terrain.ground_brightness or GroundBrightness.of(WALL_REFLECTANCE_1)
+
     def scene(
         self, number: int, name: str = "", sky: tuple[Stars, Array] | None = None
     ) -> tuple[Scene, np.random.Generator]:
@@ -130,7 +137,7 @@ class Series:
             sky_v_mag_arcsec2=self.sky_v_mag_arcsec2,
             sky_gradient=self.sky_gradient,
             sky_gradient_azimuth_rad=self.sky_gradient_azimuth_rad,
-            wall_reflectance=self.wall_reflectance,
+            ground_brightness=self.ground_brightness,
             hot_pixels=draw_hot_pixels(self.camera.size_px, self.hot_pixels, rng=sensor_rng),
             cosmic_rays=self.cosmic_rays,
             name=name,

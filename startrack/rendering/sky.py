@@ -1,4 +1,4 @@
-"""Diffuse brightness of the sky, and its step at the skyline to the brightness of the wall."""
+"""Diffuse brightness of the sky, and its step at the skyline to the brightness of the ground."""
 
 from __future__ import annotations
 
@@ -43,16 +43,17 @@ def sky_gradient(scene: Scene, east: Array, north: Array) -> Array:
 
 
 def diffuse_e(scene: Scene) -> Array:
-    """Electrons (H, W) float64 of diffuse light: sky above the skyline, wall below it, zero off the image circle.
+    """Electrons (H, W) float64 of diffuse light: sky above the skyline, ground below it, zero off the image circle.
 
-    sky x (wall + (1 - wall) c), c the fraction of the pixel's PSF that lies above the skyline.
+    sky x (ground + (1 - ground) c), c the fraction of the pixel's PSF that lies above the skyline.
     """
-    sky, above = _sky_and_mask(scene)
+    sky, part, above = _sky_and_ground(scene)
     if scene.terrain is None:
         return sky
     edge = _skyline_pixels(above, _sigma_px(scene)) & (sky > 0)
     y, x = np.nonzero(edge)
-    return sky * _part_of_sky(scene, above, edge, np.stack([x, y], axis=-1))
+    part[edge] = _part_at_edge(scene, np.stack([x, y], axis=-1))
+    return sky * part
 
 
 def diffuse_at_e(scene: Scene, xy_px: Ints, edge: Bools) -> Array:
@@ -60,15 +61,15 @@ def diffuse_at_e(scene: Scene, xy_px: Ints, edge: Bools) -> Array:
 
     `edge` (n,): those close to the skyline.
     """
-    sky, above = _sky_function(scene)(*scene.camera.radial(xy_px.astype(np.float64)))
-    return sky * _part_of_sky(scene, above, edge, xy_px[edge])
+    sky, part, _ = _sky_function(scene)(*scene.camera.radial(xy_px.astype(np.float64)))
+    part[edge] = _part_at_edge(scene, xy_px[edge])
+    return sky * part
 
 
-def _part_of_sky(scene: Scene, above: Bools, edge: Bools, edge_px: Ints) -> Array:
-    """Light as a fraction of the sky's of pixels `above` the skyline or below; those at its `edge` are at `edge_px`."""
-    fraction = np.where(above, 1.0, scene.wall_reflectance)
-    fraction[edge] = scene.wall_reflectance + (1 - scene.wall_reflectance) * coverage(scene, edge_px)
-    return fraction
+def _part_at_edge(scene: Scene, xy_px: Ints) -> Array:
+    """Light (n,) over the sky's of pixels (n, 2) near the skyline."""
+    ground = 1.0 if scene.terrain is None else scene.ground_brightness(_azel(scene, xy_px.astype(np.float64))[0])
+    return np.asarray(ground + (1 - ground) * coverage(scene, xy_px))
 
 
 def coverage(scene: Scene, xy_px: Ints | Array) -> Array:
@@ -131,37 +132,45 @@ def _skyline_pixels(above: Bools, sigma_px: float) -> Bools:
     return cv2.dilate(mask, kernel) != cv2.erode(mask, kernel)
 
 
-def _sky_and_mask(scene: Scene) -> tuple[Array, Bools]:
-    """Sky light (H, W) [e] with no terrain before it, and whether the pixel's centre is above the skyline (H, W)."""
+def _sky_and_ground(scene: Scene) -> tuple[Array, Array, Bools]:
+    """Arrays (H, W): sky light [e] with no terrain before it, the part of it that is seen, see `_sky_function`, and
+    whether the pixel's centre is above the skyline.
+    """
     camera, (width, height) = scene.camera, scene.camera.size_px
     fx, fy = camera.handed_focal_px
     u = (np.arange(width) - camera.centre_px[0]) / fx
     v = (np.arange(height)[:, None] - camera.centre_px[1]) / fy
     shift_of, sky_at = _decentring_of_rows(camera), _sky_function(scene)
-    sky, above = np.empty((height, width)), np.ones((height, width), dtype=bool)
+    sky, part, above = np.empty((height, width)), np.empty((height, width)), np.ones((height, width), dtype=bool)
     for top in range(0, height, ROWS_PER_BLOCK):
         rows = slice(top, min(top + ROWS_PER_BLOCK, height))
         du, dv = shift_of(rows)
-        sky[rows], above[rows] = sky_at(u - du, v[rows] - dv)
-    return sky, above
+        sky[rows], part[rows], above[rows] = sky_at(u - du, v[rows] - dv)
+    return sky, part, above
 
 
-def _sky_function(scene: Scene) -> Callable[[Array, Array], tuple[Array, Bools]]:
-    """A function of places x, y in the image [focal lengths], decentring removed, to what `_sky_and_mask` returns."""
+def _sky_function(scene: Scene) -> Callable[[Array, Array], tuple[Array, Array, Bools]]:
+    """A function of places x, y in the image [focal lengths], decentring removed, to what `_sky_and_ground` returns.
+
+    The part of the sky's light is that of the pixel's centre: 1 above the skyline, the ground's below it.
+    """
     rho, sky_e, side, axial = _lens_table(scene)
     tan_horizon = None if scene.terrain is None else np.tan(np.minimum(scene.skyline_rad[1], 1.5707))
     east, north, up = scene.R_cam_enu.T
 
-    def sky_at(x: Array, y: Array) -> tuple[Array, Bools]:
+    def sky_at(x: Array, y: Array) -> tuple[Array, Array, Bools]:
         r = np.sqrt(x * x + y * y)
         sky = np.interp(r, rho, sky_e, right=0.0)
         s, c = np.interp(r, rho, side), np.interp(r, rho, axial)
         e, n, h = ((axis[0] * x + axis[1] * y) * s + axis[2] * c for axis in (east, north, up))
         if scene.sky_gradient:
             sky *= sky_gradient(scene, e, n)
+        part = np.ones(sky.shape)
         if tan_horizon is None:
-            return sky, np.ones(sky.shape, dtype=bool)
-        return sky, _is_above_horizon(e, n, h, scene.skyline_rad[0], tan_horizon)
+            return sky, part, np.ones(sky.shape, dtype=bool)
+        above = _is_above_horizon(e, n, h, scene.skyline_rad[0], tan_horizon)
+        part[~above] = scene.ground_brightness(np.arctan2(e[~above], n[~above]))
+        return sky, part, above
 
     return sky_at
 

@@ -173,6 +173,7 @@ def _pixel_variance_e2(scene: Scene, rays_enu: Array, above: Bools) -> Array:
     sensor = scene.sensor
     angle = off_axis_rad(rays_enu @ scene.R_cam_enu.T)
     sky = sky_e_per_s(scene.camera, scene.sky_v_mag_arcsec2, angle)
-    sky = sky * sky_gradient(scene, rays_enu[:, 0], rays_enu[:, 1]) * np.where(above, 1.0, scene.wall_reflectance)
+    ground = scene.ground_brightness(azel_from_rays(rays_enu)[0])
+    sky = sky * sky_gradient(scene, rays_enu[:, 0], rays_enu[:, 1]) * np.where(above, 1.0, ground)
     rounding = sensor.gain_e_per_adu**2 / 12
     return np.asarray((sky + sensor.dark_e_per_s) * scene.exposure_s + sensor.read_noise_e**2 + rounding)

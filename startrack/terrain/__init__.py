@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from startrack.terrain.checks import require_bounds, require_horizons, require_place, require_site, require_terrain
 from startrack.terrain.cylinder import Cylinder
+from startrack.terrain.ground_brightness import GroundBrightness
 from startrack.terrain.io import KEYS as TERRAIN_KEYS
 from startrack.terrain.io import MAKERS, files_of_terrain, load_terrain, site_of_terrain, terrain_from_dict
 from startrack.terrain.projection import EQUIRECTANGULAR, STEREOGRAPHIC, Projection
@@ -26,10 +27,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DIAMETER", "EQUIRECTANGULAR", "MAKERS", "NO_POST", "STEREOGRAPHIC", "TERRAIN_KEYS", "WAVES", "Cylinder",
-    "EarthProjection", "ExpectedCrests", "ForwardingTerrain", "Grid", "HeightMap", "Projection", "Raster", "ShapeError",
-    "StateableError", "Terrain", "can_write_maps", "files_of_terrain", "import_maps", "is_geotiff", "load_terrain",
-    "map_of_array", "read_map", "require_bounds", "require_horizons", "require_place", "require_site",
-    "require_terrain", "site_of_terrain", "state_errors", "stateable_errors", "terrain_from_dict",
+    "EarthProjection", "ExpectedCrests", "ForwardingTerrain", "Grid", "GroundBrightness", "HeightMap", "Projection",
+    "Raster", "ShapeError", "StateableError", "Terrain", "can_write_maps", "files_of_terrain", "import_maps",
+    "is_geotiff", "load_terrain", "map_of_array", "read_map", "require_bounds", "require_horizons", "require_place",
+    "require_site", "require_terrain", "site_of_terrain", "state_errors", "stateable_errors", "terrain_from_dict",
     "write_bands", "write_map",
 ]  # fmt: skip
 _LAZY_MODULES = {  # of names that few programs use: imported at the first use

@@ -14,6 +14,7 @@ from startrack.core.kernels import njit
 from startrack.core.obstacles import Obstacles
 from startrack.core.types import Array, BadInput
 from startrack.terrain.crater import Crater, DeformedCrater, distance_bounds, distance_to_circle, slopes_of_round_crater
+from startrack.terrain.ground_brightness import GroundBrightness
 from startrack.terrain.protocol import Terrain
 from startrack.terrain.refracted import refraction_errors, refraction_slopes_rad, with_refraction_error
 from startrack.terrain.shape import (
@@ -62,6 +63,7 @@ class Cylinder(Crater):
     camera_height_sigma_m: float = EXACT
     stated_depth_m: float | None = None  # of the file, which the errors are about; None: `depth_m`
     obstacles: Obstacles | None = None
+    ground_brightness: GroundBrightness | None = None
     files: tuple[Path, ...] = ()
     axisymmetric = True
     horizon_cost = 0.02

@@ -20,6 +20,7 @@ from startrack.core.types import BadInput
 from startrack.frames import AIR_TABLE, Site
 from startrack.terrain import shape
 from startrack.terrain.cylinder import CYLINDER_KEYS, Cylinder
+from startrack.terrain.ground_brightness import GROUND_TABLE, GroundBrightness
 from startrack.terrain.protocol import Terrain
 
 FILE = Text(max_chars=4000, is_path=True)
@@ -81,6 +82,7 @@ KEYS = Table(
                 shape.REFRACTION.key: shape.REFRACTION.limits,
             },
         ),
+        "ground": GROUND_TABLE,
         "obstacles": replace(FILE, description="CSV file, relative to this one: azimuth_deg from north through east, "
                              "elevation_deg below which something that is on no map hides the skyline"),
         "rover": Table(
@@ -209,6 +211,12 @@ def _obstacles(keys: dict[str, Any], folder: Path) -> tuple[Obstacles | None, tu
     return read_obstacles(folder / keys["obstacles"], "bad_terrain"), (folder / keys["obstacles"],)
 
 
+def _ground_brightness(keys: dict[str, Any]) -> GroundBrightness | None:
+    """What a terrain file states of the light of its ground. Raises BadInput bad_terrain."""
+    stated = keys.get("ground", {}).get("brightness")
+    return None if stated is None else GroundBrightness.of(stated)
+
+
 def _make_cylinder(keys: dict[str, Any], name: str, site: Site, folder: Path) -> Cylinder:
     obstacles, files = _obstacles(keys, folder)
     cylinder, rover = keys["cylinder"], keys["rover"]
@@ -228,6 +236,7 @@ def _make_cylinder(keys: dict[str, Any], name: str, site: Site, folder: Path) ->
         camera_height_sigma_m=rover.get("camera_height_sigma_m", 0.0),
         rim_tilt_sigma_rad=_radians(sigmas.pop("rim_tilt_sigma_deg")),
         obstacles=obstacles,
+        ground_brightness=_ground_brightness(keys),
         files=files,
         **sigmas,
     )
@@ -278,6 +287,7 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
         maps=maps,
         files=(*_files_of_maps(keys, folder), *more_files),
         obstacles=obstacles,
+        ground_brightness=_ground_brightness(keys),
         search_radius_m=search.get("radius_m", Terrain.search_radius_m),
         height_sigma_m=dem.get("height_sigma_m", 0.0),
         unstated_errors=() if "height_sigma_m" in dem else ("height_sigma_m",),

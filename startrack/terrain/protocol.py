@@ -15,6 +15,7 @@ from startrack.core.obstacles import Obstacles
 from startrack.core.types import Array, Bools, Ints
 from startrack.frames import Air, Site
 from startrack.terrain.earth_projection import EarthProjection
+from startrack.terrain.ground_brightness import GroundBrightness
 from startrack.terrain.projection import STEREOGRAPHIC, Projection
 from startrack.terrain.shape import ShapeError
 
@@ -62,6 +63,7 @@ class Terrain(ABC):
     table_path: Path | None = None  # file of the table that `prepare` computes; None where it computes none
     unstated_errors: tuple[str, ...] = ()  # keys of errors that the terrain file leaves out: they count as zero
     obstacles: Obstacles | None = None  # that hide its skyline, scanned from about where the camera stands
+    ground_brightness: GroundBrightness | None = None  # in pictures that are rendered; None: not stated
     files: tuple[Path, ...] = ()  # that it was read from, beside the terrain file: what is made with it depends on them
 
     @property

@@ -15,6 +15,7 @@ from startrack.core.types import SECTORS, Array, BadInput, Bools
 from startrack.frames import Site
 from startrack.terrain.earth_projection import EarthProjection
 from startrack.terrain.ground import Ground, ground_up_m, pack_maps
+from startrack.terrain.ground_brightness import GroundBrightness
 from startrack.terrain.horizon_kernel import surfaces
 from startrack.terrain.horizon_table import AZIMUTH_BINS, FIELDS, HorizonTable, Square
 from startrack.terrain.map_cost import costs_of
@@ -56,6 +57,7 @@ class TracedMap(Terrain):
     maps: tuple[Raster, ...]  # finest first
     files: tuple[Path, ...] = ()  # of them, and of obstacles
     obstacles: Obstacles | None = None
+    ground_brightness: GroundBrightness | None = None
     camera_height_m: float = 1.5
     search_radius_m: float = Terrain.search_radius_m
     terrestrial_refraction_1: float = 0.0  # curvature of a level sight line in air, relative to the body's
@@ -69,9 +71,8 @@ class TracedMap(Terrain):
             raise BadInput("bad_terrain", "[dem] needs at least one map")
         other = [one.source for one in self.maps if one.projection.body != self.site.body]
         if other:
-            raise BadInput(
-                "bad_terrain", f"{other[0]} is not a map of the {self.site.body.title()}, where the origin is"
-            )
+            cause = f"{other[0]} is not a map of the {self.site.body.title()}, where the origin is"
+            raise BadInput("bad_terrain", cause)
         if not self._covers(self.search_radius_m):
             raise BadInput(
                 "bad_terrain",
@@ -84,9 +85,8 @@ class TracedMap(Terrain):
         counts = [(one, np.count_nonzero(np.isnan(one.heights_m))) for one in self.maps]
         found = [
             ", ".join([f"{count} of {one.heights_m.size} posts of {one.source or 'a map'} are voids", *one.notes])
-            for one, count in counts
-            if count
-        ]
+            for one, count in counts if count
+        ]  # fmt: skip
         return f" ({'; '.join(found)})" if found else ""
 
     @property

@@ -15,6 +15,8 @@ from startrack.estimation.observations import Observations, Steps
 from startrack.estimation.trajectory import smooth
 from startrack.localization import ExactPosterior, LinearErrors
 from startrack.localization.linear_errors import list_seams
+from startrack.localization.neighbourhood import Neighbourhood, SectorRows
+from startrack.localization.shared_errors import SharedErrors
 from startrack.terrain import HeightMap, Terrain, load_terrain
 from startrack.terrain.shape import EXACT_WAVES, WAVES
 
@@ -92,6 +94,20 @@ def drawn(stated: HeightMap, rng: np.random.Generator) -> Terrain:
     """The ground below AT_M: the map with waves as stated and no other error."""
     values = np.array([rng.normal() * one.sigma if one.wave else 0.0 for one in stated.shape_errors])
     return stated.with_shape(values)
+
+
+def test_sectors_whose_rows_show_nothing_tell_of_no_wave():
+    """The window's own height and variance stand there in place of a height that is seen."""
+    terrain, rng = replace(floor(), waves_sigma_rad=SIGMA_RAD), np.random.default_rng(6)
+    rows = rays_at(terrain, rng)
+    rows = rows.take(np.flatnonzero(rows.azimuth_rad < np.pi))
+    seen = SectorRows(Neighbourhood(terrain, AT_M, 0.0), rows)
+    linear = LinearErrors.of(seen, SharedErrors.of(terrain, None), "", np.ones(SECTORS))
+    unseen = MIDDLES_RAD > np.pi
+    left = np.stack([seen.moments.mean_rad, np.where(unseen, np.radians(5.0), seen.moments.mean_rad)])
+    (risen, other), log = linear.fit(left)
+    assert linear.weight[~unseen].min() > 0.0 and np.abs(risen).max() > np.radians(1e-3)
+    assert other == pytest.approx(risen, abs=1e-9) and log[1] == pytest.approx(log[0], abs=1e-3)
 
 
 def test_the_circle_holds_what_waves_do():

@@ -14,10 +14,11 @@ import pytest
 
 pytest.importorskip("rosbags", reason="the extra `ros` is not installed")
 from bag_helpers import FORMATS, STAMP, STAMP_NS, write_bag
+from hazard_helpers import rendered, small_camera
 
 from startrack.camera import save_camera
 from startrack.cli.main import main
-from startrack.core.types import BadInput
+from startrack.core.types import BadInput, Exposure
 from startrack.exposure import (
     choose_bag_image,
     list_bag_images,
@@ -37,10 +38,16 @@ def noise_topics(messages: Any) -> list[Any]:
 
 
 @pytest.fixture(scope="module")
-def drive(located, tmp_path_factory) -> Path:
-    """A bag with two exposures of the fixture's scene, a frame without stars and one of another encoding."""
-    folder, known = tmp_path_factory.mktemp("drive"), located.result.exposure
-    save_camera(located.result.camera, folder / "camera.toml")
+def known() -> Exposure:
+    """An image whose sky is that of the whole catalogue, which the commands use."""
+    return rendered(faintest_v_mag=np.inf)
+
+
+@pytest.fixture(scope="module")
+def drive(known, tmp_path_factory) -> Path:
+    """A bag with two exposures of one scene, a frame without stars and one of another encoding."""
+    folder = tmp_path_factory.mktemp("drive")
+    save_camera(small_camera(), folder / "camera.toml")
     pixels = np.asarray(known.pixels_adu).astype(np.uint16)
     start = int(known.time_utc.timestamp()) * 10**9
 
@@ -56,22 +63,9 @@ def drive(located, tmp_path_factory) -> Path:
     return write_bag(folder, "ros2.mcap", topics)
 
 
-def flags(drive: Path, out: Path, located: Any) -> list[str]:
-    camera = drive.parent.parent / "camera.toml"
-    seconds = str(located.result.exposure.exposure_s)
-    by_light = ["--evidence", "sky"]  # the fixture's sky has no stars fainter than V 7
-    return [
-        "-c",
-        str(camera),
-        "-t",
-        "shackleton-thesis",
-        "--exposure",
-        seconds,
-        "-D",
-        str(out),
-        "--no-plots",
-        *by_light,
-    ]
+def flags(drive: Path, out: Path, known: Exposure) -> list[str]:
+    camera, seconds = str(drive.parent.parent / "camera.toml"), str(known.exposure_s)
+    return ["-c", camera, "-t", "shackleton-thesis", "--exposure", seconds, "-D", str(out), "--no-plots"]
 
 
 @pytest.mark.parametrize("log_step_ns", [1, 0])  # 0: all messages are recorded at one time
@@ -110,10 +104,10 @@ def test_a_number_chooses_an_image(tmp_path):
         choose_bag_image(tmp_path / "none.mcap", 0)
 
 
-def test_locate_gives_the_fix_of_the_same_image_in_a_file(drive, located, tmp_path, capsys):
-    common = flags(drive, tmp_path, located)
+def test_locate_gives_the_fix_of_the_same_image_in_a_file(drive, known, tmp_path, capsys):
+    common = flags(drive, tmp_path, known)
     records = []
-    time = located.result.exposure.time_utc.isoformat()
+    time = known.time_utc.isoformat()
     for command in (
         ["locate", f"{drive}#0", "--image-topic", "/cam", *common, "--json", "--time-sigma", "1"],
         ["locate", str(drive.parent.parent / "same.png"), *common, "--json", "--time", time, "--time-sigma", "1"],
@@ -131,8 +125,8 @@ def test_locate_gives_the_fix_of_the_same_image_in_a_file(drive, located, tmp_pa
 
 
 @pytest.mark.slow
-def test_a_batch_of_a_bag_is_resumed(drive, located, tmp_path, capsys):
-    command = ["batch", str(drive), "--image-topic", "/cam", *flags(drive, tmp_path, located), "-j", "1", "--json"]
+def test_a_batch_of_a_bag_is_resumed(drive, known, tmp_path, capsys):
+    command = ["batch", str(drive), "--image-topic", "/cam", *flags(drive, tmp_path, known), "-j", "1", "--json"]
     assert main(command) == 5
     first = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     by_name = {record["image"]: record for record in first}

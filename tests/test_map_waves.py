@@ -103,7 +103,7 @@ def test_sectors_whose_rows_show_nothing_tell_of_no_wave():
     rows = rows.take(np.flatnonzero(rows.azimuth_rad < np.pi))
     seen = SectorRows(Neighbourhood(terrain, AT_M, 0.0), rows)
     linear = LinearErrors.of(seen, SharedErrors.of(terrain, None), "", np.ones(SECTORS))
-    unseen = MIDDLES_RAD > np.pi
+    unseen = np.pi < MIDDLES_RAD
     left = np.stack([seen.moments.mean_rad, np.where(unseen, np.radians(5.0), seen.moments.mean_rad)])
     (risen, other), log = linear.fit(left)
     assert linear.weight[~unseen].min() > 0.0 and np.abs(risen).max() > np.radians(1e-3)

@@ -127,6 +127,7 @@ WITHOUT_DEFAULT = (
     "rim_radius_m",
     "table_path",
     "obstacles",
+    "ground_brightness",
 )  # None of a terrain that has none
 
 

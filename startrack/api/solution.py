@@ -181,12 +181,13 @@ class Solution:
 
     @cached_property
     def skyline(self) -> QTable | None:
-        """The skyline that the image shows: azimuth, elevation, sigma [deg] and source; None unless located."""
+        """The skyline that the image shows: azimuth, elevation, sigma [deg], source, off_map; None unless located."""
         if not isinstance(self.result, Positioned) or self.result.skyline is None:
             return None
         from astropy.table import QTable
 
-        return QTable.read(output.skyline_table_text(self.result.skyline), format="ascii.ecsv")
+        text = output.skyline_table_text(self.result.skyline, output.off_map(self.result).whole)
+        return QTable.read(text, format="ascii.ecsv")
 
     @property
     def warnings(self) -> list[str]:

@@ -65,6 +65,8 @@ def virtualsky_of(camera: Camera, R_cam_icrs: Array, time: datetime, site: Site)
     scale = np.array([1e-3, 1e-3, 1e-3, 1.0, 1.0, 1.0])
     fits = [least_squares(lambda p: (drawn_px(p) - px).ravel(), start, x_scale=scale) for start in starts]
     best = min(fits, key=lambda fit: fit.cost).x
+    if best[3] < 0.0:  # the same drawing: a turn by half a circle
+        best[[0, 3]] = best[0] + np.pi, -best[3]
     azimuth, tilt, turn = (round(float(np.degrees(a)), 2) for a in best[:3])
     rounded = [np.radians(azimuth), np.radians(tilt), np.radians(turn), *np.rint(best[3:])]
     off_px = np.linalg.norm(drawn_px(np.array(rounded)) - px, axis=1)

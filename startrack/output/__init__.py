@@ -57,7 +57,15 @@ from startrack.output.tables import (
     star_table_text,
 )
 from startrack.output.text import Rows, explain, lens_text, refusal_line, rows, summary_line, verbose_text
-from startrack.output.values import ARCSEC_PER_RAD, R_body_enu, boresight_rad, ranges_deg, ranges_text, sectors_off_map
+from startrack.output.values import (
+    ARCSEC_PER_RAD,
+    R_body_enu,
+    boresight_rad,
+    off_map,
+    ranges_deg,
+    ranges_text,
+    sectors_off_map,
+)
 from startrack.output.write import (
     COMPANIONS,
     PICTURES,
@@ -81,9 +89,9 @@ __all__ = [
     "explain",
     "feature", "file_schema", "fill_frame", "geojson_text", "ground_map", "horizon_picture",
     "identification_dict", "json_text", "lens_text", "list_schema", "markdown_table", "mix_colours", "nice_step",
-    "object_schema", "or_null", "page_text", "path_picture", "png_bytes", "prediction_picture", "prepare_folder",
-    "qgis_style_text", "quantity_columns", "radius_classes", "ranges_deg", "ranges_text", "record_from",
-    "record_of", "refusal_line", "refused_dict", "relief_picture",
+    "object_schema", "off_map", "or_null", "page_text", "path_picture", "png_bytes", "prediction_picture",
+    "prepare_folder", "qgis_style_text", "quantity_columns", "radius_classes", "ranges_deg", "ranges_text",
+    "record_from", "record_of", "refusal_line", "refused_dict", "relief_picture",
     "remove_companions", "result_at", "result_dict", "results_under", "rows", "schema_of", "schema_of_kind",
     "sectors_off_map", "show_everywhere", "skyline_picture", "skyline_table_text", "skyline_texts_deg", "stage_values",
     "star_table_text", "summary_line", "table_columns", "verbose_text", "write_annotated", "write_geo",

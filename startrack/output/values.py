@@ -195,7 +195,7 @@ def exact_lens_text(included: bool) -> str:
 
 
 def off_map(value: Positioned) -> Blocked:
-    """The azimuths in which ground off the maps could stand above their skyline at the position found."""
+    """The azimuths in which ground off the maps could stand above their skyline at the position of `value`."""
     return sectors_off_map(value.terrain, value.position_at_time_m)
 
 

@@ -46,7 +46,10 @@ class GroundBrightness:
 
     @classmethod
     def of(cls, stated: float | Mapping[str, Any]) -> Self:
-        """That of a value of the key `ground.brightness`. Raises BadInput bad_terrain for a `low` above `high`."""
+        """The brightness that is `stated` as a value of the key `ground.brightness`.
+
+        Raises BadInput bad_terrain for a `low` above `high`.
+        """
         if not isinstance(stated, Mapping):
             return cls(low=stated, high=stated)
         low, high = stated["low"], stated["high"]
@@ -55,7 +58,7 @@ class GroundBrightness:
         return cls(low=low, high=high, size_rad=float(np.radians(stated["size_deg"])), seed=stated["seed"])
 
     def __call__(self, azimuth_rad: Array) -> Array:
-        """At azimuths (...) in enu."""
+        """Brightness (...) at azimuths `azimuth_rad` (...) in enu."""
         at, patches_1 = self._knots
         return np.interp(azimuth_rad, at, patches_1, period=2 * np.pi)
 

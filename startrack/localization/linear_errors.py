@@ -46,9 +46,7 @@ class LinearErrors:
         for covariance, one in (plain, ""), (wide, gross):
             covariance[:j, :j], covariance[j:, j:] = image.covariance, np.diag(np.square(errors.waves_sigma_rad(one)))
         rise = np.column_stack([seen.image_rise, slopes.T])
-        seams = np.zeros((SECTORS, 0))
-        if errors.are_waves(gross):
-            seams = WAVES.gross_sigma * seen.around.crest_share[:, None] * list_seams()
+        seams = WAVES.gross_sigma * list_seams() if errors.are_waves(gross) else np.zeros((SECTORS, 0))
         weight = clear * seen.moments.information / seen.moments.variance_rad2
         return cls(rise, np.r_[image.mean, np.zeros(size - j)], plain, wide, weight, size - j, seams)
 

@@ -62,11 +62,6 @@ class Neighbourhood:
         """(w, SECTORS) rise of the skyline by one unit of each of the waves among the shared `errors`."""
         return np.array([self._shape_slopes_rad[one.name] for one in errors.waves]).reshape(-1, SECTORS)
 
-    @property
-    def crest_share(self) -> Array:
-        """(SECTORS,) error of a height map's skyline by an error of height that all crests share, at the median 1."""
-        return self._shape_slopes_rad["bias_rad"]
-
     @cached_property
     def _shape_slopes_rad(self) -> dict[str, Array]:
         """Rise (SECTORS,) of the skyline by one unit of each error of the terrain's shape, by name."""

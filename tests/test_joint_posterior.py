@@ -20,6 +20,7 @@ from startrack.localization.clock import turn_evidence
 from startrack.localization.free_skyline import free_log_likelihood
 from startrack.localization.importance_sampling import moments
 from startrack.localization.joint_posterior import sample_posterior
+from startrack.localization.neighbourhood import Neighbourhood
 from startrack.localization.obstacle_chain import (
     LEVELS_RAD,
     NODES,
@@ -296,7 +297,7 @@ def test_slopes_of_the_clock_are_those_of_turned_rows(name: str) -> None:
     horizon = np.asarray(terrain.horizon_rad(place[None], MIDDLES_RAD)).ravel()
     rows = Evidence(azimuth_rad=MIDDLES_RAD, elevation_rad=horizon, llr=np.ones(SECTORS), clock=clock)
     errors = SharedErrors.of(terrain, clock)
-    slope = errors.slopes_rad(terrain, place, MIDDLES_RAD, horizon)[-1]
+    slope = Neighbourhood(terrain, place, 0.0).error_slopes_rad(errors)[-1]
     values = np.zeros((1, len(errors)))
     values[0, -1] = later_s
     turned, at = turn_evidence(rows, later_s, None), errors.true_positions(place[None], values)

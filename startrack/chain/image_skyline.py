@@ -28,6 +28,7 @@ def measured_skyline(located: Located) -> MeasuredSkyline | None:
     source = np.where(sigma < MOST_SIGMA_RAD, "stars", "").astype("<U9")
     if located.sky is not None:
         sky, used, errors = located.sky
+        used = used & np.isfinite(sky.shift_sigma_px)
         used = used if located.fix.blocked is None else used & ~located.fix.blocked.whole
         by_image = np.einsum("ni,ij,nj->n", errors.raised_rad, errors.covariance, errors.raised_rad)
         by_sky = sky.elevation_rad + sky.shift_px / sky.px_per_rad - errors.raised_rad @ errors.mean

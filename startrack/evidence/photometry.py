@@ -15,6 +15,7 @@ import numpy as np
 
 from startrack.core.kernels import REORDERED_SUMS, njit, read_only, rows_beside
 from startrack.core.types import Array, Bools, Detections, Ints
+from startrack.evidence.stamp_edge import fit_beside_edge
 from startrack.psf import pixel_profile_table, stamp_radius
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)  # literals would be of double precision
@@ -35,7 +36,7 @@ class Photometry:
     """Measured fluxes at predicted pixels (n)."""
 
     flux_e: Array  # (n,) local level and neighbours subtracted
-    variance_e2: Array  # (n,) from the pixels' noise, without the star's own light
+    variance_e2: Array  # (n,) from the pixels' noise and an edge among them, without the star's own light
     own_shot: Array  # (n,) variance per electron of the star's own light
     neighbour_variance_e2: Array  # (n,) from the unknown visibility and brightness of the neighbours
     usable: Bools  # (n,) enough good pixels
@@ -72,7 +73,7 @@ def measure(detections: Detections, sources: Sources) -> Photometry:
     measure_sources(  # type: ignore[call-arg]
         *pictures, d.background.side, d.noise.side, sources.xy_px[order], sources.flux_e[order],
         sources.fraction_sigma[order], sources.visible[order],
-        first, columns, reach_px, reach_px, radius, table, measured, usable,
+        first, columns, reach_px, reach_px, radius, np.float32(sigma_px), table, measured, usable,
     )  # fmt: skip
     columns_e, is_usable = np.empty(measured.shape[::-1]), np.empty_like(usable)
     columns_e[:, order], is_usable[order] = measured.T, usable
@@ -103,7 +104,7 @@ def order_by_cell(xy_px: Array, shape: tuple[int, ...], side_px: float) -> tuple
 @njit(cache=True, fastmath=REORDERED_SUMS)
 def measure_sources(
     image, background, noise, dead, background_side, noise_side, xy_px, flux_e, fraction_sigma, visible, first, columns,
-    reach_px, side_px, radius, profiles, measured, usable,
+    reach_px, side_px, radius, sigma_px, profiles, measured, usable,
 ) -> None:  # fmt: skip
     """Fill `measured` (n, 4) and `usable` (n,) for sources (n) ordered by cells, their stamps inside the frame.
 
@@ -117,7 +118,7 @@ def measure_sources(
     across, down, centre = profiles_of(xy_px, profiles)
     size = side * side
     profile, light, data = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
-    variance, weight = np.empty(size, np.float32), np.empty(size, np.float32)
+    variance, weight, smooth = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
     near = np.empty(n, np.int64)
     for i in range(n):
         count = _find_neighbours(near, i, xy_px, visible, first, columns, side_px, reach_px)
@@ -130,7 +131,7 @@ def measure_sources(
             _add_light(light, side, np.float32(flux_e[j] * visible[j]), across, down, j, x, y)
         _load_stamp(
             image, background, noise, dead, background_side, noise_side, across, down, i, left, top, radius, k, light,
-            profile, data, variance, weight,
+            profile, data, variance, weight, smooth,
         )  # fmt: skip
         flux, level, middle, strength, masked = _fit_masking(profile, light, data, variance, weight)
         seen = ZERO  # part of the star's light in pixels that have a weight
@@ -140,10 +141,12 @@ def measure_sources(
         measured[i, 0], measured[i, 1], measured[i, 2], measured[i, 3] = 0.0, 1.0, 0.0, 0.0
         if not usable[i]:
             continue
-        measured[i, 0] = flux
-        missed = ONE + LEVEL_VARIANCE * level * level / variance[size // 2]
+        measured[i, 0], edge, is_edge = fit_beside_edge(
+            profile, light, data, smooth, weight, flux, level, strength, sigma_px
+        )
+        missed = ONE if is_edge else ONE + LEVEL_VARIANCE * level * level / variance[size // 2]
         total, measured[i, 2] = _variances(profile, light, variance, weight, middle, strength)
-        measured[i, 1] = missed * total
+        measured[i, 1] = missed * total + edge
         for m in range(count):
             j = near[m]
             x, y = k + left - centre[j, 0], k + top - centre[j, 1]
@@ -194,9 +197,9 @@ def profiles_of(xy_px, profiles):
 @njit(inline="always")
 def _load_stamp(
     image, background, noise, dead, background_side, noise_side, across, down, i, left, top, radius, k, light,
-    profile, data, variance, weight,
+    profile, data, variance, weight, smooth,
 ) -> None:  # fmt: skip
-    """Source i: its profile, the pixels without background and neighbours, their variances, and their weights."""
+    """Source i: its profile, the pixels without background and neighbours, variances, weights, and the background."""
     side = 2 * radius + 1
     source, x0, c0 = np.uint64(i), np.uint64(left), np.uint64(k - radius)
     for r in range(side):
@@ -209,6 +212,7 @@ def _load_stamp(
             level = background[b_low, x] * (ONE - b_part) + background[b_high, x] * b_part
             sigma = noise[n_low, x] * (ONE - n_part) + noise[n_high, x] * n_part
             data[p] = image[y, x] - level - light[p]
+            smooth[p] = level
             variance[p] = sigma * sigma
             weight[p] = ZERO if dead[y, x] else ONE / variance[p]
 

@@ -11,6 +11,7 @@ import numpy as np
 from startrack.core.kernels import njit
 from startrack.core.statistics import NORMAL_BY_MEDIAN, robust_sigma
 from startrack.core.types import SECTORS, Array, Bools, Ints
+from startrack.evidence.ground_levels import patch_levels
 from startrack.evidence.sky_pixels import SkyPixels
 from startrack.evidence.skyline import CLIP_SHIFT_PX
 
@@ -22,6 +23,7 @@ SLOPE_SECTORS = (20.0, 7.0)  # of the slopes away from the skyline, and of what 
 FIRST_CLIP_SIGMAS, CLIP_SIGMAS = 6.0, 3.5  # of the pixels: faint stars and defects
 LEVEL_ROUNDS = 3
 MEDIAN_STEP = 8  # of the pixels from which the first levels are taken
+NOISE_EXCESS = 4.0  # of a sector's mean square about that of its neighbours, in sigma, which chance explains
 SLOPE_EXCESS = 2.0  # mean square of slopes that the noise explains, in units of their variance
 GROUND, SKY = range(2)
 
@@ -50,6 +52,10 @@ class SkyLevels:
         averaged = 2 * sqrt(np.pi) * LEVEL_SECTORS  # sectors in one smoothed level
         return np.asarray(np.hypot(*(self.own_sigma_e * sqrt(self.correlation / averaged))))
 
+    def step_sigmas(self, sectors: Bools) -> float:
+        """Size of the steps of either sign of some `sectors` (SECTORS,) together, in that of their noise."""
+        return sqrt(float(np.sum(np.square(self.step_e[sectors] / self.step_sigma_e[sectors]))) / LEVEL_SECTORS)
+
     def mean_step_e(self, sectors: Bools) -> tuple[float, float]:
         """The mean step of some `sectors` (SECTORS,) and its standard deviation; 0 of none."""
         count = max(int(np.count_nonzero(sectors)), 1)
@@ -60,63 +66,87 @@ class SkyLevels:
 def measure_levels(pixels: SkyPixels, sector: Ints) -> SkyLevels:
     """Levels on both sides of the skyline by `pixels` (n,) of these sectors (n,), outliers left out.
 
-    The pixels closer than LEVEL_SIGMAS of the edge to where the skyline may be are not used. A level is smoothed over
-    some sectors, a slope over many.
+    The pixels closer than LEVEL_SIGMAS of the edge to where the skyline may be are not used. The level of the sky is
+    smoothed over some sectors, that of the ground within patches, a slope over many.
     """
     height, light = pixels.height_px, pixels.light_e
     nearest = LEVEL_SIGMAS * pixels.edge_px + (pixels.reach_px - CLIP_SHIFT_PX)[sector]
     side = np.where(height > nearest, SKY, np.where(height < -nearest, GROUND, -1))
     counts = np.array([np.bincount(sector[side == s], minlength=SECTORS) for s in (GROUND, SKY)])
     covered = np.asarray((counts >= MIN_SIDE_PIXELS).all(axis=0))
-    level, noise = _first_levels(side, light)
-    slope, clip = np.zeros((2, SECTORS)), FIRST_CLIP_SIGMAS
+    level, noise = _first_levels(side, sector, light)
+    slope, limit = np.zeros((2, SECTORS)), FIRST_CLIP_SIGMAS * noise
+    limit[GROUND] += np.abs(level[GROUND] - [np.roll(level[GROUND], k) for k in (-1, 1)]).max(axis=0)  # a patch's end
     for _ in range(LEVEL_ROUNDS):
         sums = np.zeros((2, 6, SECTORS))
-        _sum_sides(side, sector, height, light, level, slope, clip * noise, sums)
+        _sum_sides(side, sector, height, light, level, slope, limit, sums)
         sums *= covered
-        count, squares = _smooth(sums[:, [0, 5]], LEVEL_SECTORS).swapaxes(0, 1)
-        noise = np.sqrt(np.maximum(squares / np.maximum(count, 1e-9), 1e-12))
+        noise = _noise_of_sides(sums)
         more, kept = _significant_slopes(sums, slope, noise)
         own = sums[:, 3] - more * sums[:, 1]
         smoothed = _smooth(np.stack([sums[:, 0], own]), LEVEL_SECTORS)
         change = smoothed[1] / np.maximum(smoothed[0], 1e-9)
-        level, slope, clip = level + change, slope + more, CLIP_SIGMAS
+        own_e, independent = own / np.maximum(sums[:, 0], 1.0), np.square(noise) / np.maximum(sums[:, 0], 1.0)
+        z2 = np.square(own_e - change)[SKY] / independent[SKY]  # the ground's levels may be those of two patches
+        correlation = max(float(np.median(z2[covered])) * NORMAL_BY_MEDIAN**2, 1.0) if covered.any() else 1.0
+        error_e2 = np.where(sums[GROUND, 0] > 0, independent[GROUND] * correlation, np.inf)
+        change[GROUND] = patch_levels(level[GROUND] + own_e[GROUND], error_e2) - level[GROUND]
+        level, slope, limit = level + change, slope + more, CLIP_SIGMAS * noise
     covered &= np.asarray((sums[:, 0] > MIN_KEPT * counts).all(axis=0))
-    own_e = own / np.maximum(sums[:, 0], 1.0) - change
-    own_sigma, variance, correlation = _level_errors(sums, own_e, noise, kept, covered)
+    own_e -= change
+    own_sigma, variance = _level_errors(sums, own_e, independent, correlation, kept, covered)
     return SkyLevels(
         covered=covered, level_e=level, slope_e=slope, own_e=own_e, own_sigma_e=own_sigma, variance_e2=variance,
         noise_e=noise, correlation=correlation,
     )  # fmt: skip
 
 
+def _noise_of_sides(sums: Array) -> Array:
+    """Standard deviation (2, SECTORS) of a pixel on either side, by sums (2, 6, SECTORS) of residuals.
+
+    It is smoothed over sectors, but for those that scatter more: where one patch of the ground goes over to the next,
+    the pixels of a sector show both.
+    """
+    count, squares = np.maximum(sums[:, 0], 1e-9), sums[:, 5]
+    own, most = squares / count, 1.0 + NOISE_EXCESS * np.sqrt(2.0 / np.maximum(count, 1.0))
+    beside = range(-int(LEVEL_SECTORS), int(LEVEL_SECTORS) + 1)
+    usual = own < most * np.median([np.roll(own, k, axis=1) for k in beside], axis=0)
+    smooth = _smooth(squares * usual, LEVEL_SECTORS) / np.maximum(_smooth(count * usual, LEVEL_SECTORS), 1e-9)
+    return np.sqrt(np.maximum(np.where(own < most * smooth, smooth, own), 1e-12))
+
+
 def _level_errors(
-    sums: Array, own_e: Array, noise_e: Array, kept_slope: Array, covered: Bools
-) -> tuple[Array, Array, float]:
-    """Sigma of the sectors' own levels, variance of the levels at the skyline (2, SECTORS), correlation of the noise.
+    sums: Array, own_e: Array, independent_e2: Array, correlation: float, kept_slope: Array, covered: Bools
+) -> tuple[Array, Array]:
+    """Sigma of the sectors' own levels, variance of the levels at the skyline (2, SECTORS), without `correlation`.
 
     Where own levels (2, SECTORS) differ from the smooth ones by more than the noise explains, these are rough: an
     excess everywhere is taken as correlated noise, one nearby as a level that varies faster than it is smoothed.
     """
-    count = np.maximum(sums[:, 0], 1.0)
-    independent = np.square(noise_e) / count
-    z2 = np.square(own_e) / independent
-    correlation = max(float(np.median(z2[:, covered])) * NORMAL_BY_MEDIAN**2, 1.0) if covered.any() else 1.0
+    z2 = np.square(own_e) / independent_e2
     nearby, seen = (_smooth(np.asarray(a, dtype=np.float64), LEVEL_SECTORS) for a in (z2 * covered, covered))
     rough = np.maximum(nearby / np.maximum(seen, 1e-9), correlation)
-    extrapolated = np.square(sums[:, 1]) / count / np.maximum(_spread(sums), 1e-9)
-    return np.sqrt(correlation * independent), independent * rough * (1.0 + kept_slope * extrapolated), correlation
+    extrapolated = np.square(sums[:, 1]) / np.maximum(sums[:, 0], 1.0) / np.maximum(_spread(sums), 1e-9)
+    return np.sqrt(correlation * independent_e2), independent_e2 * rough * (1.0 + kept_slope * extrapolated)
 
 
-def _first_levels(side: Ints, light_e: Array) -> tuple[Array, Array]:
-    """Level and noise (2, SECTORS), (2, SECTORS) from the medians of all pixels of either side."""
-    middle, noise = np.zeros(2), np.ones(2)
+def _first_levels(side: Ints, sector: Ints, light_e: Array) -> tuple[Array, Array]:
+    """Level and noise (2, SECTORS), (2, SECTORS): medians of the sky's pixels all together, of the ground's by sector.
+
+    `side`, `sector` and `light_e` (n,) are those of the pixels.
+    """
+    level, noise = np.zeros((2, SECTORS)), np.ones((2, SECTORS))
     for s in (GROUND, SKY):
-        values = light_e[side == s][::MEDIAN_STEP]
-        if len(values):
-            middle[s] = np.median(values)
-            noise[s] = robust_sigma(values, middle[s])
-    return np.repeat(middle[:, None], SECTORS, axis=1), np.repeat(noise[:, None], SECTORS, axis=1)
+        here = np.flatnonzero(side == s)[:: MEDIAN_STEP if s == SKY else 1]
+        if len(here):
+            level[s] = np.median(light_e[here])
+            if s == GROUND:
+                ordered = here[np.lexsort((light_e[here], sector[here]))]
+                count = np.bincount(sector[ordered], minlength=SECTORS)
+                middle = ordered[np.minimum(np.cumsum(count) - count + count // 2, len(ordered) - 1)]
+                level[s] = np.where(count > 0, light_e[middle], level[s])
+            noise[s] = robust_sigma(light_e[here] - level[s][sector[here]], 0.0)
+    return level, noise
 
 
 def _significant_slopes(sums: Array, slope_e: Array, noise_e: Array) -> tuple[Array, Array]:

@@ -1,9 +1,9 @@
 """Evidence of the diffuse light of the sky: pixels near a predicted skyline, summed in cells, as rows of `Evidence`.
 
-The sky shines faintly and the ground hardly does. A pixel q above the level of the ground, where the whole sky would be
-t above it, contributes l V + c V (1 - V) / 2 with l = (q t - t^2 / 2) / s^2 and c = t^2 / s^2, s^2 its variance and V
-the fraction of the sky that it shows. The pixels of a narrow sector at equal heights above the predicted skyline show
-the same V, wherever the true skyline is nearby: their sums are one row.
+The ground is darker or brighter than the sky, or as bright. A pixel q above the level of the ground, where the whole
+sky would be t above it (t of either sign), contributes l V + c V (1 - V) / 2 with l = (q t - t^2 / 2) / s^2 and c = t^2
+/ s^2, s^2 its variance and V the fraction of the sky that it shows. The pixels of a narrow sector at equal heights
+above the predicted skyline show the same V, wherever the true skyline is nearby: their sums are one row.
 """
 
 from __future__ import annotations
@@ -29,8 +29,7 @@ CELL_PX = 0.75  # of a cell
 LEVELS = 13  # cells of a sector: up to 4.9 px above and below a predicted skyline that is right to CLIP_SHIFT_PX
 SHIFT_PX, SHIFT_STEP_PX = 4.0, 0.05  # of the skyline in one sector: the largest, for such a prediction, and a step
 NEEDED_SECTORS = SECTORS // 4  # with a step; fewer determine no shift of the skyline
-MIN_STEP_SIGMAS = 8.0  # of the mean step
-SECTOR_STEP_SIGMAS = 3.0  # of the step of one sector
+MIN_STEP_SIGMAS = 8.0  # of the steps together
 MISFIT_SIGMAS = 6.0  # of a sector's misfit against the others'
 RAMP_PX = 4.0  # standard deviation of an edge that is no skyline: light that fades
 SHARP_NATS = 10.0  # by which the sharp edge must explain the pixels better than such a ramp
@@ -55,7 +54,7 @@ class SkyLight:
     width_px: float  # of the edge in pixels
     fades: bool  # over more than the edge of a skyline
     shift_px: Array  # (SECTORS,) how much higher than predicted the skyline stands
-    shift_sigma_px: Array  # (SECTORS,) infinite where the sector is not covered
+    shift_sigma_px: Array  # (SECTORS,) infinite where the sector by itself excludes hardly any height
     misfit_nats: Array  # (SECTORS,) by which the best cells exceed the best skyline
 
     @property
@@ -65,30 +64,33 @@ class SkyLight:
 
     @cached_property
     def variance_px2(self) -> Array:
-        """(SECTORS,) of the skyline's height with the errors of both levels; infinite where it is not covered."""
-        return np.asarray(np.square(self.shift_sigma_px) + self._variance_by_levels_px2)
+        """(SECTORS,) of the skyline's height with the errors of both levels; infinite where nothing tells it."""
+        return np.asarray(np.sum(self._variances_px2, axis=0))
 
     @cached_property
-    def _variance_by_levels_px2(self) -> Array:
-        """(SECTORS,). A level that is too high by d moves the edge of a step t by about 2 d / t pixels.
+    def _variances_px2(self) -> tuple[Array, Array]:
+        """(SECTORS,) by the noise, and by the levels. One too high by d moves the edge of a step t by about 2 d / t px.
 
         Levels are smoothed over sectors, whose errors then agree; over wider ranges that is as if each sector had the
-        whole error of its own level.
+        whole error of its own level. A sector that excludes hardly any height has the variance of its information.
         """
         from scipy.special import ndtr
 
         at = (self.height_px - self.shift_px[:, None]) / self.edge_px
         visible, slope = ndtr(at), np.exp(-0.5 * np.square(at)) / (np.sqrt(2 * np.pi) * self.edge_px)
         weight = self.extended_nats * slope
-        per_sky = (weight * visible).sum(axis=1) / np.maximum((weight * slope).sum(axis=1), 1e-12)
-        per_ground = (weight * (1.0 - visible)).sum(axis=1) / np.maximum((weight * slope).sum(axis=1), 1e-12)
+        information = np.maximum((weight * slope).sum(axis=1), 1e-12)
+        per_sky, per_ground = ((weight * part).sum(axis=1) / information for part in (visible, 1.0 - visible))
         variance = self.levels.variance_e2
-        step = np.where(self.levels.step_e > 0, self.levels.step_e, np.inf)
-        return np.asarray((np.square(per_ground) * variance[GROUND] + np.square(per_sky) * variance[SKY]) / step**2)
+        step = np.where(self.levels.step_e != 0, self.levels.step_e, np.inf)
+        by_levels = (np.square(per_ground) * variance[GROUND] + np.square(per_sky) * variance[SKY]) / step**2
+        own = np.where(np.isfinite(self.shift_sigma_px), np.square(self.shift_sigma_px), 1.0 / information)
+        return np.where(self.levels.covered, own, np.inf), by_levels
 
     def evidence(self, sectors: Bools) -> Evidence:
         """Rows of the chosen `sectors` (SECTORS,), for the localizer."""
-        factor = 1.0 + self._variance_by_levels_px2 / np.square(self.shift_sigma_px)
+        own, by_levels = self._variances_px2
+        factor = 1.0 + by_levels / own
         s, h = np.nonzero((self.extended_nats > 0.0) & sectors[:, None])
         return Evidence(
             azimuth_rad=MIDDLES_RAD[s],
@@ -187,20 +189,20 @@ def average_shifts(log_weights: Array, shifts: Array) -> tuple[Array, Array, Arr
 
 
 def sectors_with_step(sky: SkyLight) -> Bools:
-    """Sectors (SECTORS,) where the light steps from a ground to a sky that continue those beside them.
+    """Sectors (SECTORS,) where the light steps, up or down, from a ground to a sky that continues that beside them.
 
-    None at all where the step as a whole is too weak, or fades instead of stepping.
+    Of a weak step the rows say little. None at all where the step as a whole is too weak, or fades instead of stepping.
     """
     levels = sky.levels
-    good = levels.covered & np.isfinite(sky.shift_sigma_px) & (levels.step_e > SECTOR_STEP_SIGMAS * levels.step_sigma_e)
+    good = levels.covered & (sky.extended_nats > 0.0).any(axis=1)
     own = np.abs(levels.own_e) / (levels.own_sigma_e * sqrt(levels.correlation))
     good &= (own < SURE_SIGMAS).all(axis=0)
     if good.any():
         misfit = sky.misfit_nats[good]
         good &= sky.misfit_nats < np.median(misfit) + MISFIT_SIGMAS * max(robust_sigma(misfit), 1.0)
-    step_e, sigma_e = levels.mean_step_e(good)
-    enough = np.count_nonzero(good) >= NEEDED_SECTORS and step_e > MIN_STEP_SIGMAS * sigma_e
-    return good if enough and _is_sharp(sky, good) else np.zeros(SECTORS, dtype=bool)
+    clear = good & np.isfinite(sky.shift_sigma_px)
+    enough = np.count_nonzero(clear) >= NEEDED_SECTORS and levels.step_sigmas(clear) > MIN_STEP_SIGMAS
+    return good if enough and _is_sharp(sky, clear) else np.zeros(SECTORS, dtype=bool)
 
 
 def _is_sharp(sky: SkyLight, sectors: Bools) -> bool:
@@ -234,10 +236,11 @@ def _sum_cells(
             step = level[SKY, i] + slope[SKY, i] * h - ground
             visible = normal_cdf(h / edge)
             least, most = normal_cdf((h - reach[i]) / edge), normal_cdf((h + reach[i]) / edge)
-            s2 = variance[GROUND, i] + max(variance[SKY, i] - variance[GROUND, i], 0.0) * visible
+            s2 = variance[GROUND, i] + (variance[SKY, i] - variance[GROUND, i]) * visible
             q = light[k] - ground
-            beyond = max(step * least - q, q - step * most, 0.0)
-            if step > 0.0 and beyond * beyond * correlation <= clip * clip * s2:
+            low, high = min(step * least, step * most), max(step * least, step * most)
+            beyond = max(low - q, q - high, 0.0)
+            if beyond * beyond * correlation <= clip * clip * s2:
                 j = min(int((h + half) / CELL_PX), sums.shape[1] - 1)
                 sums[i, j, 0] += (q * step - 0.5 * step * step) / s2
                 sums[i, j, 1] += step * step / s2

@@ -1,7 +1,7 @@
 """The step of the sky's own light at the skyline: how bright the sky is, and images of stars without the step.
 
-The sky is faintly bright and the wall is not. A star beside the edge is measured on half a step, which would add light
-to the one just above the skyline and take it from the one just below.
+A star beside the edge is measured on half a step, which would add light to the one on its brighter side and take it
+from the one on its darker side.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ FADE_PX = 3.0  # over which the light beside the skyline goes over to the backgr
 def exceeds_noise(sky: SkyLight) -> bool:
     """Whether the step of the `sky` is larger than the noise of a pixel: else it shifts no star's flux by much."""
     covered = sky.levels.covered
-    step_e = sky.levels.step_e[covered]
+    step_e = np.abs(sky.levels.step_e[covered])
     return bool(covered.any() and np.median(step_e) >= np.median(sky.levels.noise_e[:, covered]))
 
 
@@ -75,9 +75,12 @@ def take_out_sky_step(band: SkylineBand, sky: SkyLight) -> Detections:
     # Faint stars, which the levels leave out, are in the background and the noise; both of all sectors together.
     sides = visible < 0.5, visible >= 0.5
     middle = [median(off[side]) for side in sides]
-    dark, bright = (robust_sigma(off[side] / sigma[pixel[side]]) ** 2 for side in sides)
+    ground_e2, sky_e2 = (
+        np.square(levels.noise_e[k, s]) * robust_sigma(off[side] / levels.noise_e[k, s[side]]) ** 2
+        for k, side in zip((GROUND, SKY), sides, strict=True)
+    )
     light = low + middle[0] + (high + middle[1] - low - middle[0]) * visible
-    ratio = np.sqrt(dark + (bright - dark) * visible)
+    ratio = np.sqrt(ground_e2 + (sky_e2 - ground_e2) * visible) / sigma[pixel]
     fade = np.clip((BAND_PX - np.abs(height_px)) / FADE_PX, 0.0, 1.0)
     level[pixel] += (fade * (light - level[pixel])).astype(np.float32)
     sigma[pixel] *= (1.0 + fade * (ratio - 1.0)).astype(np.float32)

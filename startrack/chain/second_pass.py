@@ -25,7 +25,6 @@ from startrack.evidence import (
 from startrack.localization import Localizer, moments
 
 EDGE_SIGMA_PX = 0.02  # of the whole skyline, from the models of the PSF and of both levels; see docs/method.md
-MOST_DOUBT = 0.5  # beyond that the stars alone tell the position
 MOST_MOVED = 3.0  # of nine tenths of the skyline by the second fix, in its reach; in 30 rendered frames 0.3 at most
 
 
@@ -92,8 +91,10 @@ def fix_by_all(complete: Located, localizer: Localizer) -> Located:
         rows = replace(Evidence.concatenate(rows, light) if complete.by_stars else light, image_errors=sky.errors)
     located, fix = fix_again(complete, complete.fix, localizer, rows)
     located = replace(located, fix=fix)
-    if fix.own_edge_probability > MOST_DOUBT:
-        return replace(located, sky=None, sky_unused="its edge is not the skyline that the stars show: lit ground?")
+    if sky is not None and fix.lit is not None:
+        sky = sky._replace(used=sky.used & ~fix.lit.whole)
+        text = f"at azimuths {fix.lit.text} its edge is not the skyline that the stars show: lit ground?"
+        located = replace(located, sky=sky, sky_unused=text)
     if sky is not None and not fix.ambiguous:
         _require_near(located, sky)
     return located

@@ -110,7 +110,7 @@ class ShownError:
 
 @dataclass(frozen=True, eq=False)
 class Blocked:
-    """Probability that the skyline is not the map's, by sectors of azimuth from north eastward.
+    """Probability that the skyline, or the edge of the light, is not the map's, by sectors from north eastward.
 
     Something on no map hides it, or it lies below the map's.
     """
@@ -119,7 +119,7 @@ class Blocked:
 
     @property
     def whole(self) -> Bools:
-        """(n,) in which sectors the skyline is more likely not the map's."""
+        """(n,) in which sectors it is more likely not the map's."""
         return np.asarray(self.probability > 0.5)
 
     def hides(self, azimuth_rad: Array) -> Bools:
@@ -202,7 +202,7 @@ class Fix(Value):
     unstated: tuple[UnstatedFact, ...] = ()  # the one that widens the circle most first
     shown: tuple[ShownError, ...] = ()  # errors beyond the defaults
     exact_map_radius999_m: float | None = None  # if the map had no waves; None: it has none
-    own_edge_probability: float = 0.0  # that the edge of the sky's light is not the skyline
+    lit: Blocked | None = None  # where the edge of the sky's light is not the skyline; None: nowhere
     samples: Explored | None = None  # of the posterior, for a later fix by more rows of the image; None: there are none
 
     def __post_init__(self) -> None:

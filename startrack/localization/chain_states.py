@@ -7,8 +7,7 @@ import numpy as np
 
 from startrack.core.kernels import njit
 from startrack.core.types import Array, Ints
-from startrack.localization.obstacle_chain import MOVES, STATES, Moves, emissions
-from startrack.localization.profile_cells import Profiles
+from startrack.localization.obstacle_chain import MOVES, STATES, Moves
 
 CLEAR = 1e-3  # least probability of a state over which the circle is closed
 
@@ -62,9 +61,9 @@ def _smooth(e, T):
     return post
 
 
-def state_probabilities(profiles: Profiles, shift: Array) -> Array:
-    """Probabilities (SECTORS, STATES) of the states where the map's skyline is higher by `shift` (SECTORS,) [rad]."""
-    return np.asarray(_smooth(emissions(profiles, shift), transitions()))
+def state_probabilities(likelihoods: Array, moves: Moves = MOVES) -> Array:
+    """Probabilities (SECTORS, STATES) of the states by their likelihoods (SECTORS, STATES)."""
+    return np.asarray(_smooth(likelihoods, transitions(moves)))
 
 
 def closing_of(states: Array) -> tuple[int, Ints]:

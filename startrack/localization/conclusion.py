@@ -24,7 +24,6 @@ from startrack.core.types import (
 from startrack.localization.hypothesis import Hypothesis
 from startrack.localization.importance_sampling import moments
 from startrack.localization.integrity import assess_integrity
-from startrack.localization.shared_errors import OWN_EDGE
 from startrack.localization.summary import camera_at, link_points, require_inside
 from startrack.localization.wrong_files import require_files, require_map_in_view
 from startrack.terrain import DIAMETER, Terrain
@@ -129,17 +128,18 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
     ambiguous = len(modes) > 1 and _share_beyond_circle(whole, middle) > AMBIGUOUS_MASS
     best, own = whole.best, _own_main(whole)
     parameters, near = moments(best.found.points[own], best.found.share[own])
-    clear = best.model.states(parameters)[:, 0]
+    states = best.model.states(parameters)
+    clear, lit = states[:, 0], best.model.lit(states)
     widest_m = USELESS_FRACTION * terrain.search_radius_m
     if not ambiguous and radius95 > widest_m and whole.unscaled_radius95_m > widest_m:
         raise NotLocated(_useless_text(whole))
-    require_map_in_view(best.model, clear)
+    require_map_in_view(best.model, clear + lit)
     integrity = None
     if not best.model.seen.rows.is_first_look:
         require_files(found, best.found.likeliest(own))
         if not ambiguous:
             integrity = assess_integrity(best.model, parameters, near[:2, :2], clear, covariance, radius999)
-    blocked = Blocked(1.0 - clear)
+    blocked, lit_up = Blocked(1.0 - clear - lit), Blocked(lit)
     is_bias = np.array([one.name == "bias_rad" for one in best.model.errors.listed], dtype=bool)
     bias_rad = float((shares(best.log_weight) @ best.values[:, is_bias]).sum())
     return Fix(
@@ -150,7 +150,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
         integrity=integrity, unstated=_unstated_facts(whole),
         exact_map_radius999_m=_radius_by_exact_map(whole), raised_rad=best.model.rise_rad(parameters),
         at_time_m=parameters[:2], shown=_shown_errors(best),
-        own_edge_probability=float(whole.share[whole.is_gross(OWN_EDGE)].sum()),
+        lit=lit_up if lit_up else None,
         samples=_restart_points(whole, explored, dropped_probability),
     )  # fmt: skip
 

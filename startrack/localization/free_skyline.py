@@ -9,7 +9,7 @@ import numpy as np
 
 from startrack.core.kernels import njit
 from startrack.core.types import Array
-from startrack.localization.obstacle_chain import clear_emission
+from startrack.localization.obstacle_chain import clear_emissions
 from startrack.localization.profile_cells import LOW_RAD, Profiles
 
 FREE_HEIGHTS, SPREAD = 121, 6.5  # of heights about the map's skyline, closer about it
@@ -18,36 +18,29 @@ JUMP = 1e-4  # probability of a step to anywhere
 HEIGHTS = np.sinh(SPREAD * np.linspace(-1, 1, FREE_HEIGHTS)) / np.sinh(SPREAD)  # in the farthest one
 
 
-def free_log_likelihood(
-    profiles: Profiles, shift: Array, reach_rad: float = -LOW_RAD, roughness_rad: Array = ROUGHNESS_RAD
-) -> float:
-    """Log-likelihood of the rows if the skyline is the map's, higher by `shift` (SECTORS,), and any smooth curve.
-
-    The curve is within `reach_rad` of zero, and as rough as one of `roughness_rad` (n,).
-    """
-    heights = reach_rad * HEIGHTS
-    likelihood, cells = _emissions(profiles, shift, heights), np.gradient(heights)
-    logs = [_pass(likelihood, heights, cells, rough) for rough in roughness_rad]
+def free_log_likelihood(profiles: Profiles, shift: Array) -> float:
+    """Log-likelihood of the rows if the skyline is the map's, higher by `shift` (SECTORS,), and any smooth curve."""
+    logs = list_free_logs(profiles, shift, -LOW_RAD, ROUGHNESS_RAD).sum(axis=1)
     return float(np.logaddexp.reduce(logs)) - log(len(logs))
 
 
-@njit(cache=True)
-def _emissions(profiles, shift, heights):
-    """Likelihoods (SECTORS, heights) of skylines at heights above the map's."""
-    found = np.empty((len(shift), len(heights)))
-    for s in range(len(shift)):
-        for i in range(len(heights)):
-            found[s, i] = clear_emission(profiles, s, shift[s] + heights[i])
-    return found
+def list_free_logs(profiles: Profiles, shift: Array, reach_rad: float, roughness_rad: Array) -> Array:
+    """Log-likelihoods (n, SECTORS) of each sector by the sectors before it, for each roughness (n,) of the curve.
+
+    The skyline is the map's, higher by `shift` (SECTORS,), and a curve within `reach_rad` of zero.
+    """
+    heights = reach_rad * HEIGHTS
+    likelihood, cells = clear_emissions(profiles, shift[:, None] + heights), np.gradient(heights)
+    return np.array([_pass(likelihood, heights, cells, rough) for rough in roughness_rad])
 
 
 @njit(cache=True)
 def _pass(likelihood, heights, cells, rough):
-    """Log-likelihood of one pass around the circle, with steps of a mean size `rough` to either side.
+    """Log-likelihoods (SECTORS,) by one pass around the circle, with steps of a mean size `rough` to either side.
 
     The sums over exp(-|x - x'| / rough) are two recursions, up and down.
     """
-    n, whole, found = len(heights), 0.0, 0.0
+    n, whole, found = len(heights), 0.0, np.empty(len(likelihood))
     for i in range(n):
         whole += cells[i]
     a, fall, norm = np.empty(n), np.empty(n), _spread(cells, heights, rough)
@@ -66,7 +59,7 @@ def _pass(likelihood, heights, cells, rough):
             total += a[i]
         for i in range(n):
             a[i] /= total
-        found += log(total)
+        found[s] = log(total)
     return found
 
 

@@ -4,11 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from startrack.core.circle import interpolate_circle
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, ImageErrors
+from startrack.localization.obstacle_chain import (
+    LIT_MOVES,
+    MOVES,
+    NODES,
+    RISEN,
+    Levels,
+    Moves,
+    clear_emissions,
+    emissions,
+    prepare_levels,
+)
 from startrack.localization.profile_cells import Profiles
 from startrack.localization.sector_moments import SectorMoments, measure_moments
 from startrack.localization.shared_errors import SharedErrors
@@ -135,6 +147,17 @@ def independent_sigma(covariance: Array) -> Array:
     return np.asarray(np.sqrt(np.diag(covariance) * alike))
 
 
+class OwnEdge(NamedTuple):
+    """What the rows tell where the sky's light has an edge of its own, and the stars alone show the skyline."""
+
+    stars: Profiles
+    light: Array  # (SECTORS,) likelihood of the light, in which the two profiles' offsets are made up for
+
+    def likelihoods(self, shifts: Array) -> Array:
+        """(SECTORS, n) at shifts (SECTORS, n) of the map's skyline."""
+        return np.asarray(clear_emissions(self.stars, shifts) * self.light[:, None])
+
+
 @dataclass(frozen=True, eq=False)
 class SectorRows:
     """The rows of an image about the skyline of a neighbourhood."""
@@ -142,7 +165,7 @@ class SectorRows:
     around: Neighbourhood
     rows: Evidence
     image_errors: ImageErrors = NO_IMAGE_ERRORS
-    apart_nats: float = 0.0  # log-likelihood of further rows of the image, which the skyline does not explain
+    edge: OwnEdge | None = None  # None: the light ends at the skyline
 
     @cached_property
     def above_rad(self) -> Array:
@@ -168,7 +191,27 @@ class SectorRows:
     @cached_property
     def log_offset(self) -> float:
         """What makes log-likelihoods of different references and times comparable: they see other windows of rows."""
-        return float(self.profiles.offset.sum()) + self.apart_nats
+        return float(self.profiles.offset.sum())
+
+    @property
+    def moves(self) -> Moves:
+        """Probabilities of the chain's states from sector to sector."""
+        return MOVES if self.edge is None else LIT_MOVES
+
+    def emissions(self, shift: Array) -> Array:
+        """Likelihoods (SECTORS, STATES) at shifts (SECTORS,) of the map's skyline."""
+        found = emissions(self.profiles, shift)
+        if self.edge is not None:
+            found[:, RISEN + 1 :] = self.edge.likelihoods(shift[:, None])
+        return np.asarray(found)
+
+    def prepare_levels(self, reach: Array) -> Levels:
+        """The emissions of all states but the first at shifts up to `reach` (SECTORS,)."""
+        table = prepare_levels(self.profiles, reach)
+        if self.edge is not None:
+            u = np.linspace(-1.0, 1.0, NODES)
+            table[:, RISEN:] = self.edge.likelihoods(reach[:, None] * u * np.abs(u))[:, None]
+        return Levels(reach, table)
 
     @cached_property
     def image_rise(self) -> Array:

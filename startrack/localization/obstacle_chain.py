@@ -28,6 +28,7 @@ TO_RAD = np.concatenate([LEVELS_RAD[1:], [np.inf], -NOTCH_LEVELS_RAD[:-1]])  # (
 EDGES_RAD = np.concatenate([-NOTCH_LEVELS_RAD[::-1], LEVELS_RAD])
 LOWER_EDGE, UPPER_EDGE = (np.searchsorted(EDGES_RAD, np.minimum(e, EDGES_RAD[-1])) for e in (FROM_RAD, TO_RAD))
 START, NOTCH_START = 0.03 / SECTORS, 0.01 / SECTORS  # a sector: 0.03 obstacles and 0.01 notches around the circle
+LIT_START = 1.0 / SECTORS  # of light with its own edge, where it has one: once around the circle
 STOP, KEEP, NEAR = 0.05, 0.84, 0.14  # one of them ends; else its level stays, or goes to a neighbour
 WRONG_SECTOR = 1e-3  # probability that the skyline of a sector is anywhere
 NODES = 33  # of shifts, at which the emissions of the levels are prepared
@@ -58,10 +59,13 @@ def _group(first: int, last: int, start: float) -> Group:
     return Group(first, last, start / count, (1 - STOP) * (1 - KEEP - NEAR) / count)
 
 
-MOVES = Moves(
-    _group(1, RISEN, START), _group(RISEN + 1, STATES - 1, NOTCH_START), STOP, (1 - STOP) * KEEP,
-    0.5 * (1 - STOP) * NEAR,
-)  # fmt: skip
+def _moves(sunk_start: float) -> Moves:
+    risen, sunk = _group(1, RISEN, START), _group(RISEN + 1, STATES - 1, sunk_start)
+    return Moves(risen, sunk, STOP, (1 - STOP) * KEEP, 0.5 * (1 - STOP) * NEAR)
+
+
+MOVES = _moves(NOTCH_START)
+LIT_MOVES = _moves(LIT_START)  # where all states below the map's skyline are that of light with its own edge
 
 
 class Levels(NamedTuple):
@@ -117,6 +121,14 @@ def level_emission(profiles, s, shift, j):
 def clear_emission(profiles, s, shift):
     """Likelihood of a sector whose skyline is the map's."""
     return profiles.scale[s] * ((1.0 - WRONG_SECTOR) * exp(log_at(profiles, s, shift)) + WRONG_SECTOR)
+
+
+@njit(cache=True)
+def clear_emissions(profiles, shifts):
+    """`clear_emission` (SECTORS, n) at shifts (SECTORS, n)."""
+    found = np.empty(shifts.shape)
+    fill_clear_emissions(profiles, shifts, found)
+    return found
 
 
 @njit(cache=True)

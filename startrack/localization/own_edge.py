@@ -1,7 +1,8 @@
 """The sky's light with an edge of its own: lit ground below the crest, which stars do not show, is taken for sky.
 
-Then the stars alone tell the position, and the light has any smooth edge near the skyline. This is a hypothesis as that
-of a gross error of a fact, with the same rows: the evidence decides between it and light that ends at the skyline.
+Over some directions the light then has any smooth edge near the skyline, and the stars alone show the skyline. This is
+a hypothesis as that of a gross error of a fact, with the same rows, errors and chain of obstacles, in which a state
+"the light has its own edge" stands for the notches. The evidence decides between it and light that ends at the skyline.
 """
 
 from __future__ import annotations
@@ -10,10 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from startrack.core.types import Array
-from startrack.localization.free_skyline import free_log_likelihood
+from startrack.core.statistics import shares
+from startrack.localization.free_skyline import list_free_logs
 from startrack.localization.hypothesis import Hypothesis
-from startrack.localization.neighbourhood import SectorRows
+from startrack.localization.neighbourhood import OwnEdge, SectorRows
 from startrack.localization.shared_errors import OWN_EDGE
 from startrack.localization.skyline_model import SkylineModel
 
@@ -26,23 +27,19 @@ def with_own_edge(plain: Hypothesis, half_m: float) -> SkylineModel | None:
 
     It serves positions within `half_m` of the same reference.
     """
-    model, rows = plain.model, plain.model.seen.rows
+    rows = plain.model.seen.rows
     is_light = rows.extended_nats > 0.0
     if is_light.all() or not is_light.any():
         return None
-    light = SectorRows(model.around, rows.take(np.flatnonzero(is_light)))
-    nats = edge_log_likelihood(light, model.shift_of(plain.found.share @ plain.found.points))
-    stars = rows.take(np.flatnonzero(~is_light))
-    apart = SkylineModel.of(model.terrain, stars, model.around.reference_m, half_m, model.errors)
-    by_waves = model.linear.log_volume - apart.linear.log_volume  # which the light would tell in either hypothesis
-    return replace(apart, gross=OWN_EDGE, seen=replace(apart.seen, apart_nats=nats + by_waves + light.log_offset))
-
-
-def edge_log_likelihood(seen: SectorRows, shift: Array) -> float:
-    """Log-likelihood of rows with light, stars alike, if all have any edge as smooth as the light's own.
-
-    It is near the skyline that stands higher than the reference's by `shift` (SECTORS,).
-    """
-    rows = seen.rows
-    width_rad = float(np.median(rows.edge_sigma_rad[rows.extended_nats > 0.0]))
-    return free_log_likelihood(seen.profiles, shift, EDGE_REACH * width_rad, EDGE_ROUGHNESS * width_rad)
+    around = replace(plain.model.around, half_m=half_m)
+    model = SkylineModel.of(
+        around.terrain, rows, around.reference_m, half_m, plain.model.errors, plain.model.seen.image_errors
+    )
+    stars, light = (SectorRows(model.around, rows.take(np.flatnonzero(own))) for own in (~is_light, is_light))
+    width_rad = float(np.median(rows.edge_sigma_rad[is_light]))
+    shift = plain.model.shift_of(plain.found.share @ plain.found.points)
+    logs = list_free_logs(light.profiles, shift, EDGE_REACH * width_rad, EDGE_ROUGHNESS * width_rad)
+    likely = shares(logs.sum(axis=1)) @ logs
+    offset = light.profiles.offset + stars.profiles.offset - model.seen.profiles.offset
+    edge = OwnEdge(stars.profiles, np.exp(likely + offset))
+    return replace(model, gross=OWN_EDGE, seen=replace(model.seen, edge=edge))

@@ -17,12 +17,7 @@ from startrack.core.types import SECTORS, Array, Evidence, ImageErrors, Ints
 from startrack.localization.chain_states import closing_of, state_probabilities
 from startrack.localization.linear_errors import LinearErrors
 from startrack.localization.neighbourhood import NO_IMAGE_ERRORS, Neighbourhood, SectorRows
-from startrack.localization.obstacle_chain import (
-    MOVES,
-    Levels,
-    chain_log_likelihoods,
-    prepare_levels,
-)
+from startrack.localization.obstacle_chain import RISEN, Levels, chain_log_likelihoods
 from startrack.localization.sector_moments import solve_linear
 from startrack.localization.shared_errors import ErrorBasis, SharedErrors
 from startrack.terrain import Terrain
@@ -43,7 +38,7 @@ class PreparedLevels:
         most = np.maximum(shifts.max(axis=0), -shifts.min(axis=0))
         if self._known is None or (most > self._known.reach).any():
             reach = np.maximum(MARGIN * most, LEAST_REACH_RAD)
-            self._known = Levels(reach, prepare_levels(seen.profiles, reach))
+            self._known = seen.prepare_levels(reach)
         return self._known
 
 
@@ -155,16 +150,17 @@ class SkylineModel:
 
     def log_likelihood_of(self, shifts: Array) -> Array:
         """(n,) of shifts (n, SECTORS) of the map's skyline."""
-        profiles, found = self.seen.profiles, np.empty(len(shifts))
+        seen, found = self.seen, np.empty(len(shifts))
         cut, closing = self._closing
-        chain_log_likelihoods(profiles, self.levels.at_least(self.seen, shifts), MOVES, shifts, cut, closing, found)
+        levels = self.levels.at_least(seen, shifts)
+        chain_log_likelihoods(seen.profiles, levels, seen.moves, shifts, cut, closing, found)
         return found
 
     @cached_property
     def _closing(self) -> Closing:
         if self.closing is not None:
             return self.closing
-        return closing_of(state_probabilities(self.seen.profiles, np.zeros(SECTORS)))
+        return closing_of(self._states_at(np.zeros(SECTORS)))
 
     def shift_of(self, parameters: Array) -> Array:
         """(SECTORS,) by how much the skyline of the map at parameters (2 + a,) stands higher than at the reference."""
@@ -172,7 +168,14 @@ class SkylineModel:
 
     def states(self, parameters: Array) -> Array:
         """Probabilities (SECTORS, STATES) of the chain's states at parameters (2 + a,)."""
-        return np.asarray(state_probabilities(self.seen.profiles, self.shift_of(parameters)))
+        return self._states_at(self.shift_of(parameters))
+
+    def lit(self, states: Array) -> Array:
+        """(SECTORS,) probabilities that the light has an edge of its own, by those of the `states`."""
+        return states[:, RISEN + 1 :].sum(axis=1) if self.seen.edge is not None else np.zeros(SECTORS)
+
+    def _states_at(self, shift: Array) -> Array:
+        return state_probabilities(self.seen.emissions(shift), self.seen.moves)
 
     @cached_property
     def linear(self) -> LinearErrors:

@@ -17,7 +17,6 @@ from startrack.localization.hypothesis import (
     first_plain,
     sample_gross_error,
 )
-from startrack.localization.own_edge import edge_log_likelihood
 from startrack.localization.shared_errors import CLOCK_FACT, OWN_EDGE, OWN_EDGE_PROBABILITY, SharedErrors
 from startrack.localization.skyline_model import SkylineModel
 
@@ -50,8 +49,6 @@ def require_files(found: Sequence[Hypothesis], parameters: Array) -> None:
     model, whole = found[0].model, first_plain(found).model
     shift = model.shift_of(parameters)
     free = free_log_likelihood(whole.seen.profiles, shift)
-    if model.gross == OWN_EDGE:  # which the stars must not have too
-        free = max(free, edge_log_likelihood(whole.seen, shift))
     better = free + whole.seen.log_offset - _log_map(found[0], parameters) - model.seen.log_offset
     if better > 0.0:
         wrong = Blocked(1.0 - model.states(parameters)[:, 0])

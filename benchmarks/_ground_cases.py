@@ -13,7 +13,7 @@ from _map_draws import draw_position
 from _sky_view import View, turn
 
 from startrack.core.types import Array
-from startrack.terrain import ForwardingTerrain, HeightMap, Terrain
+from startrack.terrain import ForwardingTerrain, GroundBrightness, HeightMap, Terrain
 
 SIGMA_RAD = np.radians(0.024)  # of the horizon of 5 m posts about that of the shipped map, less their mean
 WAVES = np.arange(1, 81)  # around the compass
@@ -36,6 +36,7 @@ class Drawn(NamedTuple):
 
     terrain: Terrain
     facts: dict[str, object]
+    brightness: GroundBrightness | None = None  # None: as the terrain's
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,7 @@ class Case:
     waves_deg: Callable[[HeightMap], Array] | None = None  # what a file with the whole truth states of the waves
     light_e: Callable[[View, Rng], tuple[Array, dict[str, object]]] | None = None  # added, and what was drawn for it
     time_sigma_s: float = 0.0
+    pair: str = ""  # the case with the same places and noise; "": none
 
 
 def cases_of(reference: Path | None) -> dict[str, Case]:
@@ -62,6 +64,8 @@ def cases_of(reference: Path | None) -> dict[str, Case]:
     return first | smooth | {
         "posts-3km": Case(20, place=floor, ground=posts_that_agree, waves_deg=waves_of_posts),
         "seam": Case(20, place=floor, ground=seam),
+        "dark": Case(20, "shackleton-thesis"),
+        "bright": Case(20, "shackleton-thesis", ground=patches, pair="dark"),
         "lit-strip": Case(20, "shackleton-thesis", (0.07,), light_e=strip),
         "lit-wall": Case(20, "shackleton-thesis", (0.07,), light_e=fading_wall),
         "turned": Case(20, place=floor, ground=turned, time_sigma_s=1.0),
@@ -197,6 +201,13 @@ def turned(stated: Terrain, place_m: Array, rng: Rng) -> Drawn:
     """A map that is turned by up to two degrees."""
     by_deg = rng.uniform(*TURN_DEG) * rng.choice([-1.0, 1.0])
     return Drawn(Turned(stated, float(np.radians(by_deg))), {"turned_deg": by_deg})
+
+
+def patches(stated: Terrain, place_m: Array, rng: Rng) -> Drawn:
+    """Ground in patches of 5 to 60 degrees, each 0.3 to 3 times as bright as the sky."""
+    size_deg, seed = rng.uniform(5.0, 60.0), int(rng.integers(1 << 30))
+    brightness = GroundBrightness.of({"low": 0.3, "high": 3.0, "size_deg": size_deg, "seed": seed})
+    return Drawn(stated, {"size_deg": size_deg}, brightness)
 
 
 def below_crest(view: View, rng: Rng) -> tuple[Array, Array, dict[str, object]]:

@@ -204,10 +204,15 @@ def turned(stated: Terrain, place_m: Array, rng: Rng) -> Drawn:
 
 
 def patches(stated: Terrain, place_m: Array, rng: Rng) -> Drawn:
-    """Ground in patches of 5 to 60 degrees, each 0.3 to 3 times as bright as the sky."""
+    """Ground in such patches."""
+    brightness = draw_brightness(rng)
+    return Drawn(stated, {"size_deg": float(np.degrees(brightness.size_rad))}, brightness)
+
+
+def draw_brightness(rng: Rng) -> GroundBrightness:
+    """Patches of 5 to 60 degrees, each 0.3 to 3 times as bright as the sky."""
     size_deg, seed = rng.uniform(5.0, 60.0), int(rng.integers(1 << 30))
-    brightness = GroundBrightness.of({"low": 0.3, "high": 3.0, "size_deg": size_deg, "seed": seed})
-    return Drawn(stated, {"size_deg": size_deg}, brightness)
+    return GroundBrightness.of({"low": 0.3, "high": 3.0, "size_deg": size_deg, "seed": seed})
 
 
 def below_crest(view: View, rng: Rng) -> tuple[Array, Array, dict[str, object]]:

@@ -8,6 +8,7 @@ The ground is that near Jacksboro, Tennessee, at 3 arcsec (SRTM), as it comes wi
 whose mean horizon is 9 to 26 degrees. 2048 px, a star of V 6 on the axis at 5 sigma, a sky of 21.5 mag/arcsec2, stars
 refracted and dimmed by the standard atmosphere. "5 m per post": the ground differs from the map by 5 m of white noise
 at each post, which the map states. "trees": they raise 20 % of the skyline and are on no map.
+"bright ground": the exact map, with patches of 5 to 60 degrees, 0.3 to 3 times as bright as the sky.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ import argparse
 import shlex
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+from _ground_cases import draw_brightness
 from _hazard_grounds import Risen
 from _map_draws import draw_ground
 from _results import table, write_section
@@ -106,6 +108,7 @@ class Case:
     wanted_m: float | None
     post_m: float = 0.0
     has_trees: bool = False
+    is_bright: bool = False  # ground in patches that are 0.3 to 3 times as bright as the sky
     light: Callable[[View, Rng], Array] = lambda view, rng: view.light_e
     sun_rad: tuple[float, float] = (BELOW_RAD, NIGHT_RAD)
     moon_rad: tuple[float, float] = (BELOW_RAD, DARK_RAD)
@@ -116,6 +119,7 @@ class Case:
 CASES = {
     "exact map": Case(2.0),
     "5 m per post": Case(12.0, post_m=POST_SIGMA_M),
+    "bright ground": Case(None, is_bright=True),
     "trees on 20 % of the skyline": Case(None, has_trees=True),
     "Moon up": Case(None, light=moonlight, moon_rad=tuple(MOON_RAD), is_sky=True),
     "twilight": Case(None, light=twilight, sun_rad=tuple(TWILIGHT_RAD), is_sky=True),
@@ -155,6 +159,8 @@ def locate_frame(job: tuple[str, int]) -> tuple[str, float, float, float]:
     outcomes = []
     for k in range(case.exposures):
         scene, noise = series.scene(k, f"frame-{k:03d}")
+        if case.is_bright:
+            scene = replace(scene, ground_brightness=draw_brightness(rng))
         exposure, _, _ = expose(scene, Hazard(light=case.light), noise)
         outcomes.append(locate(exposure, _camera(), stated, load_catalog()))
     if case.exposures == 1:

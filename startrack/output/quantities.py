@@ -81,7 +81,8 @@ LIGHT_QUANTITIES: tuple[Quantity, ...] = (
       "number", nullable=True, form="%.4f", columns={"sky_mag_arcsec2": ()},
       shown=show_everywhere("Sky", "{:.2f} mag/arcsec2", "evidence")),
     Q("sky.unused", "", Located, lambda v: v.sky_unused or None,
-      "why the light of the sky is not evidence of the position; null: it is, or was not asked for", "text",
+      "why the light of the sky, or a part of it, is not evidence of the position; "
+      "null: all of it is, or it was not asked for", "text",
       nullable=True, optional=True,
       shown=(Show("text", "evidence", "; sky not used: {}"), Show("page", "Sky not used", "{}"))),
 )  # fmt: skip

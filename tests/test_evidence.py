@@ -15,6 +15,7 @@ from star_painter import cramer_rao, paint
 
 from startrack.core.smooth_image import SmoothImage
 from startrack.core.types import Body, Detections, Stars
+from startrack.detection.background import background_and_noise
 from startrack.evidence import FluxScale, StarEvidence, StarPhotometry, fit_flux_scale, flux_scale
 from startrack.evidence.photometry import Photometry, Sources, half_width, measure
 from startrack.evidence.star_evidence import CAP, visibility_llr
@@ -192,6 +193,26 @@ def test_a_hot_pixel_near_a_star_is_masked(flux: float, excess: float) -> None:
     assert light.usable.mean() > 0.97
     assert np.mean(np.abs(z[light.usable]) > 5) < 0.005
     assert z[light.usable].std() < 1.15  # ten sigma at the centre of a star may count as its flux
+
+
+@pytest.mark.parametrize("step_sigmas", [15.0, 100.0])
+def test_stars_beside_the_end_of_a_bright_sky_are_unbiased(step_sigmas: float) -> None:
+    """The background bends over its blocks beside a sharp edge, and the image does not."""
+    rng, sigma, middle, radius = np.random.default_rng(5), 0.7, SIZE / 2 + 0.3, 350.0
+    y, x = np.mgrid[:SIZE, :SIZE]
+    light = VARIANCE + step_sigmas * np.sqrt(VARIANCE) * norm.cdf((radius - np.hypot(x - middle, y - middle)) / sigma)
+    image = rng.normal(light, np.sqrt(light)).astype(np.float32)
+    background, noise = background_and_noise(image, 1.0, sigma)
+    detections = replace(without_sources(image, noise.whole(), sigma_px=sigma), background=background)
+    for above_px in (rng.uniform(5.0, 20.0, 4000), rng.uniform(-20.0, -5.0, 4000)):
+        turn = rng.uniform(0.0, 2 * np.pi, 4000)
+        xy = middle + (radius - above_px)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        nothing = np.zeros(len(xy))
+        found = measure(detections, Sources(xy_px=xy, flux_e=nothing, fraction_sigma=nothing, visible=nothing))
+        assert found.usable.mean() > 0.97
+        z = (found.flux_e / np.sqrt(found.variance_e2))[found.usable]
+        assert abs(z.mean()) < 0.1  # 0.02 by chance; with the background as it is 0.4
+        assert z.std() < 1.1
 
 
 def test_saturated_stamps_are_unusable() -> None:

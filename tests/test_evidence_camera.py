@@ -31,7 +31,7 @@ def test_an_uncertain_lens_weakens_the_evidence_at_the_rim(located):
     rays = located.result.stars.rays_icrs[sure.star] @ located.result.attitude.R_cam_icrs.T
     rim = (rays[:, 2] < 0.2) & sure.usable & (sure.llr > 8)
     axis = (rays[:, 2] > 0.95) & sure.usable & (sure.llr > 8)
-    assert rim.sum() > 20 and axis.sum() > 20
+    assert rim.sum() > 10 and axis.sum() > 10
     bright = sure.flux_e > 20 * sure.sigma_e
     assert np.median(sure.llr[rim & ~bright]) > np.median(doubtful.llr[rim & ~bright])
     np.testing.assert_allclose(doubtful.llr[axis], sure.llr[axis], atol=0.5)

@@ -14,13 +14,13 @@ CONTRAST_SIGMAS = 10.0  # of an edge, in the noise of a pixel: a normal prior ab
 
 
 @njit(inline="always")
-def fit_beside_edge(profile, light, data, smooth, weight, flux, level, strength, width_px):
-    """Flux, and its variance beyond 1 / `strength`, of a star in a square stamp (n,), and whether that shows an edge.
+def fit_beside_edge(profile, light, data, shape, weight, flux, level, strength, width_px):
+    """Flux, and its variance beyond 1 / `strength`, of a star in a square stamp (n,).
 
     The edge is straight and as wide as the PSF, `width_px`; its direction is that of the stamp's slope, its place and
     its contrast are unknown: the means are over all places, by their likelihoods. A stamp whose slope the noise and
-    neighbours that may not shine explain has none: its `flux` is that without an edge, about a `level`. The `data` are
-    without the background, `smooth`, and the `light` of neighbours.
+    neighbours that may not shine explain has none: its `flux` and `level` are those of a fit with
+    the background's `shape`. The `data` are without the background, and without the `light` of neighbours.
     """
     side = int(np.sqrt(len(profile)))
     half = side // 2
@@ -31,13 +31,12 @@ def fit_beside_edge(profile, light, data, smooth, weight, flux, level, strength,
         rest = w * (data[k] - flux * profile[k] - level)
         wx, wy, lx, ly = wx + dx * rest, wy + dy * rest, lx + w * dx * light[k], ly + w * dy * light[k]
         wxx, wyy, total = wxx + w * dx * dx, wyy + w * dy * dy, total + w
-        mean_p, mean_q = mean_p + w * profile[k], mean_q + w * (data[k] + smooth[k])
+        mean_p, mean_q = mean_p + w * profile[k], mean_q + w * (data[k] + shape[k])
     wxx, wyy = max(wxx, 1e-30), max(wyy, 1e-30)
     explained = FLAT_SLOPE_EXCESS * (1.0 / wxx + 1.0 / wyy) + (lx / wxx) ** 2 + (ly / wyy) ** 2
     x, y = wx / wxx, wy / wyy
-    is_edge = x * x + y * y > explained
-    found, more = np.float64(flux), 0.0
-    if is_edge:
+    found, beyond = np.float64(flux), 0.0
+    if x * x + y * y > explained:
         mean_p, mean_q, steep = mean_p / total, mean_q / total, np.sqrt(x * x + y * y)
         x, y = x / steep, y / steep
         spread_px = np.sqrt(width_px * width_px + 1.0 / 12.0)
@@ -47,7 +46,7 @@ def fit_beside_edge(profile, light, data, smooth, weight, flux, level, strength,
             we, wee, wpe, wqe, wpp, wpq = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             for k in range(len(profile)):
                 e = normal_cdf((x * (k % side - half) + y * (k // side - half) - at) / spread_px)
-                p, q = profile[k] - mean_p, data[k] + smooth[k] - mean_q
+                p, q = profile[k] - mean_p, data[k] + shape[k] - mean_q
                 we, wee, wpe = we + weight[k] * e, wee + weight[k] * e * e, wpe + weight[k] * p * e
                 wqe, wpp, wpq = wqe + weight[k] * q * e, wpp + weight[k] * p * p, wpq + weight[k] * p * q
             wee += total / len(profile) / CONTRAST_SIGMAS**2 - we * we / total
@@ -60,5 +59,5 @@ def fit_beside_edge(profile, light, data, smooth, weight, flux, level, strength,
             part = np.exp(log - best)
             sum_w, sum_f, sum_v = sum_w + part, sum_f + part * f, sum_v + part * (f * f + wee / det)
         found = sum_f / sum_w
-        more = max(sum_v / sum_w - found * found - 1.0 / strength, 0.0)
-    return found, more, is_edge
+        beyond = max(sum_v / sum_w - found * found - 1.0 / strength, 0.0)
+    return found, beyond

@@ -25,11 +25,28 @@ HIGHEST_GROUND_RAD = np.radians(45.0)  # higher columns are narrower than pixels
 LEVEL_RAD, ABOVE_RAD = np.radians(2.0), np.radians(20.0)  # for the brightness of the sky above a step
 TOP_RAD = HIGHEST_GROUND_RAD + ABOVE_RAD + LEVEL_RAD  # of the columns
 COLUMN_SAMPLES = 3  # per pixel along a column, and across it
-WIDTHS = ((1, 0.6), (7, 0.3), (21, 0.2))  # columns averaged, and weight: they share their pixels with their neighbours
 FILL_SHARE = 0.1  # of the widest average around a star: so many columns without a star are enough
 LARGE_AREA_PX, MOON_GLARE_PX = 500, 40  # of the Moon and what surrounds it
 SATURATED_PX = 5  # around saturated pixels nothing is measured
 HOT_SIGMAS = 6.0  # above the median of the neighbours: stars and hot pixels
+
+
+@dataclass(frozen=True)
+class Averaging:
+    """A mean over columns and elevations in which steps are sought."""
+
+    columns: int  # odd
+    pixels: int  # along a column
+    slopes: tuple[float, ...]  # of its rows, elevation over azimuth
+    weight: float  # of its steps: averages share their pixels with their neighbours and with each other
+
+
+# A faint ridge shows in wide averages only, and a steep one only in those that follow it.
+SLOPES = (-0.6, -0.3, 0.0, 0.3, 0.6)
+AVERAGINGS = (
+    Averaging(1, 1, (0.0,), 0.6), Averaging(7, 1, (0.0,), 0.3), Averaging(21, 1, (0.0,), 0.2),
+    Averaging(21, 3, SLOPES, 0.2),
+)  # fmt: skip
 
 
 def elevations_rad() -> Array:
@@ -94,7 +111,7 @@ def sample_columns(
         points |= cv2.remap(disks, x, y, cv2.INTER_NEAREST) > 0
     columns = Columns(elevation, total / COLUMN_SAMPLES, spread / COLUMN_SAMPLES, px_rad / COLUMN_SAMPLES, px_rad)
     without = replace(columns, light_e=np.where(points, np.nan, columns.light_e))
-    around = average_columns(without, WIDTHS[-1][0], FILL_SHARE).light_e
+    around = average_columns(without, AVERAGINGS[-1].columns, FILL_SHARE).light_e
     return replace(columns, light_e=np.where(points, around, columns.light_e))
 
 
@@ -121,15 +138,47 @@ def _lost_pixels(detections: Detections) -> NDArray[np.uint8]:
     return np.asarray(np.maximum(*around) | masked.view(np.uint8), dtype=np.uint8)
 
 
-def average_columns(columns: Columns, width: int, least: float = 0.49) -> Columns:
-    """Running means over an odd number of columns, of which at least the share `least` must be in view."""
+def average_columns(columns: Columns, width: int, least: float = 0.49, slope: float = 0.0) -> Columns:
+    """Running means over an odd number of columns, of which at least the share `least` must be in view.
+
+    `slope` is that of the rows over which a mean goes, elevation over azimuth.
+    """
     from scipy.ndimage import uniform_filter1d
 
     known = np.isfinite(columns.light_e)
-    total = uniform_filter1d(np.where(known, columns.light_e, 0.0), width, axis=1, mode="wrap")
-    share = uniform_filter1d(known.astype(float), width, axis=1, mode="wrap")
-    light = np.where(share > least, total / np.maximum(share, 1e-9), np.nan)
-    return replace(columns, light_e=light)
+    light, share = np.where(known, columns.light_e, 0.0), known.astype(float)
+    if slope == 0.0:
+        total, share = (uniform_filter1d(one, width, axis=1, mode="wrap") for one in (light, share))
+    else:
+        rise = slope * (2 * np.pi / AZIMUTH_COLUMNS) / columns.step_rad * (np.arange(width) - width // 2)
+        total, share = (_mean_along(one, rise) for one in (light, share))
+    return replace(columns, light_e=np.where(share > least, total / np.maximum(share, 1e-9), np.nan))
+
+
+def _mean_along(samples: Array, rise: Array) -> Array:
+    """Means of samples (k, columns) over the columns beside each, `rise` (odd n,) samples higher; 0 beyond the ends."""
+    reach = int(np.ceil(np.abs(rise).max())) + 1
+    padded = np.pad(samples, ((reach, reach), (0, 0)))
+    total = np.zeros_like(samples)
+    for beside, up in zip(np.arange(len(rise)) - len(rise) // 2, rise, strict=True):
+        low = int(np.floor(up))
+        first, part = reach + low, up - low
+        rows = (1.0 - part) * padded[first : first + len(samples)] + part * padded[first + 1 : first + 1 + len(samples)]
+        total += np.roll(rows, -beside, axis=1)
+    return total / len(rise)
+
+
+def coarser(columns: Columns, pixels: int) -> Columns:
+    """The same with means over so many `pixels` along a column as pixels; those with a part out of view are unknown."""
+    rows = len(columns.elevation_rad) // pixels * pixels
+
+    def mean(samples: Array) -> Array:
+        return np.asarray(samples[:rows].reshape(-1, pixels, *samples.shape[1:]).mean(axis=1))
+
+    return Columns(
+        mean(columns.elevation_rad), mean(columns.light_e), mean(columns.noise_e) / np.sqrt(pixels),
+        columns.step_rad * pixels, columns.px_rad * pixels,
+    )  # fmt: skip
 
 
 def mean_above(columns: Columns, low_px: float, high_px: float) -> Array:

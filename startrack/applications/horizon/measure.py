@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.applications.horizon.clouds import NEAR_EDGE_RAD, cloud_probability, cloud_sigma_rad
-from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, COLUMNS_PER_AZIMUTH, SKYLINE_AZIMUTHS, WIDTHS
+from startrack.applications.horizon.columns import AVERAGINGS, AZIMUTH_COLUMNS, COLUMNS_PER_AZIMUTH, SKYLINE_AZIMUTHS
 from startrack.applications.horizon.frames import LeftOut, Progress, SkyFrame, orient_frames
 from startrack.applications.horizon.join import join_skylines
 from startrack.applications.horizon.posterior import (
@@ -35,6 +35,7 @@ WEATHER_1 = 0.1  # of the refraction: what the weather changes
 GAP_SIGNIFICANCE = 5.0  # of light below the skyline that is brighter than usual ground
 DEEPEST_GAP_RAD = np.radians(15.0)
 DECISIVE_LLR = 2.0
+CLOUD_STEPS = 2
 
 Light = tuple[StarLight, list[Steps]]  # of one picture: stars, and steps of each width
 
@@ -118,8 +119,8 @@ def measure_frame(frame: SkyFrame, site: Site) -> MeasuredFrame:
     check_time()
     steps, by_stars = find_steps(frame, stars), star_log_likelihood(stars.rays, stars.missing)
     by_steps = np.zeros_like(by_stars)
-    for found, (_, weight) in zip(steps, WIDTHS, strict=True):
-        add_step_log_likelihood(by_steps, found, weight)
+    for found, averaging in zip(steps, AVERAGINGS, strict=True):
+        add_step_log_likelihood(by_steps, found, averaging.weight)
     light = stars, steps
     return MeasuredFrame(frame, light, _skyline_of([frame], [light], by_stars + by_steps, site), by_stars, by_steps)
 
@@ -169,7 +170,7 @@ def _cloud_probability(
     probability = np.ones(len(elevation))
     for stars, steps in lights:
         shows = _has_star([stars], azimuth, elevation) | _has_step([steps], mean)
-        one = cloud_probability(steps[-1], stars, mean, elevation, lowest_rad)
+        one = cloud_probability(steps[CLOUD_STEPS], stars, mean, elevation, lowest_rad)
         probability[shows] *= one[shows]
     return probability
 

@@ -12,9 +12,9 @@ from startrack.applications.horizon.columns import AVERAGINGS, AZIMUTH_COLUMNS, 
 from startrack.applications.horizon.frames import LeftOut, Progress, SkyFrame, orient_frames
 from startrack.applications.horizon.join import join_skylines
 from startrack.applications.horizon.posterior import (
+    KINDS,
     WEAKEST_CONTRAST,
     add_step_log_likelihood,
-    column_log_prior,
     combine_columns,
     star_log_likelihood,
 )
@@ -118,7 +118,7 @@ def measure_frame(frame: SkyFrame, site: Site) -> MeasuredFrame:
     stars = measure_stars(frame)
     check_time()
     steps, by_stars = find_steps(frame, stars), star_log_likelihood(stars.rays, stars.missing)
-    by_steps = np.zeros_like(by_stars)
+    by_steps = np.zeros((len(KINDS), *by_stars.shape))
     for found, averaging in zip(steps, AVERAGINGS, strict=True):
         add_step_log_likelihood(by_steps, found, averaging.weight)
     light = stars, steps
@@ -128,10 +128,10 @@ def measure_frame(frame: SkyFrame, site: Site) -> MeasuredFrame:
 def _skyline_of(
     frames: Sequence[SkyFrame], lights: Sequence[Light], log_likelihood: Array, site: Site
 ) -> MeasuredSkyline:  # fmt: skip
-    """The skyline by the `log_likelihood` (AZIMUTH_COLUMNS, n) of the `lights` of `frames`."""
+    """The skyline by the `log_likelihood` (KINDS, AZIMUTH_COLUMNS, n) of the `lights` of `frames`."""
     check_time()
     stars, steps = zip(*lights, strict=True)
-    mean, sigma = combine_columns(column_log_prior() + log_likelihood)
+    mean, sigma = combine_columns(log_likelihood)
     # The columns' posterior as bins of one degree; the errors that the frames share are added once.
     azimuth = np.radians(np.arange(SKYLINE_AZIMUTHS, dtype=np.float64) * (360.0 / SKYLINE_AZIMUTHS))
     elevation, scatter = (_columns_of_bins(one, 0).mean(axis=1) for one in (mean, np.square(sigma)))
@@ -148,7 +148,9 @@ def _skyline_of(
     # The skyline behind a cloud's edge may be anywhere down to the lowest bin.
     known &= scatter + variation + added + cloud * np.square(elevation - lowest) < UNKNOWN_SIGMA_RAD**2
     added += np.square(cloud_sigma_rad(cloud, elevation - lowest))
-    variance = scatter / COLUMNS_PER_AZIMUTH + np.square(variation) / (variation + WALL_RAD**2) + added
+    # The errors of the columns of a bin are independent where each has its step; wide ones they have in common.
+    common = np.square(scatter) / (scatter + NEAR_EDGE_RAD**2)
+    variance = (scatter - common) / COLUMNS_PER_AZIMUTH + common + np.square(variation) / (variation + WALL_RAD**2) + added
     source = np.select([by_stars & by_light, by_light, by_stars], ["both", "sky light", "stars"], "")
     return MeasuredSkyline(
         azimuth_rad=azimuth,
@@ -206,14 +208,16 @@ def _common_sigma_rad(frames: Sequence[SkyFrame], azimuth: Array, elevation: Arr
 
 
 def _has_star(stars: Sequence[StarLight], azimuth: Array, elevation: Array) -> Bools:
-    """Whether stars near the skyline decide about each bin (n,)."""
-    found = np.zeros(len(azimuth), dtype=bool)
-    for light in stars:
-        rays = light.rays.take(np.abs(light.rays.llr) > DECISIVE_LLR)
-        number, star = np.nonzero(np.abs(rays.elevation_rad - elevation[:, None]) < UNKNOWN_SIGMA_RAD)
+    """Whether stars decide about each bin (n,): one seen near above the skyline, and one missing near below it."""
+    found = np.zeros((2, len(azimuth)), dtype=bool)
+    for rays in (light.rays.take(np.abs(light.rays.llr) > DECISIVE_LLR) for light in stars):
+        height = rays.elevation_rad - elevation[:, None]
+        number, star = np.nonzero(np.abs(height) < UNKNOWN_SIGMA_RAD)
         apart = np.abs((rays.azimuth_rad[star] - azimuth[number] + np.pi) % (2 * np.pi) - np.pi)
-        found[number[apart * np.cos(elevation[number]) < UNKNOWN_SIGMA_RAD]] = True
-    return found
+        near = apart * np.cos(elevation[number]) < UNKNOWN_SIGMA_RAD
+        for side, way in enumerate((1.0, -1.0)):
+            found[side, number[near & (way * height[number, star] > 0.0) & (way * rays.llr[star] > 0.0)]] = True
+    return np.asarray(found.all(axis=0))
 
 
 def _has_step(steps: Sequence[list[Steps]], elevation_rad: Array) -> Bools:

@@ -45,7 +45,7 @@ class Averaging:
 SLOPES = (-0.6, -0.3, 0.0, 0.3, 0.6)
 AVERAGINGS = (
     Averaging(1, 1, (0.0,), 0.6), Averaging(7, 1, (0.0,), 0.3), Averaging(21, 1, (0.0,), 0.2),
-    Averaging(21, 3, SLOPES, 0.06),
+    Averaging(21, 3, SLOPES, 0.6),
 )  # fmt: skip
 
 

@@ -29,6 +29,7 @@ SKY_PER_RAD = np.degrees(0.08)  # density of steps in the sky (clouds, reflectio
 # three pictures of another camera: 0.27; 1.18, sigma 0.60.
 SKY_LOG_SCALE, GROUND_LOG_RATIO, GROUND_LOG_SIGMA = 0.23, 1.0, 0.55
 RARE_PER_RAD = np.degrees(3e-4)  # of sharp ones in the sky: wires, halos of bright stars
+ROOF_PER_RAD = np.degrees(0.03)  # density of strong ones: a roof or a tree before a faint ridge
 GROUND_PER_RAD, GROUND_CONTRAST = np.degrees(0.3), 0.15  # density of steps below the skyline, and their scale
 SPURIOUS_PROBABILITY = 0.01  # of light at a hidden star: leaves with gaps, hot pixels
 MOST_MISSING = 0.999  # probability that a visible star is not seen
@@ -111,7 +112,7 @@ def add_step_log_likelihood(total: Array, steps: Steps, temper: float) -> None:
     contrast = np.abs(steps.contrast)
     usual = np.minimum(contrast / WEAKEST_CONTRAST, 1.0) ** 2
     in_sky = noise + SKY_PER_RAD * usual * sky_likelihood_ratio(steps.log_ratio) + RARE_PER_RAD
-    in_ground = noise + GROUND_PER_RAD * np.exp(-contrast / GROUND_CONTRAST) + 15 * RARE_PER_RAD
+    in_ground = noise + GROUND_PER_RAD * np.exp(-contrast / GROUND_CONTRAST) + ROOF_PER_RAD
     passed = 0.5 * np.log(in_sky / in_ground)
     faint = np.exp(-contrast / FAINT_CONTRAST) / (2.0 * FAINT_CONTRAST)
     order = np.argsort(steps.column, kind="stable")

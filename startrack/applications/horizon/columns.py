@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from startrack.camera import Camera
 from startrack.core.types import Array, Bools, Detections, Ints
@@ -28,6 +29,7 @@ COLUMN_SAMPLES = 3  # per pixel along a column, and across it
 FILL_SHARE = 0.1  # of the widest average around a star: so many columns without a star are enough
 LARGE_AREA_PX, MOON_GLARE_PX = 500, 40  # of the Moon and what surrounds it
 SATURATED_PX = 5  # around saturated pixels nothing is measured
+SCATTER_PX = 4.0  # up and down, over which the scatter of averaged columns is measured
 HOT_SIGMAS = 6.0  # above the median of the neighbours: stars and hot pixels
 
 
@@ -141,22 +143,29 @@ def _lost_pixels(detections: Detections) -> NDArray[np.uint8]:
 def average_columns(columns: Columns, width: int, least: float = 0.49, slope: float = 0.0) -> Columns:
     """Running means over an odd number of columns, of which at least the share `least` must be in view.
 
-    `slope` is that of the rows over which a mean goes, elevation over azimuth.
+    `slope` is that of the rows over which a mean goes, elevation over azimuth. The noise is that of the mean: by that
+    of the pixels, and by what the columns differ more than usual, half of them from the other half (at a wall).
     """
-    from scipy.ndimage import uniform_filter1d
-
+    if width == 1:
+        return columns
     known = np.isfinite(columns.light_e)
     light, share = np.where(known, columns.light_e, 0.0), known.astype(float)
-    if slope == 0.0:
-        total, share = (uniform_filter1d(one, width, axis=1, mode="wrap") for one in (light, share))
-    else:
-        rise = slope * (2 * np.pi / AZIMUTH_COLUMNS) / columns.step_rad * (np.arange(width) - width // 2)
-        total, share = (_mean_along(one, rise) for one in (light, share))
-    return replace(columns, light_e=np.where(share > least, total / np.maximum(share, 1e-9), np.nan))
+    rise = slope * (2 * np.pi / AZIMUTH_COLUMNS) / columns.step_rad * (np.arange(width) - width // 2)
+    total, squares, share = (_mean_along(one, rise) for one in (light, np.square(light), share))
+    mean = np.where(share > least, total / np.maximum(share, 1e-9), np.nan)
+    scatter2 = np.maximum(squares / np.maximum(share, 1e-9) - np.square(np.nan_to_num(mean)), 0.0)
+    nearby = uniform_filter1d(scatter2, 2 * round(SCATTER_PX * COLUMN_SAMPLES) + 1, axis=0)
+    pixel2 = np.square(columns.noise_e)
+    usual = np.nanmedian(np.where(share > least, nearby, np.nan) / np.maximum(pixel2, 1e-9))
+    width_px = width * 2 * np.pi / AZIMUTH_COLUMNS / columns.px_rad * np.cos(columns.elevation_rad)
+    noise2 = pixel2 / np.maximum(width_px, 1.0)[:, None] + np.maximum(nearby - usual * pixel2, 0.0) / 2.0
+    return replace(columns, light_e=mean, noise_e=np.sqrt(noise2))
 
 
 def _mean_along(samples: Array, rise: Array) -> Array:
     """Means of samples (k, columns) over the columns beside each, `rise` (odd n,) samples higher; 0 beyond the ends."""
+    if not rise.any():
+        return np.asarray(uniform_filter1d(samples, len(rise), axis=1, mode="wrap"))
     reach = int(np.ceil(np.abs(rise).max())) + 1
     padded = np.pad(samples, ((reach, reach), (0, 0)))
     total = np.zeros_like(samples)

@@ -93,7 +93,9 @@ def _steps_of(columns: Columns, averaging: Averaging) -> Steps:
 
     columns = coarser(columns, averaging.pixels)
     dark = float(np.nanpercentile(average_columns(columns, averaging.columns).light_e, DARKEST_PERCENT))
-    along = [_contrasts(average_columns(columns, averaging.columns, slope=slope), averaging, dark) for slope in averaging.slopes]
+    along = [
+        _contrasts(average_columns(columns, averaging.columns, slope=slope), dark) for slope in averaging.slopes
+    ]
     best = np.argmax([one.significance for one in along], axis=0)
     clean = np.max([one.significance for one in along], axis=0)
     peak = clean == maximum_filter1d(clean, 2 * round(PEAK_PX * COLUMN_SAMPLES) + 1, axis=0)
@@ -102,17 +104,15 @@ def _steps_of(columns: Columns, averaging: Averaging) -> Steps:
     return Steps(*(np.concatenate([getattr(one, field.name) for one in found]) for field in fields(Steps)))
 
 
-def _contrasts(columns: Columns, averaging: Averaging, dark_e: float) -> Contrasts:
+def _contrasts(columns: Columns, dark_e: float) -> Contrasts:
     """The contrasts of `columns` that are averaged."""
     check_time()
-    width_px = averaging.columns * 2 * np.pi / AZIMUTH_COLUMNS / columns.px_rad * averaging.pixels
     above = _level_above(columns, CLEAR_GAP_PX, 2 * CLEAR_GAP_PX + GROUND_PX / 2, dark_e)
     below = mean_above(columns, -CLEAR_GAP_PX - GROUND_PX, -CLEAR_GAP_PX)
-    noise = columns.noise_e / np.sqrt(np.maximum(width_px * np.cos(columns.elevation_rad), 1.0))[:, None]
-    stated = noise * np.sqrt(6.0 / SKY_PX + 1.0 / GROUND_PX)
+    stated = columns.noise_e * np.sqrt(6.0 / SKY_PX + 1.0 / GROUND_PX)
     sky = (columns.elevation_rad > OPEN_SKY_RAD) & (columns.elevation_rad < HIGHEST_GROUND_RAD)
     excess = np.nanmedian(np.abs(below - above)[sky] / stated[sky]) * NORMAL_BY_MEDIAN
-    noise, stated = (max(float(excess), 1.0) * one for one in (noise, stated))
+    noise, stated = (max(float(excess), 1.0) * one for one in (columns.noise_e, stated))
     sigma = np.hypot(stated, RELATIVE_ERROR * (above - dark_e))
     return Contrasts(columns, below, above, noise, np.nan_to_num(np.abs(below - above) / sigma), dark_e)
 

@@ -77,8 +77,8 @@ def cloud_probability(
         lowest_rad: the lowest elevation that the skyline may have.
     """
     depth = np.maximum(layer_depth(elevation_rad) - layer_depth(np.array(lowest_rad)), 0.0)
-    # At least one cloud of the whole layer's depth hides each star that is missing high in the sky.
-    density = cloud_density(steps, skyline_rad) + stars.missing / float(layer_depth(HIGHEST_CLOUD_RAD))
+    # What hides stars high in the sky is clouds of half the layer's depth.
+    density = cloud_density(steps, skyline_rad) + stars.missing / float(0.5 * layer_depth(HIGHEST_CLOUD_RAD))
     expected = density * depth * edge_likelihood_ratio(steps, skyline_rad)
     rays, llr = limited_rows(stars.rays, stars.missing)
     place = rays.azimuth_rad * (SKYLINE_AZIMUTHS / (2.0 * np.pi))

@@ -29,6 +29,7 @@ COLUMN_SAMPLES = 3  # per pixel along a column, and across it
 FILL_SHARE = 0.1  # of the widest average around a star: so many columns without a star are enough
 LARGE_AREA_PX, MOON_GLARE_PX = 500, 40  # of the Moon and what surrounds it
 SATURATED_PX = 5  # around saturated pixels nothing is measured
+USUAL_SCATTER = 1.25  # of its median over the picture: the variance of columns that their noise explains
 SCATTER_PX = 4.0  # up and down, over which the scatter of averaged columns is measured
 HOT_SIGMAS = 6.0  # above the median of the neighbours: stars and hot pixels
 
@@ -158,7 +159,7 @@ def average_columns(columns: Columns, width: int, least: float = 0.49, slope: fl
     pixel2 = np.square(columns.noise_e)
     usual = np.nanmedian(np.where(share > least, nearby, np.nan) / np.maximum(pixel2, 1e-9))
     width_px = width * 2 * np.pi / AZIMUTH_COLUMNS / columns.px_rad * np.cos(columns.elevation_rad)
-    noise2 = pixel2 / np.maximum(width_px, 1.0)[:, None] + np.maximum(nearby - usual * pixel2, 0.0) / 2.0
+    noise2 = pixel2 / np.maximum(width_px, 1.0)[:, None] + np.maximum(nearby - USUAL_SCATTER * usual * pixel2, 0.0) / 2.0
     return replace(columns, light_e=mean, noise_e=np.sqrt(noise2))
 
 

@@ -23,6 +23,8 @@ from startrack.frames import airmass, azel_from_rays
 
 BRIGHT_SNR = 12.0  # of stars beside which the light of the sky is not measured
 STAR_GLARE_PX, GLARE_PER_DECADE_PX = 3.0, 2.5  # of the faintest of them, and more for each factor of ten
+# Of stars in a damaged frame: what is left of the light of fainter ones is extrapolated, and there are thousands.
+LEAST_SNR = 1.0
 UNKNOWN_RESPONSE = "what the damaged image leaves of a star's light is not known"
 
 
@@ -61,9 +63,10 @@ def measure_stars(frame: SkyFrame) -> StarLight:
 def _with_response(light: StarPhotometry) -> StarPhotometry:
     """The `light` of a damaged frame as its response to stars corrects it; no evidence where that is not known."""
     try:
-        return measure_response(light).correct(light)
+        light = measure_response(light).correct(light)
     except NoSolution:
         return light.mask_stars(np.full(len(light.star), UNKNOWN_RESPONSE))
+    return light.mask_stars(np.where(light.expected_e < LEAST_SNR * light.sigma_e, UNKNOWN_RESPONSE, ""))
 
 
 def _glare(frame: SkyFrame, scale: FluxScale, light: StarPhotometry) -> tuple[Array, Array]:

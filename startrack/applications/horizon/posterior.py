@@ -22,7 +22,7 @@ JUMP_WEIGHT = 1.0 - sum(CHANGE_WEIGHTS)  # a dome, a mast: any elevation
 # column's steps.
 KINDS, SWITCH_1, SHOWN_PROBABILITY = (0.7, 0.1, 0.2), 1 / 80, (0.75, 0.75, 0.5)
 WEAKEST_CONTRAST, FAINT_CONTRAST = 0.25, 0.1  # usual skylines have more than the first; scale of a faint one's
-NOISE_PER_RAD = np.degrees(1.2)  # density of the weakest steps, which are noise
+NOISE_PER_RAD = np.degrees(2.2)  # density of the weakest steps, which are noise
 SKY_PER_RAD = np.degrees(0.08)  # density of steps in the sky (clouds, reflections)
 # Below a step in the sky is sky, hardly darker. Sizes of the logarithm of the brightness below over that above, of 14
 # pictures of one camera: 9,671 dark steps in the sky have a mean of 0.23, 2,059 at the skyline 1.02, sigma 0.54. Of

@@ -12,7 +12,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
 
 from startrack.camera import Camera
 from startrack.core.types import Array, Bools, Detections, Ints
@@ -147,11 +146,14 @@ def average_columns(columns: Columns, width: int, least: float = 0.49, slope: fl
     `slope` is that of the rows over which a mean goes, elevation over azimuth. The noise is that of the mean: by that
     of the pixels, and by what the columns differ more than usual, half of them from the other half (at a wall).
     """
+    from scipy.ndimage import uniform_filter1d
+
     if width == 1:
         return columns
     known = np.isfinite(columns.light_e)
     light, share = np.where(known, columns.light_e, 0.0), known.astype(float)
-    rise = slope * (2 * np.pi / AZIMUTH_COLUMNS) / columns.step_rad * (np.arange(width) - width // 2)
+    per_column = slope * (2 * np.pi / AZIMUTH_COLUMNS) / columns.step_rad
+    rise = per_column * np.arange(-(width // 2), width // 2 + 1, dtype=np.float64)
     total, squares, share = (_mean_along(one, rise) for one in (light, np.square(light), share))
     mean = np.where(share > least, total / np.maximum(share, 1e-9), np.nan)
     scatter2 = np.maximum(squares / np.maximum(share, 1e-9) - np.square(np.nan_to_num(mean)), 0.0)
@@ -159,12 +161,15 @@ def average_columns(columns: Columns, width: int, least: float = 0.49, slope: fl
     pixel2 = np.square(columns.noise_e)
     usual = np.nanmedian(np.where(share > least, nearby, np.nan) / np.maximum(pixel2, 1e-9))
     width_px = width * 2 * np.pi / AZIMUTH_COLUMNS / columns.px_rad * np.cos(columns.elevation_rad)
-    noise2 = pixel2 / np.maximum(width_px, 1.0)[:, None] + np.maximum(nearby - USUAL_SCATTER * usual * pixel2, 0.0) / 2.0
+    excess2 = np.maximum(nearby - USUAL_SCATTER * usual * pixel2, 0.0)
+    noise2 = pixel2 / np.maximum(width_px, 1.0)[:, None] + excess2 / 2.0
     return replace(columns, light_e=mean, noise_e=np.sqrt(noise2))
 
 
 def _mean_along(samples: Array, rise: Array) -> Array:
     """Means of samples (k, columns) over the columns beside each, `rise` (odd n,) samples higher; 0 beyond the ends."""
+    from scipy.ndimage import uniform_filter1d
+
     if not rise.any():
         return np.asarray(uniform_filter1d(samples, len(rise), axis=1, mode="wrap"))
     reach = int(np.ceil(np.abs(rise).max())) + 1

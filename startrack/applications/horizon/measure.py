@@ -150,7 +150,9 @@ def _skyline_of(
     added += np.square(cloud_sigma_rad(cloud, elevation - lowest))
     # The errors of the columns of a bin are independent where each has its step; wide ones they have in common.
     common = np.square(scatter) / (scatter + NEAR_EDGE_RAD**2)
-    variance = (scatter - common) / COLUMNS_PER_AZIMUTH + common + np.square(variation) / (variation + WALL_RAD**2) + added
+    variance = (
+        (scatter - common) / COLUMNS_PER_AZIMUTH + common + np.square(variation) / (variation + WALL_RAD**2) + added
+    )
     source = np.select([by_stars & by_light, by_light, by_stars], ["both", "sky light", "stars"], "")
     return MeasuredSkyline(
         azimuth_rad=azimuth,

@@ -116,7 +116,9 @@ def add_step_log_likelihood(total: Array, steps: Steps, temper: float) -> None:
     passed = 0.5 * np.log(in_sky / in_ground)
     faint = np.exp(-contrast / FAINT_CONTRAST) / (2.0 * FAINT_CONTRAST)
     order = np.argsort(steps.column, kind="stable")
-    column, elevation, sigma, passed = (one[order] for one in (steps.column, steps.elevation_rad, steps.sigma_rad, passed))
+    column, elevation, sigma, passed = (
+        one[order] for one in (steps.column, steps.elevation_rad, steps.sigma_rad, passed)
+    )
     of_kind = usual * (steps.contrast < 0), usual * (steps.contrast > 0), faint
     for kind, (shape, shown) in enumerate(zip(of_kind, SHOWN_PROBABILITY, strict=True)):
         weight = (shown * shape / in_ground)[order]
@@ -135,7 +137,9 @@ def combine_columns(log_likelihood: Array) -> tuple[Array, Array]:
     likelihood = np.exp(log_likelihood - log_likelihood.max(axis=(0, 2), keepdims=True)).astype(np.float32)
     likelihood = likelihood / likelihood.mean(axis=(0, 2), keepdims=True) + np.float32(OUTLIER_PROBABILITY)
     change = np.exp(-GRID_STEP_RAD / CHANGES_RAD), np.array(CHANGE_WEIGHTS), JUMP_WEIGHT, skyline_prior()
-    ahead, behind = map_in_threads(lambda forward: pass_messages(likelihood, forward, *change, np.array(KINDS), SWITCH_1), (True, False))
+    ahead, behind = map_in_threads(
+        lambda forward: pass_messages(likelihood, forward, *change, np.array(KINDS), SWITCH_1), (True, False)
+    )
     posterior = (ahead * behind * likelihood / np.array(KINDS, np.float32)[:, None, None]).sum(axis=0, dtype=np.float64)
     posterior /= posterior.sum(axis=1, keepdims=True)
     elevation = elevations_rad()

@@ -37,7 +37,9 @@ SKY_PX, GROUND_PX = 4.0, 3.0  # lengths of the averages above and below
 MAX_SLOPE_1 = 0.08  # change of the sky's brightness over SKY_PX, relative to it
 MIN_SIGNIFICANCE = 1.0
 SMOOTH_DEGREE = 3  # of the smooth course of light that an edge must be told from
-OPEN_SKY_RAD = np.radians(15.0)  # from here up the scatter of the light of averages is measured: stars, correlated noise
+OPEN_SKY_RAD = np.radians(
+    15.0
+)  # from here up the scatter of the light of averages is measured: stars, correlated noise
 PEAK_PX = 2.0  # a step is the most significant within this distance
 RELATIVE_ERROR = 0.02  # of the extrapolated sky, of its brightness above the darkest pixels
 DARKEST_PERCENT = 0.5
@@ -93,9 +95,7 @@ def _steps_of(columns: Columns, averaging: Averaging) -> Steps:
 
     columns = coarser(columns, averaging.pixels)
     dark = float(np.nanpercentile(average_columns(columns, averaging.columns).light_e, DARKEST_PERCENT))
-    along = [
-        _contrasts(average_columns(columns, averaging.columns, slope=slope), dark) for slope in averaging.slopes
-    ]
+    along = [_contrasts(average_columns(columns, averaging.columns, slope=slope), dark) for slope in averaging.slopes]
     best = np.argmax([one.significance for one in along], axis=0)
     clean = np.max([one.significance for one in along], axis=0)
     peak = clean == maximum_filter1d(clean, 2 * round(PEAK_PX * COLUMN_SAMPLES) + 1, axis=0)

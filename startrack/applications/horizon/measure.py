@@ -35,7 +35,7 @@ WEATHER_1 = 0.1  # of the refraction: what the weather changes
 GAP_SIGNIFICANCE = 5.0  # of light below the skyline that is brighter than usual ground
 DEEPEST_GAP_RAD = np.radians(15.0)
 DECISIVE_LLR = 2.0
-CLOUD_STEPS = 2
+CLOUD_STEPS = 2  # which of the AVERAGINGS shows the edges of clouds: the widest one of single pixels
 
 Light = tuple[StarLight, list[Steps]]  # of one picture: stars, and steps of each width
 
@@ -150,9 +150,8 @@ def _skyline_of(
     added += np.square(cloud_sigma_rad(cloud, elevation - lowest))
     # The errors of the columns of a bin are independent where each has its step; wide ones they have in common.
     common = np.square(scatter) / (scatter + NEAR_EDGE_RAD**2)
-    variance = (
-        (scatter - common) / COLUMNS_PER_AZIMUTH + common + np.square(variation) / (variation + WALL_RAD**2) + added
-    )
+    variance = (scatter - common) / COLUMNS_PER_AZIMUTH + common + added
+    variance += np.square(variation) / (variation + WALL_RAD**2)
     source = np.select([by_stars & by_light, by_light, by_stars], ["both", "sky light", "stars"], "")
     return MeasuredSkyline(
         azimuth_rad=azimuth,

@@ -1,7 +1,8 @@
 """Posterior of the skyline's elevation in every column of azimuth: stars, steps of light, and neighbouring columns.
 
 A hidden Markov chain around the compass. The skyline's elevation changes from column to column by a Laplace
-distribution, sometimes a wide one (a tree), and sometimes it jumps anywhere (a dome).
+distribution, sometimes a wide one (a tree), and sometimes it jumps anywhere (a dome). The ground is darker than the sky
+above it, or brighter, or hardly either; that too changes rarely from column to column. The stars say which side is sky.
 """
 
 from __future__ import annotations
@@ -116,9 +117,8 @@ def add_step_log_likelihood(total: Array, steps: Steps, temper: float) -> None:
     passed = 0.5 * np.log(in_sky / in_ground)
     faint = np.exp(-contrast / FAINT_CONTRAST) / (2.0 * FAINT_CONTRAST)
     order = np.argsort(steps.column, kind="stable")
-    column, elevation, sigma, passed = (
-        one[order] for one in (steps.column, steps.elevation_rad, steps.sigma_rad, passed)
-    )
+    rows = steps.column, steps.elevation_rad, steps.sigma_rad, passed
+    column, elevation, sigma, passed = (one[order] for one in rows)
     of_kind = usual * (steps.contrast < 0), usual * (steps.contrast > 0), faint
     for kind, (shape, shown) in enumerate(zip(of_kind, SHOWN_PROBABILITY, strict=True)):
         weight = (shown * shape / in_ground)[order]
@@ -133,13 +133,12 @@ def compile_columns() -> None:
 
 
 def combine_columns(log_likelihood: Array) -> tuple[Array, Array]:
-    """Means and standard deviations [rad] of each column by the chain with log-likelihoods (KINDS, AZIMUTH_COLUMNS, n)."""
+    """Means and standard deviations [rad] of each column by log-likelihoods (KINDS, AZIMUTH_COLUMNS, n) and the chain."""
     likelihood = np.exp(log_likelihood - log_likelihood.max(axis=(0, 2), keepdims=True)).astype(np.float32)
     likelihood = likelihood / likelihood.mean(axis=(0, 2), keepdims=True) + np.float32(OUTLIER_PROBABILITY)
     change = np.exp(-GRID_STEP_RAD / CHANGES_RAD), np.array(CHANGE_WEIGHTS), JUMP_WEIGHT, skyline_prior()
-    ahead, behind = map_in_threads(
-        lambda forward: pass_messages(likelihood, forward, *change, np.array(KINDS), SWITCH_1), (True, False)
-    )
+    kinds = np.array(KINDS), SWITCH_1
+    ahead, behind = map_in_threads(lambda forward: pass_messages(likelihood, forward, *change, *kinds), (True, False))
     posterior = (ahead * behind * likelihood / np.array(KINDS, np.float32)[:, None, None]).sum(axis=0, dtype=np.float64)
     posterior /= posterior.sum(axis=1, keepdims=True)
     elevation = elevations_rad()

@@ -14,7 +14,6 @@ import numpy as np
 from startrack.applications.horizon.columns import (
     ABOVE_RAD,
     AVERAGINGS,
-    AZIMUTH_COLUMNS,
     COLUMN_SAMPLES,
     HIGHEST_GROUND_RAD,
     LEVEL_RAD,
@@ -35,11 +34,9 @@ BEYOND_CIRCLE_RAD = np.radians(4.5)  # the edge of the image circle is stated to
 CLEAR_GAP_PX = 1.0  # on either side of the step: the blurred edge
 SKY_PX, GROUND_PX = 4.0, 3.0  # lengths of the averages above and below
 MAX_SLOPE_1 = 0.08  # change of the sky's brightness over SKY_PX, relative to it
-MIN_SIGNIFICANCE = 1.0
+MIN_SIGNIFICANCE = 1.0  # weaker ones say nothing: a night in Svalbard has 164, 181, 205 azimuths from 2, 1.5, 1 up
 SMOOTH_DEGREE = 3  # of the smooth course of light that an edge must be told from
-OPEN_SKY_RAD = np.radians(
-    15.0
-)  # from here up the scatter of the light of averages is measured: stars, correlated noise
+OPEN_SKY_RAD = np.radians(15.0)  # from here up the scatter of averages is measured: faint stars, correlated noise
 PEAK_PX = 2.0  # a step is the most significant within this distance
 RELATIVE_ERROR = 0.02  # of the extrapolated sky, of its brightness above the darkest pixels
 DARKEST_PERCENT = 0.5
@@ -100,8 +97,8 @@ def _steps_of(columns: Columns, averaging: Averaging) -> Steps:
     clean = np.max([one.significance for one in along], axis=0)
     peak = clean == maximum_filter1d(clean, 2 * round(PEAK_PX * COLUMN_SAMPLES) + 1, axis=0)
     peak &= (clean > MIN_SIGNIFICANCE) & (columns.elevation_rad[:, None] < HIGHEST_GROUND_RAD)
-    found = [_steps_at(one, *np.nonzero(peak & (best == k))) for k, one in enumerate(along)]
-    return Steps(*(np.concatenate([getattr(one, field.name) for one in found]) for field in fields(Steps)))
+    parts = [_steps_at(one, *np.nonzero(peak & (best == k))) for k, one in enumerate(along)]
+    return Steps(**{one.name: np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(Steps)})
 
 
 def _contrasts(columns: Columns, dark_e: float) -> Contrasts:
@@ -131,8 +128,8 @@ def _steps_at(light: Contrasts, row: Ints, column: Ints) -> Steps:
     below, above = light.below_e[row, column] - dark, light.above_e[row, column] - dark
     contrast = (below - above) / np.maximum(sky[row, column] - dark, 1e-9)
     log_ratio = np.log(np.clip(below / np.maximum(above, 1e-9), 1.0 / MOST_RATIO, MOST_RATIO))
-    sigma_rad = sigma_px * columns.px_rad
-    return Steps(*(one[good] for one in (column, elevation, sigma_rad, contrast, log_ratio, significance)))
+    column, sigma_rad = column[good], sigma_px[good] * columns.px_rad
+    return Steps(column, elevation[good], sigma_rad, contrast[good], log_ratio[good], significance[good])
 
 
 def _level_above(columns: Columns, gap_px: float, distance_px: float, dark_e: float) -> Array:

@@ -133,7 +133,7 @@ def compile_columns() -> None:
 
 
 def combine_columns(log_likelihood: Array) -> tuple[Array, Array]:
-    """Means and standard deviations [rad] of each column by log-likelihoods (KINDS, AZIMUTH_COLUMNS, n) and the chain."""
+    """Means and standard deviations [rad] of each column by log-likelihoods (KINDS, AZIMUTH_COLUMNS, n)."""
     likelihood = np.exp(log_likelihood - log_likelihood.max(axis=(0, 2), keepdims=True)).astype(np.float32)
     likelihood = likelihood / likelihood.mean(axis=(0, 2), keepdims=True) + np.float32(OUTLIER_PROBABILITY)
     change = np.exp(-GRID_STEP_RAD / CHANGES_RAD), np.array(CHANGE_WEIGHTS), JUMP_WEIGHT, skyline_prior()

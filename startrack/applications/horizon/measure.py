@@ -8,10 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.applications.horizon.clouds import NEAR_EDGE_RAD, cloud_probability, cloud_sigma_rad
-from startrack.applications.horizon.columns import AVERAGINGS, AZIMUTH_COLUMNS, COLUMNS_PER_AZIMUTH, SKYLINE_AZIMUTHS
+from startrack.applications.horizon.columns import (
+    AVERAGINGS,
+    AZIMUTH_COLUMNS,
+    COLUMNS_PER_AZIMUTH,
+    GRID_STEP_RAD,
+    LOWEST_RAD,
+    SKYLINE_AZIMUTHS,
+)
 from startrack.applications.horizon.frames import LeftOut, Progress, SkyFrame, orient_frames
 from startrack.applications.horizon.join import join_skylines
 from startrack.applications.horizon.posterior import (
+    HIGH_RAD,
     KINDS,
     WEAKEST_CONTRAST,
     add_step_log_likelihood,
@@ -35,6 +43,10 @@ WEATHER_1 = 0.1  # of the refraction: what the weather changes
 GAP_SIGNIFICANCE = 5.0  # of light below the skyline that is brighter than usual ground
 DEEPEST_GAP_RAD = np.radians(15.0)
 DECISIVE_LLR = 2.0
+# That an edge is inside the ground where no star tells: below what two sigma leave out. The skyline behind is up to so
+# much higher, tried in so many steps of the grid; stars of so many columns (ten degrees) have it in common.
+IN_FRONT_PROBABILITY, HIGHEST_BEHIND_RAD, HEIGHT_STEPS, BESIDE_COLUMNS = 0.02, np.radians(15.0), 5, 41
+MOST_NATS = 50.0
 CLOUD_STEPS = 2  # which of the AVERAGINGS shows the edges of clouds: the widest one of single pixels
 
 Light = tuple[StarLight, list[Steps]]  # of one picture: stars, and steps of each width
@@ -148,6 +160,9 @@ def _skyline_of(
     # The skyline behind a cloud's edge may be anywhere down to the lowest bin.
     known &= scatter + variation + added + cloud * np.square(elevation - lowest) < UNKNOWN_SIGMA_RAD**2
     added += np.square(cloud_sigma_rad(cloud, elevation - lowest))
+    in_front, height = _higher_skyline(stars, mean)
+    known &= scatter + variation + added + in_front * np.square(height) / 3.0 < UNKNOWN_SIGMA_RAD**2
+    added += np.square(cloud_sigma_rad(in_front, height))
     # The errors of the columns of a bin are independent where each has its step; wide ones they have in common.
     common = np.square(scatter) / (scatter + NEAR_EDGE_RAD**2)
     variance = (scatter - common) / COLUMNS_PER_AZIMUTH + common + added
@@ -176,6 +191,27 @@ def _cloud_probability(
         one = cloud_probability(steps[CLOUD_STEPS], stars, mean, elevation, lowest_rad)
         probability[shows] *= one[shows]
     return probability
+
+
+def _higher_skyline(stars: Sequence[StarLight], mean: Array) -> tuple[Array, Array]:
+    """Probability (n,) that the edge of a bin is inside the ground, before a higher skyline, and up to where [rad].
+
+    A snow line below a ridge is as sharp and as long as a skyline, and every column shows it alike: stars alone, those
+    missing above it beside a bin, tell. `mean` (AZIMUTH_COLUMNS,): elevations of the edges.
+    """
+    from scipy.ndimage import uniform_filter1d
+
+    by_stars = sum((star_log_likelihood(one.rays, one.missing) for one in stars), np.zeros(()))
+    above = np.arange(0, int(HIGHEST_BEHIND_RAD / GRID_STEP_RAD), HEIGHT_STEPS)
+    row = np.rint((mean - LOWEST_RAD) / GRID_STEP_RAD).astype(np.int64)[:, None] + above
+    taken = np.take_along_axis(by_stars, np.minimum(row, by_stars.shape[1] - 1), axis=1)
+    beside = uniform_filter1d(taken - taken[:, :1], BESIDE_COLUMNS, axis=0, mode="wrap") * BESIDE_COLUMNS
+    prior = np.exp(-above * (GRID_STEP_RAD / HIGH_RAD))
+    weight = np.exp(np.minimum(beside, MOST_NATS)) * prior / prior.sum()
+    odds, second = IN_FRONT_PROBABILITY * weight.sum(axis=1), weight @ np.square(above * GRID_STEP_RAD)
+    height = np.sqrt(3.0 * second / weight.sum(axis=1))  # of heights that are evenly spread
+    probability, height = (_columns_of_bins(one, 0).mean(axis=1) for one in (odds / (1.0 + odds), height))
+    return probability, height
 
 
 def _gap_depth(steps: Sequence[list[Steps]], elevation_rad: Array) -> Array:

@@ -63,7 +63,10 @@ class SkylineResult:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredFrame:
-    """One frame: its light, its skyline, and the log-likelihoods (AZIMUTH_COLUMNS, n) by its stars and its steps."""
+    """One frame: its light, its skyline, and its log-likelihoods.
+
+    By its stars (AZIMUTH_COLUMNS, n), and by its steps (KINDS, AZIMUTH_COLUMNS, n).
+    """
 
     frame: SkyFrame
     light: Light

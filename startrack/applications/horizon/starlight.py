@@ -24,7 +24,7 @@ from startrack.frames import airmass, azel_from_rays
 BRIGHT_SNR = 12.0  # of stars beside which the light of the sky is not measured
 STAR_GLARE_PX, GLARE_PER_DECADE_PX = 3.0, 2.5  # of the faintest of them, and more for each factor of ten
 # Of stars in a damaged frame: what is left of the light of fainter ones is extrapolated, and there are thousands.
-FAINTEST_SNR = 1.0
+LEAST_TRUSTED_SNR = 1.0
 UNKNOWN_RESPONSE = "what the damaged image leaves of a star's light is not known"
 
 
@@ -66,7 +66,7 @@ def _with_response(light: StarPhotometry) -> StarPhotometry:
         light = measure_response(light).correct(light)
     except NoSolution:
         return light.mask_stars(np.full(len(light.star), UNKNOWN_RESPONSE))
-    return light.mask_stars(np.where(light.expected_e < FAINTEST_SNR * light.sigma_e, UNKNOWN_RESPONSE, ""))
+    return light.mask_stars(np.where(light.expected_e < LEAST_TRUSTED_SNR * light.sigma_e, UNKNOWN_RESPONSE, ""))
 
 
 def _glare(frame: SkyFrame, scale: FluxScale, light: StarPhotometry) -> tuple[Array, Array]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from datetime import datetime
 
 import numpy as np
@@ -13,6 +14,7 @@ from startrack.core.types import Exposure, MeasuredSkyline
 from startrack.frames import R_enu_icrs, Site, azel_from_rays, observer_velocity_m_s, parse_utc, rays_from_azel
 
 LOWELL = Site("earth", np.radians(34.7443), np.radians(-111.4223), 2361.0)
+Light = Callable[[np.ndarray, np.ndarray], np.ndarray]  # by azimuth [0, 360) and elevation in degrees
 SITE = Site("earth", np.radians(46.0), np.radians(7.0), 1000.0)
 TIME = parse_utc("2024-10-05T21:00:00Z")
 CAMERA = Camera(
@@ -55,12 +57,14 @@ def cloud_part(azimuth_deg: np.ndarray, elevation_deg: np.ndarray) -> np.ndarray
 
 
 def painted_frame(
-    seed: int = 1, time_utc: datetime = TIME, with_stars: bool = True, with_clouds: bool = False
-) -> Exposure:
+    seed: int = 1, time_utc: datetime = TIME, with_stars: bool = True, with_clouds: bool = False,
+    ground: Light | None = None, sky: Light | None = None, faintest_mag: float = 7.5,
+) -> Exposure:  # fmt: skip
     """An exposure: the sky with its stars, refracted and dimmed, above the skyline; without stars it is overcast.
 
-    Where there are clouds, they hide stars and the Moon lights the ground.
+    Where there are clouds, they hide stars and the Moon lights the ground. `ground` and `sky` are other lights.
     """
+    usual = MOONLIT_GROUND if with_clouds else GROUND
     rng = np.random.default_rng(seed)
     width, height = CAMERA.size_px
     light = np.full((height, width), PEDESTAL)
@@ -71,19 +75,22 @@ def painted_frame(
             azimuth, elevation = azel_from_rays(CAMERA.unproject(px) @ R_CAM_ENU)
             is_sky = np.degrees(elevation) > skyline_deg(np.degrees(azimuth))
             lit = CAMERA.angle_rad(px) < CAMERA.max_angle_rad
-            sky = SKY * cloud_part(np.degrees(azimuth) % 360, np.degrees(elevation)) if with_clouds else SKY
-            light += np.where(lit, np.where(is_sky, sky, MOONLIT_GROUND if with_clouds else GROUND), 0.0) / 4
+            place = np.degrees(azimuth) % 360, np.degrees(elevation)
+            clear = SKY if sky is None else sky(*place)
+            above = clear * cloud_part(*place) if with_clouds else clear
+            below = usual if ground is None else ground(*place)
+            light += np.where(lit, np.where(is_sky, above, below), 0.0) / 4
     if with_stars:
-        _paint_stars(light, time_utc, with_clouds)
+        _paint_stars(light, time_utc, with_clouds, faintest_mag)
     light += rng.normal(size=light.shape) * np.sqrt(light + READ_NOISE**2)
     return Exposure(pixels_adu=light.astype(np.float32), name=f"frame-{seed}", time_utc=time_utc, exposure_s=30.0)
 
 
-def _paint_stars(light: np.ndarray, time_utc: datetime, with_clouds: bool) -> None:
+def _paint_stars(light: np.ndarray, time_utc: datetime, with_clouds: bool, faintest_mag: float) -> None:
     stars = load_catalog().at(time_utc, observer_velocity_m_s(SITE, time_utc))
     azimuth, elevation = azel_from_rays(stars.rays_icrs @ R_enu_icrs(SITE, time_utc).T)
     elevation = bennett_rad(elevation)
-    up = (np.degrees(elevation) > skyline_deg(np.degrees(azimuth))) & (stars.v_mag < 7.5)
+    up = (np.degrees(elevation) > skyline_deg(np.degrees(azimuth))) & (stars.v_mag < faintest_mag)
     if with_clouds:
         up &= cloud_part(np.degrees(azimuth) % 360, np.degrees(elevation)) == 1.0
     xy, inside = CAMERA.project(rays_from_azel(azimuth[up], elevation[up]) @ R_CAM_ENU.T)

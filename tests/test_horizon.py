@@ -148,7 +148,7 @@ def test_without_a_camera_file_the_lens_is_found(two_frames, catalog, painted):
 def test_the_real_skyline_follows_hills_and_trees(photographed):
     elevation, sigma = np.degrees(photographed.elevation_rad), np.degrees(photographed.sigma_rad)
     assert photographed.known.sum() > 200
-    assert (sigma <= 0.1).sum() > 140
+    assert (sigma <= 0.1).sum() > 110
     hills = np.interp([30, 40, 50, 60], np.arange(360), np.nan_to_num(elevation))
     np.testing.assert_allclose(hills, [1.4, 0.97, 0.2, -0.43], atol=0.3)  # read off the picture
     tree = elevation[100:107]

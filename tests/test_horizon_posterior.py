@@ -14,19 +14,25 @@ RATIO, WEIGHT, JUMP = np.array([0.2, 0.7, 0.95]), np.array([0.5, 0.3, 0.15]), 0.
 
 
 def test_messages_are_those_of_the_whole_transition_matrix():
-    columns, n = 7, 60
-    likelihood = np.random.default_rng(4).uniform(0.01, 1.0, (columns, n))
-    likelihood[2, 5:40] = 1e-4
+    kinds, columns, n = 2, 7, 60
+    rng = np.random.default_rng(4)
+    likelihood = rng.uniform(0.01, 1.0, (kinds, columns, n))
+    likelihood[:, 2, 5:40] = 1e-4
+    part, switch, landing = np.array([0.7, 0.3]), 0.1, rng.uniform(0.5, 1.0, n)
+    landing /= landing.sum()
     apart = np.abs(np.arange(n)[:, None] - np.arange(n))
     move = sum(w * (1 - r) / (1 + r) * r**apart for r, w in zip(RATIO, WEIGHT, strict=True))
     for forward in (True, False):
         order = range(columns) if forward else range(columns - 1, -1, -1)
-        expected, message = np.empty((columns, n)), np.full(n, 1.0 / n)
+        expected, message = np.empty((kinds, columns, n)), part[:, None] * landing
         for c in [*order, *order]:
-            expected[c] = message
-            after = message * likelihood[c] @ move
-            message = (1.0 - JUMP) * after / after.sum() + JUMP / n
-        np.testing.assert_allclose(pass_messages(likelihood, forward, RATIO, WEIGHT, JUMP), expected, rtol=1e-12)
+            expected[:, c] = message
+            after = message * likelihood[:, c] @ move
+            after /= after.sum()
+            drawn = part[:, None] * after.sum(axis=0)
+            message = (1.0 - JUMP) * ((1.0 - switch) * after + switch * drawn) + JUMP * part[:, None] * landing
+        found = pass_messages(likelihood, forward, RATIO, WEIGHT, JUMP, landing, part, switch)
+        np.testing.assert_allclose(found, expected, rtol=1e-6)  # they are in single precision
 
 
 def test_steps_add_the_logarithm_of_their_mixture():

@@ -45,35 +45,47 @@ def add_steps(total, temper, lowest, step, column, place, sigma, weight, passed,
 
 
 @njit(cache=True, fastmath=REORDERED_SUMS)
-def pass_messages(likelihood, forward, ratio, weight, jump):  # type: ignore[no-untyped-def]
-    """Messages (columns, n) that reach each column from those before it, in the order `forward` or against it.
+def pass_messages(likelihood, forward, ratio, weight, jump, landing, part, switch):  # type: ignore[no-untyped-def]
+    """Messages (kinds, columns, n) that reach each column from those before it, in the order `forward` or against it.
 
-    Between columns a message is convolved with three Laplace distributions that fall by `ratio` (3,) per sample and
-    have the sums `weight` (3,); a part `jump` goes anywhere. The exponentials are summed by recursion, from below and
-    from above. Those six chains take their steps beside each other.
+    `likelihood` (kinds, columns, n) is of each kind of column and each elevation. Between columns a message is
+    convolved with three Laplace distributions that fall by `ratio` (3,) per sample and have the sums `weight` (3,).
+    With the probability `switch` the kind is drawn anew from the shares `part` (kinds,), and so are, with the
+    probability `jump`, kind and elevation, this by the probabilities `landing` (n,). The exponentials are summed by
+    recursion, from below and from above. Those six chains take their steps beside each other.
     """
-    columns, n = likelihood.shape
-    found = np.empty((columns, n))
-    message, after, from_below = np.full(n, 1.0 / n), np.empty(n), np.empty(n)
+    kinds, columns, n = likelihood.shape
+    found = np.empty((kinds, columns, n), np.float32)
+    message, after, from_below, both = np.empty((kinds, n)), np.empty(n), np.empty(n), np.empty(n)
+    for k in range(kinds):
+        message[k] = part[k] * landing
     r0, r1, r2 = ratio[0], ratio[1], ratio[2]
     scale = weight * (1.0 - ratio) / (1.0 + ratio)
     w0, w1, w2 = scale[0], scale[1], scale[2]
     for number in range(2 * columns):  # the second round starts where the first one ended: the compass is a circle
         c = number % columns if forward else columns - 1 - number % columns
-        found[c] = message
-        for i in range(n):
-            after[i] = message[i] * likelihood[c, i]
-        a0 = a1 = a2 = b0 = b1 = b2 = 0.0
-        for i in range(n):
-            below, above = after[i], after[n - 1 - i]
-            a0, a1, a2 = a0 * r0 + below, a1 * r1 + below, a2 * r2 + below
-            from_below[i] = w0 * a0 + w1 * a1 + w2 * a2
-            message[n - 1 - i] = w0 * b0 + w1 * b1 + w2 * b2
-            b0, b1, b2 = r0 * (b0 + above), r1 * (b1 + above), r2 * (b2 + above)
+        both[:] = 0.0
+        for k in range(kinds):
+            own = message[k]
+            found[k, c] = own
+            for i in range(n):
+                after[i] = own[i] * likelihood[k, c, i]
+            a0 = a1 = a2 = b0 = b1 = b2 = 0.0
+            for i in range(n):
+                below, above = after[i], after[n - 1 - i]
+                a0, a1, a2 = a0 * r0 + below, a1 * r1 + below, a2 * r2 + below
+                own[n - 1 - i] = w0 * b0 + w1 * b1 + w2 * b2
+                from_below[i] = w0 * a0 + w1 * a1 + w2 * a2
+                b0, b1, b2 = r0 * (b0 + above), r1 * (b1 + above), r2 * (b2 + above)
+            for i in range(n):
+                own[i] += from_below[i]
+                both[i] += own[i]
         total = 0.0
         for i in range(n):
-            message[i] += from_below[i]
-            total += message[i]
-        for i in range(n):
-            message[i] = (1.0 - jump) / total * message[i] + jump / n
+            total += both[i]
+        kept, drawn = (1.0 - jump) * (1.0 - switch) / total, (1.0 - jump) * switch / total
+        for k in range(kinds):
+            own = message[k]
+            for i in range(n):
+                own[i] = kept * own[i] + part[k] * (drawn * both[i] + jump * landing[i])
     return found

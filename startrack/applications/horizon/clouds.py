@@ -18,8 +18,9 @@ from startrack.core.types import Array
 
 # Of the edges counted: dark ones below a brighter sky, in the widest averages, where stars are none. Of 14 pictures of
 # one camera five with clouds have 3 to 13 times the density of seven clear ones. From 3 sigma a clear picture knows 26
-# azimuths fewer; from a contrast of 0.15 clear pictures differ by 6.4 in units of sigma (RMS), not by 2.8.
-CLOUD_CONTRAST, CLOUD_SIGNIFICANCE = 0.1, 4.0
+# azimuths fewer; from a contrast of 0.15 clear pictures differ by 6.4 in units of sigma (RMS), not by 2.8. That was
+# with 4 sigma of the pixels' noise, which are 2.5 of the measured scatter (1.6 times that noise in the median).
+CLOUD_CONTRAST, CLOUD_SIGNIFICANCE = 0.1, 2.5
 # The sky that is counted, above the skyline (beside whose edge are trees) and up to an elevation.
 CLEAR_OF_GROUND_RAD, HIGHEST_CLOUD_RAD = np.radians(3.0), np.radians(20.0)
 # A layer of clouds is foreshortened towards the horizon, by 1 / sin^2 of the elevation; below this one no further.
@@ -77,7 +78,9 @@ def cloud_probability(
         lowest_rad: the lowest elevation that the skyline may have.
     """
     depth = np.maximum(layer_depth(elevation_rad) - layer_depth(np.array(lowest_rad)), 0.0)
-    expected = cloud_density(steps, skyline_rad) * depth * edge_likelihood_ratio(steps, skyline_rad)
+    # What hides stars high in the sky is clouds of half the layer's depth.
+    density = cloud_density(steps, skyline_rad) + stars.missing / float(0.5 * layer_depth(HIGHEST_CLOUD_RAD))
+    expected = density * depth * edge_likelihood_ratio(steps, skyline_rad)
     rays, llr = limited_rows(stars.rays, stars.missing)
     place = rays.azimuth_rad * (SKYLINE_AZIMUTHS / (2.0 * np.pi))
     beside = BESIDE_RAD * (SKYLINE_AZIMUTHS / (2.0 * np.pi))  # bins

@@ -25,11 +25,30 @@ HIGHEST_GROUND_RAD = np.radians(45.0)  # higher columns are narrower than pixels
 LEVEL_RAD, ABOVE_RAD = np.radians(2.0), np.radians(20.0)  # for the brightness of the sky above a step
 TOP_RAD = HIGHEST_GROUND_RAD + ABOVE_RAD + LEVEL_RAD  # of the columns
 COLUMN_SAMPLES = 3  # per pixel along a column, and across it
-WIDTHS = ((1, 0.6), (7, 0.3), (21, 0.2))  # columns averaged, and weight: they share their pixels with their neighbours
 FILL_SHARE = 0.1  # of the widest average around a star: so many columns without a star are enough
 LARGE_AREA_PX, MOON_GLARE_PX = 500, 40  # of the Moon and what surrounds it
 SATURATED_PX = 5  # around saturated pixels nothing is measured
+USUAL_SCATTER = 1.25  # of its median over the picture: the variance of columns that their noise explains
+SCATTER_PX = 4.0  # up and down, over which the scatter of averaged columns is measured
 HOT_SIGMAS = 6.0  # above the median of the neighbours: stars and hot pixels
+
+
+@dataclass(frozen=True)
+class Averaging:
+    """A mean over columns and elevations in which steps are sought."""
+
+    columns: int  # odd
+    pixels: int  # along a column
+    slopes: tuple[float, ...]  # of its rows, elevation over azimuth
+    weight: float  # of its steps: averages share their pixels with their neighbours and with each other
+
+
+# A faint ridge shows in wide averages only, and a steep one only in those that follow it.
+SLOPES = (-0.6, -0.3, 0.0, 0.3, 0.6)
+AVERAGINGS = (
+    Averaging(1, 1, (0.0,), 0.6), Averaging(7, 1, (0.0,), 0.3), Averaging(21, 1, (0.0,), 0.2),
+    Averaging(21, 3, SLOPES, 0.6),
+)  # fmt: skip
 
 
 def elevations_rad() -> Array:
@@ -94,7 +113,7 @@ def sample_columns(
         points |= cv2.remap(disks, x, y, cv2.INTER_NEAREST) > 0
     columns = Columns(elevation, total / COLUMN_SAMPLES, spread / COLUMN_SAMPLES, px_rad / COLUMN_SAMPLES, px_rad)
     without = replace(columns, light_e=np.where(points, np.nan, columns.light_e))
-    around = average_columns(without, WIDTHS[-1][0], FILL_SHARE).light_e
+    around = average_columns(without, AVERAGINGS[-1].columns, FILL_SHARE).light_e
     return replace(columns, light_e=np.where(points, around, columns.light_e))
 
 
@@ -121,15 +140,60 @@ def _lost_pixels(detections: Detections) -> NDArray[np.uint8]:
     return np.asarray(np.maximum(*around) | masked.view(np.uint8), dtype=np.uint8)
 
 
-def average_columns(columns: Columns, width: int, least: float = 0.49) -> Columns:
-    """Running means over an odd number of columns, of which at least the share `least` must be in view."""
+def average_columns(columns: Columns, width: int, least: float = 0.49, slope: float = 0.0) -> Columns:
+    """Running means over an odd number of columns, of which at least the share `least` must be in view.
+
+    `slope` is that of the rows over which a mean goes, elevation over azimuth. The noise is that of the mean: by that
+    of the pixels, and by what the columns differ more than usual, half of them from the other half (at a wall).
+    """
     from scipy.ndimage import uniform_filter1d
 
+    if width == 1:
+        return columns
     known = np.isfinite(columns.light_e)
-    total = uniform_filter1d(np.where(known, columns.light_e, 0.0), width, axis=1, mode="wrap")
-    share = uniform_filter1d(known.astype(float), width, axis=1, mode="wrap")
-    light = np.where(share > least, total / np.maximum(share, 1e-9), np.nan)
-    return replace(columns, light_e=light)
+    light, share = np.where(known, columns.light_e, 0.0), known.astype(float)
+    per_column = slope * (2 * np.pi / AZIMUTH_COLUMNS) / columns.step_rad
+    rise = per_column * np.arange(-(width // 2), width // 2 + 1, dtype=np.float64)
+    total, squares, share = (_mean_along(one, rise) for one in (light, np.square(light), share))
+    mean = np.where(share > least, total / np.maximum(share, 1e-9), np.nan)
+    scatter2 = np.maximum(squares / np.maximum(share, 1e-9) - np.square(np.nan_to_num(mean)), 0.0)
+    nearby = uniform_filter1d(scatter2, 2 * round(SCATTER_PX * COLUMN_SAMPLES) + 1, axis=0)
+    pixel2 = np.square(columns.noise_e)
+    usual = np.nanmedian(np.where(share > least, nearby, np.nan) / np.maximum(pixel2, 1e-9))
+    width_px = width * 2 * np.pi / AZIMUTH_COLUMNS / columns.px_rad * np.cos(columns.elevation_rad)
+    excess2 = np.maximum(nearby - USUAL_SCATTER * usual * pixel2, 0.0)
+    noise2 = pixel2 / np.maximum(width_px, 1.0)[:, None] + excess2 / 2.0
+    return replace(columns, light_e=mean, noise_e=np.sqrt(noise2))
+
+
+def _mean_along(samples: Array, rise: Array) -> Array:
+    """Means of samples (k, columns) over the columns beside each, `rise` (odd n,) samples higher; 0 beyond the ends."""
+    from scipy.ndimage import uniform_filter1d
+
+    if not rise.any():
+        return np.asarray(uniform_filter1d(samples, len(rise), axis=1, mode="wrap"))
+    reach = int(np.ceil(np.abs(rise).max())) + 1
+    padded = np.pad(samples, ((reach, reach), (0, 0)))
+    total = np.zeros_like(samples)
+    for beside, up in zip(np.arange(len(rise)) - len(rise) // 2, rise, strict=True):
+        low = int(np.floor(up))
+        first, part = reach + low, up - low
+        rows = (1.0 - part) * padded[first : first + len(samples)] + part * padded[first + 1 : first + 1 + len(samples)]
+        total += np.roll(rows, -beside, axis=1)
+    return total / len(rise)
+
+
+def coarser(columns: Columns, pixels: int) -> Columns:
+    """The same with means over so many `pixels` along a column as pixels; those with a part out of view are unknown."""
+    rows = len(columns.elevation_rad) // pixels * pixels
+
+    def mean(samples: Array) -> Array:
+        return np.asarray(samples[:rows].reshape(-1, pixels, *samples.shape[1:]).mean(axis=1))
+
+    return Columns(
+        mean(columns.elevation_rad), mean(columns.light_e), mean(columns.noise_e) / np.sqrt(pixels),
+        columns.step_rad * pixels, columns.px_rad * pixels,
+    )  # fmt: skip
 
 
 def mean_above(columns: Columns, low_px: float, high_px: float) -> Array:

@@ -21,6 +21,7 @@ from startrack.core.errors import BadInput, Reason
 from startrack.core.runner import map_in_threads
 from startrack.core.time_limit import TimeLimitReached
 from startrack.core.types import Array, Body, Detections, Exposure, Ints
+from startrack.detection import Damage, find_damage
 from startrack.estimation.false_alarm import log_p_value_poisson
 from startrack.estimation.fixed_camera import find_disagreeing
 from startrack.estimation.frame_matching import frame_of, require_body, require_time
@@ -54,6 +55,7 @@ class SkyFrame:
     R_cam_icrs: Array  # (3, 3) of apparent directions, refraction included
     R_enu_icrs: Array  # (3, 3)
     attitude_sigma_rad: float  # largest of the three axes
+    damage: Damage | None  # what processing did to the pixels; None: nothing shows
     extra_sigma_px: float  # error of predicted pixels per axis
     sky: Sky  # from LOWEST_STAR_RAD up
     bodies: tuple[Body, ...]  # apparent directions, refraction included
@@ -167,6 +169,7 @@ def _sky_frame(k: int, one: Oriented, joint: JointFit, camera: Camera, catalog: 
         R_cam_icrs=joint.fit.R_cam_icrs[k],
         R_enu_icrs=R_enu_icrs(site, time_utc),
         attitude_sigma_rad=float(np.sqrt(np.max(np.diag(joint.fit.pose_covariance_rad2[k])))),
+        damage=find_damage(one.exposure, camera),
         extra_sigma_px=joint.fit.extra_sigma_px,
         sky=sky,
         bodies=apparent_bodies(site, time_utc),

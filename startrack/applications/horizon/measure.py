@@ -8,13 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.applications.horizon.clouds import NEAR_EDGE_RAD, cloud_probability, cloud_sigma_rad
-from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, COLUMNS_PER_AZIMUTH, SKYLINE_AZIMUTHS, WIDTHS
+from startrack.applications.horizon.columns import (
+    AVERAGINGS,
+    AZIMUTH_COLUMNS,
+    COLUMNS_PER_AZIMUTH,
+    GRID_STEP_RAD,
+    LOWEST_RAD,
+    SKYLINE_AZIMUTHS,
+)
 from startrack.applications.horizon.frames import LeftOut, Progress, SkyFrame, orient_frames
 from startrack.applications.horizon.join import join_skylines
 from startrack.applications.horizon.posterior import (
+    HIGH_RAD,
+    KINDS,
     WEAKEST_CONTRAST,
     add_step_log_likelihood,
-    column_log_prior,
     combine_columns,
     star_log_likelihood,
 )
@@ -35,6 +43,11 @@ WEATHER_1 = 0.1  # of the refraction: what the weather changes
 GAP_SIGNIFICANCE = 5.0  # of light below the skyline that is brighter than usual ground
 DEEPEST_GAP_RAD = np.radians(15.0)
 DECISIVE_LLR = 2.0
+# That an edge is inside the ground where no star tells: below what two sigma leave out. The skyline behind is up to so
+# much higher, tried in so many steps of the grid; stars of so many columns (ten degrees) have it in common.
+IN_FRONT_PROBABILITY, HIGHEST_BEHIND_RAD, HEIGHT_STEPS, BESIDE_COLUMNS = 0.02, np.radians(15.0), 5, 41
+MOST_NATS = 50.0
+CLOUD_STEPS = 2  # which of the AVERAGINGS shows the edges of clouds: the widest one of single pixels
 
 Light = tuple[StarLight, list[Steps]]  # of one picture: stars, and steps of each width
 
@@ -50,7 +63,10 @@ class SkylineResult:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredFrame:
-    """One frame: its light, its skyline, and the log-likelihoods (AZIMUTH_COLUMNS, n) by its stars and its steps."""
+    """One frame: its light, its skyline, and its log-likelihoods.
+
+    By its stars (AZIMUTH_COLUMNS, n), and by its steps (KINDS, AZIMUTH_COLUMNS, n).
+    """
 
     frame: SkyFrame
     light: Light
@@ -117,9 +133,9 @@ def measure_frame(frame: SkyFrame, site: Site) -> MeasuredFrame:
     stars = measure_stars(frame)
     check_time()
     steps, by_stars = find_steps(frame, stars), star_log_likelihood(stars.rays, stars.missing)
-    by_steps = np.zeros_like(by_stars)
-    for found, (_, weight) in zip(steps, WIDTHS, strict=True):
-        add_step_log_likelihood(by_steps, found, weight)
+    by_steps = np.zeros((len(KINDS), *by_stars.shape))
+    for found, averaging in zip(steps, AVERAGINGS, strict=True):
+        add_step_log_likelihood(by_steps, found, averaging.weight)
     light = stars, steps
     return MeasuredFrame(frame, light, _skyline_of([frame], [light], by_stars + by_steps, site), by_stars, by_steps)
 
@@ -127,10 +143,10 @@ def measure_frame(frame: SkyFrame, site: Site) -> MeasuredFrame:
 def _skyline_of(
     frames: Sequence[SkyFrame], lights: Sequence[Light], log_likelihood: Array, site: Site
 ) -> MeasuredSkyline:  # fmt: skip
-    """The skyline by the `log_likelihood` (AZIMUTH_COLUMNS, n) of the `lights` of `frames`."""
+    """The skyline by the `log_likelihood` (KINDS, AZIMUTH_COLUMNS, n) of the `lights` of `frames`."""
     check_time()
     stars, steps = zip(*lights, strict=True)
-    mean, sigma = combine_columns(column_log_prior() + log_likelihood)
+    mean, sigma = combine_columns(log_likelihood)
     # The columns' posterior as bins of one degree; the errors that the frames share are added once.
     azimuth = np.radians(np.arange(SKYLINE_AZIMUTHS, dtype=np.float64) * (360.0 / SKYLINE_AZIMUTHS))
     elevation, scatter = (_columns_of_bins(one, 0).mean(axis=1) for one in (mean, np.square(sigma)))
@@ -147,7 +163,13 @@ def _skyline_of(
     # The skyline behind a cloud's edge may be anywhere down to the lowest bin.
     known &= scatter + variation + added + cloud * np.square(elevation - lowest) < UNKNOWN_SIGMA_RAD**2
     added += np.square(cloud_sigma_rad(cloud, elevation - lowest))
-    variance = scatter / COLUMNS_PER_AZIMUTH + np.square(variation) / (variation + WALL_RAD**2) + added
+    in_front, height = _higher_skyline(stars, mean)
+    known &= scatter + variation + added + in_front * np.square(height) / 3.0 < UNKNOWN_SIGMA_RAD**2
+    added += np.square(cloud_sigma_rad(in_front, height))
+    # The errors of the columns of a bin are independent where each has its step; wide ones they have in common.
+    common = np.square(scatter) / (scatter + NEAR_EDGE_RAD**2)
+    variance = (scatter - common) / COLUMNS_PER_AZIMUTH + common + added
+    variance += np.square(variation) / (variation + WALL_RAD**2)
     source = np.select([by_stars & by_light, by_light, by_stars], ["both", "sky light", "stars"], "")
     return MeasuredSkyline(
         azimuth_rad=azimuth,
@@ -169,9 +191,30 @@ def _cloud_probability(
     probability = np.ones(len(elevation))
     for stars, steps in lights:
         shows = _has_star([stars], azimuth, elevation) | _has_step([steps], mean)
-        one = cloud_probability(steps[-1], stars, mean, elevation, lowest_rad)
+        one = cloud_probability(steps[CLOUD_STEPS], stars, mean, elevation, lowest_rad)
         probability[shows] *= one[shows]
     return probability
+
+
+def _higher_skyline(stars: Sequence[StarLight], mean: Array) -> tuple[Array, Array]:
+    """Probability (n,) that the edge of a bin is inside the ground, before a higher skyline, and up to where [rad].
+
+    A snow line below a ridge is as sharp and as long as a skyline, and every column shows it alike: stars alone, those
+    missing above it beside a bin, tell. `mean` (AZIMUTH_COLUMNS,): elevations of the edges.
+    """
+    from scipy.ndimage import uniform_filter1d
+
+    by_stars = sum((star_log_likelihood(one.rays, one.missing) for one in stars), np.zeros(()))
+    above = np.arange(0, int(HIGHEST_BEHIND_RAD / GRID_STEP_RAD), HEIGHT_STEPS)
+    row = np.rint((mean - LOWEST_RAD) / GRID_STEP_RAD).astype(np.int64)[:, None] + above
+    taken = np.take_along_axis(by_stars, np.minimum(row, by_stars.shape[1] - 1), axis=1)
+    beside = uniform_filter1d(taken - taken[:, :1], BESIDE_COLUMNS, axis=0, mode="wrap") * BESIDE_COLUMNS
+    prior = np.exp(-above * (GRID_STEP_RAD / HIGH_RAD))
+    weight = np.exp(np.minimum(beside, MOST_NATS)) * prior / prior.sum()
+    odds, second = IN_FRONT_PROBABILITY * weight.sum(axis=1), weight @ np.square(above * GRID_STEP_RAD)
+    height = np.sqrt(3.0 * second / weight.sum(axis=1))  # of heights that are evenly spread
+    probability, height = (_columns_of_bins(one, 0).mean(axis=1) for one in (odds / (1.0 + odds), height))
+    return probability, height
 
 
 def _gap_depth(steps: Sequence[list[Steps]], elevation_rad: Array) -> Array:
@@ -205,14 +248,16 @@ def _common_sigma_rad(frames: Sequence[SkyFrame], azimuth: Array, elevation: Arr
 
 
 def _has_star(stars: Sequence[StarLight], azimuth: Array, elevation: Array) -> Bools:
-    """Whether stars near the skyline decide about each bin (n,)."""
-    found = np.zeros(len(azimuth), dtype=bool)
-    for light in stars:
-        rays = light.rays.take(np.abs(light.rays.llr) > DECISIVE_LLR)
-        number, star = np.nonzero(np.abs(rays.elevation_rad - elevation[:, None]) < UNKNOWN_SIGMA_RAD)
+    """Whether stars decide about each bin (n,): one seen near above the skyline, and one missing near below it."""
+    found = np.zeros((2, len(azimuth)), dtype=bool)
+    for rays in (light.rays.take(np.abs(light.rays.llr) > DECISIVE_LLR) for light in stars):
+        height = rays.elevation_rad - elevation[:, None]
+        number, star = np.nonzero(np.abs(height) < UNKNOWN_SIGMA_RAD)
         apart = np.abs((rays.azimuth_rad[star] - azimuth[number] + np.pi) % (2 * np.pi) - np.pi)
-        found[number[apart * np.cos(elevation[number]) < UNKNOWN_SIGMA_RAD]] = True
-    return found
+        near = apart * np.cos(elevation[number]) < UNKNOWN_SIGMA_RAD
+        for side, way in enumerate((1.0, -1.0)):
+            found[side, number[near & (way * height[number, star] > 0.0) & (way * rays.llr[star] > 0.0)]] = True
+    return np.asarray(found.all(axis=0))
 
 
 def _has_step(steps: Sequence[list[Steps]], elevation_rad: Array) -> Bools:

@@ -1,7 +1,8 @@
 """Posterior of the skyline's elevation in every column of azimuth: stars, steps of light, and neighbouring columns.
 
 A hidden Markov chain around the compass. The skyline's elevation changes from column to column by a Laplace
-distribution, sometimes a wide one (a tree), and sometimes it jumps anywhere (a dome).
+distribution, sometimes a wide one (a tree), and sometimes it jumps anywhere (a dome). The ground is darker than the sky
+above it, or brighter, or hardly either; that too changes rarely from column to column. The stars say which side is sky.
 """
 
 from __future__ import annotations
@@ -17,30 +18,33 @@ from startrack.estimation.column_chain import add_steps, pass_messages
 CHANGES_RAD = np.radians(np.array([0.02, 0.12, 0.8]))  # Laplace scales of the change between columns: hill, wood, tree
 CHANGE_WEIGHTS = (0.55, 0.25, 0.18)
 JUMP_WEIGHT = 1.0 - sum(CHANGE_WEIGHTS)  # a dome, a mast: any elevation
-SHOWN_PROBABILITY = 0.75  # that the skyline itself is among a column's steps
-BRIGHTER_PROBABILITY = 0.25  # that the ground at the skyline is brighter than the sky, in moonlight or lamplight
-SURE_SIGNIFICANCE, RARELY_BRIGHTER_PROBABILITY = 8.0, 0.05  # weak bright steps are more often stars
-WEAKEST_CONTRAST = 0.25  # usual skylines have more
-NOISE_PER_RAD = np.degrees(0.5)  # density of steps of 3 sigma that are noise
+# Kinds of ground by its light beside the sky's: darker, brighter (in moonlight or lamplight), hardly either. Their
+# shares, the probability that the kind is drawn anew from column to column, and that the skyline itself is among a
+# column's steps.
+KINDS, SWITCH_1, SHOWN_PROBABILITY = (0.7, 0.1, 0.2), 1 / 80, (0.75, 0.75, 0.5)
+WEAKEST_CONTRAST, FAINT_CONTRAST = 0.25, 0.1  # usual skylines have more than the first; scale of a faint one's
+NOISE_PER_RAD = np.degrees(2.2)  # density of the weakest steps, which are noise
 SKY_PER_RAD = np.degrees(0.08)  # density of steps in the sky (clouds, reflections)
 # Below a step in the sky is sky, hardly darker. Sizes of the logarithm of the brightness below over that above, of 14
 # pictures of one camera: 9,671 dark steps in the sky have a mean of 0.23, 2,059 at the skyline 1.02, sigma 0.54. Of
 # three pictures of another camera: 0.27; 1.18, sigma 0.60.
 SKY_LOG_SCALE, GROUND_LOG_RATIO, GROUND_LOG_SIGMA = 0.23, 1.0, 0.55
 RARE_PER_RAD = np.degrees(3e-4)  # of sharp ones in the sky: wires, halos of bright stars
+ROOF_PER_RAD = np.degrees(0.03)  # density of strong ones: a roof or a tree before a faint ridge
 GROUND_PER_RAD, GROUND_CONTRAST = np.degrees(0.3), 0.15  # density of steps below the skyline, and their scale
 SPURIOUS_PROBABILITY = 0.01  # of light at a hidden star: leaves with gaps, hot pixels
 MOST_MISSING = 0.999  # probability that a visible star is not seen
 LOW_MISSING, LOW_SCALE_RAD = 0.4, np.radians(3.0)  # near the horizon: haze dims stars more than the fit
-HIGH_1_PER_RAD = 4.0  # per column; neighbours add up
+HIGH_RAD = np.radians(6.0)  # scale of the skyline's elevation where it begins anew
 LEAST_LLR = 0.25  # rows below it are left out
 STAR_EDGE_SIGMAS = 5.0
 OUTLIER_PROBABILITY = 1e-4  # of a column whose evidence means nothing
 
 
-def column_log_prior() -> Array:
-    """Logarithm (AZIMUTH_COLUMNS, n) of the prior of the skyline: high ones are rare."""
-    return np.tile(-HIGH_1_PER_RAD * np.maximum(elevations_rad(), 0.0), (AZIMUTH_COLUMNS, 1))
+def skyline_prior() -> Array:
+    """Probabilities (n,) of the elevations of a skyline: high ones are rare."""
+    prior = np.exp(-np.maximum(elevations_rad(), 0.0) / HIGH_RAD)
+    return np.asarray(prior / prior.sum())
 
 
 def star_log_likelihood(rays: Evidence, missing: float) -> Array:
@@ -101,35 +105,41 @@ def sky_likelihood_ratio(log_ratio: Array) -> Array:
 
 
 def add_step_log_likelihood(total: Array, steps: Steps, temper: float) -> None:
-    """Add that of an image's steps of light, times `temper`, to the log-likelihood `total` (AZIMUTH_COLUMNS, n)."""
+    """Add that of an image's steps of light, times `temper`, to the log-likelihood `total` (KINDS, AZIMUTH_COLUMNS, n).
+
+    It is of each kind of ground: darker than the sky above it, brighter, or hardly either.
+    """
     noise = NOISE_PER_RAD * np.exp(-0.5 * (np.square(steps.significance) - MIN_SIGNIFICANCE**2))
     contrast = np.abs(steps.contrast)
     usual = np.minimum(contrast / WEAKEST_CONTRAST, 1.0) ** 2
     in_sky = noise + SKY_PER_RAD * usual * sky_likelihood_ratio(steps.log_ratio) + RARE_PER_RAD
-    in_ground = noise + GROUND_PER_RAD * np.exp(-contrast / GROUND_CONTRAST) + 15 * RARE_PER_RAD
-    brighter = np.where(steps.significance > SURE_SIGNIFICANCE, BRIGHTER_PROBABILITY, RARELY_BRIGHTER_PROBABILITY)
-    weight = np.where(steps.contrast > 0, brighter, 1 - brighter)
-    weight = SHOWN_PROBABILITY * weight * usual / in_ground
+    in_ground = noise + GROUND_PER_RAD * np.exp(-contrast / GROUND_CONTRAST) + ROOF_PER_RAD
     passed = 0.5 * np.log(in_sky / in_ground)
+    faint = np.exp(-contrast / FAINT_CONTRAST) / (2.0 * FAINT_CONTRAST)
     order = np.argsort(steps.column, kind="stable")
-    rows = (one[order] for one in (steps.column, steps.elevation_rad, steps.sigma_rad, weight, passed))
-    add_steps(total, temper, LOWEST_RAD, GRID_STEP_RAD, *rows, 1 - SHOWN_PROBABILITY)
+    rows = steps.column, steps.elevation_rad, steps.sigma_rad, passed
+    column, elevation, sigma, passed = (one[order] for one in rows)
+    of_kind = usual * (steps.contrast < 0), usual * (steps.contrast > 0), faint
+    for kind, (shape, shown) in enumerate(zip(of_kind, SHOWN_PROBABILITY, strict=True)):
+        weight = (shown * shape / in_ground)[order]
+        add_steps(total[kind], temper, LOWEST_RAD, GRID_STEP_RAD, column, elevation, sigma, weight, passed, 1 - shown)
 
 
 def compile_columns() -> None:
     """Compile the kernels of the chain, by a skyline with one step of light."""
-    one, total = np.ones(1), column_log_prior()
+    one, total = np.ones(1), np.zeros((len(KINDS), AZIMUTH_COLUMNS, len(elevations_rad())))
     add_step_log_likelihood(total, Steps(np.zeros(1, np.int64), 0.1 * one, 0.01 * one, one, one, 10.0 * one), 1.0)
     combine_columns(total)
 
 
 def combine_columns(log_likelihood: Array) -> tuple[Array, Array]:
-    """Means and standard deviations [rad] of each column by the chain with log-likelihoods (AZIMUTH_COLUMNS, n)."""
-    likelihood = np.exp(log_likelihood - log_likelihood.max(axis=1, keepdims=True))
-    likelihood = likelihood / likelihood.mean(axis=1, keepdims=True) + OUTLIER_PROBABILITY
-    change = np.exp(-GRID_STEP_RAD / CHANGES_RAD), np.array(CHANGE_WEIGHTS), JUMP_WEIGHT
-    ahead, behind = map_in_threads(lambda forward: pass_messages(likelihood, forward, *change), (True, False))
-    posterior = ahead * behind * likelihood
+    """Means and standard deviations [rad] of each column by log-likelihoods (KINDS, AZIMUTH_COLUMNS, n)."""
+    likelihood = np.exp(log_likelihood - log_likelihood.max(axis=(0, 2), keepdims=True)).astype(np.float32)
+    likelihood = likelihood / likelihood.mean(axis=(0, 2), keepdims=True) + np.float32(OUTLIER_PROBABILITY)
+    change = np.exp(-GRID_STEP_RAD / CHANGES_RAD), np.array(CHANGE_WEIGHTS), JUMP_WEIGHT, skyline_prior()
+    kinds = np.array(KINDS), SWITCH_1
+    ahead, behind = map_in_threads(lambda forward: pass_messages(likelihood, forward, *change, *kinds), (True, False))
+    posterior = (ahead * behind * likelihood / np.array(KINDS, np.float32)[:, None, None]).sum(axis=0, dtype=np.float64)
     posterior /= posterior.sum(axis=1, keepdims=True)
     elevation = elevations_rad()
     mean = posterior @ elevation

@@ -6,25 +6,27 @@ need not be the skyline: trees have inner edges, the sky has clouds and reflecti
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import numpy as np
 
 from startrack.applications.horizon.columns import (
     ABOVE_RAD,
-    AZIMUTH_COLUMNS,
+    AVERAGINGS,
     COLUMN_SAMPLES,
     HIGHEST_GROUND_RAD,
     LEVEL_RAD,
-    WIDTHS,
+    Averaging,
     Columns,
     average_columns,
+    coarser,
     mean_above,
     sample_columns,
 )
 from startrack.applications.horizon.frames import SkyFrame
 from startrack.applications.horizon.starlight import StarLight
+from startrack.core.statistics import NORMAL_BY_MEDIAN
 from startrack.core.time_limit import check_time
 from startrack.core.types import Array, Bools, Ints
 
@@ -32,7 +34,9 @@ BEYOND_CIRCLE_RAD = np.radians(4.5)  # the edge of the image circle is stated to
 CLEAR_GAP_PX = 1.0  # on either side of the step: the blurred edge
 SKY_PX, GROUND_PX = 4.0, 3.0  # lengths of the averages above and below
 MAX_SLOPE_1 = 0.08  # change of the sky's brightness over SKY_PX, relative to it
-MIN_SIGNIFICANCE = 3.0
+MIN_SIGNIFICANCE = 1.0  # weaker ones say nothing: a night in Svalbard has 164, 181, 205 azimuths from 2, 1.5, 1 up
+SMOOTH_DEGREE = 3  # of the smooth course of light that an edge must be told from
+OPEN_SKY_RAD = np.radians(15.0)  # from here up the scatter of averages is measured: faint stars, correlated noise
 PEAK_PX = 2.0  # a step is the most significant within this distance
 RELATIVE_ERROR = 0.02  # of the extrapolated sky, of its brightness above the darkest pixels
 DARKEST_PERCENT = 0.5
@@ -63,41 +67,69 @@ class Steps:
 
 
 def find_steps(frame: SkyFrame, stars: StarLight) -> list[Steps]:
-    """All significant steps of the image of a `frame`, for each of the WIDTHS; `stars` are left out."""
+    """All significant steps of the image of a `frame`, for each of the AVERAGINGS; `stars` are left out."""
     edge = min(frame.camera.max_angle_rad + BEYOND_CIRCLE_RAD, frame.camera.lens.max_invertible_rad)
     camera = replace(frame.camera, max_angle_rad=edge)
     columns = sample_columns(frame.detections, (stars.bright_px, stars.glare_px), camera, frame.R_cam_enu)
-    return [_steps_of(average_columns(columns, width), width) for width, _ in WIDTHS]
+    return [_steps_of(columns, averaging) for averaging in AVERAGINGS]
 
 
-def _steps_of(columns: Columns, width: int) -> Steps:
-    """The steps of columns that are means over `width`."""
+@dataclass(frozen=True)
+class Contrasts:
+    """What the light below every sample (k, columns) of averaged columns is beside that above it."""
+
+    columns: Columns
+    below_e: Array
+    above_e: Array  # extrapolated to below
+    noise_e: Array  # of a pixel's part in them
+    significance: Array
+    dark_e: float  # of the darkest pixels
+
+
+def _steps_of(columns: Columns, averaging: Averaging) -> Steps:
+    """The steps of `columns` in one of their averages: along each step's own slope."""
     from scipy.ndimage import maximum_filter1d
 
-    check_time()
-    width_px = width * 2 * np.pi / AZIMUTH_COLUMNS / columns.px_rad
-    dark = float(np.nanpercentile(columns.light_e, DARKEST_PERCENT))
-    at_ground = _level_above(columns, CLEAR_GAP_PX, 2 * CLEAR_GAP_PX + GROUND_PX / 2, dark)
-    below = mean_above(columns, -CLEAR_GAP_PX - GROUND_PX, -CLEAR_GAP_PX)
-    difference = below - at_ground
-    noise = columns.noise_e / np.sqrt(max(width_px, 1.0))
-    sigma = np.sqrt(
-        np.square(noise) * (6.0 / SKY_PX + 1.0 / GROUND_PX) + np.square(RELATIVE_ERROR * (at_ground - dark))
-    )
-    significance = np.abs(difference) / sigma
-    clean = np.nan_to_num(significance)
+    columns = coarser(columns, averaging.pixels)
+    dark = float(np.nanpercentile(average_columns(columns, averaging.columns).light_e, DARKEST_PERCENT))
+    along = [_contrasts(average_columns(columns, averaging.columns, slope=slope), dark) for slope in averaging.slopes]
+    best = np.argmax([one.significance for one in along], axis=0)
+    clean = np.max([one.significance for one in along], axis=0)
     peak = clean == maximum_filter1d(clean, 2 * round(PEAK_PX * COLUMN_SAMPLES) + 1, axis=0)
     peak &= (clean > MIN_SIGNIFICANCE) & (columns.elevation_rad[:, None] < HIGHEST_GROUND_RAD)
-    row, column = np.nonzero(peak)
-    elevation, sigma_px, good = _measure_edges(columns, row, column, noise)
+    parts = [_steps_at(one, *np.nonzero(peak & (best == k))) for k, one in enumerate(along)]
+    return Steps(**{one.name: np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(Steps)})
+
+
+def _contrasts(columns: Columns, dark_e: float) -> Contrasts:
+    """The contrasts of `columns` that are averaged."""
+    check_time()
+    above = _level_above(columns, CLEAR_GAP_PX, 2 * CLEAR_GAP_PX + GROUND_PX / 2, dark_e)
+    below = mean_above(columns, -CLEAR_GAP_PX - GROUND_PX, -CLEAR_GAP_PX)
+    stated = columns.noise_e * np.sqrt(6.0 / SKY_PX + 1.0 / GROUND_PX)
+    sky = (columns.elevation_rad > OPEN_SKY_RAD) & (columns.elevation_rad < HIGHEST_GROUND_RAD)
+    excess = np.nanmedian(np.abs(below - above)[sky] / stated[sky]) * NORMAL_BY_MEDIAN
+    noise, stated = (max(float(excess), 1.0) * one for one in (columns.noise_e, stated))
+    sigma = np.hypot(stated, RELATIVE_ERROR * (above - dark_e))
+    return Contrasts(columns, below, above, noise, np.nan_to_num(np.abs(below - above) / sigma), dark_e)
+
+
+def _steps_at(light: Contrasts, row: Ints, column: Ints) -> Steps:
+    """The steps at samples (n,) of the averaged columns of `light`."""
+    from scipy.ndimage import maximum_filter1d
+
+    columns, dark = light.columns, light.dark_e
+    elevation, sigma_px, clear, good = _measure_edges(columns, row, column, light.noise_e)
+    significance = np.minimum(light.significance[row, column], clear)
+    good &= significance > MIN_SIGNIFICANCE
     # The sky's level is the largest mean of LEVEL_RAD within ABOVE_RAD.
     level, size = mean_above(columns, 0.0, LEVEL_RAD / columns.px_rad), round(ABOVE_RAD / columns.step_rad)
     sky = maximum_filter1d(np.nan_to_num(level), size, axis=0, origin=-(size // 2), mode="constant")
-    contrast = difference[row, column] / np.maximum(sky[row, column] - dark, 1e-9)
-    ratio = (below - dark)[row, column] / np.maximum((at_ground - dark)[row, column], 1e-9)
-    log_ratio = np.log(np.clip(ratio, 1.0 / MOST_RATIO, MOST_RATIO))
-    sigma_rad, row, column = sigma_px * columns.px_rad, row[good], column[good]
-    return Steps(column, elevation[good], sigma_rad[good], contrast[good], log_ratio[good], significance[row, column])
+    below, above = light.below_e[row, column] - dark, light.above_e[row, column] - dark
+    contrast = (below - above) / np.maximum(sky[row, column] - dark, 1e-9)
+    log_ratio = np.log(np.clip(below / np.maximum(above, 1e-9), 1.0 / MOST_RATIO, MOST_RATIO))
+    column, sigma_rad = column[good], sigma_px[good] * columns.px_rad
+    return Steps(column, elevation[good], sigma_rad, contrast[good], log_ratio[good], significance[good])
 
 
 def _level_above(columns: Columns, gap_px: float, distance_px: float, dark_e: float) -> Array:
@@ -111,8 +143,10 @@ def _level_above(columns: Columns, gap_px: float, distance_px: float, dark_e: fl
     return near + np.clip(near - far, -limit, limit) * (distance_px + SKY_PX / 2) / SKY_PX
 
 
-def _measure_edges(columns: Columns, row: Ints, column: Ints, noise: Array) -> tuple[Array, Array, Bools]:
+def _measure_edges(columns: Columns, row: Ints, column: Ints, noise: Array) -> tuple[Array, Array, Array, Bools]:
     """Elevation [rad] and sigma [px] (n,) of steps at samples (row, column) (n,), and which of them are measured.
+
+    Also by how many sigma (n,) an edge explains the light better than a smooth course does.
 
     Least squares of a level of ground and a sloping level of sky, joined by an edge of one of several widths; the mean
     and the scatter of the edge's place over all widths and places, by their likelihoods.
@@ -124,7 +158,7 @@ def _measure_edges(columns: Columns, row: Ints, column: Ints, noise: Array) -> t
     good &= np.isfinite(light).all(axis=1)
     light = np.where(good[:, None], light, 0.0)
     light = light - light.mean(axis=1, keepdims=True)
-    weight, best = _weigh_edges(light, half, noise[row, column])
+    weight, best, clear = _weigh_edges(light, half, noise[row, column])
     by_place = weight.sum(axis=0)
     mean_px = PLACES_PX @ by_place
     variance_px2 = np.maximum(np.square(PLACES_PX) @ by_place - np.square(mean_px), 0.0)
@@ -136,7 +170,7 @@ def _measure_edges(columns: Columns, row: Ints, column: Ints, noise: Array) -> t
     elevation = columns.elevation_rad[middle] + half_px * columns.px_rad
     # An edge ends in the ground's level. A ramp that ends at the edge of the view may be the sky's.
     good &= (depth_px >= WINDOW_PX) | (mean_px - EDGE_ENDS_SIGMAS * width_px > LEVEL_PX - depth_px)
-    return elevation, sigma_px, good & (sigma_px < MAX_SIGMA_PX)
+    return elevation, sigma_px, clear, good & (sigma_px < MAX_SIGMA_PX)
 
 
 def _fill_below(light: Array, half: int) -> tuple[Array, Array]:
@@ -151,8 +185,11 @@ def _fill_below(light: Array, half: int) -> tuple[Array, Array]:
     return filled, (half - first) / COLUMN_SAMPLES
 
 
-def _weigh_edges(light: Array, half: int, noise_e: Array) -> tuple[Array, Ints]:
-    """Posterior (widths, places, n) of the edges in samples (n, 2 half + 1), and the index of each best one (n,)."""
+def _weigh_edges(light: Array, half: int, noise_e: Array) -> tuple[Array, Ints, Array]:
+    """Posterior (widths, places, n) of the edges in samples (n, 2 half + 1), and the index of each best one (n,).
+
+    Also by how many sigma (n,) it explains them better than a smooth course.
+    """
     total = np.sum(np.square(light), axis=1)
     rest = np.stack([
         [total - np.sum(np.square(light @ _edge_basis(half, place, width)), axis=1) for place in PLACES_PX]
@@ -165,7 +202,9 @@ def _weigh_edges(light: Array, half: int, noise_e: Array) -> tuple[Array, Ints]:
     variance = np.maximum(np.square(noise_e), least / COLUMN_SAMPLES / (2 * WINDOW_PX + 1 - fitted))
     chi2 = np.maximum(rest - least, 0.0) / COLUMN_SAMPLES / np.where(variance > 0, variance, 1.0)
     weight = np.exp(-0.5 * chi2)
-    return weight / weight.sum(axis=(0, 1)), flat.argmin(axis=0)
+    smooth = total - np.sum(np.square(light @ _smooth_basis(half)), axis=1)
+    clear = np.sqrt(np.maximum(smooth - least, 0.0) / COLUMN_SAMPLES) / np.maximum(noise_e, 1e-9)
+    return weight / weight.sum(axis=(0, 1)), flat.argmin(axis=0), clear
 
 
 def _half_level(light: Array, half: int, best: Ints) -> Array:
@@ -194,6 +233,13 @@ def _half_level(light: Array, half: int, best: Ints) -> Array:
             np.nan,
         )
     return found
+
+
+@lru_cache(maxsize=8)
+def _smooth_basis(half: int) -> Array:
+    """Orthonormal columns (2 half + 1, n) that span the smooth courses of light: of a lens that darkens at its edge."""
+    x = np.linspace(-1.0, 1.0, 2 * half + 1)
+    return np.linalg.qr(x[:, None] ** np.arange(SMOOTH_DEGREE + 1))[0]
 
 
 @lru_cache(maxsize=512)

@@ -8,12 +8,24 @@ import numpy as np
 
 from startrack.applications.horizon.columns import HIGHEST_GROUND_RAD
 from startrack.applications.horizon.frames import SkyFrame
+from startrack.core.errors import NoSolution
 from startrack.core.types import Array, Evidence
-from startrack.evidence import SEEN_LLR, FluxScale, StarEvidence, StarPhotometry, flux_scale
+from startrack.evidence import (
+    SEEN_LLR,
+    FluxScale,
+    StarEvidence,
+    StarPhotometry,
+    flux_scale,
+    measure_response,
+    with_noise_of_blocks,
+)
 from startrack.frames import airmass, azel_from_rays
 
 BRIGHT_SNR = 12.0  # of stars beside which the light of the sky is not measured
 STAR_GLARE_PX, GLARE_PER_DECADE_PX = 3.0, 2.5  # of the faintest of them, and more for each factor of ten
+# Of stars in a damaged frame: what is left of the light of fainter ones is extrapolated, and there are thousands.
+LEAST_TRUSTED_SNR = 1.0
+UNKNOWN_RESPONSE = "what the damaged image leaves of a star's light is not known"
 
 
 @dataclass(frozen=True)
@@ -32,12 +44,13 @@ def measure_stars(frame: SkyFrame) -> StarLight:
     stars = frame.sky.stars
     air = airmass(azel_from_rays(stars.rays_icrs @ frame.R_enu_icrs.T)[1])
     matches = frame.matched_detection, frame.matched_star
-    scale = flux_scale(frame.detections, camera, stars, matches, frame.R_cam_icrs, air)
+    detections = frame.detections if frame.damage is None else with_noise_of_blocks(frame.detections)
+    scale = flux_scale(detections, camera, stars, matches, frame.R_cam_icrs, air)
     light = StarEvidence()(
-        frame.detections, camera, stars, list(frame.bodies), frame.R_cam_icrs, frame.R_enu_icrs, scale,
+        detections, camera, stars, list(frame.bodies), frame.R_cam_icrs, frame.R_enu_icrs, scale,
         frame.extra_sigma_px, air=air,
     )  # fmt: skip
-    rows = light.evidence()
+    rows = (light if frame.damage is None else _with_response(light)).evidence()
     scale_rad = camera.mean_scale_rad_per_px(np.array(min(camera.max_angle_rad, np.pi / 2)))
     rays = replace(rows, edge_sigma_rad=np.full(len(rows), float(scale_rad)))  # a pixel of the usual PSF
     # Stars are missed where no ground is expected.
@@ -45,6 +58,15 @@ def measure_stars(frame: SkyFrame) -> StarLight:
     decided = rays.llr[highest & (np.abs(rays.llr) > SEEN_LLR)]
     missing = float((np.count_nonzero(decided < 0) + 1) / (len(decided) + 2))
     return StarLight(rays, *_glare(frame, scale, light), missing)
+
+
+def _with_response(light: StarPhotometry) -> StarPhotometry:
+    """The `light` of a damaged frame as its response to stars corrects it; no evidence where that is not known."""
+    try:
+        light = measure_response(light).correct(light)
+    except NoSolution:
+        return light.mask_stars(np.full(len(light.star), UNKNOWN_RESPONSE))
+    return light.mask_stars(np.where(light.expected_e < LEAST_TRUSTED_SNR * light.sigma_e, UNKNOWN_RESPONSE, ""))
 
 
 def _glare(frame: SkyFrame, scale: FluxScale, light: StarPhotometry) -> tuple[Array, Array]:

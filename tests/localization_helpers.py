@@ -14,11 +14,13 @@ from startrack.localization import ExactPosterior
 from startrack.localization.chain_states import transitions
 from startrack.localization.obstacle_chain import (
     LEVELS_RAD,
+    MOVES,
     NOTCH_LEVELS_RAD,
     RISEN,
     STATES,
     STOP,
     WRONG_SECTOR,
+    Moves,
 )
 from startrack.localization.profile_cells import HIGH_RAD, LOW_RAD
 from startrack.localization.search_profiles import HIDE, SEARCH_EPSILON
@@ -118,14 +120,14 @@ def _mean_likelihoods(margin_rad: Array, llr: Array, ranges_rad: list[tuple[Arra
     return means
 
 
-def slow_chain(emissions: Array) -> Array:
+def slow_chain(emissions: Array, moves: Moves = MOVES) -> Array:
     """Logarithms (p,) of the traces of the products of transitions and emissions (p, SECTORS, STATES)."""
     parts = np.array_split(emissions, max(len(emissions) // PART, 1))
-    return np.concatenate([_chain_of_part(part) for part in parts])
+    return np.concatenate([_chain_of_part(part, transitions(moves)) for part in parts])
 
 
-def _chain_of_part(emissions: Array) -> Array:
-    product, log, T = np.tile(np.eye(STATES), (len(emissions), 1, 1)), np.zeros(len(emissions)), transitions()
+def _chain_of_part(emissions: Array, T: Array) -> Array:
+    product, log = np.tile(np.eye(STATES), (len(emissions), 1, 1)), np.zeros(len(emissions))
     for e in np.moveaxis(emissions, 1, 0):
         # One product of two matrices, instead of one small product a position.
         product = (product.reshape(-1, STATES) @ T).reshape(product.shape) * e[:, None]

@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from localization_helpers import slow_chain
 from render_helpers import CRATER
 from sky_helpers import PX_PER_RAD
 from test_localization_refinement import PLACE, sky_rows, star_rows
@@ -14,11 +15,15 @@ from test_skyline import CAMERA, PLACES_M, Frame, expose, locate
 from test_skyline import CRATER as RENDERED
 
 from startrack.catalog import load_catalog
-from startrack.core.types import MIDDLES_RAD, Array, Bools, Evidence, Fix
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Bools, Evidence, Fix
 from startrack.evidence.sky_light import LEVELS
 from startrack.evidence.skyline import Skyline, look_through, scale_across, skyline_band
 from startrack.frames import azel_from_rays
 from startrack.localization import ExactPosterior
+from startrack.localization.neighbourhood import OwnEdge, SectorRows
+from startrack.localization.obstacle_chain import NODES, RISEN, STATES, clear_emissions
+from startrack.localization.shared_errors import SharedErrors
+from startrack.localization.skyline_model import SkylineModel
 
 NATS = 4.0  # of a cell of the light: a sky of 7 %
 STARS = 1500  # within 1.1 degrees of the skyline
@@ -59,6 +64,23 @@ def test_light_that_ends_at_the_skyline_is_not_doubted(seed: int) -> None:
 
 def test_light_alone_has_no_other_edge_than_the_skyline() -> None:
     assert fix_with(0.0, 0, with_stars=False).lit is None
+
+
+def test_lit_states_are_those_of_stars_at_the_skyline_and_light_by_its_neighbours() -> None:
+    """The prepared levels are the emissions at their nodes; the chain's likelihood is a product of matrices."""
+    rng = np.random.default_rng(3)
+    light, stars = sky_rows(TRUE, rng, NATS), star_rows(TRUE, rng, STARS)
+    plain = SkylineModel.of(CRATER, Evidence.concatenate(light, stars), PLACE, 30.0, SharedErrors.of(CRATER, None))
+    by_stars = SectorRows(plain.around, stars).profiles
+    edge = OwnEdge(by_stars, rng.uniform(0.01, 2.0, SECTORS) * np.exp(by_stars.offset - plain.seen.profiles.offset))
+    seen, reach = replace(plain.seen, edge=edge), np.full(SECTORS, np.radians(0.3))
+    at_node = seen.emissions(-0.25 * reach)[:, 1:]
+    np.testing.assert_allclose(seen.prepare_levels(reach).table[:, :, NODES // 4], at_node, rtol=1e-4, atol=1e-6)
+    expected = clear_emissions(by_stars, -0.25 * reach[:, None])[:, 0] * edge.light
+    np.testing.assert_allclose(at_node[:, RISEN:], np.repeat(expected[:, None], STATES - 1 - RISEN, axis=1))
+    shift = np.zeros(SECTORS)
+    by_matrices = slow_chain(np.array([seen.emissions(shift)]), seen.moves)
+    assert replace(plain, seen=seen).log_likelihood_of(shift[None]) == pytest.approx(by_matrices, abs=0.05)
 
 
 def light_strip(frame: Frame, light_e: float) -> Frame:

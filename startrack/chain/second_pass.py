@@ -92,8 +92,9 @@ def fix_by_all(complete: Located, localizer: Localizer) -> Located:
     located, fix = fix_again(complete, complete.fix, localizer, rows)
     located = replace(located, fix=fix)
     if sky is not None and fix.lit is not None:
-        sky = sky._replace(used=sky.used & ~fix.lit.whole)
-        text = f"at azimuths {fix.lit.text} its edge is not the skyline that the stars show: lit ground?"
+        used = sky.used & ~fix.lit.whole
+        sky = sky._replace(used=used) if used.any() else None
+        text = f"at azimuths {fix.lit.text}, where its edge is not the skyline that the stars show: lit ground?"
         located = replace(located, sky=sky, sky_unused=text)
     if sky is not None and not fix.ambiguous:
         _require_near(located, sky)

@@ -224,7 +224,7 @@ class Located(Positioned, StarFix, Measured):
 
     sky: SkyEvidence | None = None  # None: not used for the fix
     by_stars: bool = True  # whether the stars' rows are in the posterior too
-    sky_unused: str = ""  # why the sky's light is not used
+    sky_unused: str = ""  # why the sky's light is not used, or not in all directions
     skyline: MeasuredSkyline | None = None  # that the image shows; None: not one position, or not right to its error
     sky_brightness_mag_arcsec2: float | None = None  # beyond that of the ground; None: no step, no zero point
 

@@ -64,7 +64,7 @@ class SkyLight:
 
     @cached_property
     def variance_px2(self) -> Array:
-        """(SECTORS,) of the skyline's height with the errors of both levels; infinite where nothing tells it."""
+        """(SECTORS,) of the skyline's height with the errors of both levels; infinite where it is not covered."""
         return np.asarray(np.sum(self._variances_px2, axis=0))
 
     @cached_property

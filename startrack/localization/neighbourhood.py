@@ -13,7 +13,6 @@ from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, ImageErr
 from startrack.localization.obstacle_chain import (
     LIT_MOVES,
     MOVES,
-    NODES,
     RISEN,
     Levels,
     Moves,
@@ -153,10 +152,6 @@ class OwnEdge(NamedTuple):
     stars: Profiles
     light: Array  # (SECTORS,) likelihood of the light, in which the two profiles' offsets are made up for
 
-    def likelihoods(self, shifts: Array) -> Array:
-        """(SECTORS, n) at shifts (SECTORS, n) of the map's skyline."""
-        return np.asarray(clear_emissions(self.stars, shifts) * self.light[:, None])
-
 
 @dataclass(frozen=True, eq=False)
 class SectorRows:
@@ -202,16 +197,14 @@ class SectorRows:
         """Likelihoods (SECTORS, STATES) at shifts (SECTORS,) of the map's skyline."""
         found = emissions(self.profiles, shift)
         if self.edge is not None:
-            found[:, RISEN + 1 :] = self.edge.likelihoods(shift[:, None])
+            at_skyline = clear_emissions(self.edge.stars, np.ascontiguousarray(shift)[:, None])
+            found[:, RISEN + 1 :] = at_skyline * self.edge.light[:, None]
         return np.asarray(found)
 
     def prepare_levels(self, reach: Array) -> Levels:
         """The emissions of all states but the first at shifts up to `reach` (SECTORS,)."""
-        table = prepare_levels(self.profiles, reach)
-        if self.edge is not None:
-            u = np.linspace(-1.0, 1.0, NODES)
-            table[:, RISEN:] = self.edge.likelihoods(reach[:, None] * u * np.abs(u))[:, None]
-        return Levels(reach, table)
+        stars, light = (self.profiles, np.zeros(0)) if self.edge is None else self.edge
+        return Levels(reach, prepare_levels(self.profiles, reach), stars, light)
 
     @cached_property
     def image_rise(self) -> Array:

@@ -2,9 +2,10 @@
 
 In each sector the skyline is the map's (state 0), stands above it by one of the levels of LEVELS_RAD (something on no
 map), hides everything, or lies below it by one of the levels of NOTCH_LEVELS_RAD (a gap that the map has filled, a
-crest that it has too high). An obstacle or a notch pays once to begin and little to continue; its level stays, moves to
-a neighbour or, seldom, jumps. Besides, each sector may show a skyline that is anywhere. The likelihood is the trace of
-the product of transitions and emissions around the circle.
+crest that it has too high). Where the sky's light has an edge of its own over a part of the circle, all states below
+the map's mean that instead: stars at the map's skyline, light at its own edge. An obstacle or a notch pays once to
+begin and little to continue; its level stays, moves to a neighbour or, seldom, jumps. Besides, each sector may show a
+skyline that is anywhere. The likelihood is the trace of the product of transitions and emissions around the circle.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 
 from startrack.core.kernels import REORDERED_SUMS, njit
 from startrack.core.types import SECTORS, Array
-from startrack.localization.profile_cells import cell_at, integral_to, log_at
+from startrack.localization.profile_cells import Profiles, cell_at, integral_to, log_at
 
 LEVELS_RAD = np.radians([0.04, 0.08, 0.14, 0.24, 0.4, 0.65, 1.0, 1.6, 2.5, 4.0, 6.5, 10.0, 16.0])  # edges
 NOTCH_LEVELS_RAD = np.radians([0.04, 0.1, 0.25, 0.65, 1.6, 4.0, 8.0])  # edges, below the map's skyline
@@ -73,6 +74,8 @@ class Levels(NamedTuple):
 
     reach: Array  # (SECTORS,) largest shift
     table: Array  # (SECTORS, STATES - 1, NODES), float32
+    stars: Profiles  # of the stars alone, where the light may have its own edge
+    light: Array  # (SECTORS,) likelihood of light with its own edge; (0,): it has none
 
 
 @njit(cache=True)
@@ -160,12 +163,15 @@ def chain_log_likelihoods(profiles, levels, moves, shifts, cut, closing, found):
     clear, total = np.empty(BLOCK, dtype=np.float32), np.empty(BLOCK, dtype=np.float32)
     ended, part = np.empty(BLOCK, dtype=np.float32), np.empty(BLOCK, dtype=np.float32)
     node = np.empty(BLOCK, dtype=np.int64)
-    reach, table = levels.reach, levels.table
-    logs, product, clear_emissions = np.empty(BLOCK), np.empty(BLOCK), np.empty((sectors, BLOCK))
+    reach, table, is_lit = levels.reach, levels.table, len(levels.light) > 0
+    logs, product, at_skyline = np.empty(BLOCK), np.empty(BLOCK), np.empty((sectors, BLOCK))
+    lit = np.empty((sectors if is_lit else 0, BLOCK))
     for first in range(0, count, BLOCK):
         shift = shifts[first : first + BLOCK].T.copy()
         points = shift.shape[1]
-        fill_clear_emissions(profiles, shift, clear_emissions)
+        fill_clear_emissions(profiles, shift, at_skyline)
+        if is_lit:
+            fill_clear_emissions(levels.stars, shift, lit)
         found[first : first + BLOCK] = -np.inf
         for k in closing:
             clear[:], logs[:], product[:] = 0.0, 0.0, 1.0
@@ -208,8 +214,12 @@ def chain_log_likelihoods(profiles, levels, moves, shifts, cut, closing, found):
                         for p in range(points):
                             low = emission[node[p]]
                             off[r, p] = moved[r, p] * (low + part[p] * (emission[node[p] + 1] - low))
+                if is_lit:
+                    for r in range(rows[1, 0], rows[1, 1]):
+                        for p in range(points):
+                            off[r, p] = moved[r, p] * np.float32(levels.light[s] * lit[s, p])
                 for p in range(points):
-                    clear[p] *= clear_emissions[s, p]
+                    clear[p] *= at_skyline[s, p]
                 if step % 4 == 3:
                     for p in range(points):  # numba takes 1.5 s to compile total[:] = clear
                         total[p] = clear[p]

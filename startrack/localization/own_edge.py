@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from startrack.core.statistics import shares
+from startrack.core.types import SECTORS
 from startrack.localization.free_skyline import list_free_logs
 from startrack.localization.hypothesis import Hypothesis
 from startrack.localization.neighbourhood import OwnEdge, SectorRows
@@ -39,7 +40,8 @@ def with_own_edge(plain: Hypothesis, half_m: float) -> SkylineModel | None:
     width_rad = float(np.median(rows.edge_sigma_rad[is_light]))
     shift = plain.model.shift_of(plain.found.share @ plain.found.points)
     logs = list_free_logs(light.profiles, shift, EDGE_REACH * width_rad, EDGE_ROUGHNESS * width_rad)
-    likely = shares(logs.sum(axis=1)) @ logs
+    whole, likely = logs.sum(axis=1), shares(logs.sum(axis=1)) @ logs
+    likely += (np.logaddexp.reduce(whole) - np.log(len(whole)) - likely.sum()) / SECTORS  # all equally likely before
     offset = light.profiles.offset + stars.profiles.offset - model.seen.profiles.offset
     edge = OwnEdge(stars.profiles, np.exp(likely + offset))
     return replace(model, gross=OWN_EDGE, seen=replace(model.seen, edge=edge))

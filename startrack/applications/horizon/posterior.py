@@ -139,7 +139,7 @@ def combine_columns(log_likelihood: Array) -> tuple[Array, Array]:
     change = np.exp(-GRID_STEP_RAD / CHANGES_RAD), np.array(CHANGE_WEIGHTS), JUMP_WEIGHT, skyline_prior()
     kinds = np.array(KINDS), SWITCH_1
     ahead, behind = map_in_threads(lambda forward: pass_messages(likelihood, forward, *change, *kinds), (True, False))
-    posterior = (ahead * behind * likelihood / np.array(KINDS, np.float32)[:, None, None]).sum(axis=0, dtype=np.float64)
+    posterior = (ahead * behind * likelihood).sum(axis=0, dtype=np.float64)
     posterior /= posterior.sum(axis=1, keepdims=True)
     elevation = elevations_rad()
     mean = posterior @ elevation

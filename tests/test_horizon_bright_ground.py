@@ -20,7 +20,7 @@ from startrack.applications.horizon.columns import (
     elevations_rad,
     mean_above,
 )
-from startrack.applications.horizon.measure import measure_frames
+from startrack.applications.horizon.measure import _has_step, measure_frames
 from startrack.applications.horizon.posterior import KINDS, add_step_log_likelihood, combine_columns
 from startrack.applications.horizon.skylight import Steps, _steps_of
 from startrack.applications.horizon.starlight import measure_stars
@@ -128,6 +128,24 @@ def test_the_noise_of_means_is_that_of_white_noise(averaging, px_of_columns):
         mean, inside = average_columns(found, averaging.columns, slope=slope), slice(30, -30)
         true = np.nanstd(mean_above(mean, 0.0, 4.0)[inside]) * np.sqrt(4.0)
         assert true / np.median(mean.noise_e[inside]) == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_view_without_open_sky_has_steps():
+    light = np.full((600, AZIMUTH_COLUMNS), 100.0)
+    light[:200] = 50.0
+    light[300:] = np.nan
+    found = _steps_of(columns_of(light + np.random.default_rng(6).normal(size=light.shape), 1.0), AVERAGINGS[0])
+    assert len(np.unique(found.column[found.significance > 9.0])) == AZIMUTH_COLUMNS
+
+
+def test_white_noise_has_no_skyline():
+    noise, share = 3.0, []
+    drawn = 300.0 + np.random.default_rng(7).normal(0.0, noise, (400, AZIMUTH_COLUMNS))
+    columns = columns_of(drawn.repeat(COLUMN_SAMPLES, axis=0), noise, 360.0 / AZIMUTH_COLUMNS / COLUMN_SAMPLES)
+    steps = [_steps_of(columns, averaging) for averaging in AVERAGINGS]
+    for elevation_deg in (5.0, 10.0, 20.0):
+        share.append(_has_step([steps], np.full(AZIMUTH_COLUMNS, np.radians(elevation_deg))).mean())
+    assert max(share) < 0.02
 
 
 def test_means_follow_a_slope():

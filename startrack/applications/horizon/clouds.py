@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, COLUMNS_PER_AZIMUTH, SKYLINE_AZIMUTHS
-from startrack.applications.horizon.posterior import limited_rows, sky_likelihood_ratio
+from startrack.applications.horizon.posterior import limited_rows, sky_likelihood_ratio, steps_at
 from startrack.applications.horizon.skylight import Steps
 from startrack.applications.horizon.starlight import StarLight
 from startrack.core.types import Array
@@ -26,7 +26,6 @@ CLEAR_OF_GROUND_RAD, HIGHEST_CLOUD_RAD = np.radians(3.0), np.radians(20.0)
 # A layer of clouds is foreshortened towards the horizon, by 1 / sin^2 of the elevation; below this one no further.
 FLAT_RAD = np.radians(8.0)
 LEAST_EDGES = 4.0  # columns with an edge that a picture without any is taken to have
-NEAR_EDGE_RAD = np.radians(0.3)  # a step this near to an edge is the edge
 BEYOND_TWO_SIGMA = 0.0455  # probability of an error of more than two sigma
 BESIDE_RAD = np.radians(1.5)  # of azimuth: stars this near to a bin are behind its edge
 
@@ -55,11 +54,11 @@ def cloud_density(steps: Steps, skyline_rad: Array) -> float:
 def edge_likelihood_ratio(steps: Steps, skyline_rad: Array) -> Array:
     """Likelihood ratio (SKYLINE_AZIMUTHS,) of a cloud's edge to the ground's, by the light below the edge in each bin.
 
-    `skyline_rad`: elevations (AZIMUTH_COLUMNS,) of the edge; 1 where none of the `steps` of the picture is near it.
+    `skyline_rad`: elevations (AZIMUTH_COLUMNS,) of the edge; 1 where none of the `steps` is at it.
     """
-    near = np.abs(steps.elevation_rad - skyline_rad[steps.column]) < NEAR_EDGE_RAD
-    of_bin = steps.column[near] // COLUMNS_PER_AZIMUTH
-    number, total = (np.bincount(of_bin, part, SKYLINE_AZIMUTHS) for part in (None, steps.log_ratio[near]))
+    steps = steps_at(steps, skyline_rad)
+    of_bin = steps.column // COLUMNS_PER_AZIMUTH
+    number, total = (np.bincount(of_bin, part, SKYLINE_AZIMUTHS) for part in (None, steps.log_ratio))
     return np.where(number > 0, sky_likelihood_ratio(total / np.maximum(number, 1)), 1.0)
 
 

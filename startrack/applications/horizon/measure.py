@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.applications.horizon.clouds import NEAR_EDGE_RAD, cloud_probability, cloud_sigma_rad
+from startrack.applications.horizon.clouds import cloud_probability, cloud_sigma_rad
 from startrack.applications.horizon.columns import (
     AVERAGINGS,
     AZIMUTH_COLUMNS,
@@ -21,10 +21,12 @@ from startrack.applications.horizon.join import join_skylines
 from startrack.applications.horizon.posterior import (
     HIGH_RAD,
     KINDS,
+    NEAR_EDGE_RAD,
     WEAKEST_CONTRAST,
     add_step_log_likelihood,
     combine_columns,
     star_log_likelihood,
+    steps_at,
 )
 from startrack.applications.horizon.skylight import Steps, find_steps
 from startrack.applications.horizon.starlight import StarLight, measure_stars
@@ -261,11 +263,10 @@ def _has_star(stars: Sequence[StarLight], azimuth: Array, elevation: Array) -> B
 
 
 def _has_step(steps: Sequence[list[Steps]], elevation_rad: Array) -> Bools:
-    """Whether steps of light lie at the skyline of most columns of each bin."""
+    """Whether steps of light that are no noise lie at the skyline of most columns of each bin."""
     found = np.zeros(AZIMUTH_COLUMNS, dtype=bool)
     for one in (one for by_width in steps for one in by_width):
-        near = np.abs(one.elevation_rad - elevation_rad[one.column]) < NEAR_EDGE_RAD
-        found[one.column[near]] = True
+        found[steps_at(one, elevation_rad).column] = True
     return np.asarray(_columns_of_bins(found, 0).mean(axis=1) >= 0.5)
 
 

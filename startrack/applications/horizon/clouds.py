@@ -16,10 +16,11 @@ from startrack.applications.horizon.skylight import Steps
 from startrack.applications.horizon.starlight import StarLight
 from startrack.core.types import Array
 
-# Of the edges counted: dark ones below a brighter sky, in the widest averages, where stars are none. Of 14 pictures of
-# one camera five with clouds have 3 to 13 times the density of seven clear ones. From 3 sigma a clear picture knows 26
-# azimuths fewer; from a contrast of 0.15 clear pictures differ by 6.4 in units of sigma (RMS), not by 2.8. That was
-# with 4 sigma of the pixels' noise, which are 2.5 of the measured scatter (1.6 times that noise in the median).
+# Of the edges counted: dark ones below a brighter sky, in the widest averages of single pixels, where stars are none.
+# Of 14 pictures of one camera five with clouds have 3 to 13 times the density of seven clear ones. From 3 sigma a clear
+# picture knows 26 azimuths fewer; from a contrast of 0.15 clear pictures differ by 6.4 in units of sigma (RMS), not by
+# 2.8. That was with 4 sigma of the pixels' noise, which are 2.5 of the measured scatter (1.6 times that noise in the
+# median).
 CLOUD_CONTRAST, CLOUD_SIGNIFICANCE = 0.1, 2.5
 # The sky that is counted, above the skyline (beside whose edge are trees) and up to an elevation.
 CLEAR_OF_GROUND_RAD, HIGHEST_CLOUD_RAD = np.radians(3.0), np.radians(20.0)
@@ -70,7 +71,7 @@ def cloud_probability(
     Stars missing behind the edge say that it is ground's, unless one cloud hides them all, and so does darkness.
 
     Args:
-        steps: of the picture, in the widest averages.
+        steps: of the picture, in the widest averages of single pixels (CLOUD_STEPS).
         stars: of the picture.
         skyline_rad: elevations (AZIMUTH_COLUMNS,) of the edge.
         elevation_rad: (SKYLINE_AZIMUTHS,) of the edge in each bin; infinite or nan ones have no meaning.

@@ -112,8 +112,8 @@ def sample_columns(
         total += np.where(hidden, np.nan, cv2.remap(image_e, x, y, cv2.INTER_LINEAR))
         spread += cv2.remap(noise_e, x, y, cv2.INTER_NEAREST)
         points |= cv2.remap(disks, x, y, cv2.INTER_NEAREST) > 0
-    mean_e, noise_e = total / COLUMN_SAMPLES, spread / COLUMN_SAMPLES
-    columns = Columns(elevation, mean_e, noise_e, px_rad / COLUMN_SAMPLES, px_rad, px_rad)
+    light_e, spread_e = total / COLUMN_SAMPLES, spread / COLUMN_SAMPLES
+    columns = Columns(elevation, light_e, spread_e, px_rad / COLUMN_SAMPLES, px_rad, px_rad)
     without = replace(columns, light_e=np.where(points, np.nan, columns.light_e))
     around = average_columns(without, AVERAGINGS[-1].columns, FILL_SHARE).light_e
     return replace(columns, light_e=np.where(points, around, columns.light_e))

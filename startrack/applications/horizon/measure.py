@@ -123,7 +123,7 @@ def skyline_of_frames(measured: Sequence[MeasuredFrame], site: Site) -> Measured
     # Other stars stand there in another picture. Steps are the same edges: which of them is the skyline, a second
     # picture shows no better than the first.
     by_stars = sum((one.by_stars for one in measured), np.zeros(()))
-    by_steps = sum((one.by_steps for one in measured), np.zeros(()))
+    by_steps = sum((one.by_steps for one in measured), np.zeros((), np.float32))
     frames, lights = [one.frame for one in measured], [one.light for one in measured]
     together = _skyline_of(frames, lights, by_stars + by_steps / len(measured), site)
     return join_skylines(together, alone)
@@ -135,7 +135,7 @@ def measure_frame(frame: SkyFrame, site: Site) -> MeasuredFrame:
     stars = measure_stars(frame)
     check_time()
     steps, by_stars = find_steps(frame, stars), star_log_likelihood(stars.rays, stars.missing)
-    by_steps = np.zeros((len(KINDS), *by_stars.shape))
+    by_steps = np.zeros((len(KINDS), *by_stars.shape), np.float32)  # it is kept of every picture
     for found, averaging in zip(steps, AVERAGINGS, strict=True):
         add_step_log_likelihood(by_steps, found, averaging.weight)
     light = stars, steps

@@ -19,8 +19,8 @@ CHANGES_RAD = np.radians(np.array([0.02, 0.12, 0.8]))  # Laplace scales of the c
 CHANGE_WEIGHTS = (0.55, 0.25, 0.18)
 JUMP_WEIGHT = 1.0 - sum(CHANGE_WEIGHTS)  # a dome, a mast: any elevation
 # Kinds of ground by its light beside the sky's: darker, brighter (in moonlight or lamplight), hardly either. Their
-# shares, the probability that the kind is drawn anew from column to column, and that the skyline itself is among a
-# column's steps.
+# shares, the probability that the kind alone is drawn anew from column to column (a jump draws it too: both together
+# every 7.8 degrees), and that the skyline itself is among a column's steps.
 KINDS, SWITCH_1, SHOWN_PROBABILITY = (0.7, 0.1, 0.2), 1 / 80, (0.75, 0.75, 0.5)
 WEAKEST_CONTRAST, FAINT_CONTRAST = 0.25, 0.1  # usual skylines have more than the first; scale of a faint one's
 NEAR_EDGE_RAD = np.radians(0.3)  # a step this near to an edge is the edge
@@ -150,7 +150,7 @@ def add_step_log_likelihood(total: Array, steps: Steps, temper: float) -> None:
 
 def compile_columns() -> None:
     """Compile the kernels of the chain, by a skyline with one step of light."""
-    one, total = np.ones(1), np.zeros((len(KINDS), AZIMUTH_COLUMNS, len(elevations_rad())))
+    one, total = np.ones(1), np.zeros((len(KINDS), AZIMUTH_COLUMNS, len(elevations_rad())), np.float32)
     add_step_log_likelihood(total, Steps(np.zeros(1, np.int64), 0.1 * one, 0.01 * one, one, one, 10.0 * one), 1.0)
     combine_columns(total)
 

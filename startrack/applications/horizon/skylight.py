@@ -150,9 +150,9 @@ def _level_above(columns: Columns, gap_px: float, distance_px: float, dark_e: fl
 
 
 def _measure_edges(columns: Columns, row: Ints, column: Ints, noise: Array) -> tuple[Array, Array, Array, Bools]:
-    """Elevation [rad] and sigma [px] (n,) of steps at samples (row, column) (n,), and which of them are measured.
+    """Steps at samples (row, column) (n,): elevation [rad], sigma [px], significance, which are measured; each (n,).
 
-    Also by how many sigma (n,) an edge explains the light better than a smooth course does.
+    The significance is by how many sigma an edge explains the light better than a smooth course does.
 
     Least squares of a level of ground and a sloping level of sky, joined by an edge of one of several widths; the mean
     and the scatter of the edge's place over all widths and places, by their likelihoods.

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from startrack.applications.horizon.clouds import cloud_probability, cloud_sigma_rad
 from startrack.applications.horizon.columns import (
@@ -74,7 +75,7 @@ class MeasuredFrame:
     light: Light
     skyline: MeasuredSkyline
     by_stars: Array
-    by_steps: Array
+    by_steps: NDArray[np.float32]
 
 
 def measure_skyline(

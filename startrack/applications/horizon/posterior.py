@@ -7,7 +7,10 @@ above it, or brighter, or hardly either; that too changes rarely from column to 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, GRID_STEP_RAD, LOWEST_RAD, column_of, elevations_rad
 from startrack.applications.horizon.skylight import MIN_SIGNIFICANCE, Steps
@@ -129,7 +132,7 @@ def steps_at(steps: Steps, skyline_rad: Array) -> Steps:
     return steps.take((np.abs(off) < NEAR_EDGE_RAD) & (own * here > _noise_density(steps)))
 
 
-def add_step_log_likelihood(total: Array, steps: Steps, temper: float) -> None:
+def add_step_log_likelihood(total: NDArray[np.floating[Any]], steps: Steps, temper: float) -> None:
     """Add that of an image's steps of light, times `temper`, to the log-likelihood `total` (KINDS, AZIMUTH_COLUMNS, n).
 
     It is of each kind of ground: darker than the sky above it, brighter, or hardly either.
@@ -155,7 +158,7 @@ def compile_columns() -> None:
     combine_columns(total)
 
 
-def combine_columns(log_likelihood: Array) -> tuple[Array, Array]:
+def combine_columns(log_likelihood: NDArray[np.floating[Any]]) -> tuple[Array, Array]:
     """Means and standard deviations [rad] of each column by log-likelihoods (KINDS, AZIMUTH_COLUMNS, n)."""
     likelihood = np.exp(log_likelihood - log_likelihood.max(axis=(0, 2), keepdims=True)).astype(np.float32)
     likelihood = likelihood / likelihood.mean(axis=(0, 2), keepdims=True) + np.float32(OUTLIER_PROBABILITY)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, COLUMNS_PER_AZIMUTH, SKYLINE_AZIMUTHS
-from startrack.applications.horizon.posterior import limited_rows, sky_likelihood_ratio, steps_at
+from startrack.applications.horizon.posterior import NEAR_EDGE_RAD, limited_rows, sky_likelihood_ratio
 from startrack.applications.horizon.skylight import Steps
 from startrack.applications.horizon.starlight import StarLight
 from startrack.core.types import Array
@@ -55,9 +55,9 @@ def cloud_density(steps: Steps, skyline_rad: Array) -> float:
 def edge_likelihood_ratio(steps: Steps, skyline_rad: Array) -> Array:
     """Likelihood ratio (SKYLINE_AZIMUTHS,) of a cloud's edge to the ground's, by the light below the edge in each bin.
 
-    `skyline_rad`: elevations (AZIMUTH_COLUMNS,) of the edge; 1 where none of the `steps` is at it.
+    `skyline_rad`: elevations (AZIMUTH_COLUMNS,) of the edge; 1 where none of the `steps` of the picture is near it.
     """
-    steps = steps_at(steps, skyline_rad)
+    steps = steps.take(np.abs(steps.elevation_rad - skyline_rad[steps.column]) < NEAR_EDGE_RAD)
     of_bin = steps.column // COLUMNS_PER_AZIMUTH
     number, total = (np.bincount(of_bin, part, SKYLINE_AZIMUTHS) for part in (None, steps.log_ratio))
     return np.where(number > 0, sky_likelihood_ratio(total / np.maximum(number, 1)), 1.0)

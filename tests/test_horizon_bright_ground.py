@@ -18,8 +18,9 @@ from startrack.applications.horizon.columns import (
     average_columns,
     coarser,
     elevations_rad,
+    mean_above,
 )
-from startrack.applications.horizon.measure import measure_frames
+from startrack.applications.horizon.measure import _has_step, measure_frames
 from startrack.applications.horizon.posterior import KINDS, add_step_log_likelihood, combine_columns
 from startrack.applications.horizon.skylight import Steps, _steps_of
 from startrack.applications.horizon.starlight import measure_stars
@@ -87,7 +88,8 @@ def test_a_step_of_light_in_the_sky_is_not_stated_as_the_skyline():
 def columns_of(light_e: np.ndarray, noise_e: float, step_deg: float = 0.04) -> Columns:
     elevation = np.radians(-2.0 + step_deg * np.arange(len(light_e)))
     step = float(np.radians(step_deg))
-    return Columns(elevation, light_e, np.full(light_e.shape, noise_e), step, COLUMN_SAMPLES * step)
+    px = COLUMN_SAMPLES * step
+    return Columns(elevation, light_e, np.full(light_e.shape, noise_e), step, px, px)
 
 
 def test_light_that_falls_smoothly_has_no_steps():
@@ -113,6 +115,39 @@ def test_the_mean_of_unlike_columns_has_the_error_by_which_they_differ():
     assert np.median(mean.noise_e[60, 720:1400]) < 1.5
 
 
+@pytest.mark.parametrize("averaging", AVERAGINGS)
+@pytest.mark.parametrize("px_of_columns", [1, 4])
+def test_the_noise_of_means_is_that_of_white_noise(averaging, px_of_columns):
+    """Over four pixels of each averaging, of an image's pixels as wide as a column, or four to a column."""
+    noise, pixels, width_deg = 3.0, 200, 360.0 / AZIMUTH_COLUMNS
+    drawn = np.random.default_rng(5).normal(0.0, noise, (pixels, AZIMUTH_COLUMNS, px_of_columns)).mean(axis=2)
+    step_deg = width_deg / px_of_columns / COLUMN_SAMPLES
+    columns = columns_of(drawn.repeat(COLUMN_SAMPLES, axis=0), noise, step_deg)
+    found = coarser(columns, averaging.pixels)
+    for slope in averaging.slopes[len(averaging.slopes) // 2 :]:
+        mean, inside = average_columns(found, averaging.columns, slope=slope), slice(30, -30)
+        true = np.nanstd(mean_above(mean, 0.0, 4.0)[inside]) * np.sqrt(4.0)
+        assert true / np.median(mean.noise_e[inside]) == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_view_without_open_sky_has_steps():
+    light = np.full((600, AZIMUTH_COLUMNS), 100.0)
+    light[:200] = 50.0
+    light[300:] = np.nan
+    found = _steps_of(columns_of(light + np.random.default_rng(6).normal(size=light.shape), 1.0), AVERAGINGS[0])
+    assert len(np.unique(found.column[found.significance > 9.0])) == AZIMUTH_COLUMNS
+
+
+def test_white_noise_has_no_skyline():
+    noise, share = 3.0, []
+    drawn = 300.0 + np.random.default_rng(7).normal(0.0, noise, (400, AZIMUTH_COLUMNS))
+    columns = columns_of(drawn.repeat(COLUMN_SAMPLES, axis=0), noise, 360.0 / AZIMUTH_COLUMNS / COLUMN_SAMPLES)
+    steps = [_steps_of(columns, averaging) for averaging in AVERAGINGS]
+    for elevation_deg in (5.0, 10.0, 20.0):
+        share.append(_has_step([steps], np.full(AZIMUTH_COLUMNS, np.radians(elevation_deg))).mean())
+    assert max(share) < 0.02
+
+
 def test_means_follow_a_slope():
     slope, columns = 0.6, columns_of(np.zeros((600, AZIMUTH_COLUMNS)), 1.0)
     azimuth = (np.arange(AZIMUTH_COLUMNS) - 700) * 2 * np.pi / AZIMUTH_COLUMNS
@@ -128,6 +163,7 @@ def test_a_coarser_column_has_the_means_of_its_pixels():
     np.testing.assert_allclose(found.light_e[:, 0], [1.0, 4.0, 7.0, 10.0])
     np.testing.assert_allclose(found.noise_e, np.sqrt(3.0))
     assert found.px_rad == pytest.approx(3 * columns.px_rad)
+    assert found.across_px_rad == columns.across_px_rad
 
 
 def test_the_sign_of_the_step_is_a_matter_of_many_columns():

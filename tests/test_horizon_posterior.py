@@ -5,8 +5,18 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import norm
 
-from startrack.applications.horizon.columns import column_of, elevations_rad
-from startrack.applications.horizon.posterior import limited_rows, star_log_likelihood
+from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, GRID_STEP_RAD, column_of, elevations_rad
+from startrack.applications.horizon.posterior import (
+    CHANGE_WEIGHTS,
+    CHANGES_RAD,
+    JUMP_WEIGHT,
+    KINDS,
+    SWITCH_1,
+    combine_columns,
+    limited_rows,
+    skyline_prior,
+    star_log_likelihood,
+)
 from startrack.core.types import Evidence
 from startrack.estimation.column_chain import add_steps, pass_messages
 
@@ -22,17 +32,31 @@ def test_messages_are_those_of_the_whole_transition_matrix():
     landing /= landing.sum()
     apart = np.abs(np.arange(n)[:, None] - np.arange(n))
     move = sum(w * (1 - r) / (1 + r) * r**apart for r, w in zip(RATIO, WEIGHT, strict=True))
+    move /= move.sum(axis=1, keepdims=True)
+    change = (1.0 - switch) * np.eye(kinds) + switch * part  # from a kind (rows) to another
+    jump = np.broadcast_to(np.outer(part, landing).ravel(), (kinds * n, kinds * n))
+    matrix = (1.0 - JUMP) * np.kron(change, move) + JUMP * jump
     for forward in (True, False):
         order = range(columns) if forward else range(columns - 1, -1, -1)
-        expected, message = np.empty((kinds, columns, n)), part[:, None] * landing
+        expected = np.empty((kinds, columns, n))
+        message = np.outer(part, landing) if forward else np.ones((kinds, n))
         for c in [*order, *order]:
             expected[:, c] = message
-            after = message * likelihood[:, c] @ move
-            after /= after.sum()
-            drawn = part[:, None] * after.sum(axis=0)
-            message = (1.0 - JUMP) * ((1.0 - switch) * after + switch * drawn) + JUMP * part[:, None] * landing
+            after = (message * likelihood[:, c]).ravel()
+            message = ((after @ matrix if forward else matrix @ after) / after.sum()).reshape(kinds, n)
         found = pass_messages(likelihood, forward, RATIO, WEIGHT, JUMP, landing, part, switch)
         np.testing.assert_allclose(found, expected, rtol=1e-6)  # they are in single precision
+
+
+def test_without_evidence_the_posterior_is_the_chains_own_distribution():
+    """The prior of the elevation counts once: the columns after one say nothing about it."""
+    change = np.exp(-GRID_STEP_RAD / CHANGES_RAD), np.array(CHANGE_WEIGHTS), JUMP_WEIGHT, skyline_prior()
+    ones = np.ones((len(KINDS), AZIMUTH_COLUMNS, len(elevations_rad())), np.float32)
+    ahead = pass_messages(ones, True, *change, np.array(KINDS), SWITCH_1)[:, -1].astype(float)
+    np.testing.assert_allclose(ahead.sum(axis=1), KINDS, rtol=1e-5)
+    expected = ahead.sum(axis=0) @ elevations_rad()
+    mean, _ = combine_columns(np.zeros(ones.shape))
+    np.testing.assert_allclose(np.degrees(mean), np.degrees(expected), atol=0.02)
 
 
 def test_steps_add_the_logarithm_of_their_mixture():

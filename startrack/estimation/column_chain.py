@@ -46,30 +46,48 @@ def add_steps(total, temper, lowest, step, column, place, sigma, weight, passed,
 
 @njit(cache=True, fastmath=REORDERED_SUMS)
 def pass_messages(likelihood, forward, ratio, weight, jump, landing, part, switch):  # type: ignore[no-untyped-def]
-    """Messages (kinds, columns, n) that reach each column from those before it, in the order `forward` or against it.
+    """Messages (kinds, columns, n) that reach each column: what those before it say, or, not `forward`, those after it.
 
-    `likelihood` (kinds, columns, n) is of each kind of column and each elevation. Between columns a message is
-    convolved with three Laplace distributions that fall by `ratio` (3,) per sample and have the sums `weight` (3,).
-    With the probability `switch` the kind is drawn anew from the shares `part` (kinds,), and so are, with the
-    probability `jump`, kind and elevation, this by the probabilities `landing` (n,). The exponentials are summed by
-    recursion, from below and from above. Those six chains take their steps beside each other.
+    The product of both with the `likelihood` (kinds, columns, n) is the posterior of kind and elevation, to a factor in
+    each column. Between columns a kind and an elevation change by one matrix: the elevation by three Laplace
+    distributions that fall by `ratio` (3,) per sample, with the sums `weight` (3,), within the n samples. With the
+    probability `switch` the kind is drawn anew from the shares `part` (kinds,), and so are, with the probability
+    `jump`, kind and elevation, this by the probabilities `landing` (n,). Backward messages go through the transposed
+    matrix. The exponentials are summed by recursion, from below and from above. Those six chains take their steps
+    beside each other.
     """
     kinds, columns, n = likelihood.shape
     found = np.empty((kinds, columns, n), np.float32)
     message, after, from_below, both = np.empty((kinds, n)), np.empty(n), np.empty(n), np.empty(n)
-    for k in range(kinds):
-        message[k] = part[k] * landing
     r0, r1, r2 = ratio[0], ratio[1], ratio[2]
     scale = weight * (1.0 - ratio) / (1.0 + ratio)
     w0, w1, w2 = scale[0], scale[1], scale[2]
+    inside = np.zeros(n)  # what the sums of exponentials about each sample hold within the n samples
+    for j in range(len(ratio)):
+        for i in range(n):
+            inside[i] += weight[j] * (1.0 - (ratio[j] ** (i + 1) + ratio[j] ** (n - i)) / (1.0 + ratio[j]))
+    # Factors of what is taken from each kind and sample, and of what is given to it.
+    if forward:
+        taken, given, left, landed, before, behind = np.ones(kinds), part, np.ones(n), landing, 1.0 / inside, np.ones(n)
+    else:
+        taken, given, left, landed, before, behind = part, np.ones(kinds), landing, np.ones(n), np.ones(n), 1.0 / inside
+    for k in range(kinds):
+        message[k] = given[k] * landed
     for number in range(2 * columns):  # the second round starts where the first one ended: the compass is a circle
         c = number % columns if forward else columns - 1 - number % columns
         both[:] = 0.0
+        total = jumped = 0.0
         for k in range(kinds):
             own = message[k]
             found[k, c] = own
+            own_total = own_left = 0.0
             for i in range(n):
-                after[i] = own[i] * likelihood[k, c, i]
+                weighed = own[i] * likelihood[k, c, i]
+                own_total += weighed
+                own_left += weighed * left[i]
+                after[i] = weighed * before[i]
+            total += own_total
+            jumped += taken[k] * own_left
             a0 = a1 = a2 = b0 = b1 = b2 = 0.0
             for i in range(n):
                 below, above = after[i], after[n - 1 - i]
@@ -78,14 +96,12 @@ def pass_messages(likelihood, forward, ratio, weight, jump, landing, part, switc
                 from_below[i] = w0 * a0 + w1 * a1 + w2 * a2
                 b0, b1, b2 = r0 * (b0 + above), r1 * (b1 + above), r2 * (b2 + above)
             for i in range(n):
-                own[i] += from_below[i]
-                both[i] += own[i]
-        total = 0.0
-        for i in range(n):
-            total += both[i]
+                own[i] = (own[i] + from_below[i]) * behind[i]
+                both[i] += taken[k] * own[i]
         kept, drawn = (1.0 - jump) * (1.0 - switch) / total, (1.0 - jump) * switch / total
+        jumped *= jump / total
         for k in range(kinds):
             own = message[k]
             for i in range(n):
-                own[i] = kept * own[i] + part[k] * (drawn * both[i] + jump * landing[i])
+                own[i] = kept * own[i] + given[k] * (drawn * both[i] + jumped * landed[i])
     return found

@@ -11,22 +11,22 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, COLUMNS_PER_AZIMUTH, SKYLINE_AZIMUTHS
-from startrack.applications.horizon.posterior import limited_rows, sky_likelihood_ratio
+from startrack.applications.horizon.posterior import NEAR_EDGE_RAD, limited_rows, sky_likelihood_ratio
 from startrack.applications.horizon.skylight import Steps
 from startrack.applications.horizon.starlight import StarLight
 from startrack.core.types import Array
 
-# Of the edges counted: dark ones below a brighter sky, in the widest averages, where stars are none. Of 14 pictures of
-# one camera five with clouds have 3 to 13 times the density of seven clear ones. From 3 sigma a clear picture knows 26
-# azimuths fewer; from a contrast of 0.15 clear pictures differ by 6.4 in units of sigma (RMS), not by 2.8. That was
-# with 4 sigma of the pixels' noise, which are 2.5 of the measured scatter (1.6 times that noise in the median).
+# Of the edges counted: dark ones below a brighter sky, in the widest averages of single pixels, where stars are none.
+# Of 14 pictures of one camera five with clouds have 3 to 13 times the density of seven clear ones. From 3 sigma a clear
+# picture knows 26 azimuths fewer; from a contrast of 0.15 clear pictures differ by 6.4 in units of sigma (RMS), not by
+# 2.8. That was with 4 sigma of the pixels' noise, which are 2.5 of the measured scatter (1.6 times that noise in the
+# median).
 CLOUD_CONTRAST, CLOUD_SIGNIFICANCE = 0.1, 2.5
 # The sky that is counted, above the skyline (beside whose edge are trees) and up to an elevation.
 CLEAR_OF_GROUND_RAD, HIGHEST_CLOUD_RAD = np.radians(3.0), np.radians(20.0)
 # A layer of clouds is foreshortened towards the horizon, by 1 / sin^2 of the elevation; below this one no further.
 FLAT_RAD = np.radians(8.0)
 LEAST_EDGES = 4.0  # columns with an edge that a picture without any is taken to have
-NEAR_EDGE_RAD = np.radians(0.3)  # a step this near to an edge is the edge
 BEYOND_TWO_SIGMA = 0.0455  # probability of an error of more than two sigma
 BESIDE_RAD = np.radians(1.5)  # of azimuth: stars this near to a bin are behind its edge
 
@@ -57,9 +57,9 @@ def edge_likelihood_ratio(steps: Steps, skyline_rad: Array) -> Array:
 
     `skyline_rad`: elevations (AZIMUTH_COLUMNS,) of the edge; 1 where none of the `steps` of the picture is near it.
     """
-    near = np.abs(steps.elevation_rad - skyline_rad[steps.column]) < NEAR_EDGE_RAD
-    of_bin = steps.column[near] // COLUMNS_PER_AZIMUTH
-    number, total = (np.bincount(of_bin, part, SKYLINE_AZIMUTHS) for part in (None, steps.log_ratio[near]))
+    steps = steps.take(np.abs(steps.elevation_rad - skyline_rad[steps.column]) < NEAR_EDGE_RAD)
+    of_bin = steps.column // COLUMNS_PER_AZIMUTH
+    number, total = (np.bincount(of_bin, part, SKYLINE_AZIMUTHS) for part in (None, steps.log_ratio))
     return np.where(number > 0, sky_likelihood_ratio(total / np.maximum(number, 1)), 1.0)
 
 
@@ -71,7 +71,7 @@ def cloud_probability(
     Stars missing behind the edge say that it is ground's, unless one cloud hides them all, and so does darkness.
 
     Args:
-        steps: of the picture, in the widest averages.
+        steps: of the picture, in the widest averages of single pixels (CLOUD_STEPS).
         stars: of the picture.
         skyline_rad: elevations (AZIMUTH_COLUMNS,) of the edge.
         elevation_rad: (SKYLINE_AZIMUTHS,) of the edge in each bin; infinite or nan ones have no meaning.

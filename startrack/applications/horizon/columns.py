@@ -70,7 +70,8 @@ class Columns:
     light_e: Array  # (k, columns)
     noise_e: Array  # (k, columns) of one sample's pixel
     step_rad: float
-    px_rad: float
+    px_rad: float  # along a column
+    across_px_rad: float  # a pixel across the columns, by which the noise of neighbouring columns is the same
 
     @cached_property
     def sums(self) -> tuple[Array, Array]:
@@ -111,7 +112,8 @@ def sample_columns(
         total += np.where(hidden, np.nan, cv2.remap(image_e, x, y, cv2.INTER_LINEAR))
         spread += cv2.remap(noise_e, x, y, cv2.INTER_NEAREST)
         points |= cv2.remap(disks, x, y, cv2.INTER_NEAREST) > 0
-    columns = Columns(elevation, total / COLUMN_SAMPLES, spread / COLUMN_SAMPLES, px_rad / COLUMN_SAMPLES, px_rad)
+    light_e, spread_e = total / COLUMN_SAMPLES, spread / COLUMN_SAMPLES
+    columns = Columns(elevation, light_e, spread_e, px_rad / COLUMN_SAMPLES, px_rad, px_rad)
     without = replace(columns, light_e=np.where(points, np.nan, columns.light_e))
     around = average_columns(without, AVERAGINGS[-1].columns, FILL_SHARE).light_e
     return replace(columns, light_e=np.where(points, around, columns.light_e))
@@ -148,21 +150,20 @@ def average_columns(columns: Columns, width: int, least: float = 0.49, slope: fl
     """
     from scipy.ndimage import uniform_filter1d
 
-    if width == 1:
-        return columns
     known = np.isfinite(columns.light_e)
     light, share = np.where(known, columns.light_e, 0.0), known.astype(float)
     per_column = slope * (2 * np.pi / AZIMUTH_COLUMNS) / columns.step_rad
     rise = per_column * np.arange(-(width // 2), width // 2 + 1, dtype=np.float64)
     total, squares, share = (_mean_along(one, rise) for one in (light, np.square(light), share))
     mean = np.where(share > least, total / np.maximum(share, 1e-9), np.nan)
-    scatter2 = np.maximum(squares / np.maximum(share, 1e-9) - np.square(np.nan_to_num(mean)), 0.0)
-    nearby = uniform_filter1d(scatter2, 2 * round(SCATTER_PX * COLUMN_SAMPLES) + 1, axis=0)
     pixel2 = np.square(columns.noise_e)
-    usual = np.nanmedian(np.where(share > least, nearby, np.nan) / np.maximum(pixel2, 1e-9))
-    width_px = width * 2 * np.pi / AZIMUTH_COLUMNS / columns.px_rad * np.cos(columns.elevation_rad)
-    excess2 = np.maximum(nearby - USUAL_SCATTER * usual * pixel2, 0.0)
-    noise2 = pixel2 / np.maximum(width_px, 1.0)[:, None] + excess2 / 2.0
+    width_px = width * 2 * np.pi / AZIMUTH_COLUMNS / columns.across_px_rad * np.cos(columns.elevation_rad)
+    noise2 = pixel2 / np.maximum(width_px, 1.0)[:, None]
+    if width > 1:
+        scatter2 = np.maximum(squares / np.maximum(share, 1e-9) - np.square(np.nan_to_num(mean)), 0.0)
+        nearby = uniform_filter1d(scatter2, 2 * round(SCATTER_PX * COLUMN_SAMPLES) + 1, axis=0)
+        usual = np.nanmedian(np.where(share > least, nearby, np.nan) / np.maximum(pixel2, 1e-9))
+        noise2 += np.maximum(nearby - USUAL_SCATTER * usual * pixel2, 0.0) / 2.0
     return replace(columns, light_e=mean, noise_e=np.sqrt(noise2))
 
 
@@ -184,7 +185,10 @@ def _mean_along(samples: Array, rise: Array) -> Array:
 
 
 def coarser(columns: Columns, pixels: int) -> Columns:
-    """The same with means over so many `pixels` along a column as pixels; those with a part out of view are unknown."""
+    """The columns with pixels that are means over so many `pixels` along a column, and samples as much farther apart.
+
+    A mean with a part out of view is unknown. Across the columns the pixels are those of the image.
+    """
     rows = len(columns.elevation_rad) // pixels * pixels
 
     def mean(samples: Array) -> Array:
@@ -192,7 +196,7 @@ def coarser(columns: Columns, pixels: int) -> Columns:
 
     return Columns(
         mean(columns.elevation_rad), mean(columns.light_e), mean(columns.noise_e) / np.sqrt(pixels),
-        columns.step_rad * pixels, columns.px_rad * pixels,
+        columns.step_rad * pixels, columns.px_rad * pixels, columns.across_px_rad,
     )  # fmt: skip
 
 

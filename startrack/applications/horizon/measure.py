@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from startrack.applications.horizon.clouds import NEAR_EDGE_RAD, cloud_probability, cloud_sigma_rad
+from startrack.applications.horizon.clouds import cloud_probability, cloud_sigma_rad
 from startrack.applications.horizon.columns import (
     AVERAGINGS,
     AZIMUTH_COLUMNS,
@@ -21,10 +22,12 @@ from startrack.applications.horizon.join import join_skylines
 from startrack.applications.horizon.posterior import (
     HIGH_RAD,
     KINDS,
+    NEAR_EDGE_RAD,
     WEAKEST_CONTRAST,
     add_step_log_likelihood,
     combine_columns,
     star_log_likelihood,
+    steps_at,
 )
 from startrack.applications.horizon.skylight import Steps, find_steps
 from startrack.applications.horizon.starlight import StarLight, measure_stars
@@ -72,7 +75,7 @@ class MeasuredFrame:
     light: Light
     skyline: MeasuredSkyline
     by_stars: Array
-    by_steps: Array
+    by_steps: NDArray[np.float32]
 
 
 def measure_skyline(
@@ -121,7 +124,7 @@ def skyline_of_frames(measured: Sequence[MeasuredFrame], site: Site) -> Measured
     # Other stars stand there in another picture. Steps are the same edges: which of them is the skyline, a second
     # picture shows no better than the first.
     by_stars = sum((one.by_stars for one in measured), np.zeros(()))
-    by_steps = sum((one.by_steps for one in measured), np.zeros(()))
+    by_steps = sum((one.by_steps for one in measured), np.zeros((), np.float32))
     frames, lights = [one.frame for one in measured], [one.light for one in measured]
     together = _skyline_of(frames, lights, by_stars + by_steps / len(measured), site)
     return join_skylines(together, alone)
@@ -133,7 +136,7 @@ def measure_frame(frame: SkyFrame, site: Site) -> MeasuredFrame:
     stars = measure_stars(frame)
     check_time()
     steps, by_stars = find_steps(frame, stars), star_log_likelihood(stars.rays, stars.missing)
-    by_steps = np.zeros((len(KINDS), *by_stars.shape))
+    by_steps = np.zeros((len(KINDS), *by_stars.shape), np.float32)  # it is kept of every picture
     for found, averaging in zip(steps, AVERAGINGS, strict=True):
         add_step_log_likelihood(by_steps, found, averaging.weight)
     light = stars, steps
@@ -261,11 +264,10 @@ def _has_star(stars: Sequence[StarLight], azimuth: Array, elevation: Array) -> B
 
 
 def _has_step(steps: Sequence[list[Steps]], elevation_rad: Array) -> Bools:
-    """Whether steps of light lie at the skyline of most columns of each bin."""
+    """Whether steps of light that are no noise lie at the skyline of most columns of each bin."""
     found = np.zeros(AZIMUTH_COLUMNS, dtype=bool)
     for one in (one for by_width in steps for one in by_width):
-        near = np.abs(one.elevation_rad - elevation_rad[one.column]) < NEAR_EDGE_RAD
-        found[one.column[near]] = True
+        found[steps_at(one, elevation_rad).column] = True
     return np.asarray(_columns_of_bins(found, 0).mean(axis=1) >= 0.5)
 
 

@@ -7,7 +7,10 @@ above it, or brighter, or hardly either; that too changes rarely from column to 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, GRID_STEP_RAD, LOWEST_RAD, column_of, elevations_rad
 from startrack.applications.horizon.skylight import MIN_SIGNIFICANCE, Steps
@@ -19,10 +22,11 @@ CHANGES_RAD = np.radians(np.array([0.02, 0.12, 0.8]))  # Laplace scales of the c
 CHANGE_WEIGHTS = (0.55, 0.25, 0.18)
 JUMP_WEIGHT = 1.0 - sum(CHANGE_WEIGHTS)  # a dome, a mast: any elevation
 # Kinds of ground by its light beside the sky's: darker, brighter (in moonlight or lamplight), hardly either. Their
-# shares, the probability that the kind is drawn anew from column to column, and that the skyline itself is among a
-# column's steps.
+# shares, the probability that the kind alone is drawn anew from column to column (a jump draws it too: both together
+# every 7.8 degrees), and that the skyline itself is among a column's steps.
 KINDS, SWITCH_1, SHOWN_PROBABILITY = (0.7, 0.1, 0.2), 1 / 80, (0.75, 0.75, 0.5)
 WEAKEST_CONTRAST, FAINT_CONTRAST = 0.25, 0.1  # usual skylines have more than the first; scale of a faint one's
+NEAR_EDGE_RAD = np.radians(0.3)  # a step this near to an edge is the edge
 NOISE_PER_RAD = np.degrees(2.2)  # density of the weakest steps, which are noise
 SKY_PER_RAD = np.degrees(0.08)  # density of steps in the sky (clouds, reflections)
 # Below a step in the sky is sky, hardly darker. Sizes of the logarithm of the brightness below over that above, of 14
@@ -104,42 +108,64 @@ def sky_likelihood_ratio(log_ratio: Array) -> Array:
     return np.asarray(in_sky * np.sqrt(2.0 * np.pi) * GROUND_LOG_SIGMA * np.exp(0.5 * np.square(z)))
 
 
-def add_step_log_likelihood(total: Array, steps: Steps, temper: float) -> None:
+def _noise_density(steps: Steps) -> Array:
+    """Density (n,) [1/rad] of noise that looks like each of the steps."""
+    return np.asarray(NOISE_PER_RAD * np.exp(-0.5 * (np.square(steps.significance) - MIN_SIGNIFICANCE**2)))
+
+
+def _skyline_likelihoods(contrast: Array) -> tuple[Array, Array, Array]:
+    """Likelihood (n,) of contrasts at the skyline of each of the KINDS, beside a usual one."""
+    size = np.abs(contrast)
+    usual = np.minimum(size / WEAKEST_CONTRAST, 1.0) ** 2
+    return usual * (contrast < 0), usual * (contrast > 0), np.exp(-size / FAINT_CONTRAST) / (2.0 * FAINT_CONTRAST)
+
+
+def steps_at(steps: Steps, skyline_rad: Array) -> Steps:
+    """Those of the steps at a skyline (AZIMUTH_COLUMNS,) [rad] that are more likely its own, of any kind, than noise.
+
+    White noise has such steps at 1 of 100 bins, and steps within NEAR_EDGE_RAD at 17.
+    """
+    off = steps.elevation_rad - skyline_rad[steps.column]
+    of_kind = zip(SHOWN_PROBABILITY, _skyline_likelihoods(steps.contrast), strict=True)
+    own = np.max([shown * likelihood for shown, likelihood in of_kind], axis=0)
+    here = np.exp(-0.5 * np.square(off / steps.sigma_rad)) / (np.sqrt(2.0 * np.pi) * steps.sigma_rad)
+    return steps.take((np.abs(off) < NEAR_EDGE_RAD) & (own * here > _noise_density(steps)))
+
+
+def add_step_log_likelihood(total: NDArray[np.floating[Any]], steps: Steps, temper: float) -> None:
     """Add that of an image's steps of light, times `temper`, to the log-likelihood `total` (KINDS, AZIMUTH_COLUMNS, n).
 
     It is of each kind of ground: darker than the sky above it, brighter, or hardly either.
     """
-    noise = NOISE_PER_RAD * np.exp(-0.5 * (np.square(steps.significance) - MIN_SIGNIFICANCE**2))
-    contrast = np.abs(steps.contrast)
+    noise, contrast = _noise_density(steps), np.abs(steps.contrast)
     usual = np.minimum(contrast / WEAKEST_CONTRAST, 1.0) ** 2
     in_sky = noise + SKY_PER_RAD * usual * sky_likelihood_ratio(steps.log_ratio) + RARE_PER_RAD
     in_ground = noise + GROUND_PER_RAD * np.exp(-contrast / GROUND_CONTRAST) + ROOF_PER_RAD
     passed = 0.5 * np.log(in_sky / in_ground)
-    faint = np.exp(-contrast / FAINT_CONTRAST) / (2.0 * FAINT_CONTRAST)
     order = np.argsort(steps.column, kind="stable")
     rows = steps.column, steps.elevation_rad, steps.sigma_rad, passed
     column, elevation, sigma, passed = (one[order] for one in rows)
-    of_kind = usual * (steps.contrast < 0), usual * (steps.contrast > 0), faint
-    for kind, (shape, shown) in enumerate(zip(of_kind, SHOWN_PROBABILITY, strict=True)):
-        weight = (shown * shape / in_ground)[order]
+    of_kind = zip(SHOWN_PROBABILITY, _skyline_likelihoods(steps.contrast), strict=True)
+    for kind, (shown, likelihood) in enumerate(of_kind):
+        weight = (shown * likelihood / in_ground)[order]
         add_steps(total[kind], temper, LOWEST_RAD, GRID_STEP_RAD, column, elevation, sigma, weight, passed, 1 - shown)
 
 
 def compile_columns() -> None:
     """Compile the kernels of the chain, by a skyline with one step of light."""
-    one, total = np.ones(1), np.zeros((len(KINDS), AZIMUTH_COLUMNS, len(elevations_rad())))
+    one, total = np.ones(1), np.zeros((len(KINDS), AZIMUTH_COLUMNS, len(elevations_rad())), np.float32)
     add_step_log_likelihood(total, Steps(np.zeros(1, np.int64), 0.1 * one, 0.01 * one, one, one, 10.0 * one), 1.0)
     combine_columns(total)
 
 
-def combine_columns(log_likelihood: Array) -> tuple[Array, Array]:
+def combine_columns(log_likelihood: NDArray[np.floating[Any]]) -> tuple[Array, Array]:
     """Means and standard deviations [rad] of each column by log-likelihoods (KINDS, AZIMUTH_COLUMNS, n)."""
     likelihood = np.exp(log_likelihood - log_likelihood.max(axis=(0, 2), keepdims=True)).astype(np.float32)
     likelihood = likelihood / likelihood.mean(axis=(0, 2), keepdims=True) + np.float32(OUTLIER_PROBABILITY)
     change = np.exp(-GRID_STEP_RAD / CHANGES_RAD), np.array(CHANGE_WEIGHTS), JUMP_WEIGHT, skyline_prior()
     kinds = np.array(KINDS), SWITCH_1
     ahead, behind = map_in_threads(lambda forward: pass_messages(likelihood, forward, *change, *kinds), (True, False))
-    posterior = (ahead * behind * likelihood / np.array(KINDS, np.float32)[:, None, None]).sum(axis=0, dtype=np.float64)
+    posterior = (ahead * behind * likelihood).sum(axis=0, dtype=np.float64)
     posterior /= posterior.sum(axis=1, keepdims=True)
     elevation = elevations_rad()
     mean = posterior @ elevation

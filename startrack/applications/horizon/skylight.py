@@ -65,6 +65,10 @@ class Steps:
     log_ratio: Array  # logarithm of the brightness below over that of the sky right above
     significance: Array
 
+    def take(self, which: Bools) -> Steps:
+        """The steps that a mask (n,) selects."""
+        return Steps(**{one.name: getattr(self, one.name)[which] for one in fields(Steps)})
+
 
 def find_steps(frame: SkyFrame, stars: StarLight) -> list[Steps]:
     """All significant steps of the image of a `frame`, for each of the AVERAGINGS; `stars` are left out."""
@@ -108,8 +112,10 @@ def _contrasts(columns: Columns, dark_e: float) -> Contrasts:
     below = mean_above(columns, -CLEAR_GAP_PX - GROUND_PX, -CLEAR_GAP_PX)
     stated = columns.noise_e * np.sqrt(6.0 / SKY_PX + 1.0 / GROUND_PX)
     sky = (columns.elevation_rad > OPEN_SKY_RAD) & (columns.elevation_rad < HIGHEST_GROUND_RAD)
-    excess = np.nanmedian(np.abs(below - above)[sky] / stated[sky]) * NORMAL_BY_MEDIAN
-    noise, stated = (max(float(excess), 1.0) * one for one in (columns.noise_e, stated))
+    scatter = np.abs(below - above)[sky] / stated[sky]
+    scatter = scatter[np.isfinite(scatter)]
+    excess = max(float(np.median(scatter)) * NORMAL_BY_MEDIAN, 1.0) if len(scatter) else 1.0  # no open sky in view
+    noise, stated = (excess * one for one in (columns.noise_e, stated))
     sigma = np.hypot(stated, RELATIVE_ERROR * (above - dark_e))
     return Contrasts(columns, below, above, noise, np.nan_to_num(np.abs(below - above) / sigma), dark_e)
 
@@ -144,9 +150,9 @@ def _level_above(columns: Columns, gap_px: float, distance_px: float, dark_e: fl
 
 
 def _measure_edges(columns: Columns, row: Ints, column: Ints, noise: Array) -> tuple[Array, Array, Array, Bools]:
-    """Elevation [rad] and sigma [px] (n,) of steps at samples (row, column) (n,), and which of them are measured.
+    """Steps at samples (row, column) (n,): elevation [rad], sigma [px], significance, which are measured; each (n,).
 
-    Also by how many sigma (n,) an edge explains the light better than a smooth course does.
+    The significance is by how many sigma an edge explains the light better than a smooth course does.
 
     Least squares of a level of ground and a sloping level of sky, joined by an edge of one of several widths; the mean
     and the scatter of the edge's place over all widths and places, by their likelihoods.

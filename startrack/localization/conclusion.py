@@ -66,11 +66,8 @@ class Posterior:
     @cached_property
     def is_core(self) -> Array:
         """(n,) points of hypotheses with the gross error of the best one, if it has any."""
-        return self.is_gross(self.best.gross)
-
-    def is_gross(self, fact: str) -> Array:
-        """(n,) points of hypotheses with a gross error of `fact`."""
-        return np.concatenate([np.full(len(one.log_weight), one.gross == fact) for one in self.hypotheses])
+        gross = self.best.gross
+        return np.concatenate([np.full(len(one.log_weight), one.gross == gross) for one in self.hypotheses])
 
     @cached_property
     def label(self) -> Ints:

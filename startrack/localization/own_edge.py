@@ -28,20 +28,18 @@ def with_own_edge(plain: Hypothesis, half_m: float) -> SkylineModel | None:
 
     It serves positions within `half_m` of the same reference.
     """
-    rows = plain.model.seen.rows
+    seen, errors = plain.model.seen, plain.model.errors
+    rows = seen.rows
     is_light = rows.extended_nats > 0.0
     if is_light.all() or not is_light.any():
         return None
     around = replace(plain.model.around, half_m=half_m)
-    model = SkylineModel.of(
-        around.terrain, rows, around.reference_m, half_m, plain.model.errors, plain.model.seen.image_errors
-    )
-    stars, light = (SectorRows(model.around, rows.take(np.flatnonzero(own))) for own in (~is_light, is_light))
+    stars, light = (SectorRows(around, rows.take(np.flatnonzero(own))) for own in (~is_light, is_light))
     width_rad = float(np.median(rows.edge_sigma_rad[is_light]))
     shift = plain.model.shift_of(plain.found.share @ plain.found.points)
     logs = list_free_logs(light.profiles, shift, EDGE_REACH * width_rad, EDGE_ROUGHNESS * width_rad)
     whole, likely = logs.sum(axis=1), shares(logs.sum(axis=1)) @ logs
     likely += (np.logaddexp.reduce(whole) - np.log(len(whole)) - likely.sum()) / SECTORS  # all equally likely before
-    offset = light.profiles.offset + stars.profiles.offset - model.seen.profiles.offset
+    offset = light.profiles.offset + stars.profiles.offset - seen.profiles.offset  # the same about one reference
     edge = OwnEdge(stars.profiles, np.exp(likely + offset))
-    return replace(model, gross=OWN_EDGE, seen=replace(model.seen, edge=edge))
+    return SkylineModel(replace(seen, around=around, edge=edge), errors, around.error_slopes_rad(errors), OWN_EDGE)

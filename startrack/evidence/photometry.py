@@ -15,7 +15,7 @@ import numpy as np
 
 from startrack.core.kernels import REORDERED_SUMS, njit, read_only, rows_beside
 from startrack.core.types import Array, Bools, Detections, Ints
-from startrack.evidence.stamp_edge import fit_beside_edge
+from startrack.evidence.stamp_edge import edge_profiles, fit_beside_edge
 from startrack.psf import pixel_profile_table, stamp_radius
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)  # literals would be of double precision
@@ -74,7 +74,8 @@ def measure(detections: Detections, sources: Sources) -> Photometry:
     measure_sources(  # type: ignore[call-arg]
         *pictures, d.background.side, d.noise.side, sources.xy_px[order], sources.flux_e[order],
         sources.fraction_sigma[order], sources.visible[order],
-        first, columns, reach_px, reach_px, radius, np.float32(sigma_px), table, measured, usable,
+        first, columns, reach_px, reach_px, radius, np.float32(sigma_px), table, edge_profiles(radius, sigma_px), measured,
+        usable,
     )  # fmt: skip
     columns_e, is_usable = np.empty(measured.shape[::-1]), np.empty_like(usable)
     columns_e[:, order], is_usable[order] = measured.T, usable
@@ -105,13 +106,13 @@ def order_by_cell(xy_px: Array, shape: tuple[int, ...], side_px: float) -> tuple
 @njit(cache=True, fastmath=REORDERED_SUMS)
 def measure_sources(
     image, background, noise, dead, background_side, noise_side, xy_px, flux_e, fraction_sigma, visible, first, columns,
-    reach_px, side_px, radius, sigma_px, profiles, measured, usable,
+    reach_px, side_px, radius, sigma_px, profiles, edges, measured, usable,
 ) -> None:  # fmt: skip
     """Fill `measured` (n, 4) and `usable` (n,) for sources (n) ordered by cells, their stamps inside the frame.
 
     The columns are flux, variance, own shot noise and neighbours' variance, as `Photometry` explains them. `background`
     and `noise` are rows of a SmoothImage. `profiles` (steps + 1, 2 k + 1) are pixel profiles at offsets from -1/2 to
-    1/2. Neighbours lie within `reach_px`, at most `side_px`, the side of cells; `first` is each cell's first source.
+    1/2, and `edges` the `edge_profiles`. Neighbours lie within `reach_px`, at most `side_px`, the side of cells; `first` is each cell's first source.
     """
     n = len(xy_px)
     k = profiles.shape[1] // 2
@@ -142,7 +143,9 @@ def measure_sources(
         measured[i, 0], measured[i, 1], measured[i, 2], measured[i, 3] = 0.0, 1.0, 0.0, 0.0
         if not usable[i]:
             continue
-        measured[i, 0], edge = fit_beside_edge(profile, light, data, shape, weight, flux, level, strength, sigma_px)
+        measured[i, 0], edge = fit_beside_edge(
+            profile, light, data, shape, weight, flux, level, strength, sigma_px, edges
+        )
         total, measured[i, 2] = _variances(profile, shape, light, variance, weight)
         measured[i, 1] = total + edge
         for m in range(count):

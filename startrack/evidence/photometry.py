@@ -74,8 +74,8 @@ def measure(detections: Detections, sources: Sources) -> Photometry:
     measure_sources(  # type: ignore[call-arg]
         *pictures, d.background.side, d.noise.side, sources.xy_px[order], sources.flux_e[order],
         sources.fraction_sigma[order], sources.visible[order],
-        first, columns, reach_px, reach_px, radius, np.float32(sigma_px), table, edge_profiles(radius, sigma_px), measured,
-        usable,
+        first, columns, reach_px, reach_px, radius, np.float32(sigma_px), table,
+        edge_profiles(radius, sigma_px), measured, usable,
     )  # fmt: skip
     columns_e, is_usable = np.empty(measured.shape[::-1]), np.empty_like(usable)
     columns_e[:, order], is_usable[order] = measured.T, usable
@@ -112,7 +112,8 @@ def measure_sources(
 
     The columns are flux, variance, own shot noise and neighbours' variance, as `Photometry` explains them. `background`
     and `noise` are rows of a SmoothImage. `profiles` (steps + 1, 2 k + 1) are pixel profiles at offsets from -1/2 to
-    1/2, and `edges` the `edge_profiles`. Neighbours lie within `reach_px`, at most `side_px`, the side of cells; `first` is each cell's first source.
+    1/2, and `edges` are `edge_profiles`. Neighbours lie within `reach_px`, at most `side_px`, the side of cells;
+    `first` is each cell's first source.
     """
     n = len(xy_px)
     k = profiles.shape[1] // 2

@@ -25,8 +25,8 @@ def edge_profiles(radius: int, width_px: float) -> Array:
     Rows are phases of a pixel between two places of the edge; the column is the number of places from the edge to the
     pixel, from the farthest before it to the farthest behind it.
     """
-    spread_px, step_px = _spread_px(width_px), width_px * EDGE_STEP_PX
-    farthest = _farthest_place(radius, width_px) + EDGE_PLACES // 2
+    spread_px, step_px = _spread_px.py_func(width_px), width_px * EDGE_STEP_PX
+    farthest = _farthest_place.py_func(radius, width_px) + EDGE_PLACES // 2
     places = np.arange(-farthest, farthest + 1.0) + np.linspace(0.0, 1.0, PHASES + 1)[:, None]
     z = places * step_px / spread_px
     slope = np.exp(-0.5 * z * z) / (np.sqrt(2.0 * np.pi) * spread_px)
@@ -77,7 +77,7 @@ def fit_beside_edge(profile, light, data, shape, weight, flux, level, strength, 
     return found, beyond
 
 
-@njit(cache=True, fastmath=REORDERED_SUMS)
+@njit(cache=True, inner=True, fastmath=REORDERED_SUMS)
 def fit_at_places(profile, data, shape, weight, x, y, mean_p, mean_q, total, width_px, edges):
     """Mean flux of a star, and its variance, over the places of an edge that faces (x, y), by their likelihoods.
 
@@ -159,7 +159,8 @@ def _sum_at_places(sums, profile, data, shape, weight, x, y, mean_p, mean_q, wid
 def _solve_edge(A, b, pixel_weight, step_px):
     """Logarithm of the likelihood of an edge's place, with the star's flux there and its variance.
 
-    A and b are the products of the columns with each other and with the light; A is overwritten. The edge is within half a `step_px` of its place.
+    A and b are the products of the columns with each other and with the light; A is overwritten. The edge is within
+    half a `step_px` of its place.
     """
     A[1, 1] += pixel_weight / CONTRAST_SIGMAS**2
     det = A[0, 0] * A[1, 1] - A[1, 0] * A[1, 0]

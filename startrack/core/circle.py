@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from startrack.core.kernels import njit
 from startrack.core.types import Array
+from startrack.kernels.library import kernel
 
 
 def interpolate_circle(values: Array, azimuth_rad: Array) -> Array:
@@ -15,14 +15,4 @@ def interpolate_circle(values: Array, azimuth_rad: Array) -> Array:
     return found
 
 
-@njit(cache=True)
-def _interpolate(values, found):  # type: ignore[no-untyped-def]
-    """Replace the azimuths (n,) [rad] in `found` by values (m,), given at even steps from azimuth 0 on."""
-    m = len(values)
-    for k in range(len(found)):
-        at = found[k] * (m / (2 * np.pi))
-        if at < 0.0 or at >= m:
-            at %= m
-        low = min(int(at), m - 1)
-        part = at - low
-        found[k] = (1.0 - part) * values[low] + part * values[low + 1 if low + 1 < m else 0]
+_interpolate = kernel("interpolate_circle", "values: float64[m]", "found: out float64[n]")

@@ -1,0 +1,125 @@
+"""Functions of the compiled library for arrays of numpy, which are checked before the library sees them.
+
+The library for this machine's processor is loaded with this module; nothing is compiled. The environment variable
+STARTRACK_KERNELS names another one: baseline, v3, sanitized. Calls release the GIL.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import operator
+import os
+import re
+import sys
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from startrack.kernels.build import COMPILED, levels, library_name
+
+VARIABLE = "STARTRACK_KERNELS"
+SCALARS = {"float64": (ctypes.c_double, float), "float32": (ctypes.c_float, float)}
+SCALARS |= {"int64": (ctypes.c_int64, operator.index), "bool": (ctypes.c_bool, bool)}  # type: ignore[dict-item]
+FORM = re.compile(r"(\w+): (out )?(\w+)(?:\[(.+)\])?")
+DECLARED: dict[str, tuple[list[Argument], str | None]] = {}  # by the name in the library: arguments and result
+
+
+class Argument(NamedTuple):
+    """An argument of a kernel. A dimension is a name or a number, and what is added to it."""
+
+    text: str
+    name: str
+    is_written: bool
+    dtype: str
+    shape: tuple[tuple[str, int], ...] | None  # None: a number
+
+    @classmethod
+    def of(cls, text: str) -> Argument:
+        """From `name: dtype`, `name: dtype[n, m + 1, 3]`, or `name: out dtype[n]` of an array that is written to."""
+        name, out, dtype, shape = FORM.fullmatch(text).groups()  # type: ignore[union-attr]
+        parts = [part.split("+") for part in shape.split(",")] if shape else []
+        dims = tuple((part[0].strip(), int(part[1]) if len(part) > 1 else 0) for part in parts)
+        return cls(text, name, bool(out), dtype, dims if shape else None)
+
+
+def _open(level: str) -> ctypes.CDLL:
+    path = COMPILED / library_name(level)
+    if not path.is_file():
+        of_level = " sanitized" if level == "sanitized" else ""
+        raise ImportError(
+            f"there is no compiled library ({level}) of the C sources in {path.parent.parent}: type `{sys.executable} "
+            f"-m startrack.kernels.build{of_level}` in {path.parent.parents[2]}, or install startrack"
+        )
+    return ctypes.CDLL(str(path))
+
+
+def _load() -> tuple[str, ctypes.CDLL]:
+    """The level that is loaded, and its library."""
+    level = os.environ.get(VARIABLE) or None
+    if level not in (None, "baseline", "v3", "sanitized"):
+        raise ImportError(f"{VARIABLE} is {level!r}; it may be baseline, v3 or sanitized")
+    if level == "sanitized":
+        return level, _open(level)
+    baseline = _open("baseline")
+    has_v3 = "v3" in levels() and bool(baseline.has_x86_64_v3())
+    if level == "v3" and not has_v3:
+        raise ImportError(f"{VARIABLE} is v3, which this processor is not")
+    return ("v3", _open("v3")) if has_v3 and level != "baseline" else ("baseline", baseline)
+
+
+LEVEL, LIBRARY = _load()
+
+
+def compiler() -> str:
+    """Name and version of the compiler that made the library."""
+    LIBRARY.compiler_name.restype = ctypes.c_char_p
+    return str(LIBRARY.compiler_name().decode())
+
+
+def kernel(name: str, *declarations: str, result: str | None = None) -> Callable[..., Any]:
+    """The function `name` of the library, called with arrays and numbers in the order of `declarations`.
+
+    See `Argument.of` for these. The C function takes the named sizes first, in their order, then the arguments. Arrays
+    must be C-contiguous. Its `result` is of a type of SCALARS; None: it has none. The function raises TypeError where
+    an argument is not as declared.
+    """
+    arguments = [Argument.of(text) for text in declarations]
+    DECLARED[name] = arguments, result
+    names = list(dict.fromkeys(dim for one in arguments for dim, _ in one.shape or () if not dim.isdigit()))
+    types = [SCALARS[one.dtype][0] if one.shape is None else ctypes.c_void_p for one in arguments]
+    function = getattr(LIBRARY, name)
+    function.argtypes = [ctypes.c_int64] * len(names) + types
+    function.restype = SCALARS[result][0] if result else None
+    checks = [
+        (one, np.dtype(one.dtype) if one.shape else SCALARS[one.dtype][1], one.shape, one.is_written)
+        for one in arguments
+    ]
+
+    def call(*values: Any) -> Any:
+        sizes, words = dict.fromkeys(names, -1), []
+        if len(values) != len(checks):
+            raise TypeError(f"{name} takes {len(checks)} arguments, not {len(values)}")
+        for value, (argument, kind, shape, is_written) in zip(values, checks, strict=True):
+            if shape is None:
+                words.append(kind(value))  # type: ignore[operator]
+                continue
+            if not isinstance(value, np.ndarray) or value.dtype != kind or value.ndim != len(shape):
+                raise TypeError(f"{name}: `{argument.text}` is asked for, not {_text(value)}")
+            flags = value.flags
+            if not flags.c_contiguous or (is_written and not flags.writeable):
+                raise TypeError(f"{name}: {argument.name} must be C-contiguous, and writable where it is written to")
+            for (dim, more), size in zip(shape, value.shape, strict=True):
+                known = sizes.get(dim)
+                if known == -1 and size >= more:
+                    sizes[dim] = size - more
+                elif size != (int(dim) if known is None else known) + more:
+                    raise TypeError(f"{name}: `{argument.text}` is asked for, not {value.shape}; sizes: {sizes}")
+            words.append(value.__array_interface__["data"][0])
+        return function(*sizes.values(), *words)
+
+    return call
+
+
+def _text(value: Any) -> str:
+    return f"{value.dtype}{list(value.shape)}" if isinstance(value, np.ndarray) else type(value).__name__

@@ -34,8 +34,8 @@ LOG = logging.getLogger(__name__)
 WARNED: set[str] = set()  # texts logged by this process
 REORDERED_SUMS = {"reassoc", "contract", "nsz"}  # as `fastmath`: lets the compiler sum several pixels at a time
 PYTHON_WRAPPER = "_ZN7cpython"  # begin of the name by which Python calls
-REACH, CDF_STEPS = 8.0, 4096  # of `normal_cdf`: standard deviations on either side, and steps of the table
-TABLE = np.array([0.5 * erfc(-x / sqrt(2.0)) for x in np.linspace(-REACH, REACH, CDF_STEPS + 1)])
+REACH, CDF_STEPS = 8.0, 4096  # of `normal_cdf`: standard deviations on either side, and steps; in common.h too
+NORMAL_CDF = np.array([0.5 * erfc(-x / sqrt(2.0)) for x in np.linspace(-REACH, REACH, CDF_STEPS + 1)])
 
 
 class KernelLibrary(JITCodeLibrary):  # type: ignore[misc]
@@ -196,7 +196,7 @@ def normal_cdf(x):  # type: ignore[no-untyped-def]
     """The normal distribution function Phi(x) by linear interpolation of a table, to 5e-7."""
     at = (min(max(x, -REACH), REACH) + REACH) * (CDF_STEPS / (2 * REACH))
     i = min(int(at), CDF_STEPS - 1)
-    return TABLE[i] + (at - i) * (TABLE[i + 1] - TABLE[i])
+    return NORMAL_CDF[i] + (at - i) * (NORMAL_CDF[i + 1] - NORMAL_CDF[i])
 
 
 @njit(inline="always")

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-# mypy: disable-error-code="no-untyped-def"
 from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
 
-from startrack.core.kernels import njit
 from startrack.core.statistics import NORMAL_BY_MEDIAN, robust_sigma
 from startrack.core.types import SECTORS, Array, Bools, Ints
 from startrack.evidence.ground_levels import patch_levels
 from startrack.evidence.sky_pixels import SkyPixels
 from startrack.evidence.skyline import CLIP_SHIFT_PX
+from startrack.kernels.library import kernel
 
 LEVEL_SIGMAS = 4.0  # of the edge: from here on a pixel shows the sky or the ground alone
 MIN_SIDE_PIXELS = 12  # of a sector on either side of the skyline; 30 left out half of it for a camera of 1 Mpx
@@ -185,18 +184,9 @@ def _smooth(values: Array, sectors: float) -> Array:
     return np.asarray(smooth)
 
 
-@njit(cache=True)
-def _sum_sides(side, sector, height, light, level, slope, limit, sums):
-    """Add up sums (2, 6, SECTORS): count, h, h^2, and with the residual q: q, q h, q^2, of pixels within the limits."""
-    for k in range(len(side)):
-        s = side[k]
-        if s >= 0:
-            i, h = sector[k], height[k]
-            q = light[k] - level[s, i] - slope[s, i] * h
-            if abs(q) <= limit[s, i]:
-                sums[s, 0, i] += 1.0
-                sums[s, 1, i] += h
-                sums[s, 2, i] += h * h
-                sums[s, 3, i] += q
-                sums[s, 4, i] += q * h
-                sums[s, 5, i] += q * q
+# Adds to sums (2, 6, SECTORS): count, h, h^2, and with the residual q: q, q h, q^2, of pixels within the limits.
+_sum_sides = kernel(
+    "sum_sides", "side: int64[n]", "sector: int64[n]", "height: float64[n]", "light: float64[n]",
+    "level: float64[2, sectors]", "slope: float64[2, sectors]", "limit: float64[2, sectors]",
+    "sums: out float64[2, 6, sectors]",
+)  # fmt: skip

@@ -8,7 +8,6 @@ above the predicted skyline show the same V, wherever the true skyline is nearby
 
 from __future__ import annotations
 
-# mypy: disable-error-code="no-untyped-def"
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil, sqrt
@@ -16,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from startrack.core.kernels import njit, normal_cdf
+from startrack.core.kernels import NORMAL_CDF
 from startrack.core.statistics import relative_weights, robust_sigma
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Bools, Evidence, Ints, sector_of
 from startrack.evidence.photometry import SURE_SIGMAS
@@ -24,6 +23,7 @@ from startrack.evidence.sky_levels import CLIP_SIGMAS, GROUND, SKY, SkyLevels, m
 from startrack.evidence.sky_pixels import SkyPixels
 from startrack.evidence.skyline import CLIP_SHIFT_PX, Horizon
 from startrack.evidence.star_evidence import SEEN_LLR
+from startrack.kernels.library import kernel
 
 CELL_PX = 0.75  # of a cell
 LEVELS = 13  # cells of a sector: up to 4.9 px above and below a predicted skyline that is right to CLIP_SHIFT_PX
@@ -144,7 +144,7 @@ def _sum_pixels(
     _sum_cells(
         sector, pixels.height_px, pixels.light_e, pixels.px_per_rad, levels.covered, levels.level_e, levels.slope_e,
         np.square(levels.noise_e) * levels.correlation, levels.correlation, width_px, pixels.reach_px,
-        CLIP_SIGMAS, sums, scale,
+        CLIP_SIGMAS, CELL_PX, NORMAL_CDF, sums, scale,
     )  # fmt: skip
     llr, extended, moment = np.moveaxis(sums, -1, 0)
     return (moment / np.where(extended > 0, extended, 1.0), llr, extended), scale
@@ -169,7 +169,8 @@ def _shifts(
     """Mean and standard deviation (SECTORS,) of the skyline's height above the predicted one, and the misfit."""
     shifts_px = np.linspace(-most_px, most_px, 2 * ceil(most_px / SHIFT_STEP_PX) + 1)
     log = np.empty((SECTORS, len(shifts_px)))
-    _score_shifts(height_px, llr, extended, edge_px, shifts_px, log)
+    cells = (np.ascontiguousarray(one) for one in (height_px, llr, extended))
+    _score_shifts(*cells, edge_px, shifts_px, NORMAL_CDF, log)
     best = log.max(axis=1)
     informed = best - np.maximum(log[:, 0], log[:, -1]) > SEEN_LLR
     _, mean, sigma = average_shifts(log, shifts_px)
@@ -211,39 +212,17 @@ def _is_sharp(sky: SkyLight, sectors: Bools) -> bool:
     return not sky.fades and _nats(*cells, sky.edge_px) > _nats(*cells, RAMP_PX) + SHARP_NATS
 
 
-@njit(cache=True)
-def _score_shifts(height, llr, extended, edge, shifts, log):
-    """Fill log (SECTORS, shifts) with the log-likelihoods of a skyline that is shifted."""
-    for i in range(log.shape[0]):
-        for m in range(log.shape[1]):
-            total = 0.0
-            for j in range(llr.shape[1]):
-                visible = normal_cdf((height[i, j] - shifts[m]) / edge)
-                total += visible * (llr[i, j] + 0.5 * extended[i, j] * (1.0 - visible))
-            log[i, m] = total
-
-
-@njit(cache=True)
-def _sum_cells(
-    sector, height, light, scale, covered, level, slope, variance, correlation, edge, reach, clip, sums, scales
-):
-    """Add up sums (SECTORS, cells, 3) of l, c and c times the height; scales (SECTORS, 2): pixels, their scale."""
-    half = 0.5 * sums.shape[1] * CELL_PX
-    for k in range(len(sector)):
-        i, h = sector[k], height[k]
-        if covered[i] and abs(h) < half:
-            ground = level[GROUND, i] + slope[GROUND, i] * h
-            step = level[SKY, i] + slope[SKY, i] * h - ground
-            visible = normal_cdf(h / edge)
-            least, most = normal_cdf((h - reach[i]) / edge), normal_cdf((h + reach[i]) / edge)
-            s2 = variance[GROUND, i] + (variance[SKY, i] - variance[GROUND, i]) * visible
-            q = light[k] - ground
-            low, high = min(step * least, step * most), max(step * least, step * most)
-            beyond = max(low - q, q - high, 0.0)
-            if beyond * beyond * correlation <= clip * clip * s2:
-                j = min(int((h + half) / CELL_PX), sums.shape[1] - 1)
-                sums[i, j, 0] += (q * step - 0.5 * step * step) / s2
-                sums[i, j, 1] += step * step / s2
-                sums[i, j, 2] += step * step / s2 * h
-                scales[i, 0] += 1.0
-                scales[i, 1] += scale[k]
+# Fills log (SECTORS, shifts) with the log-likelihoods of a skyline that is shifted.
+_score_shifts = kernel(
+    "score_shifts", "height: float64[sectors, cells]", "llr: float64[sectors, cells]",
+    "extended: float64[sectors, cells]", "edge: float64", "shift: float64[shifts]", f"cdf: float64[{len(NORMAL_CDF)}]",
+    "log: out float64[sectors, shifts]",
+)  # fmt: skip
+# Adds to sums (SECTORS, cells, 3) of l, c and c times the height; scales (SECTORS, 2): pixels, their scale.
+_sum_cells = kernel(
+    "sum_cells", "sector: int64[n]", "height: float64[n]", "light: float64[n]", "scale: float64[n]",
+    "covered: bool[sectors]", "level: float64[2, sectors]", "slope: float64[2, sectors]",
+    "variance: float64[2, sectors]", "correlation: float64", "edge: float64", "reach: float64[sectors]",
+    "clip: float64", "cell: float64", f"cdf: float64[{len(NORMAL_CDF)}]", "sums: out float64[sectors, cells, 3]",
+    "scales: out float64[sectors, 2]",
+)  # fmt: skip

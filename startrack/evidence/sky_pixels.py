@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-# mypy: disable-error-code="no-untyped-def"
 from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.core.kernels import njit
 from startrack.core.types import MIDDLES_RAD, Array, Bools, Detections, Ints, sector_of
 from startrack.evidence.skyline import (
     BAND_PX,
@@ -24,6 +22,7 @@ from startrack.evidence.skyline import (
 )
 from startrack.evidence.star_evidence import StarPhotometry, filtered_noise_e
 from startrack.frames import azel_from_rays
+from startrack.kernels.library import kernel
 from startrack.psf import noise_area_px
 
 MASKED_SIGMA = 0.4  # light of a known star, in a pixel's noise, from which the pixel is left out
@@ -111,22 +110,15 @@ def _leave_out_stars(band: Bools, detections: Detections, stars: StarPhotometry)
     _clear_disks(band, np.rint(np.clip(xy_px[bright], -1e6, 1e6)).astype(np.int64), radius.astype(np.int64))
 
 
-@njit(cache=True)
-def _clear_disks(mask, xy_px, radius_px):
+def _clear_disks(mask: Bools, xy_px: Ints, radius_px: Ints) -> None:
     """Clear the pixels of a mask (H, W) within `radius_px` (n,) of the pixels (n, 2).
 
     A small disk whose middle the mask lacks hardly reaches into the band: it is left out.
     """
-    height, width = mask.shape
-    touching = np.empty(len(xy_px), np.bool_)
-    for k in range(len(xy_px)):
-        x, y = xy_px[k, 0], xy_px[k, 1]
-        touching[k] = radius_px[k] > BAND_PX / 2 or (0 <= x < width and 0 <= y < height and mask[y, x])
-    for k in range(len(xy_px)):
-        x, y, r = xy_px[k, 0], xy_px[k, 1], radius_px[k]
-        if not touching[k]:
-            continue
-        for row in range(max(y - r, 0), min(y + r + 1, height)):
-            for column in range(max(x - r, 0), min(x + r + 1, width)):
-                if (column - x) * (column - x) + (row - y) * (row - y) <= r * r:
-                    mask[row, column] = False
+    _clear(mask, xy_px, radius_px, BAND_PX / 2, np.empty(len(xy_px), np.bool_))
+
+
+_clear = kernel(
+    "clear_disks", "mask: out bool[height, width]", "xy_px: int64[n, 2]", "radius_px: int64[n]", "large_px: float64",
+    "touching: out bool[n]",
+)  # fmt: skip

@@ -110,10 +110,10 @@ def kernel(name: str, *declarations: str, result: str | None = None) -> Callable
             if not flags.c_contiguous or (is_written and not flags.writeable):
                 raise TypeError(f"{name}: {argument.name} must be C-contiguous, and writable where it is written to")
             for (dim, more), size in zip(shape, value.shape, strict=True):
-                known = sizes.get(dim)
-                if known == -1 and size >= more:
+                if sizes.get(dim) == -1:
                     sizes[dim] = size - more
-                elif size != (int(dim) if known is None else known) + more:
+                wanted = sizes[dim] if dim in sizes else int(dim)
+                if size != wanted + more or wanted < 0:
                     raise TypeError(f"{name}: `{argument.text}` is asked for, not {value.shape}; sizes: {sizes}")
             words.append(value.__array_interface__["data"][0])
         return function(*sizes.values(), *words)

@@ -36,4 +36,130 @@ KERNEL const char *compiler_name(void);
    even steps around the circle from azimuth 0 on. No value: 0. A NaN or infinite azimuth gives NaN. */
 KERNEL void interpolate_circle(int64_t m, int64_t n, const double *restrict values, double *restrict found);
 
+/* Rows of comma-separated fields `rows` [n] from the lines [n] of several columns one after another, which begin at
+   `at` [columns]; `at` is advanced. The end of the rows, or -1 where a column has fewer lines than another. */
+KERNEL int64_t join_columns(int64_t n, int64_t columns, const uint8_t *restrict lines, int64_t *restrict at,
+                            uint8_t *restrict rows);
+
+/* Write the `values` [n] into `out` [room], 32 bytes for each, a line break after each, as %.<digits>g where
+   `is_general`, else as %.<digits>f; nothing for NaN. Digits: 1 to 9. Magnitudes: below 1e15 / 10**digits, or of general
+   ones 0 and 1e-12 to 1e15. The end of what was written. */
+KERNEL int64_t write_numbers(int64_t n, int64_t room, const double *restrict values, int64_t digits, bool is_general,
+                             uint8_t *restrict out);
+
+/* evidence.c */
+
+/* Fill `weight`, `mean` and `spread` (variance) [n, longest] of the light of the ground, by its sector and those before
+   it around the circle, one for each number of sectors since the patch began. `own` and `variance` [n] are what each
+   sector shows; `width`: range of levels of another patch; `drift`: variance that a sector adds; `border`: probability
+   of another patch. The three arrays begin as 0, 0 and 1, the scratch [3, longest + 1] as 0. */
+KERNEL void filter_patches(int64_t n, int64_t longest, const double *restrict own, const double *restrict variance,
+                           double width, double drift, double border, double *restrict weight, double *restrict mean,
+                           double *restrict spread, double *restrict scratch);
+
+/* Fill `level` [n] with the means by the sectors up to each one and by the patches of those after it, of states
+   [n, longest] of `filter_patches`; states of weights below `least_weight` are left out. */
+KERNEL void join_patches(int64_t n, int64_t longest, const double *restrict weight, const double *restrict mean,
+                         const double *restrict spread, const double *restrict later_weight,
+                         const double *restrict later_mean, const double *restrict later_spread, double width,
+                         double drift, double border, double least_weight, double *restrict level);
+
+/* Add to `sums` [2, 6, sectors] of pixels [n] on a side (0 or 1; below 0: none) in a sector: their count, heights h,
+   h^2, and with the residual q of the light: q, q h, q^2. Level, slope and limit of q [2, sectors]. Pixels beyond the
+   limit are left out, those with NaN too. */
+KERNEL void sum_sides(int64_t n, int64_t sectors, const int64_t *restrict side, const int64_t *restrict sector,
+                      const double *restrict height, const double *restrict light, const double *restrict level,
+                      const double *restrict slope, const double *restrict limit, double *restrict sums);
+
+/* Fill `log` [sectors, shifts] with log-likelihoods of a skyline that is higher by `shift` [shifts] (pixels), by cells
+   [sectors, cells] at heights with l (`llr`) and c (`extended`). `edge`: its width (pixels). `cdf` [4097]: see
+   common.h. */
+KERNEL void score_shifts(int64_t sectors, int64_t cells, int64_t shifts, const double *restrict height,
+                         const double *restrict llr, const double *restrict extended, double edge,
+                         const double *restrict shift, const double *restrict cdf, double *restrict log);
+
+/* Add to `sums` [sectors, cells, 3] of l, c and c times the height, of pixels [n] in cells of `cell` pixels of height,
+   and to `scales` [sectors, 2]: pixels, their scale. Level, slope and variance [2, sectors] are those of ground and
+   sky; the skyline is within `reach` [sectors] (pixels, may be infinite). Pixels of sectors that are not covered, and
+   those that differ by more than `clip` sigma from any fraction of sky, are left out. */
+KERNEL void sum_cells(int64_t n, int64_t sectors, int64_t cells, const int64_t *restrict sector,
+                      const double *restrict height, const double *restrict light, const double *restrict scale,
+                      const bool *restrict covered, const double *restrict level, const double *restrict slope,
+                      const double *restrict variance, double correlation, double edge, const double *restrict reach,
+                      double clip, double cell, const double *restrict cdf, double *restrict sums,
+                      double *restrict scales);
+
+/* Clear the pixels of `mask` [height, width] within radii [n] of the pixels `xy_px` [n, 2], which may lie outside, up
+   to 1e9 pixels away. Disks up to `large_px` whose middle the mask lacks at first are left out. Scratch: `touching`. */
+KERNEL void clear_disks(int64_t height, int64_t width, int64_t n, bool *restrict mask, const int64_t *restrict xy_px,
+                        const int64_t *restrict radius_px, double large_px, bool *restrict touching);
+
+/* exposure.c */
+
+/* Undo the filters of the rows [height, length + 1] of a PNG (W3C PNG, section 9), the kind of each in its first byte,
+   and write the samples; false where a filter is unknown, whose row counts as unfiltered. `pixel_bytes`: of a pixel, at
+   least 1. `scratch` [2, room] is zero; room = length + pixel_bytes, length = samples times their bytes. */
+KERNEL bool unfilter_grey_8(int64_t height, int64_t length, int64_t room, int64_t samples, const uint8_t *restrict rows,
+                            int64_t pixel_bytes, uint8_t *restrict scratch, float *restrict found);
+KERNEL bool unfilter_grey_16(int64_t height, int64_t length, int64_t room, int64_t samples,
+                             const uint8_t *restrict rows, int64_t pixel_bytes, uint8_t *restrict scratch,
+                             float *restrict found);
+KERNEL bool unfilter_colour_8(int64_t height, int64_t length, int64_t room, int64_t samples,
+                              const uint8_t *restrict rows, int64_t pixel_bytes, uint8_t *restrict scratch,
+                              uint8_t *restrict found);
+KERNEL bool unfilter_colour_16(int64_t height, int64_t length, int64_t room, int64_t samples,
+                               const uint8_t *restrict rows, int64_t pixel_bytes, uint8_t *restrict scratch,
+                               uint16_t *restrict found);
+
+/* photometry.c */
+
+/* Fill `across` and `down` [n, wide] with the profiles of stars at `xy_px` [n, 2] in x and in y about their middle
+   pixels, which are `centre` [n, 2]. `profiles` [steps + 1, wide] are those at offsets from -1/2 to 1/2. Positions are
+   finite. */
+KERNEL void profiles_of(int64_t n, int64_t steps, int64_t wide, const double *restrict xy_px,
+                        const double *restrict profiles, float *restrict across, float *restrict down,
+                        int64_t *restrict centre);
+
+/* Fill `measured` [n, 4] (flux, its variance, variance per electron of its own light, variance by neighbours) and
+   `usable` [n] for stars at `xy_px` [n, 2], whose stamps of 2 radius + 1 pixels lie inside the image [height, width].
+   The stars are ordered by square cells of `side_px`, of `columns` a row; `first` [cells + 1] is each cell's first.
+   Neighbours within `reach_px` (at most `side_px`) count by their expected flux, its relative error and their
+   probability to be visible [n]. `background` and `noise` are rows in the middles of blocks of so many rows.
+   `outlier`: squared sigma from which a pixel is masked, at most `most_masked`; `model`: variance of a star's squared
+   light; `shape_variance`: of the part by which the background's shape is wrong. `edges` [2, phases + 1, table_places]:
+   light of an edge and its slope, at places `step_px` (of the PSF's width `sigma_px`) apart; `flat_excess`,
+   `width_part`, `contrast_sigmas`: see stamp_edge.py. Scratch: `across` to `near`; `stamp` [8, room], room: the pixels
+   of a stamp, filled up to a multiple of 8; `sums` [15, 32], at most 32 places. The image is finite, in dead pixels
+   too. */
+KERNEL void measure_sources(int64_t height, int64_t width, int64_t background_rows, int64_t noise_rows, int64_t n,
+                            int64_t cells, int64_t steps, int64_t wide, int64_t phases, int64_t table_places,
+                            int64_t room, const float *restrict image, const float *restrict background,
+                            const float *restrict noise, const bool *restrict dead, int64_t background_side,
+                            int64_t noise_side, const double *restrict xy_px, const double *restrict flux_e,
+                            const double *restrict fraction_sigma, const double *restrict visible,
+                            const int64_t *restrict first, int64_t columns, double reach_px, double side_px,
+                            int64_t radius, float outlier, float model, float shape_variance, int64_t most_masked,
+                            const double *restrict profiles, const float *restrict edges, double sigma_px,
+                            double step_px, double flat_excess, double width_part, double contrast_sigmas,
+                            int64_t places, float *restrict across, float *restrict down, int64_t *restrict centre,
+                            int64_t *restrict near, float *restrict stamp, double *restrict sums,
+                            double *restrict measured, bool *restrict usable);
+
+/* simulation.c */
+
+/* Fill `found` [n, 5] for stars at `xy_px` [n, 2] with sums over others [m] within `reach_px`, at most `side_px`; the
+   others are ordered by cells as in `measure_sources`. `number` [m]: another one's index among the stars, or -1. The
+   weights of a stamp are those of linear least squares for flux and level, (P - mean(P)) / S with
+   S = sum P (P - mean(P)). Columns: parts of the others' light that they collect, times `weight`; the variance that
+   each of their electrons adds, times `weight`; squares of the parts, times `square_weight`; the variance that each
+   electron of the star itself adds; S. No position is negative. Profiles and middle pixels as of `profiles_of`; the
+   profiles are 0 as far from their middle as a stamp of another star reaches. */
+KERNEL void collect_light(int64_t n, int64_t wide, int64_t m, int64_t cells, const double *restrict xy_px,
+                          const float *restrict across, const float *restrict down, const int64_t *restrict centre,
+                          const double *restrict others_px, const float *restrict others_across,
+                          const float *restrict others_down, const int64_t *restrict others_centre,
+                          const int64_t *restrict number, const double *restrict weight,
+                          const double *restrict square_weight, const int64_t *restrict first, int64_t columns,
+                          double side_px, double reach_px, int64_t radius, double *restrict found);
+
 #endif

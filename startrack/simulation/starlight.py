@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-# mypy: disable-error-code="no-untyped-def"
 from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.core.kernels import REORDERED_SUMS, njit
 from startrack.core.types import Array
 from startrack.evidence import Photometry, Sources, half_width, neighbour_profiles, order_by_cell, profiles_of
+from startrack.kernels.library import kernel
 from startrack.psf import pixel_profile
 
 NEIGHBOUR_SIGMAS = 3.0  # of the PSF beyond half a stamp, to the last star whose light is subtracted, as in `measure`
@@ -61,9 +60,11 @@ class Starlight:
 def _collect(
     xy_px: Array, sigma_px: float, others_px: Array, weight: Array, reach_px: float, square_weight: Array | None = None
 ) -> Array:
-    """Sums (5, n) of `collect_light` for the stamps about stars (n, 2), over others (m, 2) within reach.
+    """Sums (5, n) for the stamps about stars (n, 2), over others (m, 2) within reach; no position is negative.
 
-    Others with a `square_weight` are the stars themselves. No position is negative.
+    Of the kernel `collect_light`: parts of the others' light that the stamps collect, times `weight`; the variance that
+    each of their electrons adds, times `weight`; squares of the parts, times `square_weight`; the variance that each
+    electron of the star itself adds; the strength of the fit. Others with a `square_weight` are the stars themselves.
     """
     size_px = np.maximum(xy_px.max(axis=0, initial=0.0), others_px.max(axis=0, initial=0.0)) + 1.0
     order, first, columns = order_by_cell(others_px, (int(size_px[1]), int(size_px[0])), reach_px)
@@ -71,70 +72,18 @@ def _collect(
     squares = np.zeros(len(order)) if square_weight is None else square_weight[order]
     found, beyond = np.empty((len(xy_px), 5)), int(reach_px) + 2
     profiles = np.pad(neighbour_profiles(sigma_px), ((0, 0), (beyond, beyond)))
-    collect_light(
-        xy_px, others_px[order], number, weight[order], squares, first, columns, reach_px, reach_px,
-        half_width(sigma_px), profiles, found,
+    others_px = others_px[order]
+    _collect_light(
+        xy_px, *profiles_of(xy_px, profiles), others_px, *profiles_of(others_px, profiles), number, weight[order],
+        squares, first, columns, reach_px, reach_px, half_width(sigma_px), found,
     )  # fmt: skip
     return np.ascontiguousarray(found.T)
 
 
-@njit(cache=True, fastmath=REORDERED_SUMS)
-def collect_light(
-    xy_px, others_px, number, weight, square_weight, first, columns, side_px, reach_px, radius, table, found
-) -> None:  # fmt: skip
-    """Fill found (n, 5) for stars at `xy_px` (n, 2) with sums over others (m) within `reach_px`, at most `side_px`.
-
-    The others are ordered by cells of `side_px`, `first` is each cell's first; `number` (m,) is the index of another
-    among the stars, or -1. The weights of a stamp are those of linear least squares for flux and level,
-    (P - mean(P)) / S with S = sum P (P - mean(P)). Columns: the parts of the others' light that they collect, times
-    `weight`; the variance that each of their electrons adds, times `weight`; the squares of the parts, times
-    `square_weight`; the variance that each electron of the star itself adds; and S. Positions in px, none negative.
-    Profiles of the `table` are 0 as far from their middle as a stamp of another star reaches.
-    """
-    across, down, centre = profiles_of(xy_px, table)
-    others_across, others_down, others_centre = profiles_of(others_px, table)
-    side, rows = 2 * radius + 1, (len(first) - 1) // columns
-    first_place = table.shape[1] // 2 - radius
-    for i in range(len(xy_px)):
-        light_x, profile_x, square_x = _sum_along(across, i, across, i, first_place, side, first_place)
-        light_y, profile_y, square_y = _sum_along(down, i, down, i, first_place, side, first_place)
-        total = light_x * light_y
-        middle = total / side**2
-        strength = profile_x * profile_y - middle * total
-        collected, shot, squares = 0.0, 0.0, 0.0
-        found[i, 3] = (square_x * square_y - 2 * middle * profile_x * profile_y + middle**2 * total) / strength**2
-        found[i, 4] = strength
-        column, row = int(xy_px[i, 0] / side_px), int(xy_px[i, 1] / side_px)
-        for cell_row in range(max(row - 1, 0), min(row + 2, rows)):
-            start = first[cell_row * columns + max(column - 1, 0)]
-            stop = first[cell_row * columns + min(column + 1, columns - 1) + 1]
-            for j in range(start, stop):
-                dx, dy = others_px[j, 0] - xy_px[i, 0], others_px[j, 1] - xy_px[i, 1]
-                if dx * dx + dy * dy <= reach_px * reach_px and number[j] != i:
-                    left = first_place + centre[i, 0] - others_centre[j, 0]
-                    top = first_place + centre[i, 1] - others_centre[j, 1]
-                    light_x, profile_x, square_x = _sum_along(across, i, others_across, j, left, side, first_place)
-                    light_y, profile_y, square_y = _sum_along(down, i, others_down, j, top, side, first_place)
-                    light, with_profile = light_x * light_y, profile_x * profile_y
-                    part = (with_profile - middle * light) / strength
-                    noise = square_x * square_y - 2 * middle * with_profile + middle**2 * light
-                    collected += weight[j] * part
-                    shot += weight[j] * noise / strength**2
-                    squares += square_weight[j] * part * part
-        found[i, 0], found[i, 1], found[i, 2] = collected, shot, squares
-
-
-@njit(inline="always")
-def _sum_along(own, i, others, j, start, side, first):
-    """Sums over a stamp along one axis: the profile of star j alone, times star i's, times its square.
-
-    The stamp begins at the place `first` of star i's profile, and at `start` of star j's.
-    """
-    light, with_profile, with_square = 0.0, 0.0, 0.0
-    row, at, other_row, other_at = np.uint64(i), np.uint64(first), np.uint64(j), np.uint64(start)
-    for c in range(np.uint64(side)):
-        p, q = float(own[row, at + c]), float(others[other_row, other_at + c])
-        light += q
-        with_profile += p * q
-        with_square += p * p * q
-    return light, with_profile, with_square
+_SIDES = ("across: float32[{0}, wide]", "down: float32[{0}, wide]", "centre: int64[{0}, 2]")
+_collect_light = kernel(
+    "collect_light", "xy_px: float64[n, 2]", *(side.format("n") for side in _SIDES), "others_px: float64[m, 2]",
+    *(f"others_{side.format('m')}" for side in _SIDES), "number: int64[m]", "weight: float64[m]",
+    "square_weight: float64[m]", "first: int64[cells + 1]", "columns: int64", "side_px: float64", "reach_px: float64",
+    "radius: int64", "found: out float64[n, 5]",
+)  # fmt: skip

@@ -1,0 +1,375 @@
+"""The compiled kernels: their border, their header, the same bytes of all builds, and how they are built."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import inspect
+import os
+import pkgutil
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import startrack
+from startrack.kernels import build, library
+
+ROOT = Path(__file__).parent.parent
+HEADER = (build.FOLDER / "startrack_kernels.h").read_text()
+C_TYPES = {
+    "float64": "double", "float32": "float", "int64": "int64_t", "int32": "int32_t", "uint8": "uint8_t",
+    "uint16": "uint16_t", "bool": "bool",
+}  # fmt: skip
+LEVEL_SCRIPT = "import test_kernels; print(test_kernels.bytes_of_all_kernels())"
+
+
+@pytest.fixture(scope="module")
+def declared():
+    """Declarations in Python of all kernels, by name."""
+    for one in pkgutil.walk_packages(startrack.__path__, "startrack."):
+        source = importlib.util.find_spec(one.name).origin
+        if "kernels.library import" in Path(source).read_text(encoding="utf-8"):
+            importlib.import_module(one.name)
+    return library.DECLARED
+
+
+def prototype(name, arguments, result):
+    """The C declaration that the declarations of a kernel in Python stand for."""
+    sizes = dict.fromkeys(dim for one in arguments for dim, _ in one.shape or () if not dim.isdigit())
+    words = [f"int64_t {size}" for size in sizes]
+    for one in arguments:
+        kind = C_TYPES[one.dtype]
+        pointer = f"{'' if one.is_written else 'const '}{kind} *restrict"
+        words.append(f"{kind if one.shape is None else pointer}")
+    return f"{C_TYPES[result] if result else 'void'} {name}", words
+
+
+def test_declarations_in_python_are_those_of_the_header(declared):
+    found = {}
+    for kind, name, text in re.findall(r"KERNEL (\w+) (\w+)\((.*?)\);", HEADER, re.DOTALL):
+        found[name] = f"{kind} {name}", [" ".join(one.split()) for one in text.split(",")]
+    del found["has_x86_64_v3"]
+    assert found.keys() == declared.keys()
+    for name, (arguments, result) in declared.items():
+        head, words = prototype(name, arguments, result)
+        assert head == found[name][0]
+        sizes = len(words) - len(arguments)
+        assert words[:sizes] == found[name][1][:sizes], name
+        assert words[sizes:] == [re.sub(r" ?\w+$", "", one) for one in found[name][1][sizes:]], name
+
+
+def test_each_function_of_the_header_is_documented():
+    for text in re.split(r"\nKERNEL [^;]*;", HEADER)[:-1]:
+        last = text.strip()
+        assert last.endswith("*/") or not last, text  # of a group of functions the first one is
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda values, found: (values.astype(np.float32), found),
+        lambda values, found: (values[::2], found),
+        lambda values, found: (values.reshape(2, -1), found),
+        lambda values, found: (values.tolist(), found),
+        lambda values, found: (values, 1.0),
+        lambda values, found: (values,),
+        lambda values, found: (values, read_only(found)),
+        lambda values, found: (values.byteswap().view(values.dtype.newbyteorder()), found),
+        lambda values, found: (None, found),
+    ],
+)
+def test_an_argument_that_is_not_as_declared_is_a_type_error(wrong):
+    call = library.kernel("interpolate_circle", "values: float64[m]", "found: out float64[n]")
+    values, found = np.arange(8.0), np.zeros(3)
+    call(values, found)
+    with pytest.raises(TypeError, match="interpolate_circle"):
+        call(*wrong(values, found))
+
+
+def read_only(array):
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def test_shapes_that_do_not_go_together_are_a_type_error():
+    call = library.kernel(
+        "clear_disks", "mask: out bool[height, width]", "xy_px: int64[n, 2]", "radius_px: int64[n]",
+        "large_px: float64", "touching: out bool[n]",
+    )  # fmt: skip
+    mask, xy, radius, touching = (
+        np.ones((4, 5), bool),
+        np.zeros((3, 2), np.int64),
+        np.ones(3, np.int64),
+        np.ones(3, bool),
+    )
+    call(mask, xy, radius, 0.5, touching)
+    assert mask.sum() == 17
+    for wrong in (
+        (mask, xy[:2], radius, 0.5, touching),
+        (mask, np.zeros((3, 3), np.int64), radius, 0.5, touching),
+        (mask, xy, radius, 0.5, touching[:1]),
+        (mask, xy, radius, "wide", touching),
+        (mask, xy, radius, 0.5, touching[:0]),
+    ):
+        with pytest.raises((TypeError, ValueError)):
+            call(*wrong)
+
+
+def test_an_array_has_as_many_elements_as_are_added_to_its_size():
+    call = library.kernel(
+        "profiles_of", "xy_px: float64[n, 2]", "profiles: float64[steps + 1, wide]", "across: out float32[n, wide]",
+        "down: out float32[n, wide]", "centre: out int64[n, 2]",
+    )  # fmt: skip
+    with pytest.raises(TypeError, match="profiles"):
+        call(np.zeros((0, 2)), np.zeros((0, 5)), *np.zeros((2, 0, 5), np.float32), np.zeros((0, 2), np.int64))
+
+
+def random_arguments(arguments, rng):
+    """Arrays and numbers as declared, whose indices are those of elements that exist."""
+    sizes: dict[str, int] = {}
+    for one in arguments:
+        for dim, _ in one.shape or ():
+            sizes.setdefault(dim, int(dim) if dim.isdigit() else int(rng.integers(2, 9)))
+    values = []
+    for one in arguments:
+        if one.shape is None:
+            values.append(int(rng.integers(1, 3)) if one.dtype in ("int64", "bool") else float(rng.uniform(0.5, 2.0)))
+            continue
+        shape = tuple(sizes[dim] + more for dim, more in one.shape)
+        if one.dtype.startswith("float"):
+            values.append(rng.uniform(0.1, 2.0, shape).astype(one.dtype))
+        else:
+            values.append(rng.integers(0, 2, shape).astype(one.dtype))
+    return values
+
+
+# Kernels that trust more of their arguments than random ones can keep: a stamp lies in its image, cells are in order.
+RANDOM = (
+    "interpolate_circle", "filter_patches", "join_patches", "sum_sides", "score_shifts", "sum_cells", "clear_disks",
+    "profiles_of",
+)  # fmt: skip
+
+
+def bytes_of_all_kernels():
+    """A hash of what kernels make of random arguments, and of a star's stamp."""
+    importlib.import_module("startrack.evidence")
+    rng, key = np.random.default_rng(3), hashlib.sha256()
+    for name in RANDOM:
+        arguments, _ = library.DECLARED[name]
+        call = library.kernel(name, *(one.text for one in arguments))
+        for _ in range(20):
+            values = random_arguments(arguments, rng)
+            values = [np.linspace(0.0, 1.0, 4097) if np.shape(v) == (4097,) else v for v in values]
+            call(*values)
+            for one, value in zip(arguments, values, strict=True):
+                if one.is_written:
+                    key.update(value.tobytes())
+    for array in photometry_of(rng):
+        key.update(array.tobytes())
+    return key.hexdigest()
+
+
+def photometry_of(rng):
+    """Fluxes and variances of stars beside an edge of the background."""
+    from types import SimpleNamespace
+
+    from startrack.core.smooth_image import SmoothImage
+    from startrack.evidence.photometry import Sources, measure
+
+    image = rng.normal(100.0, 3.0, (96, 128)).astype(np.float32)
+    image[:, 64:] += 40.0
+    flat = SmoothImage.of(np.full(image.shape, 100.0, np.float32))
+    noise = SmoothImage.of(np.full(image.shape, 3.0, np.float32))
+    seen = SimpleNamespace(
+        image_e=image, background=flat, noise=noise, dead=rng.random(image.shape) < 0.01, psf_sigma_px=1.1
+    )
+    xy = rng.uniform((40.0, 20.0), (96.0, 76.0), (300, 2))
+    found = measure(
+        seen, Sources(xy_px=xy, flux_e=rng.uniform(50.0, 900.0, 300), fraction_sigma=np.full(300, 0.1),
+                      visible=rng.random(300)),
+    )  # fmt: skip
+    return found.flux_e, found.variance_e2, found.own_shot, found.neighbour_variance_e2, found.usable
+
+
+def run_level(level, code, **more):
+    environment = {
+        **os.environ,
+        "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}",
+        "STARTRACK_KERNELS": level,
+        **more,
+    }
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+
+
+def test_both_levels_give_the_same_bytes():
+    if library.LEVEL != "v3":
+        pytest.skip("this processor has one level only")
+    one, other = (run_level(level, LEVEL_SCRIPT) for level in ("baseline", "v3"))
+    assert one.returncode == other.returncode == 0, one.stderr + other.stderr
+    assert len(one.stdout.strip()) == 64
+    assert one.stdout == other.stdout
+
+
+@pytest.mark.parametrize(("level", "words"), [("fast", "may be baseline, v3 or sanitized"), ("baseline", "")])
+def test_the_variable_chooses_the_level(level, words):
+    run = run_level(level, "from startrack.kernels.library import LEVEL, compiler; print(LEVEL, compiler())")
+    assert (run.returncode != 0) == bool(words)
+    assert words in run.stderr
+    assert words or run.stdout.startswith("baseline ")
+
+
+def copy_kernels(folder):
+    """A package of the loader and the C sources alone, without a library."""
+    package = folder / "startrack" / "kernels"
+    package.mkdir(parents=True)
+    (folder / "startrack" / "__init__.py").touch()
+    for path in build.FOLDER.iterdir():
+        if path.is_file():
+            (package / path.name).write_bytes(path.read_bytes())
+    return package
+
+
+def run_copy(folder, *words, **more):
+    environment = {**os.environ, "PYTHONPATH": str(folder), **more}
+    return subprocess.run([sys.executable, *words], capture_output=True, text=True, env=environment, cwd=folder)
+
+
+LOAD = ("-c", "from startrack.kernels import library; print(library.LEVEL)")
+
+
+@pytest.mark.slow
+def test_a_changed_source_is_refused_with_the_command_that_helps(tmp_path):
+    package = copy_kernels(tmp_path)
+    missing = run_copy(tmp_path, *LOAD)
+    assert missing.returncode == 1
+    assert "-m startrack.kernels.build" in missing.stderr
+    assert run_copy(tmp_path, "-m", "startrack.kernels.build").returncode == 0
+    assert run_copy(tmp_path, *LOAD).stdout.strip() == library.LEVEL
+    first = set((package / "compiled").iterdir())
+    with (package / "core.c").open("a") as file:
+        file.write("\n/* changed */\n")
+    assert "there is no compiled library" in run_copy(tmp_path, *LOAD).stderr
+    assert run_copy(tmp_path, "-m", "startrack.kernels.build").returncode == 0
+    assert run_copy(tmp_path, *LOAD).returncode == 0
+    assert not first & set((package / "compiled").iterdir())
+
+
+@pytest.mark.slow
+def test_a_failed_build_says_what_was_tried_and_what_helps(tmp_path):
+    package = copy_kernels(tmp_path)
+    nothing = tmp_path / "empty"
+    nothing.mkdir()
+    hidden = {"PATH": str(nothing), "CC": "no-such-compiler -O9"}
+    code = (
+        "import importlib.util as u; f = u.find_spec; u.find_spec = lambda n, *a: None if n == 'ziglang' else f(n, *a)"
+    )
+    run = run_copy(
+        tmp_path, "-c", f"{code}; from startrack.kernels.build import main; raise SystemExit(main())", **hidden
+    )
+    assert run.returncode == 1
+    for words in (
+        "no-such-compiler -O9: No such file",
+        "cc: No such file",
+        "ziglang: not installed",
+        "apt-get install gcc",
+    ):
+        assert words in run.stderr
+    (package / "core.c").write_text("this is no C\n")
+    run = run_copy(tmp_path, "-m", "startrack.kernels.build")
+    assert run.returncode == 1
+    assert "error" in run.stderr and "apt-get" in run.stderr
+    assert list((package / "compiled").iterdir()) == []
+
+
+def has(command):
+    return subprocess.run(["which", command], capture_output=True).returncode == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_the_sources_compile_without_a_warning(tmp_path, compiler):
+    if not has(compiler):
+        pytest.skip(f"there is no {compiler} on this machine")
+    strict = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-fsyntax-only"]
+    for source in build.FOLDER.glob("*.c"):
+        run = subprocess.run([compiler, *strict, str(source)], capture_output=True, text=True)
+        assert run.returncode == 0, run.stderr
+
+
+@pytest.mark.slow
+def test_no_kernel_reads_or_writes_beside_its_arrays(tmp_path):
+    """The random arguments again, in a library with AddressSanitizer and UndefinedBehaviorSanitizer."""
+    compiler = next((one for one in ("gcc", "clang") if has(one)), None)
+    if compiler is None:
+        pytest.skip("neither gcc nor clang is installed, which have the sanitizers")
+    name = "libasan.so" if compiler == "gcc" else "libclang_rt.asan-x86_64.so"
+    found = subprocess.run([compiler, f"-print-file-name={name}"], capture_output=True, text=True).stdout.strip()
+    if not Path(found).is_absolute():
+        pytest.skip(f"{compiler} has no AddressSanitizer on this machine")
+    copy_kernels(tmp_path)
+    made = run_copy(tmp_path, "-m", "startrack.kernels.build", "sanitized", CC=compiler)
+    assert made.returncode == 0, made.stderr
+    library_path = made.stdout.strip()
+    code = (
+        "import startrack.kernels.build as b; from pathlib import Path; "
+        f"b.COMPILED = Path({str(Path(library_path).parent)!r}); {LEVEL_SCRIPT}"
+    )
+    checks = {"LD_PRELOAD": found, "ASAN_OPTIONS": "detect_leaks=0", "UBSAN_OPTIONS": "print_stacktrace=1"}
+    run = run_level("sanitized", code, **checks)
+    assert run.returncode == 0, run.stderr[-3000:]
+    assert run.stdout == run_level("baseline", LEVEL_SCRIPT).stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", ["aarch64-freestanding", "riscv64-freestanding", "wasm32-freestanding"])
+def test_the_sources_compile_for_a_rover_and_for_a_browser(tmp_path, target):
+    """They need no operating system: `math.h` and a few integers are all."""
+    if importlib.util.find_spec("ziglang") is None:
+        pytest.skip("the package ziglang, a compiler for other processors, is not installed")
+    zig = [
+        sys.executable,
+        "-m",
+        "ziglang",
+        "cc",
+        "-target",
+        target.replace("-none", ""),
+        "-ffreestanding",
+        *build.FLAGS,
+    ]
+    (tmp_path / "math.h").write_text(MATH_H)
+    cache = dict.fromkeys(("ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR"), str(tmp_path / "zig"))
+    for source in sorted(build.FOLDER.glob("*.c")):
+        run = subprocess.run(
+            [*zig, "-I", str(tmp_path), "-c", str(source), "-o", str(tmp_path / f"{source.stem}.o")],
+            capture_output=True, text=True, env={**os.environ, **cache},
+        )  # fmt: skip
+        assert run.returncode == 0, run.stderr
+    assert len(list(tmp_path.glob("*.o"))) == len(list(build.FOLDER.glob("*.c")))
+
+
+# What the kernels use of math.h, as a `libm` without an operating system declares it.
+MATH_H = """
+#define INFINITY __builtin_inff()
+#define NAN __builtin_nanf("")
+#define isfinite(x) __builtin_isfinite(x)
+#define signbit(x) __builtin_signbit(x)
+double exp(double), log(double), log10(double), sqrt(double), fabs(double), floor(double), ceil(double), rint(double);
+double fmod(double, double), erf(double), copysign(double, double);
+"""
+
+
+def test_the_loader_is_small():
+    assert len(inspect.getsource(library).splitlines()) <= 130
+
+
+def test_kernels_keep_no_state():
+    """No global variable that is written to: only constants may stand at the top of a C source."""
+    for path in build.FOLDER.glob("*.c"):
+        text = re.sub(r"/\*.*?\*/", "", path.read_text(), flags=re.DOTALL)
+        assert re.findall(r"^(?=\w)(?!.*\bconst\b)[^(\n]*=.*", text, re.MULTILINE) == []
+        assert re.findall(r"\b(?:malloc|calloc|realloc|free|printf|fopen|Python\.h)\b", text) == []

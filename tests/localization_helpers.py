@@ -22,7 +22,7 @@ from startrack.localization.obstacle_chain import (
     WRONG_SECTOR,
     Moves,
 )
-from startrack.localization.profile_cells import HIGH_RAD, LOW_RAD
+from startrack.localization.profile_cells import HIGH_RAD, LOW_RAD, Profiles
 from startrack.localization.search_profiles import HIDE, SEARCH_EPSILON
 from startrack.localization.skyline_profiles import ROW_NATS, sector_of
 from startrack.terrain import Cylinder, ForwardingTerrain, Terrain, load_terrain
@@ -196,3 +196,29 @@ class ThreeMethods(Terrain):
 
 
 WRAPPERS = (Delegating, ForwardingTerrain, ThreeMethods)
+
+
+def _cell_part(profiles: Profiles, sector: int, height_rad: float) -> tuple[int, float]:
+    """The cell of a sector that holds a height, and the part of the way through it, from 0 to 1 within the window."""
+    begin, last = profiles.first[sector], profiles.first[sector + 1] - 1
+    k = begin + int(np.clip(np.searchsorted(profiles.x[begin:last], height_rad, side="right") - 1, 0, None))
+    return k, (height_rad - profiles.x[k]) / (profiles.x[k + 1] - profiles.x[k])
+
+
+def log_at(profiles: Profiles, sector: int, height_rad: float) -> float:
+    """F - R of a sector at a height, from the cells."""
+    if height_rad >= HIGH_RAD:
+        return -float(profiles.free[sector])
+    k, u = _cell_part(profiles, sector, height_rad)
+    u = float(np.clip(u, 0.0, 1.0))
+    level = (1.0 - u) * profiles.left[k] + u * profiles.right[k]
+    return float(level + u * (1.0 - u) * profiles.bend[k] - profiles.free[sector])
+
+
+def integral_to(profiles: Profiles, sector: int, height_rad: float) -> float:
+    """Integral of exp(F - R) of a sector up to a height, from the cells."""
+    if height_rad >= HIGH_RAD:
+        end = profiles.integral[profiles.first[sector + 1] - 1]
+        return float(end + (height_rad - HIGH_RAD) * np.exp(-profiles.free[sector]))
+    k, u = _cell_part(profiles, sector, height_rad)
+    return float((1.0 - u) * profiles.integral[k] + u * profiles.integral[k + 1])

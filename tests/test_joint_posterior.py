@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from localization_helpers import slow_chain, slow_chain_scores
+from localization_helpers import integral_to, log_at, slow_chain, slow_chain_scores
 from scipy.special import ndtr
 from test_localization_shape import evidence_at
 
@@ -30,7 +30,7 @@ from startrack.localization.obstacle_chain import (
     emissions,
     prepare_levels,
 )
-from startrack.localization.profile_cells import HIGH_RAD, LOW_RAD, integral_to, log_at
+from startrack.localization.profile_cells import HIGH_RAD, LOW_RAD
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel
 from startrack.localization.skyline_profiles import ROW_NATS, profiles_of

@@ -16,7 +16,6 @@ from startrack.evidence.sky_light import CELL_PX, LEVELS
 from startrack.evidence.star_offsets import offset_terms
 from startrack.localization import ExactPosterior
 from startrack.localization.sky_profiles import SkyProfiles
-from startrack.localization.skyline_profiles import _cubic
 
 PLACE = np.array([3000.0, -2000.0])
 
@@ -58,10 +57,21 @@ def slow_profile(rows: Evidence, which: Array, horizon_rad: Array) -> Array:
     return np.asarray((visible * (rows.llr[which] + 0.5 * rows.extended_nats[which] * (1.0 - visible))).sum(axis=1))
 
 
+def lagrange(values: Array, at: Array) -> Array:
+    """Cubics through four knots at places `at` (n,) between `values` (k,) of a uniform grid, constant beyond."""
+    at = np.clip(at, 0.0, len(values) - 1.0)
+    first = np.clip(at.astype(int), 1, len(values) - 3) - 1
+    knots = np.arange(4)
+    weights = [
+        np.prod([(at - first - other) / (own - other) for other in knots if other != own], axis=0) for own in knots
+    ]
+    return np.asarray(np.sum(weights * values[first[:, None] + knots].T, axis=0))
+
+
 def profile_sums(profiles: SkyProfiles, horizon_rad: Array) -> Array:
     """The profiles (n, m) at horizons (n, m)."""
     at = (horizon_rad - profiles.low_rad) / profiles.step_rad
-    return np.stack([[_cubic(knots, x) for x in own] for knots, own in zip(profiles.values, at.T, strict=True)], axis=1)
+    return np.stack([lagrange(knots, own) for knots, own in zip(profiles.values, at.T, strict=True)], axis=1)
 
 
 @pytest.mark.parametrize("nats", [1.0, 50.0, 1500.0])

@@ -118,7 +118,8 @@ def test_correlated_errors_of_neighbours_do_not_average_away():
 def test_rows_are_normal_near_the_height_that_was_measured():
     terrain = basin(0.0)
     seen = SeenSkyline.at(points_of(terrain, PLACE_M, correlation_deg=0.0, step_deg=1.5), terrain, PLACE_M, np.zeros(3))
-    from startrack.localization.profile_cells import log_at
+    from localization_helpers import log_at
+
     from startrack.localization.skyline_profiles import profiles_of
 
     rows = seen.rows()

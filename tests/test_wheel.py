@@ -6,14 +6,19 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
 
+from startrack.kernels import build
+
 ROOT = Path(__file__).parent.parent
 BUILD = "from hatchling.build import build_wheel; import sys; print(build_wheel(sys.argv[1]))"
+BUILD_SOURCES = BUILD.replace("build_wheel", "build_sdist")
+COMPILED_BY = "from startrack.kernels.library import compiler; print(compiler())"
 MODULES_OF_EXTRAS = (  # that the tests below do not load
     "matplotlib.pyplot", "playwright.sync_api", "axe_playwright_python.sync_playwright", "sphinx", "furo",
     "myst_parser", "photutils.psf", "sep",
@@ -73,13 +78,19 @@ def test_catalogue_cameras_and_terrains_are_inside(wheel):
     assert "startrack/py.typed" in inside
 
 
+def test_the_compiled_kernels_are_inside_for_this_system_and_any_python(wheel):
+    assert re.fullmatch(r"startrack-[\d.]+-py3-none-(?!any)\w+\.whl", wheel.name)
+    libraries = sorted(name for name in names(wheel) if "/compiled/" in name)
+    assert libraries == [f"startrack/kernels/compiled/{build.library_name(level)}" for level in build.levels()]
+
+
 def test_nothing_else_is_inside(wheel):
     inside = names(wheel)
     assert {name.split("/")[0].split("-")[0] for name in inside} == {"startrack"}
     strange = re.compile(r"(^|/)(tests?|benchmarks|sample_images|docs)/|/test_|\.pyc$|\.(png|fits|bz2)$")
     assert [name for name in inside if strange.search(name)] == []
     assert any(name.endswith("dist-info/licenses/LICENSE") for name in inside)
-    assert wheel.stat().st_size < 6e6
+    assert wheel.stat().st_size < 6.5e6
 
 
 def test_it_works_away_from_the_checkout(unpacked_wheel, tmp_path):
@@ -117,19 +128,19 @@ class Environment:
         if self.finish(self.python, "-m", "pip", "download", "-q", "--no-deps", "filelock").returncode:
             pytest.skip("no index of packages is reached")
 
-    def finish(self, *words):
+    def finish(self, *words, **more):
         clean = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "NUMBA_CACHE_DIR")}
-        clean["XDG_CACHE_HOME"] = str(self.folder / "cache")
+        clean |= {"XDG_CACHE_HOME": str(self.folder / "cache"), **more}
         return subprocess.run(list(map(str, words)), cwd=self.folder, capture_output=True, text=True, env=clean)
 
-    def run(self, *words):
-        """The output of a command that succeeds."""
-        done = self.finish(*words)
+    def run(self, *words, **more):
+        """The output of a command that succeeds, with `more` variables of the environment."""
+        done = self.finish(*words, **more)
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
-    def pip(self, *words):
-        return self.run(self.python, "-m", "pip", *words)
+    def pip(self, *words, **more):
+        return self.run(self.python, "-m", "pip", *words, **more)
 
     def locate_sample(self):
         image = ROOT / "sample_images/near-wall.png"
@@ -138,6 +149,42 @@ class Environment:
         ]
         assert abs(position["east_m"] + 6900) < 40
         assert abs(position["north_m"] - 4700) < 40
+
+
+@pytest.fixture(scope="module")
+def source_archive(tmp_path_factory):
+    out = tmp_path_factory.mktemp("sources")
+    done = subprocess.run([sys.executable, "-c", BUILD_SOURCES, str(out)], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return out / done.stdout.splitlines()[-1]
+
+
+def locate_elsewhere(unpacked, folder):
+    """Locate a sample with the content of a wheel or of sources; the compiler of the kernels."""
+    image = str(ROOT / "sample_images/near-centre.png")
+    out = run_elsewhere(unpacked, folder, "-m", "startrack", "locate", image, "--json", "--no-plots")
+    assert json.loads(out)["status"] == "ok"
+    return run_elsewhere(unpacked, folder, "-c", COMPILED_BY)
+
+
+def test_a_wheel_of_the_sources_is_compiled_by_a_package_where_there_is_no_compiler(source_archive, tmp_path):
+    own = Environment(sys.executable, tmp_path)
+    own.pip("wheel", "-q", "--no-deps", "-w", "out", source_archive, PATH=str(own.python.parent), CC="")
+    (made,) = (tmp_path / "out").glob("*.whl")
+    with zipfile.ZipFile(made) as archive:
+        archive.extractall(tmp_path / "site")
+    assert "Clang" in locate_elsewhere(tmp_path / "site", tmp_path)
+
+
+def test_an_editable_installation_of_the_sources_compiles_beside_them(source_archive, tmp_path):
+    own = Environment(sys.executable, tmp_path)
+    with tarfile.open(source_archive) as archive:
+        archive.extractall(tmp_path, filter="data")
+    (sources,) = tmp_path.glob("startrack-*")
+    own.pip("install", "-q", "--no-deps", "-e", sources)
+    where = own.run(own.python, "-c", "import startrack; print(startrack.__file__)")
+    assert Path(where.strip()).is_relative_to(sources)
+    assert locate_elsewhere(sources, tmp_path).strip()
 
 
 def newest_python(minor):

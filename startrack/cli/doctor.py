@@ -45,6 +45,7 @@ def run(args: argparse.Namespace) -> int:
         "cameras": lambda: _check_shipped_files("calib"),
         "terrains": lambda: _check_shipped_files("terrain"),
         "ephemeris": _ephemeris,
+        "library": _library,
         "kernels": lambda: _kernels(args),
         "self-test": _self_test,
     }
@@ -109,6 +110,13 @@ def _ephemeris() -> str:
 
     found = bodies(Site("moon", -1.56, 2.27), parse_utc("2030-01-01T00:00:00"))
     return f"SPICE orients the Moon; {len(found)} bodies placed"
+
+
+def _library() -> str:
+    """The C library that is loaded."""
+    from startrack.kernels import library
+
+    return f"C kernels for processors of level {library.LEVEL}, compiled by {library.compiler()}"
 
 
 def _kernels(args: argparse.Namespace) -> str:

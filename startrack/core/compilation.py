@@ -131,11 +131,11 @@ def discard_stale_kernels() -> None:
 
 
 def is_compiled() -> bool:
-    """Whether numba's cache holds localization kernels for this Python.
+    """Whether numba's cache holds kernels of a terrain for this Python.
 
     For a decision that costs only time if it is wrong: kernels of changed sources count too.
     """
-    return any(True for source in (PACKAGE / "localization").glob("*.py") for _ in _indices_of(source))
+    return any(True for source in (PACKAGE / "terrain").glob("*.py") for _ in _indices_of(source))
 
 
 def compiled_files() -> dict[Path, list[Path]]:

@@ -111,6 +111,162 @@ KERNEL bool unfilter_colour_16(int64_t height, int64_t length, int64_t room, int
                                const uint8_t *restrict rows, int64_t pixel_bytes, uint8_t *restrict scratch,
                                uint16_t *restrict found);
 
+/* localization.c */
+
+/* Fill `found` [sectors, n] with likelihoods at `shifts` of sectors whose skyline is the map's; `wrong`: probability that
+   it is anywhere. */
+KERNEL void clear_emissions(int64_t sectors, int64_t m, int64_t guides, int64_t n, const int64_t *restrict first,
+                            const double *restrict x, const double *restrict left, const double *restrict right,
+                            const double *restrict bend, const double *restrict free, const int32_t *restrict guide,
+                            const double *restrict scale, double highest, double wrong, const double *restrict shifts,
+                            double *restrict found);
+
+/* Fill `found` [sectors, n] with logarithms of likelihoods of sectors that show the map's skyline with probabilities
+   `clear` [sectors], else anything. */
+KERNEL void clear_logs(int64_t sectors, int64_t m, int64_t guides, int64_t n, const int64_t *restrict first,
+                       const double *restrict x, const double *restrict left, const double *restrict right,
+                       const double *restrict bend, const double *restrict free, const int32_t *restrict guide,
+                       const double *restrict scale, double highest, double wrong, const double *restrict shifts,
+                       const double *restrict clear, double *restrict found);
+
+/* Fill `table` [sectors, levels, nodes] with likelihoods of the states but the first at shifts up to `reach` [sectors], on
+   nodes closer to each other about 0. The levels' edges are `edge` [edges], each between `lower` and `upper`, which
+   stand at `from` and `until`; level `risen` (from 1 on) hides everything. Scratch: [edges + 1, nodes]. */
+KERNEL void prepare_levels(int64_t sectors, int64_t m, int64_t guides, int64_t edges, int64_t levels, int64_t nodes,
+                           const int64_t *restrict first, const double *restrict x, const double *restrict integral,
+                           const double *restrict free, const int32_t *restrict guide, const double *restrict scale,
+                           const double *restrict hidden, double highest, double wrong, const double *restrict reach,
+                           const double *restrict edge, const int64_t *restrict lower, const int64_t *restrict upper,
+                           const double *restrict from, const double *restrict until, int64_t risen,
+                           double *restrict scratch, float *restrict table);
+
+/* Fill `found` [sectors, states] with likelihoods of all states at shifts [sectors]; levels = states - 1. */
+KERNEL void emissions(int64_t sectors, int64_t m, int64_t guides, int64_t levels, int64_t states,
+                      const int64_t *restrict first, const double *restrict x, const double *restrict left,
+                      const double *restrict right, const double *restrict bend, const double *restrict integral,
+                      const double *restrict free, const int32_t *restrict guide, const double *restrict scale,
+                      const double *restrict hidden, double highest, double wrong, const double *restrict shift,
+                      const double *restrict from, const double *restrict until, int64_t risen, double *restrict found);
+
+/* Fill `found` [n] with log-likelihoods at `shifts` [n, sectors] of the chain of states around the circle, which is cut at
+   the sector `cut` and closed over its states `closing`. `table` and `reach`: see `prepare_levels`. `light` [0 or
+   sectors]: likelihoods of light with its own edge, beside the cells of the stars alone. Probabilities from sector to
+   sector: see obstacle_chain.py. Scratch: `states` [2 (levels + 3), 64], [3, sectors, 64]. */
+KERNEL void chain_log_likelihoods(int64_t sectors, int64_t m, int64_t guides, int64_t star_cells, int64_t levels,
+                                  int64_t nodes, int64_t lights, int64_t n, int64_t closings, int64_t rows,
+                                  const int64_t *restrict first, const double *restrict x, const double *restrict left,
+                                  const double *restrict right, const double *restrict bend,
+                                  const double *restrict free, const int32_t *restrict guide,
+                                  const double *restrict scale, const int64_t *restrict star_first,
+                                  const double *restrict star_x, const double *restrict star_left,
+                                  const double *restrict star_right, const double *restrict star_bend,
+                                  const double *restrict star_free, const int32_t *restrict star_guide,
+                                  const double *restrict star_scale, double highest, double wrong,
+                                  const double *restrict reach, const float *restrict table,
+                                  const double *restrict light, int64_t risen, double risen_start, double risen_jump,
+                                  double sunk_start, double sunk_jump, double stop, double keep, double near,
+                                  const double *restrict shifts, int64_t cut, const int64_t *restrict closing,
+                                  float *restrict states, double *restrict scratch, double *restrict found);
+
+/* Fill `post` [sectors, states] with the probabilities of the states of a closed chain, of likelihoods `e` and transitions
+   `T` from rows to columns, by two rounds forward (which fill `f`) and backward. Scratch: [states + 2, states]. */
+KERNEL void smooth_states(int64_t sectors, int64_t states, const double *restrict e, const double *restrict T,
+                          double *restrict scratch, double *restrict f, double *restrict post);
+
+/* Fill `found` [sectors] with log-likelihoods of each sector by those before it, of a curve at one of the heights [n] of
+   widths `cells`, whose steps have the mean size `rough`, or lead anywhere with probability `jump`. Scratch: [5, n]. */
+KERNEL void pass_curve(int64_t sectors, int64_t n, const double *restrict likelihood, const double *restrict heights,
+                       const double *restrict cells, double rough, double jump, double *restrict scratch,
+                       double *restrict found);
+
+/* profiles.c */
+
+/* Fill `values` [m, knots], at horizons from `low` on, `step` apart (radians), with sums of l V + c V (1 - V) / 2 over
+   the rows [n] from `first` to `last` [m], of widths `sigma`. `cdf` [4097]: see common.h. */
+KERNEL void fill_profiles(int64_t n, int64_t m, int64_t knots, const double *restrict elevation,
+                          const double *restrict llr, const double *restrict extended, const double *restrict sigma,
+                          const int64_t *restrict first, const int64_t *restrict last, const double *restrict low,
+                          const double *restrict step, const double *restrict cdf, double *restrict values);
+
+/* Make cells (see profiles.h) between stars at heights `above` [stars], in order within a sector, whose first star is
+   `starts`; a star above the skyline counts its `llr`. Window from `lowest` to `highest`. The number of cells, or -1
+   where they are more than `room`: stars and 2 a sector are enough. */
+KERNEL int64_t fill_cells(int64_t stars, int64_t sectors, int64_t room, const double *restrict above,
+                          const double *restrict llr, const int64_t *restrict starts, double lowest, double highest,
+                          int64_t *restrict first, double *restrict x, double *restrict left);
+
+/* Make cells of those given [m], divided in widths of `cell` (radians) where the sky's light shows the skyline, with the
+   `values` [sectors, knots] of that light at heights from `low` on, `step` apart; step 0: none. The number of cells, or
+   -1 where they are more than `room`. */
+KERNEL int64_t add_sky(int64_t sectors, int64_t m, int64_t knots, int64_t room, const int64_t *restrict old_first,
+                       const double *restrict old_x, const double *restrict old_left, const double *restrict old_right,
+                       const double *restrict old_bend, const double *restrict low, const double *restrict step,
+                       const double *restrict cell, const double *restrict values, int64_t *restrict first,
+                       double *restrict x, double *restrict left, double *restrict right, double *restrict bend);
+
+/* Make cells of those given [m], with exp F averaged over a normal error `sigma` [sectors] of the skyline between `low`
+   and `high`, in so many equal cells (`counts`); by bins that end at `ends` [between + 1] sigma, of `weights`. No
+   mean is less than `least_mean`, relative to that over all heights. The number of cells, or -1 where they are more
+   than `room`. Scratch: [between + 1]. */
+KERNEL int64_t average_over_error(int64_t sectors, int64_t m, int64_t guides, int64_t between, int64_t room,
+                                  const int64_t *restrict old_first, const double *restrict old_x,
+                                  const double *restrict old_left, const double *restrict old_right,
+                                  const double *restrict old_bend, const double *restrict old_integral,
+                                  const double *restrict free, const int32_t *restrict guide,
+                                  const double *restrict sigma, const double *restrict low, const double *restrict high,
+                                  const int64_t *restrict counts, double highest, const double *restrict ends,
+                                  const double *restrict weights, double least_mean, int64_t *restrict scratch,
+                                  int64_t *restrict first, double *restrict x, double *restrict left,
+                                  double *restrict right, double *restrict bend);
+
+/* Fill `integral` [m] of exp(F - free) from the lowest height to x, `free` [sectors] (the logarithm of the mean of exp F
+   over a window of that `width`), and the guide to cells of heights up to `highest`. Simpson's rule. */
+KERNEL void integrate_cells(int64_t sectors, int64_t m, int64_t guides, const int64_t *restrict first,
+                            const double *restrict x, const double *restrict left, const double *restrict right,
+                            const double *restrict bend, double width, double highest, double *restrict integral,
+                            double *restrict free, int32_t *restrict guide);
+
+/* Fill mean and variance [sectors] of heights within `reach` (radians) of 0, by exp F. */
+KERNEL void fill_moments(int64_t sectors, int64_t m, int64_t guides, const int64_t *restrict first,
+                         const double *restrict x, const double *restrict left, const double *restrict right,
+                         const double *restrict bend, const int32_t *restrict guide, double highest, double reach,
+                         double *restrict mean, double *restrict variance);
+
+/* search.c */
+
+/* Add values [n] to `found` [sectors, count] at their places `at` (below 0: nowhere), then sum from the last place
+   downwards. */
+KERNEL void sum_above(int64_t n, int64_t sectors, int64_t count, const int64_t *restrict sector,
+                      const double *restrict at, const double *restrict value, double *restrict found);
+
+/* Fill `found` [sectors, count] with integrals of exp(F - best) up to elevations from `lowest` on, `step` apart, and
+   `best` [sectors] with the greatest F at an end of a cell. */
+KERNEL void fill_integral(int64_t sectors, int64_t m, int64_t count, const int64_t *restrict first,
+                          const double *restrict x, const double *restrict left, const double *restrict right,
+                          const double *restrict integral, const double *restrict free, double lowest, double step,
+                          double *restrict found, double *restrict best);
+
+/* Logarithm of the trace around the circle: every so many sectors are clear [n], or all is `hidden` [sectors]. `hide` and
+   `stop`: probabilities to hide all from one sector to the next, and no longer. */
+KERNEL double log_circle(int64_t n, int64_t sectors, const double *restrict clear, const double *restrict hidden,
+                         int64_t every, double hide, double stop);
+
+/* Fill `found` [n] with upper bounds of log-likelihoods where skylines are between `low` and `high` [n, sectors]. The
+   tables [sectors, count] begin at `lowest` and are `step` apart; `epsilon`: least likelihood of a sector beside its
+   best. NaN counts as the lowest elevation. Scratch: [sectors]. */
+KERNEL void fill_bounds(int64_t sectors, int64_t count, int64_t n, const double *restrict visible,
+                        const double *restrict open_from, const double *restrict open_above,
+                        const double *restrict best, const double *restrict hidden, const double *restrict low,
+                        const double *restrict high, double lowest, double step, double epsilon, double hide,
+                        double stop, double *restrict scratch, double *restrict found);
+
+/* Fill `found` [n] with log-likelihoods where skylines are anywhere between `low` and `high` [n, seen], of evenly spread
+   sectors. Scratch: [seen]. */
+KERNEL void fill_averages(int64_t sectors, int64_t count, int64_t n, int64_t seen, const double *restrict integral,
+                          const double *restrict hidden, const double *restrict low, const double *restrict high,
+                          double lowest, double step, double epsilon, double hide, double stop,
+                          double *restrict scratch, double *restrict found);
+
 /* photometry.c */
 
 /* Fill `across` and `down` [n, wide] with the profiles of stars at `xy_px` [n, 2] in x and in y about their middle

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-# mypy: disable-error-code="no-untyped-def"
 import numpy as np
 
-from startrack.core.kernels import njit
 from startrack.core.types import Array, Ints
+from startrack.kernels.library import kernel
 from startrack.localization.obstacle_chain import MOVES, STATES, Moves
 
 CLEAR = 1e-3  # least probability of a state over which the circle is closed
@@ -27,43 +26,23 @@ def transitions(moves: Moves = MOVES) -> Array:
     return T
 
 
-@njit(cache=True)
-def _smooth(e, T):
+def _smooth(e: Array, T: Array) -> Array:
     """Posterior (SECTORS, STATES) by two rounds forward and backward: the second has forgotten where it began."""
-    sectors, states = e.shape
-    f, post, a, b = np.zeros((sectors, states)), np.zeros((sectors, states)), np.zeros(states), np.zeros(states)
-    for step in range(2 * sectors):
-        s, total = step % sectors, 0.0
-        for j in range(states):
-            moved = 1.0 if step == 0 else 0.0
-            for i in range(states):
-                moved += a[i] * T[i, j]
-            f[s, j] = moved * e[s, j]
-            total += f[s, j]
-        for j in range(states):
-            f[s, j] /= total
-            a[j] = f[s, j]
-    for j in range(states):
-        a[j] = 1.0
-    for step in range(2 * sectors):
-        s, total, whole = sectors - 1 - step % sectors, 0.0, 0.0
-        for j in range(states):
-            post[s, j], b[j] = f[s, j] * a[j], a[j] * e[s, j]
-            total += post[s, j]
-        for i in range(states):
-            post[s, i] /= total
-            a[i] = 0.0
-            for j in range(states):
-                a[i] += T[i, j] * b[j]
-            whole += a[i]
-        for i in range(states):
-            a[i] /= whole
+    post = np.empty_like(e)
+    _smooth_states(e, T, np.empty((e.shape[1] + 2, e.shape[1])), np.empty_like(e), post)
     return post
+
+
+_smooth_states = kernel(
+    "smooth_states", "e: float64[sectors, states]", "T: float64[states, states]",
+    "scratch: out float64[states + 2, states]", "f: out float64[sectors, states]",
+    "post: out float64[sectors, states]",
+)  # fmt: skip
 
 
 def state_probabilities(likelihoods: Array, moves: Moves = MOVES) -> Array:
     """Probabilities (SECTORS, STATES) of the states by their likelihoods (SECTORS, STATES)."""
-    return np.asarray(_smooth(likelihoods, transitions(moves)))
+    return np.asarray(_smooth(np.ascontiguousarray(likelihoods), transitions(moves)))
 
 
 def closing_of(states: Array) -> tuple[int, Ints]:

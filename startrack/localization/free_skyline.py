@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-# mypy: disable-error-code="no-untyped-def"
-from math import exp, log
+from math import log
 
 import numpy as np
 
-from startrack.core.kernels import njit
 from startrack.core.types import Array
+from startrack.kernels.library import kernel
 from startrack.localization.obstacle_chain import clear_emissions
 from startrack.localization.profile_cells import LOW_RAD, Profiles
 
@@ -34,45 +33,14 @@ def list_free_logs(profiles: Profiles, shift: Array, reach_rad: float, roughness
     return np.array([_pass(likelihood, heights, cells, rough) for rough in roughness_rad])
 
 
-@njit(cache=True)
-def _pass(likelihood, heights, cells, rough):
-    """Log-likelihoods (SECTORS,) by one pass around the circle, with steps of a mean size `rough` to either side.
-
-    The sums over exp(-|x - x'| / rough) are two recursions, up and down.
-    """
-    n, whole, found = len(heights), 0.0, np.empty(len(likelihood))
-    for i in range(n):
-        whole += cells[i]
-    a, fall, norm = np.empty(n), np.empty(n), _spread(cells, heights, rough)
-    for i in range(n):
-        a[i] = cells[i] / whole
-    for s in range(len(likelihood)):
-        if s > 0:
-            for i in range(n):
-                fall[i] = a[i] / norm[i]
-            moved = _spread(fall, heights, rough)
-            for i in range(n):
-                a[i] = cells[i] * ((1.0 - JUMP) * moved[i] + JUMP / whole)
-        total = 0.0
-        for i in range(n):
-            a[i] *= likelihood[s, i]
-            total += a[i]
-        for i in range(n):
-            a[i] /= total
-        found[s] = log(total)
+def _pass(likelihood: Array, heights: Array, cells: Array, rough: float) -> Array:
+    """Log-likelihoods (SECTORS,) by one pass around the circle, with steps of a mean size `rough` to either side."""
+    found = np.empty(len(likelihood))
+    _pass_curve(likelihood, heights, cells, rough, JUMP, np.empty((5, len(heights))), found)
     return found
 
 
-@njit(cache=True)
-def _spread(values, heights, rough):
-    """Sums (n,) over j of values[j] exp(-|heights[i] - heights[j]| / rough)."""
-    n = len(values)
-    found = values.copy()
-    up, down = values[0], 0.0
-    for i in range(1, n):
-        up = up * exp((heights[i - 1] - heights[i]) / rough) + values[i]
-        found[i] = up
-    for i in range(n - 2, -1, -1):
-        down = (down + values[i + 1]) * exp((heights[i] - heights[i + 1]) / rough)
-        found[i] += down
-    return found
+_pass_curve = kernel(
+    "pass_curve", "likelihood: float64[sectors, n]", "heights: float64[n]", "cells: float64[n]", "rough: float64",
+    "jump: float64", "scratch: out float64[5, n]", "found: out float64[sectors]",
+)  # fmt: skip

@@ -7,14 +7,10 @@ step. Source: solution separation, as in Blanch et al. 2015, IEEE Trans. AES 51(
 
 from __future__ import annotations
 
-# mypy: disable-error-code="no-untyped-def"
-from math import log
-
 import numpy as np
 
-from startrack.core.kernels import njit
 from startrack.core.types import SECTORS, Array, Bools, Integrity
-from startrack.localization.obstacle_chain import fill_clear_emissions
+from startrack.localization.obstacle_chain import log_clear_emissions
 from startrack.localization.profile_cells import Profiles
 from startrack.localization.skyline_model import SkylineModel
 
@@ -89,18 +85,7 @@ def clear_logs(profiles: Profiles, shifts: Array, clear: Array) -> Array:
 
     `shifts` (n, SECTORS) [rad] are of the skyline, which has the `profiles`.
     """
-    # In one layout they are compiled once.
-    return np.asarray(_clear_logs(profiles, np.ascontiguousarray(shifts.T), np.ascontiguousarray(clear)))
-
-
-@njit(cache=True)
-def _clear_logs(profiles, shifts, clear):
-    found = np.empty(shifts.shape)
-    fill_clear_emissions(profiles, shifts, found)
-    for s in range(found.shape[0]):
-        for i in range(found.shape[1]):
-            found[s, i] = log(clear[s] * found[s, i] + 1.0 - clear[s])
-    return found.T
+    return log_clear_emissions(profiles, shifts.T, clear).T
 
 
 def _moments(offsets_m: Array, logs: Array) -> tuple[Array, Array]:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-# mypy: disable-error-code="no-untyped-def"
-from math import copysign, exp, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from startrack.core.kernels import njit
 from startrack.core.types import Array, Ints
+from startrack.kernels.library import kernel
 
 LOW_RAD, HIGH_RAD = np.radians(-12.0), np.radians(20.0)  # window of heights: beyond it a skyline is no skyline
 GUIDE = 256  # heights of the guide to the cells, to each side
@@ -36,76 +34,34 @@ class Profiles(NamedTuple):
     offset: Array  # (SECTORS,) N: all likelihoods of a sector are less it
 
 
-@njit(cache=True, inner=True)
-def integrate_cells(first, x, left, right, bend, width):
-    """The cells with `free`, the guide and the integral; each cell by Simpson's rule."""
+FORMS = {"first": "int64[sectors + 1]", "guide": "int32[sectors, guides]"}
+FORMS |= dict.fromkeys(("x", "left", "right", "bend", "integral"), "float64[m]")
+FORMS |= dict.fromkeys(("free", "scale", "hidden"), "float64[sectors]")
+
+
+def declare(names: str, prefix: str = "", size: str = "m") -> list[str]:
+    """Declarations of the arrays of Profiles with these `names`, for a kernel; `size`: name of the number of cells."""
+    return [f"{prefix}{name}: {FORMS[name].replace('[m]', f'[{size}]')}" for name in names.split()]
+
+
+def take(profiles: Profiles, names: str) -> list[Array]:
+    """The arrays of `profiles` with these `names`, as `declare` declares them."""
+    return [getattr(profiles, name) for name in names.split()]
+
+
+Cells = tuple[Ints, Array, Array, Array, Array, Array, Array, Any]  # the first fields of Profiles
+
+
+def integrate_cells(first: Ints, x: Array, left: Array, right: Array, bend: Array, width: float) -> Cells:
+    """The cells with `integral`, `free` and the guide, for a window of that `width`; each cell by Simpson's rule."""
     sectors = len(first) - 1
     integral, free = np.zeros(len(x)), np.zeros(sectors)
-    for s in range(sectors):
-        top = -np.inf
-        for k in range(first[s], first[s + 1] - 1):
-            top = max(top, left[k], right[k], 0.5 * (left[k] + right[k]) + 0.25 * bend[k])
-        total = 0.0
-        for k in range(first[s], first[s + 1] - 1):
-            integral[k] = total
-            middle = exp(0.5 * (left[k] + right[k]) + 0.25 * bend[k] - top)
-            total += (x[k + 1] - x[k]) / 6.0 * (exp(left[k] - top) + 4.0 * middle + exp(right[k] - top))
-        last = first[s + 1] - 1
-        integral[last] = total
-        free[s] = top + np.log(total / width)
-        for k in range(first[s], last + 1):
-            integral[k] *= width / total
-    return first, x, left, right, bend, integral, free, _guide_to(first, x)
+    guide = np.empty((sectors, 2 * GUIDE + 1), np.int32)
+    _integrate(first, x, left, right, bend, width, HIGH_RAD, integral, free, guide)
+    return first, x, left, right, bend, integral, free, guide
 
 
-@njit(cache=True, inner=True)
-def _guide_to(first, x):
-    """The `guide`: the cell (SECTORS, 2 GUIDE + 1) that holds each of its heights."""
-    found = np.empty((len(first) - 1, 2 * GUIDE + 1), dtype=np.int32)
-    for s in range(len(found)):
-        k, last = first[s], first[s + 1] - 2
-        for i in range(2 * GUIDE + 1):
-            u = i / GUIDE - 1.0
-            while k < last and x[k + 1] <= u * abs(u) * HIGH_RAD:
-                k += 1
-            found[s, i] = k
-    return found
-
-
-@njit(cache=True, inline="always")
-def cell_at(x, guide, s, height):
-    """The cell of a sector that holds a height, or the nearest one."""
-    u = copysign(sqrt(abs(height) * (1.0 / HIGH_RAD)), height)
-    i = min(max(int((u + 1.0) * GUIDE), 0), 2 * GUIDE - 1)
-    k, last = guide[s, i], guide[s, i + 1]
-    k += k < last and x[k + 1] <= height
-    while k < last and x[k + 1] <= height:
-        k += 1
-    return k
-
-
-@njit(cache=True, inline="always")
-def value_in(profiles, k, u):
-    """F at a part u of the way through cell k."""
-    return profiles.left[k] + u * (profiles.right[k] - profiles.left[k]) + u * (1.0 - u) * profiles.bend[k]
-
-
-@njit(cache=True)
-def log_at(profiles, s, height):
-    """F - R of a sector at a height."""
-    if height >= HIGH_RAD:
-        return -profiles.free[s]
-    k = cell_at(profiles.x, profiles.guide, s, height)
-    u = min(max((height - profiles.x[k]) / (profiles.x[k + 1] - profiles.x[k]), 0.0), 1.0)
-    return value_in(profiles, k, u) - profiles.free[s]
-
-
-@njit(cache=True)
-def integral_to(profiles, s, height):
-    """Integral of exp(F - R) of a sector up to a height; constant beyond the window's ends, where none is."""
-    if height >= HIGH_RAD:
-        last = profiles.first[s + 1] - 1
-        return profiles.integral[last] + (height - HIGH_RAD) * exp(-profiles.free[s])
-    k = cell_at(profiles.x, profiles.guide, s, height)
-    u = (height - profiles.x[k]) / (profiles.x[k + 1] - profiles.x[k])
-    return profiles.integral[k] + u * (profiles.integral[k + 1] - profiles.integral[k])
+_integrate = kernel(
+    "integrate_cells", *declare("first x left right bend"), "width: float64", "highest: float64",
+    "integral: out float64[m]", "free: out float64[sectors]", "guide: out int32[sectors, guides]",
+)  # fmt: skip

@@ -9,15 +9,15 @@ row that its skylines may meet as it suits best.
 
 from __future__ import annotations
 
-# mypy: disable-error-code="no-untyped-def"
 from dataclasses import dataclass, replace
-from math import exp, floor, log
+from math import exp
 
 import numpy as np
 
-from startrack.core.kernels import njit
 from startrack.core.types import SECTORS, Array, Evidence, Ints, sector_of
+from startrack.kernels.library import kernel
 from startrack.localization.obstacle_chain import STOP
+from startrack.localization.profile_cells import declare, take
 from startrack.localization.skyline_profiles import EDGE_SIGMAS, ROW_NATS, profiles_of
 
 SEARCH_EPSILON = 0.1  # e: an obstacle costs the true position 2.3 nats a sector
@@ -26,6 +26,7 @@ SLACK_NATS = 44.0  # by which the published model may favour a position over the
 HIDE = exp(-SLACK_NATS)  # that all is hidden from one sector to the next: beside a wall the rest must not count less
 STEP_RAD = np.radians(0.04)  # between them: boxes of 12 m see a rim 10 km away in 0.14 degrees
 COUNT = int((HIGHEST_RAD - LOWEST_RAD) / STEP_RAD) + 1
+TABLE = LOWEST_RAD, STEP_RAD, SEARCH_EPSILON, HIDE, STOP  # for the kernels
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +49,7 @@ class SearchProfiles:
         llr = _counted_llr(rows)
         most = _greatest_contributions(llr, rows.extended_nats)
         integral, best = np.empty((SECTORS, COUNT)), np.empty(SECTORS)
-        _fill_integral(profiles, integral, best)
+        _fill_integral(*take(profiles, _CELLS), LOWEST_RAD, STEP_RAD, integral, best)
         return cls(
             _sum_above(sector, rows.elevation_rad - margin, llr),
             _sum_above(sector, rows.elevation_rad + margin, most),
@@ -60,14 +61,14 @@ class SearchProfiles:
         found = np.empty(len(low_rad))
         _fill_bounds(
             self.visible, self.open_from, self.open_above, self.best, self.hidden, np.ascontiguousarray(low_rad),
-            np.ascontiguousarray(high_rad), found,
+            np.ascontiguousarray(high_rad), *TABLE, np.empty(len(self.best)), found,
         )  # fmt: skip
         return found
 
     def score(self, sums: Array) -> float:
         """Log-likelihood of sums (SECTORS,) of the contributions of rows."""
         clear = (1.0 - SEARCH_EPSILON) * np.exp(np.minimum(sums - self.best, 0.0)) + SEARCH_EPSILON
-        return float(_log_circle(clear, self.hidden, 1))
+        return float(_log_circle(clear, self.hidden, 1, HIDE, STOP))
 
     def average(self, low_rad: Array, high_rad: Array) -> Array:
         """Log-likelihoods (n,) where skylines are anywhere between (n, m) and (n, m), for m evenly spread sectors.
@@ -75,7 +76,8 @@ class SearchProfiles:
         Each sector's skyline is equally likely anywhere there, independently of the others.
         """
         found = np.empty(len(low_rad))
-        _fill_averages(self.integral, self.hidden, np.ascontiguousarray(low_rad), np.ascontiguousarray(high_rad), found)
+        low_rad, high_rad = np.ascontiguousarray(low_rad), np.ascontiguousarray(high_rad)
+        _fill_averages(self.integral, self.hidden, low_rad, high_rad, *TABLE, np.empty(low_rad.shape[1]), found)
         return found
 
 
@@ -113,75 +115,27 @@ def _sum_above(sector: Ints, elevation_rad: Array, value: Array) -> Array:
     return found
 
 
-@njit(cache=True)
-def _fill_sums(sector, at, value, found):
-    for k in range(len(sector)):
-        if at[k] >= 0.0:
-            found[sector[k], min(int(at[k]), COUNT - 1)] += value[k]
-    for s in range(len(found)):
-        for i in range(COUNT - 2, -1, -1):
-            found[s, i] += found[s, i + 1]
-
-
-@njit(cache=True)
-def _fill_integral(profiles, integral, best):
-    for s in range(len(best)):
-        k, last = profiles.first[s], profiles.first[s + 1] - 1
-        best[s] = -np.inf
-        for j in range(k, last):
-            best[s] = max(best[s], profiles.left[j], profiles.right[j])
-        scale = exp(profiles.free[s] - best[s])
-        for i in range(integral.shape[1]):
-            at = LOWEST_RAD + i * STEP_RAD
-            while k < last - 1 and profiles.x[k + 1] <= at:
-                k += 1
-            u = (at - profiles.x[k]) / (profiles.x[k + 1] - profiles.x[k])
-            integral[s, i] = scale * (profiles.integral[k] + u * (profiles.integral[k + 1] - profiles.integral[k]))
-
-
-@njit(cache=True)
-def _fill_bounds(visible, open_from, open_above, best, hidden, low, high, found):
-    clear = np.empty(len(best))
-    for n in range(len(found)):
-        for s in range(len(best)):
-            a = min(max(floor((low[n, s] - LOWEST_RAD) / STEP_RAD), 0), COUNT - 2)
-            b = min(max(floor((high[n, s] - LOWEST_RAD) / STEP_RAD), 0), COUNT - 2) + 1
-            value = visible[s, b] + open_from[s, a] - open_above[s, b] - best[s]
-            clear[s] = 1.0  # within a sector a real skyline hardly beats the best level one
-            if value < 0.0:
-                clear[s] = (1.0 - SEARCH_EPSILON) * exp(value) + SEARCH_EPSILON
-        found[n] = _log_circle(clear, hidden, 1)
-
-
-@njit(cache=True)
-def _fill_averages(integral, hidden, low, high, found):
-    every, clear = len(integral) // low.shape[1], np.empty(low.shape[1])
-    for n in range(len(found)):
-        for k in range(low.shape[1]):
-            rise = _integral_to(integral[k * every], high[n, k]) - _integral_to(integral[k * every], low[n, k])
-            mean = min(max(rise / (high[n, k] - low[n, k]), 0.0), 1.0)
-            clear[k] = (1.0 - SEARCH_EPSILON) * mean + SEARCH_EPSILON
-        found[n] = _log_circle(clear, hidden, every)
-
-
-@njit(cache=True)
-def _log_circle(clear, hidden, every):
-    """Logarithm of the trace around the circle: every so many sectors that are clear, or in which all is hidden."""
-    total, a, b, c, d = 0.0, 1.0, 0.0, 0.0, 1.0  # rows of the product: begun clear, begun hidden
-    for k in range(len(clear)):
-        e, h = clear[k], hidden[k * every]
-        a, b = (a * (1.0 - HIDE) + b * STOP) * e, (a * HIDE + b * (1.0 - STOP)) * h
-        c, d = (c * (1.0 - HIDE) + d * STOP) * e, (c * HIDE + d * (1.0 - STOP)) * h
-        if k % 16 == 15:
-            size = a + b + c + d
-            a, b, c, d = a / size, b / size, c / size, d / size
-            total += log(size)
-    return total + log(a + d)
-
-
-@njit(cache=True, inner=True)
-def _integral_to(integral, elevation):
-    """The integral of a sector up to an elevation, linear between those of the table."""
-    at = (elevation - LOWEST_RAD) / STEP_RAD
-    i = min(max(floor(at), 0), COUNT - 2)
-    return integral[i] + (at - i) * (integral[i + 1] - integral[i])
+# Adds to found (SECTORS, COUNT) the values of rows at their place in the table, and sums from the highest downwards.
+_fill_sums = kernel(
+    "sum_above", "sector: int64[n]", "at: float64[n]", "value: float64[n]", "found: out float64[sectors, count]"
+)
+_CELLS = "first x left right integral free"
+_fill_integral = kernel(
+    "fill_integral", *declare(_CELLS), "lowest: float64", "step: float64", "found: out float64[sectors, count]",
+    "best: out float64[sectors]",
+)  # fmt: skip
+_CIRCLE = ("hide: float64", "stop: float64")
+_TABLE = ("lowest: float64", "step: float64", "epsilon: float64", *_CIRCLE)
+_fill_bounds = kernel(
+    "fill_bounds", *(f"{name}: float64[sectors, count]" for name in ("visible", "open_from", "open_above")),
+    "best: float64[sectors]", "hidden: float64[sectors]", "low: float64[n, sectors]", "high: float64[n, sectors]",
+    *_TABLE, "scratch: out float64[sectors]", "found: out float64[n]",
+)  # fmt: skip
+_fill_averages = kernel(
+    "fill_averages", "integral: float64[sectors, count]", "hidden: float64[sectors]", "low: float64[n, seen]",
+    "high: float64[n, seen]", *_TABLE, "scratch: out float64[seen]", "found: out float64[n]",
+)  # fmt: skip
+# Logarithm of the trace around the circle: every so many sectors that are clear, or in which all is hidden.
+_log_circle = kernel(
+    "log_circle", "clear: float64[n]", "hidden: float64[sectors]", "every: int64", *_CIRCLE, result="float64"
+)

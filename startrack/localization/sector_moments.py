@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-# mypy: disable-error-code="no-untyped-def"
-from math import exp
 from typing import NamedTuple
 
 import numpy as np
 
-from startrack.core.kernels import njit
 from startrack.core.types import Array
-from startrack.localization.profile_cells import Profiles, cell_at
+from startrack.kernels.library import kernel
+from startrack.localization.profile_cells import HIGH_RAD, Profiles, declare, take
 
 REACH_RAD = np.radians(1.2)  # of heights about the reference's skyline
 LEAST_SIGMA_RAD, LEAST_SHOWN_PART = 1e-7, 1e-9
@@ -33,32 +31,15 @@ class SectorMoments(NamedTuple):
 def measure_moments(profiles: Profiles) -> SectorMoments:
     """Moments of all sectors, every height within REACH_RAD equally likely before."""
     mean, variance = np.empty(len(profiles.free)), np.empty(len(profiles.free))
-    _fill_moments(profiles, REACH_RAD, mean, variance)
+    _fill_moments(*take(profiles, _CELLS), HIGH_RAD, REACH_RAD, mean, variance)
     return SectorMoments(mean, np.maximum(variance, LEAST_SIGMA_RAD**2))
 
 
-@njit(cache=True)
-def _fill_moments(profiles, reach, mean, variance):
-    for s in range(len(mean)):
-        last = profiles.first[s + 1] - 1
-        begin = cell_at(profiles.x, profiles.guide, s, -reach)
-        top, k = -np.inf, begin
-        while k < last and profiles.x[k] < reach:
-            top = max(top, profiles.left[k], profiles.right[k])
-            k += 1
-        total, first, second, k = 0.0, 0.0, 0.0, begin
-        while k < last and profiles.x[k] < reach:
-            a, b = max(profiles.x[k], -reach), min(profiles.x[k + 1], reach)
-            middle, width = 0.5 * (a + b), b - a
-            u = (middle - profiles.x[k]) / (profiles.x[k + 1] - profiles.x[k])
-            at = profiles.left[k] + u * (profiles.right[k] - profiles.left[k]) + u * (1.0 - u) * profiles.bend[k]
-            weight = width * exp(min(at - top, 50.0))
-            total += weight
-            first += weight * middle
-            second += weight * (middle * middle + width * width / 12.0)
-            k += 1
-        mean[s] = first / total
-        variance[s] = second / total - mean[s] * mean[s]
+_CELLS = "first x left right bend guide"
+_fill_moments = kernel(
+    "fill_moments", *declare(_CELLS), "highest: float64", "reach: float64", "mean: out float64[sectors]",
+    "variance: out float64[sectors]",
+)  # fmt: skip
 
 
 def heavy_log_likelihood(moments: SectorMoments, rise_rad: Array) -> float:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-# mypy: disable-error-code="no-untyped-def"
 import numpy as np
 
-from startrack.core.kernels import njit, normal_cdf
+from startrack.core.kernels import NORMAL_CDF
 from startrack.core.types import Array, Evidence, Ints
+from startrack.kernels.library import kernel
 
 EDGE_SIGMAS = 8.0  # beyond this the edge of a single row is not computed, and splines of rows are constant
 KNOT_SIGMAS = 0.2  # of the edge: distance of the knots; a cubic errs by 0.03 nats in a sector of 2e4 nats
@@ -42,18 +42,14 @@ class SkyProfiles:
         values = np.empty((len(first), knots))
         _fill_profiles(
             elevation, evidence.llr[rows], evidence.extended_nats[rows], evidence.edge_sigma_rad[rows], first, last,
-            low, step, values,
+            low, step, NORMAL_CDF, values,
         )  # fmt: skip
         return cls(rows[first], low, step, values)
 
 
-@njit(cache=True)
-def _fill_profiles(elevation, llr, extended, sigma, first, last, low, step, values):
-    """Fill values (m, knots) with sums of l V + c V (1 - V) / 2 over the rows from first to last (m,)."""
-    for m in range(len(first)):
-        for j in range(values.shape[1]):
-            horizon, total = low[m] + j * step[m], 0.0
-            for k in range(first[m], last[m] + 1):
-                visible = normal_cdf((elevation[k] - horizon) / sigma[k])
-                total += visible * (llr[k] + 0.5 * extended[k] * (1.0 - visible))
-            values[m, j] = total
+# Fills values (m, knots) with sums of l V + c V (1 - V) / 2 over the rows from first to last (m,).
+_fill_profiles = kernel(
+    "fill_profiles", "elevation: float64[n]", "llr: float64[n]", "extended: float64[n]", "sigma: float64[n]",
+    "first: int64[m]", "last: int64[m]", "low: float64[m]", "step: float64[m]", f"cdf: float64[{len(NORMAL_CDF)}]",
+    "values: out float64[m, knots]",
+)  # fmt: skip

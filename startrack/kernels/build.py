@@ -28,7 +28,7 @@ ZIGLANG = "ziglang>=0.13,<0.18"  # a C compiler as a Python package, for machine
 X86_64 = ("x86_64", "amd64")
 # No fast arithmetic and no contraction: all compilers and both levels give the same bytes. The kernels read neither
 # `errno` nor the flags of floating-point exceptions.
-FLAGS = ("-std=c99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math")
+FLAGS = ("-std=c99", "-O3", "-fno-fast-math", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math")
 V3 = ("-mavx", "-mavx2", "-mbmi", "-mbmi2", "-mf16c", "-mfma", "-mlzcnt", "-mmovbe")  # of x86-64-v3, for old compilers
 SANITIZED = ("-O1", "-g", "-fno-omit-frame-pointer", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined")
 PROBE = "#include <math.h>\n#if defined(_WIN32)\n__declspec(dllexport)\n#endif\ndouble probe(double x) {return exp(x);}"
@@ -158,7 +158,9 @@ def _candidates(with_zig: bool) -> Iterator[Compiler]:
 
 def _check(compiler: Compiler) -> None:
     """Raise BuildFailed unless the compiler builds a library for each level, and Python can call it."""
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+    # Beside the sources: some systems run nothing from their folder for temporary files.
+    place = FOLDER if os.access(FOLDER, os.W_OK) else None
+    with tempfile.TemporaryDirectory(prefix="probe-", dir=place, ignore_cleanup_errors=True) as folder:
         source = Path(folder, "probe.c")
         source.write_text(PROBE)
         for level in reversed(levels()):

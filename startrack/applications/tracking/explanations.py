@@ -2,7 +2,7 @@
 
 An explanation states of each image whether it is of this camera, and which of its positions is right; of each move,
 whether the wheels slipped, in it alone or alike in the moves of a leg; and of the odometry, whether it is as stated or
-wrong as a whole. Each has a prior (the constants below) and a likelihood: that of a Kalman filter without posts, whose
+wrong as a whole. Each has a prior (the constants below) and a likelihood: that of the filter without posts, whose
 errors count as the image's own. An image that is not of the track is anywhere, or near its place with a gross error.
 The moves are turned by the attitude of the last image that an explanation takes as right.
 """
@@ -18,6 +18,7 @@ from startrack.applications.tracking.branches import Branches
 from startrack.applications.tracking.moves import FREEDOMS, LEG_FREEDOMS, Moves
 from startrack.core.types import Array, Ints
 from startrack.estimation.observations import FrameEstimate, Steps
+from startrack.estimation.trajectory import TrackFilter, log_normal
 
 SLIP_PROBABILITY, SLIP_SIGMA_M = 0.05, 20.0  # of a move by wheel slip, and its size on each axis
 LEG_PROBABILITY, LEG_END_PROBABILITY = 0.05, 0.2  # that a leg begins with a move, and that a move of it is its last
@@ -128,17 +129,18 @@ class Explanations:
     def _explanation(self, one: Branches, share: float, n: int) -> Explanation:
         mode, kind, anchor = one.history[0].T
         return Explanation(
-            share, self._moves[one.odometry[0]], int(one.odometry[0]), mode, kind[1:], anchor[1:n], one.mean[0, :2],
-            one.covariance[0, :2, :2],
+            share, self._moves[one.odometry[0]], int(one.odometry[0]), mode, kind[1:], anchor[1:n],
+            one.state.position_m, one.state.covariance_m2,
         )  # fmt: skip
 
     def _start(self) -> Branches:
-        count, more = len(self._moves), np.ones(FREEDOMS + LEG_FREEDOMS)
-        prior = np.diag(np.square(np.append(self._free_sigma, more)))
+        count = len(self._moves)
+        state = TrackFilter.start(
+            self.shared_count, FREEDOMS, LEG_FREEDOMS, count=count, unknown_m=FOREIGN_SIGMA_M
+        )  # fmt: skip
         nothing, none = np.zeros(count), np.zeros(count, dtype=np.int64)
         return Branches(
-            np.array([m.log_prior for m in self._moves]), nothing, none, np.zeros((count, len(prior))),
-            np.tile(prior, (count, 1, 1)), np.arange(count), none,
+            np.array([m.log_prior for m in self._moves]), nothing, none, state, np.arange(count), none,
             np.zeros((count, 1, 3), dtype=np.int64),
         )  # fmt: skip
 
@@ -156,20 +158,12 @@ class Explanations:
         sigma = np.array([m.sigma_m[step] for m in self._moves])[one.odometry]
         freedom = np.array([m.freedom_m[step] for m in self._moves])[one.odometry]
         move = np.einsum("bij,bj->bi", turn, delta)[:, :2]
-        lost = ~(np.isfinite(move).all(axis=1) & np.isfinite(sigma))
-        shift = np.tile(np.eye(one.mean.shape[1]), (len(lost), 1, 1))
-        all_moves = slice(-FREEDOMS - LEG_FREEDOMS, -LEG_FREEDOMS)
-        shift[:, :2, all_moves] = np.where(lost[:, None, None], 0.0, (turn @ freedom)[:, :2])
-        mean = np.einsum("bij,bj->bi", shift, one.mean)
-        covariance = shift @ one.covariance @ shift.swapaxes(1, 2)
-        mean[:, :2] = np.where(lost[:, None], 0.0, mean[:, :2] + move)
-        covariance[lost, :2], covariance[lost, :, :2] = 0.0, 0.0
-        covariance[:, [0, 1], [0, 1]] += np.square(np.where(lost, FOREIGN_SIGMA_M, sigma))[:, None]
+        sigma = np.where(np.isfinite(move).all(axis=1), sigma, np.inf)
+        lost, state = np.isinf(sigma), one.state.take(slice(None))
+        state.move(move, sigma, (turn @ freedom)[:, :2])
         entry = np.stack([np.zeros_like(one.anchor), np.zeros_like(one.anchor), one.anchor], axis=-1)
         history = np.concatenate([one.history, entry[:, None]], axis=1)
-        moved = Branches(
-            one.log_likelihood, one.log_wrong, one.wrong, mean, covariance, one.odometry, one.anchor, history
-        )
+        moved = Branches(one.log_likelihood, one.log_wrong, one.wrong, state, one.odometry, one.anchor, history)
         if not self.may_slip:
             return moved
         may_begin = ~lost & np.array([m.has_legs and not m.fault for m in self._moves])[one.odometry]
@@ -188,46 +182,31 @@ class Explanations:
             branches.log_likelihood += log_prior[may]
             branches.history[:, -1, 1] = kind
             if kind == SLIPS:
-                branches.covariance[:, [0, 1], [0, 1]] += SLIP_SIGMA_M**2
+                branches.state.add_noise(SLIP_SIGMA_M)
             elif kind != STRAIGHT:
-                branches.move_by_leg(by_leg[may], is_new=kind == BEGINS)
+                branches.state.move_by_leg(by_leg[may], is_new=kind == BEGINS)
             parts.append(branches)
         return Branches.join(parts)
 
     def _used(self, one: Branches, number: int, mode: FrameEstimate, anchor: Ints) -> Branches:
-        residual, covariance, noise = self._innovation(one, mode)
-        seen = np.pad(mode.response, ((0, 0), (0, FREEDOMS + LEG_FREEDOMS)))
-        cross = one.covariance @ seen.T
-        gain = np.linalg.solve(covariance, cross.swapaxes(1, 2)).swapaxes(1, 2)
-        found = _decided(
-            one, one.log_likelihood + np.log(mode.weight) + log_normal(residual, covariance), number, anchor
-        )
-        found.mean = one.mean + np.einsum("bij,bj->bi", gain, residual)
-        rest = np.eye(one.mean.shape[1]) - gain @ seen
-        found.covariance = rest @ one.covariance @ rest.swapaxes(1, 2) + gain @ noise @ gain.swapaxes(1, 2)
+        found = _decided(one, one.log_likelihood + np.log(mode.weight), number, anchor)
+        found.log_likelihood += found.state.update(mode.without_posts)
         return found
 
     def _wrong(self, one: Branches, modes: Sequence[FrameEstimate]) -> Branches:
         """The frame is not of the track: anywhere, or near with a gross error; its shared errors are its own."""
         near, free = np.r_[[WRONG_SIGMA_M**2] * 2, np.ones(self.shared_count)], np.square(self._free_sigma)
         parts = []
-        for mode in modes:
-            residual, covariance, noise = self._innovation(one, mode)
+        for mode in (mode.without_posts for mode in modes):
+            residual, covariance, _ = one.state.innovation(mode)
             gross = covariance + (mode.response * near) @ mode.response.T
-            anywhere = log_normal(mode.mean, (mode.response * free) @ mode.response.T + noise)
+            anywhere = log_normal(mode.mean, (mode.response * free) @ mode.response.T + mode.noise)
             either = np.logaddexp(log_normal(residual, gross), anywhere) - np.log(2.0)
             parts.append(np.log(mode.weight) + either)
         likelihood = np.logaddexp.reduce(parts)
         found = _decided(one, one.log_likelihood + likelihood, -1, one.anchor)
         found.log_wrong, found.wrong = one.log_wrong + likelihood, one.wrong + 1
         return found
-
-    def _innovation(self, one: Branches, mode: FrameEstimate) -> tuple[Array, Array, Array]:
-        """Observation less prediction (b, p), its covariance (b, p, p), and the part by the frame itself (p, p)."""
-        noise = mode.noise + mode.by_post @ mode.by_post.T
-        p = mode.parameters
-        covariance = mode.response @ one.covariance[:, :p, :p] @ mode.response.T + noise
-        return mode.mean - one.mean[:, :p] @ mode.response.T, covariance, noise
 
     def _wrong_prior(self, wrong: Ints) -> Array:
         """Logarithm of the prior of so many wrong frames: single ones, or a set with images from elsewhere."""
@@ -274,13 +253,5 @@ def _decided(one: Branches, log_likelihood: Array, mode: int, anchor: Ints) -> B
     """The same with a decision about the last frame."""
     history = one.history.copy()
     history[:, -1, 0] = mode
-    return Branches(
-        log_likelihood, one.log_wrong, one.wrong, one.mean, one.covariance, one.odometry, anchor, history
-    )  # fmt: skip
-
-
-def log_normal(residual: Array, covariance: Array) -> Array:
-    """Logarithm of normal densities at residuals (..., p) with covariances (..., p, p)."""
-    chi2 = np.einsum("...i,...ij,...j->...", residual, np.linalg.inv(covariance), residual)
-    size = residual.shape[-1] * np.log(2.0 * np.pi)
-    return np.asarray(-0.5 * (chi2 + size + np.linalg.slogdet(covariance)[1]))
+    state = one.state.take(slice(None))
+    return Branches(log_likelihood, one.log_wrong, one.wrong, state, one.odometry, anchor, history)

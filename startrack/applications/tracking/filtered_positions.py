@@ -25,7 +25,7 @@ from startrack.applications.tracking.moves import FREEDOMS, LEG_FREEDOMS, Moves
 from startrack.applications.tracking.observed_frame import ObservedFrame
 from startrack.applications.tracking.track_errors import SIZE_ROUNDS, TrackErrors
 from startrack.core.types import Array, BadInput, Ints
-from startrack.estimation.observations import UNKNOWN_M, FrameEstimate, Observations, Steps
+from startrack.estimation.observations import UNKNOWN_M, FrameEstimate, Steps
 from startrack.estimation.trajectory import Smoothed, TrackFilter, mixed_normal, smooth
 from startrack.localization import AMBIGUOUS_MASS
 from startrack.terrain import Terrain
@@ -39,7 +39,7 @@ class OnlineTrack:
     """Positions at the time of each frame; `add` in the order of time. Without contradictions a Kalman filter."""
 
     def __init__(self, shared_count: int) -> None:
-        self.filter = TrackFilter(shared_count, FREEDOMS + LEG_FREEDOMS)
+        self.filter = TrackFilter.start(shared_count, FREEDOMS, LEG_FREEDOMS)
         self.is_vouched = True  # whether explanations of another position of the last frame are unlikely together
         self._explanations = Explanations(shared_count)
         self._modes: list[Modes] = []
@@ -87,7 +87,7 @@ class OnlineTrack:
         moved = [(), *zip(best.kind.tolist(), best.anchor.tolist(), [best.number] * (n - 1), strict=True)]
         decided = [(mode, *move) for mode, move in zip(best.mode.tolist(), moved, strict=True)]
         if decided[:-1] != self._decided:  # another explanation of the frames before is likelier now
-            self.filter = TrackFilter(self.filter.shared_count, FREEDOMS + LEG_FREEDOMS)
+            self.filter = TrackFilter.start(self.filter.shared_count, FREEDOMS, LEG_FREEDOMS)
             self._decided = []
         for k in range(len(self._decided), n):
             if k:
@@ -144,10 +144,10 @@ def positions_at_rest(
     position, covariance = np.zeros((n, 2)), np.repeat([UNKNOWN_M**2 * np.eye(2)], n, axis=0)
 
     def take(k: int, estimate: FrameEstimate) -> Smoothed:
-        found = smooth(Observations.of([errors.place(estimate)]), Steps.unknown(1))
+        found = smooth([errors.place(estimate)], Steps.unknown(1))
         for _ in range(SIZE_ROUNDS if errors.bends else 0):
             placed = errors.place(estimate, found.position_m[0], found.shared)
-            found = smooth(Observations.of([placed]), Steps.unknown(1))
+            found = smooth([placed], Steps.unknown(1))
         position[k:], covariance[k:] = found.position_m[0], found.covariance_m2[0]
         return found
 

@@ -107,7 +107,8 @@ class TrackFilter:
 
     def take(self, which: Ints | Bools | slice) -> Self:
         """The explanations of an index, without followers."""
-        return replace(self, mean=self.mean[which].copy(), covariance=self.covariance[which].copy(), followers=None)
+        mean, covariance = self.mean[which].copy(), self.covariance[which].copy()
+        return replace(self, mean=mean, covariance=covariance, posts=self.posts.copy(), followers=None)
 
     def join(self, others: Sequence[Self]) -> Self:
         """These explanations and those of `others`, which have the same posts."""

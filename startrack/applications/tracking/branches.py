@@ -17,12 +17,12 @@ class Branches:
     """Explanations (b,) of the frames so far."""
 
     log_likelihood: Array  # (b,) with all priors but that of wrong frames
-    log_wrong: Array  # (b,) the part of it by wrong frames
+    log_wrong: Array  # (b, w) the part of it by each of the last frames that is wrong
     wrong: Ints  # (b,) number of wrong frames
     state: TrackFilter  # their estimates
     odometry: Ints  # (b,) which moves
-    anchor: Ints  # (b,) entry of their turns
-    history: Ints  # (b, frames, 3) mode, kind and anchor of the move before it
+    anchor: Ints  # (b,) number from 1 of the frame whose attitude turns the next move; 0: none
+    history: Ints  # (b, w, 3) mode, kind and anchor of the move before it, of the last frames
 
     def take(self, which: Ints | Bools) -> Branches:
         """Those of an index."""

@@ -139,9 +139,9 @@ def main() -> None:
             ])  # fmt: skip
             print(lines[-1], flush=True)
     errors = ["mean error, m", "largest, m", "drives with a pose beyond its 99.9 % circle", "beyond twice it"]
-    head = ["terrain", "class", "drives", "images used", "moves judged slip",
-            f"the first leg named, its factor within {100 * NAMED_PART:.0f} %", "mean error of single images, m", *errors,
-            *(f"filtered: {text}" for text in errors)]  # fmt: skip
+    named = f"the first leg named, its factor within {100 * NAMED_PART:.0f} %"
+    head = ["terrain", "class", "drives", "images used", "moves judged slip", named, "mean error of single images, m",
+            *errors, *(f"filtered: {text}" for text in errors)]  # fmt: skip
     body = table(head, lines)
     print(body)
     if not (args.classes or args.terrain):

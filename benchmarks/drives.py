@@ -26,7 +26,7 @@ from startrack.applications.tracking.contradictions import smooth_robustly
 from startrack.applications.tracking.filtered_positions import filter_positions, positions_at_rest
 from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.types import Array
-from startrack.estimation.observations import FrameEstimate, Observations, Steps
+from startrack.estimation.observations import FrameEstimate, Steps
 from startrack.estimation.trajectory import smooth
 from startrack.terrain import HeightMap, load_terrain
 
@@ -116,7 +116,7 @@ def score_track(case: Case, rng: np.random.Generator, pixels: bool, number: int)
     used = np.flatnonzero([one is not None for one in single])
     found = {"frame": _scored([single[k] for k in used], course.position_m[used])}
     steps = odometry(case, course.position_m, rng)
-    plain = smooth(Observations.of([one and alone(one) for one in single]), steps)
+    plain = smooth([one and alone(one) for one in single], steps)
     found["plain"] = _score(plain.position_m, plain.covariance_m2, course.position_m)
     if case.spacing_m == 0.0:
         _, position, covariance = positions_at_rest(frames, course.stated, course.shared)

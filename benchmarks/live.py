@@ -29,7 +29,7 @@ WARM_UP = 2  # images
 PLACES = {"shackleton-thesis": (-4000.0, 3000.0), "shackleton-rendered": (-1500.0, 1000.0)}  # start, on the floor
 SPACING_M, EVERY_S = 50.0, 900.0
 CORE = 0
-TRACK_FILES = ("track.tum", "track.filtered.tum", "track.ecsv", "track.geojson", "track.json", "track.crests.ecsv")
+TRACK_FILES = ("track.tum", "track.filtered.tum", "track.ecsv", "track.geojson", "track.json")
 KILL_AFTER_S = 1.0, 8.0  # of each start, uniform
 SEED = 7
 

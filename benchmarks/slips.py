@@ -32,6 +32,7 @@ class Slip:
     turned_deg: float = 0.0
 
 
+NAMED_PART = 0.05  # of a leg's factor
 CLASSES: dict[str, tuple[Slip, ...]] = {
     "none": (),
     "4 of 9 moves 20 % too long": (Slip(4, 1.2),),
@@ -42,17 +43,28 @@ CLASSES: dict[str, tuple[Slip, ...]] = {
 }
 
 
-def with_slips(draw: Draw, slips: tuple[Slip, ...], rng: np.random.Generator) -> Draw:
-    """The drive with legs one after the other, at random places that do not overlap."""
+def places_of(slips: tuple[Slip, ...], rng: np.random.Generator) -> list[int]:
+    """Numbers of the first moves of legs one after the other, at random places that do not overlap."""
     free = FRAMES - 1 - sum(one.moves for one in slips)
-    gaps = np.diff(np.sort(rng.integers(0, free + 1, len(slips))), prepend=0)
-    odometry, first = draw.odometry, 0
-    start_s = draw.course.time_utc[0].timestamp()
-    for slip, gap in zip(slips, gaps.tolist(), strict=True):
-        first += gap
+    before = np.cumsum([0, *(one.moves for one in slips)])[: len(slips)]
+    return [int(k) for k in np.sort(rng.integers(0, free + 1, len(slips))) + before]
+
+
+def with_slips(draw: Draw, slips: tuple[Slip, ...], rng: np.random.Generator) -> Draw:
+    """The drive with legs at random places."""
+    odometry, start_s = draw.odometry, draw.course.time_utc[0].timestamp()
+    for slip, first in zip(slips, places_of(slips, rng), strict=True):
         odometry = slipped(odometry, start_s + EVERY_S * first, start_s + EVERY_S * (first + slip.moves), slip)
-        first += slip.moves
     return replace(draw, odometry=odometry)
+
+
+def is_named(track: Track, slips: tuple[Slip, ...], rng: np.random.Generator) -> bool:
+    """Whether a leg of the track has most of the moves of the first slip, and its factor to NAMED_PART."""
+    return any(
+        2 * len({*range(leg.first, leg.last)} & {*range(first, first + slip.moves)}) > slip.moves
+        and abs(leg.factor_1 / slip.factor_1 - 1.0) <= NAMED_PART
+        for slip, first in zip(slips[:1], places_of(slips, rng), strict=False) for leg in track.legs
+    )  # fmt: skip
 
 
 def slipped(odometry: Odometry, first_s: float, last_s: float, slip: Slip) -> Odometry:
@@ -112,10 +124,13 @@ def main() -> None:
                 track = estimate_track(
                     changed.frames, changed.course.stated, changed.course.shared, odometry=changed.odometry
                 )
-                rows.append(score(track, changed))
+                named = is_named(track, CLASSES[name], np.random.default_rng([SEED, 1, number]))
+                rows.append(score(track, changed) | {"named": float(named)})
             lines.append([
                 terrain, name, str(len(rows)), f"{np.mean([row['used'] for row in rows]):.1f}",
-                f"{np.mean([row['slips'] for row in rows]):.1f}", f"{np.mean([row['single m'] for row in rows]):.1f}",
+                f"{np.mean([row['slips'] for row in rows]):.1f}",
+                str(int(sum(row["named"] for row in rows))) if CLASSES[name] else "",
+                f"{np.mean([row['single m'] for row in rows]):.1f}",
                 *(text for kind in ("smoothed", "filtered") for text in (
                     f"{np.mean([row[f'{kind} m'] for row in rows]):.1f}",
                     f"{max(row[f'{kind} largest'] for row in rows):.0f}",
@@ -124,8 +139,9 @@ def main() -> None:
             ])  # fmt: skip
             print(lines[-1], flush=True)
     errors = ["mean error, m", "largest, m", "drives with a pose beyond its 99.9 % circle", "beyond twice it"]
-    head = ["terrain", "class", "drives", "images used", "moves judged slip", "mean error of single images, m", *errors,
-            *(f"filtered: {text}" for text in errors)]  # fmt: skip
+    named = f"the first leg named, its factor within {100 * NAMED_PART:.0f} %"
+    head = ["terrain", "class", "drives", "images used", "moves judged slip", named, "mean error of single images, m",
+            *errors, *(f"filtered: {text}" for text in errors)]  # fmt: skip
     body = table(head, lines)
     print(body)
     if not (args.classes or args.terrain):

@@ -20,7 +20,6 @@ from _results import table, write_section
 from drives import Case, course_of, odometry
 
 from startrack.applications.tracking.filtered_positions import filter_positions
-from startrack.estimation.observations import Observations
 from startrack.estimation.trajectory import smooth
 
 CASE = Case(40, 50.0, 900.0, degraded=True)
@@ -65,7 +64,7 @@ def compare(rng: np.random.Generator, python: str) -> dict[str, float]:
     estimates = [frame.modes[0] for frame in frames_by_evidence(course, rng)]
     steps = odometry(CASE, course.position_m, rng)
     start = time.process_time()
-    ours = smooth(Observations.of(estimates), steps).position_m
+    ours = smooth(estimates, steps).position_m
     middle = time.process_time()
     filtered, _, _, _ = filter_positions([(e,) for e in estimates], steps, len(course.shared))
     end = time.process_time()

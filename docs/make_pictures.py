@@ -1,4 +1,4 @@
-"""Makes the pictures of README.md and docs/ from a sample and from benchmarks/RESULTS.md.
+"""Makes the pictures of README.md and docs/ from a sample and from benchmarks/results/.
 
     python docs/make_pictures.py [NAME ...]
 
@@ -8,6 +8,7 @@ Needs the extras `plots` and, for `report`, `browser` with Chromium. The figures
 
 from __future__ import annotations
 
+import json
 import shutil
 import sys
 import tempfile
@@ -115,12 +116,9 @@ def log_posterior(rows: Evidence, terrain: startrack.Terrain, points_m: Array) -
 
 
 def make_accuracy(solution: Any, folder: Path) -> None:
-    """Position errors of the methods on the same rendered frames: section Chain of RESULTS.md."""
-    text = (ROOT / "benchmarks/RESULTS.md").read_text(encoding="utf-8")
-    section = text.split("\n## Chain\n")[1].split("\n## ")[0]
-    cells = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("|")]
-    head = next(k for k, row in enumerate(cells) if row[0] == "position error, m")
-    rows = cells[head + 2 : head + 5]
+    """Position errors of the methods on the same rendered frames: the stored result of benchmarks/chain.py."""
+    stored = json.loads((ROOT / "benchmarks/results/chain.json").read_text(encoding="utf-8"))
+    rows = next(one["rows"] for one in stored["blocks"] if "head" in one and one["head"][0] == "position error, m")
     names = [row[0] for row in rows][::-1]
     mean, median, _, largest = np.array([[float(cell) for cell in row[1:]] for row in rows])[::-1].T
     figure, axes = plt.subplots(figsize=(8, 2.6), layout="constrained")

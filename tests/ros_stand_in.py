@@ -7,6 +7,7 @@ as ROS 2 does, which fails where a field has a wrong type or is missing.
 from __future__ import annotations
 
 import sys
+from functools import partial
 from types import ModuleType
 
 import numpy as np
@@ -15,13 +16,16 @@ from rosbags.typesys import Stores, get_typestore
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 MESSAGES = (
     "sensor_msgs/Image", "nav_msgs/Odometry", "geometry_msgs/PoseWithCovarianceStamped",
-    "geometry_msgs/TransformStamped",
+    "geometry_msgs/TransformStamped", "geometry_msgs/PoseStamped", "nav_msgs/Path",
 )  # fmt: skip
 
 
-def empty_message(kind):
-    """A message of a `kind` such as "std_msgs/msg/Header" with the default values of its fields, as rclpy makes it."""
-    return STORE.types[kind](**{name: _empty_field(field) for name, field in STORE.fielddefs[kind][1]})
+def empty_message(kind, **given):
+    """A message of a `kind` such as "std_msgs/msg/Header" with the default values of its fields, as rclpy makes it.
+
+    `given` are the values of some of them.
+    """
+    return STORE.types[kind](**{name: _empty_field(field) for name, field in STORE.fielddefs[kind][1]} | given)
 
 
 def _empty_field(field):
@@ -32,6 +36,8 @@ def _empty_field(field):
     if form.name == "BASE":
         return "" if of[0] == "string" else 0.0 if of[0].startswith("float") else 0
     element, count = of
+    if element[0].name == "NAME":
+        return [empty_message(element[1]) for _ in range(count)]
     return np.zeros(count, element[1][0])
 
 
@@ -54,9 +60,10 @@ class Publisher:
         self.messages = []
 
     def publish(self, message):
-        covariance = message.pose.covariance
-        assert len(covariance) == 36 and all(isinstance(one, float) for one in covariance)  # rclpy asserts this
-        message.pose.covariance = np.array(covariance)
+        if hasattr(message, "pose"):
+            covariance = message.pose.covariance
+            assert len(covariance) == 36 and all(isinstance(one, float) for one in covariance)  # rclpy asserts this
+            message.pose.covariance = np.array(covariance)
         STORE.serialize_cdr(message, message.__msgtype__)
         self.messages.append(message)
 
@@ -109,7 +116,7 @@ def install(monkeypatch, **parameters):
     }
     for kind in MESSAGES:
         package, _, name = kind.partition("/")
-        make = staticmethod(lambda full=f"{package}/msg/{name}": empty_message(full))
+        make = staticmethod(partial(empty_message, f"{package}/msg/{name}"))
         parts[package] = {}
         parts.setdefault(f"{package}.msg", {})[name] = make
     for name, values in parts.items():

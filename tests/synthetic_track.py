@@ -42,7 +42,7 @@ def synthetic_track(
     return Track(
         frames=tuple(_frame(k, status[k]) for k in range(frames)),
         filtered=_trajectory(filtered, filtered_m2, known), smoothed=_trajectory(smoothed, smoothed_m2, known),
-        bias_rad=1e-4, bias_sigma_rad=5e-5, clock=None, depth=None, width=None, crests=None,
+        bias_rad=1e-4, bias_sigma_rad=5e-5, clock=None, depth=None, width=None,
         slipped=(np.arange(frames - 1) == 5) & (not at_rest), at_rest=at_rest, terrain=terrain,
     )  # fmt: skip
 

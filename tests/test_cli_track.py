@@ -29,7 +29,7 @@ from startrack.terrain import write_map
 
 FRAMES = 5
 KILLS, KILL_AFTER_S, KILL_SEED = 3, (1.5, 6.0), 8
-FILES = ("track.tum", "track.filtered.tum", "track.ecsv", "track.geojson", "track.json", "track.crests.ecsv")
+FILES = ("track.tum", "track.filtered.tum", "track.ecsv", "track.geojson", "track.json")
 
 
 def run(*arguments):
@@ -123,7 +123,6 @@ def test_tables_are_read_by_astropy_and_the_map_has_every_frame(tracked):
     table = Table.read(tracked / "track.ecsv")
     assert table["east_m"].unit == "m"
     np.testing.assert_allclose(table["east_m"], [one["east_m"] for one in record["frames"]], atol=1e-4)
-    assert len(Table.read(tracked / "track.crests.ecsv")) == 0  # a cylinder has no posts
     features = json.loads((tracked / "track.geojson").read_text())["features"]
     assert [one["geometry"]["type"] for one in features] == ["LineString", *["Point"] * FRAMES]
     assert features[0]["geometry"]["coordinates"][0] == features[1]["geometry"]["coordinates"]

@@ -11,7 +11,7 @@ from localization_helpers import locate_or_refuse
 from startrack.applications.tracking.frame_estimate import FIRST_WAVE, estimate_frame, waves_at
 from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence
-from startrack.estimation.observations import Observations, Steps
+from startrack.estimation.observations import Steps
 from startrack.estimation.trajectory import smooth
 from startrack.localization import ExactPosterior, LinearErrors
 from startrack.localization.linear_errors import list_seams
@@ -146,8 +146,8 @@ def test_exposures_of_one_place_share_the_waves():
             for k in range(6)
         ]
         still = Steps(np.zeros((5, 2)), np.full(5, 1e-3))
-        one = smooth(Observations.of(frames[:1]), Steps.unknown(1)).covariance_m2[0]
-        every = smooth(Observations.of(frames), still).covariance_m2[-1]
+        one = smooth(frames[:1], Steps.unknown(1)).covariance_m2[0]
+        every = smooth(frames, still).covariance_m2[-1]
         sizes[terrain.waves_sigma_rad == EXACT_WAVES] = np.sqrt(np.trace(every) / np.trace(one))
     assert sizes[False] > 0.8 and sizes[True] < 0.6
 

@@ -14,7 +14,6 @@ from startrack.output import relief_picture
 from startrack.output.picture.axes import nice_step
 from startrack.output.picture.backdrop import View
 from startrack.output.picture.canvas import Canvas, Ink, mix_colours, printable, text_width, wrap_text
-from startrack.output.picture.contours import contour_lines
 from startrack.output.picture.maps import Map, distance_text, draw_overview, draw_zoom
 from startrack.terrain import Terrain
 
@@ -204,21 +203,6 @@ def test_contours_stand_at_their_heights_with_their_names():
     for (x, _), text, *_ in canvas._texts:  # each name stands on its own contour
         assert x == pytest.approx(300 + float(text), abs=1.5)
     assert view.draw_heights(Ramp(0.0)) == ""
-
-
-def test_contours_are_closed_lines_cut_by_the_mask_and_join_low_values_at_a_saddle():
-    y, x = np.mgrid[-20:21, -20:21].astype(float)
-    everywhere = np.ones(x.shape, bool)
-    (circle,) = contour_lines(x**2 + y**2, 101.5, everywhere)
-    np.testing.assert_allclose(np.hypot(*(circle - 20.0).T), np.sqrt(101.5), atol=0.02)
-    np.testing.assert_array_equal(circle[0], circle[-1])
-    assert len(circle) == len(np.unique(circle[1:], axis=0)) + 1
-    (half,) = contour_lines(x**2 + y**2, 101.5, x <= 0)
-    assert sorted(half[[0, -1], 1]) == pytest.approx(20.0 + np.array([-1, 1]) * np.sqrt(101.5), abs=0.05)
-    assert half[:, 0].max() == 20.0
-    saddle = contour_lines(np.array([[1.0, 0.0], [0.0, 1.0]]), 0.5, np.ones((2, 2), bool))
-    assert sorted(sorted(map(tuple, line)) for line in saddle) == [[(0, 0.5), (0.5, 0)], [(0.5, 1), (1, 0.5)]]
-    assert contour_lines(x, 30.0, everywhere) == []
 
 
 def test_the_relief_picture_has_scales_and_contours():

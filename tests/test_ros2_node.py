@@ -89,6 +89,11 @@ def test_poses_are_those_of_the_track_and_a_refused_image_has_none(drive, node):
         np.testing.assert_allclose(camera_m, [at.x, at.y, at.z], rtol=0, atol=1e-6)
         off = R_map_odom * R_odom_body * Rotation.from_quat([q.x, q.y, q.z, q.w]).inv()
         assert off.magnitude() < 1e-6
+    path = node.publishers["path"].messages[-1]
+    assert path.header.frame_id == "map" and path.header.stamp == published[-1].header.stamp
+    assert [(one.header.stamp, one.pose) for one in path.poses] == [
+        (one.header.stamp, one.pose.pose) for one in published
+    ]
     last_ns = stamp_ns(exposures[-1])
     for later_s, is_sent in ((LASTS_S - 1.0, True), (LASTS_S + 1.0, False)):
         count = len(node.transforms)

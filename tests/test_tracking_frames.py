@@ -25,7 +25,7 @@ from startrack.applications.tracking.observed_frame import (
 )
 from startrack.applications.tracking.track_errors import BIAS, CLOCK, DEPTH, EDGE, TrackErrors
 from startrack.core.types import BadInput, Clock, Evidence, ImageErrors, ShownError
-from startrack.estimation.observations import Observations, Steps
+from startrack.estimation.observations import Steps
 from startrack.estimation.trajectory import smooth
 from startrack.localization import ExactPosterior
 from startrack.localization.importance_sampling import sample
@@ -96,7 +96,7 @@ def test_the_observation_is_the_exact_posterior(ground):
     found = estimate(evidence, ground)
     away = found.mean[:2] - fix.position_enu_m[:2]
     assert away @ np.linalg.solve(fix.covariance_m2, away) < 0.3
-    alone = smooth(Observations.of([found]), Steps.unknown(1))
+    alone = smooth([found], Steps.unknown(1))
     np.testing.assert_allclose(np.trace(alone.covariance_m2[0]), np.trace(fix.covariance_m2), rtol=0.5)
     assert found.mean[2] * ground.common_sigma_rad == pytest.approx(HORIZON_ERROR_RAD, abs=np.radians(0.02))
 
@@ -190,7 +190,7 @@ def test_an_error_that_the_evidence_does_not_depend_on_stays_unknown():
     assert with_edge.mean[-1] == 0.0 and not with_edge.response[-1].any()  # of stars alone
     away = with_edge.mean[:2] - without.mean[:2]
     assert away @ np.linalg.solve(without.covariance[:2, :2], away) < 0.3
-    found = smooth(Observations.of([with_edge, with_edge]), Steps(np.zeros((1, 2)), np.ones(1)))
+    found = smooth([with_edge, with_edge], Steps(np.zeros((1, 2)), np.ones(1)))
     assert found.shared[-1] == pytest.approx(0.0, abs=1e-9)
     assert found.shared_covariance[-1, -1] == pytest.approx(1.0)
 

@@ -1,6 +1,6 @@
 """The linear estimator of a track: against least squares with every unknown written out, and against the truth."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from startrack.applications.tracking.contradictions import smooth_robustly
 from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions
 from startrack.applications.tracking.moves import Moves
 from startrack.estimation import trajectory
-from startrack.estimation.observations import Observations, Steps
+from startrack.estimation.observations import Steps
 from startrack.estimation.trajectory import TrackFilter, smooth
 
 
@@ -21,8 +21,15 @@ def with_shared_moves(drive: Drive) -> Drive:
 
 
 def least_squares(drive: Drive, frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """Positions, shared errors and heights as unknowns of one linear problem, and their covariance."""
-    k, posts, moves = len(drive.shared), len(drive.height_error_m), drive.steps.by_shared_m.shape[-1]
+    """Positions, shared errors, heights, and errors of moves and of legs, as unknowns of one linear problem.
+
+    Also their covariance.
+    """
+    k, posts, steps = len(drive.shared), len(drive.height_error_m), drive.steps
+    legs = [number for number in np.unique(steps.leg) if number]
+    by_moves = [steps.by_shared_m, *(steps.by_leg_m * (steps.leg == number)[:, None, None] for number in legs)]
+    by_move = np.concatenate(by_moves, axis=-1)
+    moves = by_move.shape[-1]
     size = 2 * frames + k + posts + moves
     rows, values = [], []
 
@@ -41,7 +48,7 @@ def least_squares(drive: Drive, frames: int) -> tuple[np.ndarray, np.ndarray]:
         design = np.zeros((2, size))
         design[:, 2 * i : 2 * i + 2], design[:, 2 * i + 2 : 2 * i + 4] = -np.eye(2), np.eye(2)
         if moves:
-            design[:, -moves:] = -drive.steps.by_shared_m[i]
+            design[:, -moves:] = -by_move[i]
         add(design, drive.steps.move_m[i], STEP_SIGMA_M**2 * np.eye(2))
     priors = np.ones(k + posts + moves)
     add(np.eye(size)[2 * frames :], np.zeros(len(priors)), np.eye(len(priors)))
@@ -54,13 +61,12 @@ def least_squares(drive: Drive, frames: int) -> tuple[np.ndarray, np.ndarray]:
 def test_the_smoother_is_least_squares_with_all_unknowns(shared_count, by_moves):
     drive = simulate_drive(np.random.default_rng(1), 7, shared_count)
     drive = with_shared_moves(drive) if by_moves else drive
-    found = smooth(Observations.of(drive.estimates), drive.steps)
+    found = smooth(drive.estimates, drive.steps)
     solution, covariance = least_squares(drive, 7)
-    posts = 14 + shared_count + found.post
     np.testing.assert_allclose(found.position_m.ravel(), solution[:14], atol=1e-6)
     np.testing.assert_allclose(found.shared, solution[14 : 14 + shared_count], atol=1e-7)
-    np.testing.assert_allclose(found.post_error, solution[posts], atol=1e-6)
-    np.testing.assert_allclose(found.post_sigma, np.sqrt(np.diag(covariance)[posts]), atol=1e-6)
+    shared = slice(14, 14 + shared_count)
+    np.testing.assert_allclose(found.shared_covariance, covariance[shared, shared], atol=1e-6)
     for i in range(7):
         part = slice(2 * i, 2 * i + 2)
         np.testing.assert_allclose(found.covariance_m2[i], covariance[part, part], atol=1e-6)
@@ -68,32 +74,50 @@ def test_the_smoother_is_least_squares_with_all_unknowns(shared_count, by_moves)
 
 @pytest.mark.parametrize("by_moves", [False, True])
 @pytest.mark.parametrize("leg", [[0] * 8, [0, 1, 1, 1, 0, 3, 4, 4]])
-def test_the_filter_is_the_smoother_of_the_frames_so_far(by_moves, leg):
+def test_the_filter_is_least_squares_with_the_frames_so_far(by_moves, leg):
     drive = simulate_drive(np.random.default_rng(2), 9)
     drive = with_shared_moves(drive) if by_moves else drive
     by_leg_m = 0.2 * np.stack([drive.steps.move_m, drive.steps.move_m[:, ::-1]], axis=-1)
     drive = replace(drive, steps=replace(drive.steps, leg=np.array(leg), by_leg_m=by_leg_m)) if by_moves else drive
-    state = TrackFilter(1, drive.steps.by_shared_m.shape[-1] + drive.steps.by_leg_m.shape[-1])
+    state = TrackFilter.start(1, drive.steps.by_shared_m.shape[-1], drive.steps.by_leg_m.shape[-1])
     for k, estimate in enumerate(drive.estimates):
         if k:
             state.predict(drive.steps, k - 1)
         state.update(estimate)
-        steps = Steps(*(getattr(drive.steps, one.name)[:k] for one in fields(Steps)))
-        batch = smooth(Observations.of(drive.estimates[: k + 1]), steps)
-        np.testing.assert_allclose(state.position_m, batch.position_m[-1], atol=1e-4)
-        np.testing.assert_allclose(state.covariance_m2, batch.covariance_m2[-1], atol=1e-4)
+        solution, covariance = least_squares(drive, k + 1)
+        last = slice(2 * k, 2 * k + 2)
+        np.testing.assert_allclose(state.position_m, solution[last], atol=1e-4)
+        np.testing.assert_allclose(state.covariance_m2, covariance[last, last], atol=1e-4)
+    found = smooth(drive.estimates, drive.steps)
+    np.testing.assert_allclose(found.position_m.ravel(), solution[:18], atol=1e-4)
+    every = [covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(9)]
+    np.testing.assert_allclose(found.covariance_m2, every, atol=1e-4)
+
+
+def test_positions_of_long_ago_change_no_more(monkeypatch):
+    """Those of the last frames do as before, and the others are as they were known when so many frames had followed."""
+    drive = simulate_drive(np.random.default_rng(13), 30)
+    whole = smooth(drive.estimates, drive.steps)
+    first = smooth(drive.estimates[:13], Steps(drive.steps.move_m[:12], drive.steps.sigma_m[:12]))
+    monkeypatch.setattr(trajectory, "MOST_FOLLOWING", 12)
+    found = smooth(drive.estimates, drive.steps)
+    np.testing.assert_allclose(found.position_m[-13:], whole.position_m[-13:], atol=1e-9)
+    np.testing.assert_allclose(found.covariance_m2[-13:], whole.covariance_m2[-13:], atol=1e-9)
+    np.testing.assert_allclose(found.position_m[0], first.position_m[0], atol=1e-9)
+    off = np.linalg.norm(found.position_m - whole.position_m, axis=1)
+    assert off.max() < 0.25 * np.sqrt(np.trace(whole.covariance_m2, axis1=1, axis2=2)).min()
 
 
 def test_the_filter_forgets_posts_without_a_jump(monkeypatch):
     drive = simulate_drive(np.random.default_rng(12), 30)
 
     def states():
-        state = TrackFilter(1)
+        state = TrackFilter.start(1)
         for k, estimate in enumerate(drive.estimates):
             if k:
                 state.predict(drive.steps, k - 1)
             state.update(estimate)
-            yield len(state.mean), state.position_m, state.covariance_m2
+            yield state.mean.shape[1], state.position_m, state.covariance_m2
 
     whole = list(states())
     monkeypatch.setattr(trajectory, "MOST_POSTS", 16)  # 12 are kept: a frame depends on 8, of which the next has 6
@@ -108,9 +132,9 @@ def test_positions_have_their_stated_errors_and_the_plain_sum_has_not():
     errors, covariances, plain_errors, plain_covariances = [], [], [], []
     for seed in range(60):
         drive = simulate_drive(np.random.default_rng([4, seed]), 12)
-        found = smooth(Observations.of(drive.estimates), drive.steps)
+        found = smooth(drive.estimates, drive.steps)
         alone = [replace(e, noise=e.covariance, post=e.post[:0], by_post=e.by_post[:, :0]) for e in drive.estimates]
-        plain = smooth(Observations.of(alone), drive.steps)
+        plain = smooth(alone, drive.steps)
         errors.append(found.position_m - drive.position_m)
         covariances.append(found.covariance_m2)
         plain_errors.append(plain.position_m - drive.position_m)
@@ -133,7 +157,7 @@ def test_slipped_moves_are_found_and_cost_no_more_than_their_loss():
         assert not smooth_robustly(modes, drive.steps).slipped.any()
         without = np.where(np.isin(np.arange(29), which), np.inf, drive.steps.sigma_m)
         unslipped = smooth(
-            Observations.of(drive.estimates), replace(drive.steps, sigma_m=without)
+            drive.estimates, replace(drive.steps, sigma_m=without)
         )  # fmt: skip
         lost.append(np.linalg.norm(slipped.smoothed.position_m - drive.position_m, axis=1).mean())
         known.append(np.linalg.norm(unslipped.position_m - drive.position_m, axis=1).mean())
@@ -192,7 +216,7 @@ def test_the_sequence_chooses_the_mode_of_an_ambiguous_frame():
 
 def test_without_odometry_only_the_shared_errors_connect_the_frames():
     drive = simulate_drive(np.random.default_rng(11), 8)
-    alone = smooth(Observations.of([drive.estimates[3]]), Steps.unknown(1))
+    alone = smooth([drive.estimates[3]], Steps.unknown(1))
     modes = [(e,) for e in drive.estimates]
     found = smooth_robustly(modes, Steps.unknown(8))
     assert found.mode.tolist() == [0] * 8

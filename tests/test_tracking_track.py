@@ -70,10 +70,6 @@ def test_a_track_names_what_it_used_and_bridges_the_rest(ground):
         np.testing.assert_allclose(found.position_enu_m[:, 2], up)
     np.testing.assert_allclose(track.filtered.position_enu_m[-1], track.smoothed.position_enu_m[-1], atol=0.02)
     assert track.bias_rad == pytest.approx(1e-3 * drive.shared[0], abs=4 * track.bias_sigma_rad)
-    assert track.crests is not None
-    truth = drive.height_error_m[track.crests.post]
-    assert (track.crests.sigma_m < HEIGHT_SIGMA_M).all()
-    assert np.mean(np.square((truth - track.crests.error_m) / track.crests.sigma_m)) == pytest.approx(1.0, abs=0.5)
     assert not track.slipped.any()
     assert track.clock is None
 

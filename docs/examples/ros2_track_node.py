@@ -3,8 +3,9 @@
 Subscriptions: `image` (sensor_msgs/Image; the stamp is the middle of the exposure) and `odom` (nav_msgs/Odometry of the
 rover's body). Publication: `pose` (geometry_msgs/PoseWithCovarianceStamped) in the frame of the parameter `map_frame`:
 x east, y north, z up (REP-103, REP-105) from the terrain's origin; its orientation is that of the body (x forward, y
-left, z up), its position that of the camera. From then on the transform from `map_frame` to `odom_frame` is broadcast
-(tf2) with each odometry message. An image that is refused, or left out, gives neither.
+left, z up), its position that of the camera. `path` (nav_msgs/Path) has the poses so far. From then on the transform
+from `map_frame` to `odom_frame` is broadcast (tf2) with each odometry message. An image that is refused, or left
+out, gives none of them.
 
     python ros2_track_node.py --ros-args -p camera:=fisheye-2048 -p terrain:=shackleton-thesis \
         -r image:=/camera/image_raw -r odom:=/wheel/odometry
@@ -14,8 +15,9 @@ import math
 
 import numpy as np
 import rclpy
-from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry as OdometryMessage
+from nav_msgs.msg import Path
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from scipy.spatial.transform import Rotation
@@ -71,6 +73,8 @@ class TrackNode(Node):
         self.broadcaster = TransformBroadcaster(self)
         self.map_from_odom: tuple[float, np.ndarray, Rotation] | None = None  # time [s] of its image, move [m], turn
         self.publisher = self.create_publisher(PoseWithCovarianceStamped, "pose", 10)
+        self.path, self.path_publisher = Path(), self.create_publisher(Path, "path", 10)
+        self.path.header.frame_id = self.map_frame
         self.create_subscription(Image, "image", self.on_image, qos_profile_sensor_data)
         self.create_subscription(OdometryMessage, "odom", self.on_odometry, ODOMETRY_QUEUE)
 
@@ -131,9 +135,16 @@ class TrackNode(Node):
         covariance[:2, :2] = track.filtered.covariance_m2[0]
         message.pose.covariance = covariance.ravel().tolist()
         self.publisher.publish(message)
+        self.publish_path(PoseStamped(header=message.header, pose=pose))
         if self.odom_frame and np.trace(track.filtered.covariance_m2[0]) < MAX_VARIANCE_M2:
             R_map_body = Rotation.from_quat(frame.quat_xyzw_body_enu).inv()
             self.keep_transform(stamp, position_m - R_map_body.apply(self.camera_in_body_m), R_map_body, odometry)
+
+    def publish_path(self, newest: PoseStamped) -> None:
+        """Publish the poses so far with the `newest` one; each is by the images up to its own."""
+        self.path.poses = [*self.path.poses, newest]
+        self.path.header.stamp = newest.header.stamp
+        self.path_publisher.publish(self.path)
 
     def keep_transform(self, stamp: object, body_m: np.ndarray, R_map_body: Rotation, odometry: Odometry) -> None:
         """Keep map <- odom = (map <- body) (odom <- body)^-1, with the `odometry` at the time of the image."""

@@ -123,7 +123,7 @@ COMMANDS = (
         "track", function_at("track.run"), "images of a drive or of a rover at rest to a trajectory",
         "Locate the images of one camera and estimate its trajectory from all of them, with the errors that they "
         "share. Writes track.tum (by all images), track.filtered.tum (by the images up to each), track.ecsv, "
-        "track.geojson, track.json, track.crests.ecsv, track.png and track.html.",
+        "track.geojson, track.json, track.png and track.html.",
         {
             "input": (
                 flag("frames FRAMES", "images, one folder, or one ROS bag", nargs="+"),

@@ -1,114 +1,225 @@
-"""Positions of a track and the errors that its frames share: known at each frame's own time, and by all frames.
+"""Positions of a track and the errors that its frames share, by one estimator: at each frame's time, and by all frames.
 
-The first is a Kalman filter over the last position, the shared errors, and the errors of all posts that a recent
-observation has depended on, in standard deviations. Posts that were not seen for the longest time are left out, so that
-memory stays flat; where they are seen again, they count as new. The second is generalised least squares; given all
-observations, the estimates of the errors of the map's posts follow.
+A Kalman filter has the last position, the errors that frames and moves share, and the errors of all posts and waves of
+the map that a recent observation has depended on, in standard deviations. Posts that were not seen for the longest time
+are left out, so that memory stays flat; where they are seen again, they count as new. Positions of earlier frames may
+follow: each observation moves them by their covariance with the filter's state. That is a fixed-point smoother, whose
+last result is the estimate by all frames. Source: Anderson and Moore 1979, Optimal Filtering, 7.2.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
-from startrack.core.types import Array, Ints
-from startrack.estimation.observations import UNKNOWN_M, FrameEstimate, Observations, Steps, inverse
+from startrack.core.types import Array, Bools, Ints
+from startrack.estimation.observations import UNKNOWN_M, FrameEstimate, Steps
 
 MOST_POSTS = 2000  # in the state; 40 frames 50 m apart depend on 500
+MOST_FOLLOWING = 400  # earlier positions; later frames change those before no more
 SIGMAS_95 = float(np.sqrt(-2.0 * np.log(0.05)))  # half axes of the ellipse that holds 95 % of a Gaussian
 DIRECTIONS = 256  # over half a turn
 
 
 @dataclass(eq=False)
-class TrackFilter:
-    """Estimates after the frames so far; `predict` and `update` in the order of time.
+class Followers:
+    """Positions (m,) of earlier frames, which observations of later ones move, for each of b explanations."""
 
-    The state: the last position, the shared errors, those of all moves and of the last leg, and posts.
+    mean: Array  # (b, 2 m)
+    own: Array  # (b, m, 2, 2) covariances
+    cross: Array  # (b, 2 m, s) covariance with the state
+    settled: list[tuple[Array, Array]] = field(default_factory=list)  # mean (b, 2) and covariance of those before
+
+    @classmethod
+    def none(cls, count: int, size: int) -> Self:
+        """Before the second frame, for a `count` of explanations with a state of this `size`."""
+        return cls(np.zeros((count, 0)), np.zeros((count, 0, 2, 2)), np.zeros((count, 0, size)))
+
+    def append(self, mean: Array, covariance: Array) -> None:
+        """One more position, the first of a state with this mean (b, s) and covariance (b, s, s)."""
+        self.mean = np.hstack([self.mean, mean[:, :2]])
+        self.own = np.concatenate([self.own, covariance[:, None, :2, :2]], axis=1)
+        self.cross = np.concatenate([self.cross, covariance[:, :2]], axis=1)
+        if self.own.shape[1] > MOST_FOLLOWING:
+            self.settled.append((self.mean[:, :2], self.own[:, 0]))
+            self.mean, self.own, self.cross = self.mean[:, 2:], self.own[:, 1:], self.cross[:, 2:]
+
+    def update(self, cross: Array, covariance: Array, residual: Array, gain: Array) -> None:
+        """Take in an observation that leaves a `residual` (b, p) of this `covariance` (b, p, p).
+
+        `cross` (b, 2 m, p) is that of the positions with it, `gain` (b, p, s) the state's.
+        """
+        own_gain = np.linalg.solve(covariance, cross.swapaxes(1, 2))
+        self.mean = self.mean + (residual[:, None] @ own_gain)[:, 0]
+        self.cross = self.cross - cross @ gain
+        b, m, p = len(cross), self.own.shape[1], cross.shape[2]
+        self.own = self.own - cross.reshape(b, m, 2, p) @ own_gain.reshape(b, p, m, 2).transpose(0, 2, 1, 3)
+
+
+@dataclass(eq=False)
+class TrackFilter:
+    """Estimates by b explanations after the frames so far; moves and observations come in the order of time.
+
+    The state (s,): the last position, the shared errors, those of all moves and of the last leg, and posts.
     """
 
+    mean: Array  # (b, s)
+    covariance: Array  # (b, s, s)
     shared_count: int
-    moves_count: int = 0  # of errors that all moves share, and then of the last leg
-    mean: Array = field(init=False)
-    covariance: Array = field(init=False)
+    moves_count: int  # of errors that all moves share
+    leg_count: int  # of errors that the moves of a leg share
+    unknown_m: float  # standard deviation of a position about which nothing is known
     posts: dict[int, int] = field(default_factory=dict)  # number of a post to its place in the state
+    followers: Followers | None = None
 
-    def __post_init__(self) -> None:
-        self.mean = np.zeros(self._first_post)
-        self.covariance = np.diag([UNKNOWN_M**2] * 2 + [1.0] * (self._first_post - 2))
-
-    @property
-    def _first_post(self) -> int:
-        return 2 + self.shared_count + self.moves_count
+    @classmethod
+    def start(
+        cls, shared_count: int, moves_count: int = 0, leg_count: int = 0, *, count: int = 1,
+        unknown_m: float = UNKNOWN_M, follows: bool = False,
+    ) -> Self:  # fmt: skip
+        """Before the first frame, for a `count` of explanations; `follows`: with the positions of earlier frames."""
+        size = 2 + shared_count + moves_count + leg_count
+        prior = np.diag([unknown_m**2] * 2 + [1.0] * (size - 2))
+        return cls(
+            np.zeros((count, size)), np.tile(prior, (count, 1, 1)), shared_count, moves_count, leg_count, unknown_m,
+            followers=Followers.none(count, size) if follows else None,
+        )  # fmt: skip
 
     @property
     def position_m(self) -> Array:
-        """(2,) of the last frame."""
-        return self.mean[:2].copy()
+        """(2,) of the last frame, by the first explanation."""
+        return self.mean[0, :2].copy()
 
     @property
     def covariance_m2(self) -> Array:
-        """(2, 2) of the last frame."""
-        return self.covariance[:2, :2].copy()
+        """(2, 2) of the last frame, by the first explanation."""
+        return self.covariance[0, :2, :2].copy()
+
+    def positions(self) -> tuple[Array, Array]:
+        """Positions (n, 2) and covariances (n, 2, 2) of all frames that follow, and of the last one, by the first."""
+        last = self.followers or Followers.none(1, 0)
+        settled, before = [mean[0] for mean, _ in last.settled], last.mean[0].reshape(-1, 2)
+        mean = np.vstack([*settled, before, self.mean[0, :2]])
+        return mean, np.stack([*(own[0] for _, own in last.settled), *last.own[0], self.covariance[0, :2, :2]])
+
+    def take(self, which: Ints | Bools | slice) -> Self:
+        """The explanations of an index, without followers."""
+        mean, covariance = self.mean[which].copy(), self.covariance[which].copy()
+        return replace(self, mean=mean, covariance=covariance, posts=self.posts.copy(), followers=None)
+
+    def join(self, others: Sequence[Self]) -> Self:
+        """These explanations and those of `others`, which have the same posts."""
+        parts = [self, *others]
+        mean, covariance = (np.concatenate([getattr(one, name) for one in parts]) for name in ("mean", "covariance"))
+        return replace(self, mean=mean, covariance=covariance)
 
     def predict(self, steps: Steps, number: int) -> None:
-        """The camera made the move of this `number`; one that is not known leads anywhere."""
-        sigma_m, move_m = float(steps.sigma_m[number]), steps.move_m[number]
-        if not np.isfinite(sigma_m):
-            self.mean[:2] = 0.0
-            self.covariance[:2], self.covariance[:, :2] = 0.0, 0.0
-            sigma_m = UNKNOWN_M
-        elif self.moves_count:
-            shared, by = slice(2 + self.shared_count, self._first_post), steps.by_shared_m[number]
-            if len(steps.leg):
-                if steps.leg[number] > steps.leg[:number].max(initial=0):
-                    self._forget(slice(self._first_post - steps.by_leg_m.shape[-1], self._first_post))
-                by = np.hstack([by, steps.by_leg_m[number] * (steps.leg[number] > 0)])
-            move_m = move_m + by @ self.mean[shared]
-            self.covariance[:2] += by @ self.covariance[shared]
-            self.covariance[:, :2] += self.covariance[:, shared] @ by.T
-        self.mean[:2] += move_m
-        self.covariance[[0, 1], [0, 1]] += sigma_m**2
+        """The camera made the move of this `number`, by all explanations; one that is not known leads anywhere."""
+        count = len(self.mean)
+        self.move(*(np.repeat(of[number : number + 1], count, axis=0) for of in steps.of_all))
+        if len(steps.leg) and steps.leg[number] and np.isfinite(steps.sigma_m[number]):
+            is_new = bool(steps.leg[number] > steps.leg[:number].max(initial=0))
+            self.move_by_leg(np.repeat(steps.by_leg_m[number : number + 1], count, axis=0), is_new=is_new)
 
-    def _forget(self, part: slice) -> None:
-        """These errors are those of a new leg."""
-        self.mean[part] = 0.0
-        self.covariance[part], self.covariance[:, part] = 0.0, 0.0
-        self.covariance[part, part] = np.eye(part.stop - part.start)
+    def move(self, move_m: Array, sigma_m: Array, by_m: Array) -> None:
+        """Make moves (b, 2) with errors of `sigma_m` (b,) on each axis; infinite: not known, they lead anywhere.
 
-    def update(self, estimate: FrameEstimate) -> None:
-        """Take in the observation of one frame."""
+        `by_m` (b, 2, f) are their changes by one sigma of each error that all moves share.
+        """
+        if self.followers is not None:
+            self.followers.append(self.mean, self.covariance)
+        lost = ~np.isfinite(sigma_m)
+        if lost.any():
+            self.mean[lost, :2] = 0.0
+            self.covariance[lost, :2], self.covariance[lost, :, :2] = 0.0, 0.0
+            if self.followers is not None:
+                self.followers.cross[lost, :, :2] = 0.0
+        first = 2 + self.shared_count
+        self._shift(np.where(lost[:, None, None], 0.0, by_m), slice(first, first + self.moves_count))
+        self.mean[:, :2] += np.where(lost[:, None], 0.0, move_m)
+        self.add_noise(np.where(lost, self.unknown_m, sigma_m))
+
+    def add_noise(self, sigma_m: Array | float) -> None:
+        """More uncertain by errors of `sigma_m` (b,) on each axis."""
+        self.covariance[:, [0, 1], [0, 1]] += np.square(np.broadcast_to(sigma_m, len(self.mean)))[:, None]
+
+    def move_by_leg(self, by_m: Array, *, is_new: bool) -> None:
+        """Move by the errors of the last leg, or of a new one: `by_m` (b, 2, l) by one sigma of each."""
+        end = 2 + self.shared_count + self.moves_count + self.leg_count
+        leg = slice(end - self.leg_count, end)
+        if is_new:
+            self.mean[:, leg], self.covariance[:, leg], self.covariance[:, :, leg] = 0.0, 0.0, 0.0
+            self.covariance[:, leg, leg] = np.eye(self.leg_count)
+            if self.followers is not None:
+                self.followers.cross[:, :, leg] = 0.0
+        self._shift(by_m, leg)
+
+    def _shift(self, by_m: Array, part: slice) -> None:
+        """Move by errors of a `part` of the state: `by_m` (b, 2, f) by one sigma of each."""
+        turned = by_m.swapaxes(1, 2)
+        self.mean[:, :2] += (by_m @ self.mean[:, part, None])[..., 0]
+        self.covariance[:, :2] += by_m @ self.covariance[:, part]
+        self.covariance[:, :, :2] += self.covariance[:, :, part] @ turned
+        if self.followers is not None:
+            self.followers.cross[:, :, :2] += self.followers.cross[:, :, part] @ turned
+
+    def update(self, estimate: FrameEstimate) -> Array:
+        """Take in the observation of one frame; returns the logarithm (b,) of its probability density."""
         residual, covariance, cross = self.innovation(estimate)
-        gain = np.linalg.solve(covariance, cross.T).T
-        self.mean = self.mean + gain @ residual
-        self.covariance -= gain @ cross.T
-        for number in estimate.post.tolist():  # the last ones of the dictionary are the latest
-            self.posts[number] = self.posts.pop(number)
-        if len(self.posts) > MOST_POSTS:  # those that were not seen for the longest time are left out
-            kept, first = list(self.posts)[-(3 * MOST_POSTS // 4) :], self._first_post
-            place = np.append(np.arange(first), [self.posts[number] for number in kept])
-            self.mean, self.covariance = self.mean[place], self.covariance[np.ix_(place, place)]
-            self.posts = {number: first + k for k, number in enumerate(kept)}
+        gain = np.asarray(np.linalg.solve(covariance, cross.swapaxes(1, 2)), dtype=np.float64)
+        if self.followers is not None:
+            of_followers = self._with(self.followers.cross, estimate)
+            self.followers.update(of_followers, covariance, residual, gain)
+        self.mean = self.mean + (residual[:, None] @ gain)[:, 0]
+        self.covariance = self.covariance - cross @ gain
+        self._forget_posts(estimate)
+        return log_normal(residual, covariance)
 
     def innovation(self, estimate: FrameEstimate) -> tuple[Array, Array, Array]:
-        """Observation less prediction (p,), its covariance (p, p), and that of the state with it (s, p).
+        """Observation less prediction (b, p), its covariance (b, p, p), and that of the state with it (b, s, p).
 
         The state grows by the posts that it does not have.
         """
-        size, new = len(self.mean), [number for number in estimate.post.tolist() if number not in self.posts]
-        if new:
-            self.posts.update((number, size + k) for k, number in enumerate(new))
-            self.mean = np.append(self.mean, np.zeros(len(new)))
-            grown = np.eye(len(self.mean))
-            grown[:size, :size] = self.covariance
-            self.covariance = grown
-        place = np.array([self.posts[number] for number in estimate.post.tolist()], dtype=np.int64)
-        p, by_post = estimate.parameters, estimate.by_post
-        cross = self.covariance[:, :p] @ estimate.response.T + self.covariance[:, place] @ by_post.T
-        predicted = estimate.response @ self.mean[:p] + by_post @ self.mean[place]
-        covariance = estimate.response @ cross[:p] + by_post @ cross[place] + estimate.noise
-        return estimate.mean - predicted, 0.5 * (covariance + covariance.T), cross
+        self._add_posts([number for number in estimate.post.tolist() if number not in self.posts])
+        cross = self._with(self.covariance, estimate)
+        predicted = self._with(self.mean[:, None], estimate)[:, 0]
+        covariance = self._with(cross.swapaxes(1, 2), estimate) + estimate.noise
+        return estimate.mean - predicted, 0.5 * (covariance + covariance.swapaxes(1, 2)), cross
+
+    def _with(self, values: Array, estimate: FrameEstimate) -> Array:
+        """(b, n, p) of `values` (b, n, s): their products with the response of the observation to the state."""
+        place = [self.posts[number] for number in estimate.post.tolist()]
+        found = values[..., : estimate.parameters] @ estimate.response.T
+        return found + values[..., place] @ estimate.by_post.T if place else found
+
+    def _add_posts(self, numbers: Sequence[int]) -> None:
+        """The errors of more posts, of which nothing is known but their prior."""
+        if not numbers:
+            return
+        (count, size), more = self.mean.shape, len(numbers)
+        self.posts.update((number, size + k) for k, number in enumerate(numbers))
+        self.mean = np.pad(self.mean, ((0, 0), (0, more)))
+        grown = np.tile(np.eye(size + more), (count, 1, 1))
+        grown[:, :size, :size] = self.covariance
+        self.covariance = grown
+        if self.followers is not None:
+            self.followers.cross = np.pad(self.followers.cross, ((0, 0), (0, 0), (0, more)))
+
+    def _forget_posts(self, estimate: FrameEstimate) -> None:
+        """Leave out the posts that were not seen for the longest time, where there are too many."""
+        for number in estimate.post.tolist():  # the last ones of the dictionary are the latest
+            self.posts[number] = self.posts.pop(number)
+        if len(self.posts) > MOST_POSTS:
+            kept = list(self.posts)[-(3 * MOST_POSTS // 4) :]
+            first = 2 + self.shared_count + self.moves_count + self.leg_count
+            place = np.append(np.arange(first), [self.posts[number] for number in kept])
+            self.mean, self.covariance = self.mean[:, place], self.covariance[:, place[:, None], place]
+            self.posts = {number: first + k for k, number in enumerate(kept)}
+            if self.followers is not None:
+                self.followers.cross = self.followers.cross[..., place]
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,9 +230,32 @@ class Smoothed:
     covariance_m2: Array  # (n, 2, 2)
     shared: Array  # (k,) in standard deviations of their priors
     shared_covariance: Array  # (k, k)
-    post: Ints  # (c,) numbers of the posts that the observations depend on
-    post_error: Array  # (c,) in their standard deviations
-    post_sigma: Array  # (c,) of these
+
+
+def smooth(estimates: Sequence[FrameEstimate | None], steps: Steps) -> Smoothed:
+    """The best positions and shared errors by the frames (n,) that have an estimate, with their covariances.
+
+    Raises ValueError where no frame has one.
+    """
+    one = next((estimate for estimate in estimates if estimate is not None), None)
+    if one is None:
+        raise ValueError("no frame has an estimate")
+    state = TrackFilter.start(one.parameters - 2, steps.by_shared_m.shape[-1], steps.by_leg_m.shape[-1], follows=True)
+    for k, estimate in enumerate(estimates):
+        if k:
+            state.predict(steps, k - 1)
+        if estimate is not None:
+            state.update(estimate)
+    position_m, covariance_m2 = state.positions()
+    shared = slice(2, one.parameters)
+    return Smoothed(position_m, covariance_m2, state.mean[0, shared], state.covariance[0, shared, shared])
+
+
+def mix_smoothed(parts: Sequence[Smoothed], share: Array) -> Smoothed:
+    """The estimate by several explanations of the same observations, with their shares (m,)."""
+    position = mixed_normal([one.position_m for one in parts], [one.covariance_m2 for one in parts], share)
+    shared = mixed_normal([one.shared for one in parts], [one.shared_covariance for one in parts], share)
+    return Smoothed(*position, *shared)
 
 
 def mixed_normal(means: Sequence[Array], covariances: Sequence[Array], share: Array) -> tuple[Array, Array]:
@@ -131,54 +265,11 @@ def mixed_normal(means: Sequence[Array], covariances: Sequence[Array], share: Ar
     return mean, np.einsum("m,m...->...", share, covariances + off[..., None] * off[..., None, :])
 
 
-def mix_smoothed(parts: Sequence[Smoothed], share: Array) -> Smoothed:
-    """The estimate by several explanations of the same observations, with their shares (m,)."""
-    position = mixed_normal([one.position_m for one in parts], [one.covariance_m2 for one in parts], share)
-    shared = mixed_normal([one.shared for one in parts], [one.shared_covariance for one in parts], share)
-    errors = [one.post_error[:, None] for one in parts]
-    post = mixed_normal(errors, [np.square(one.post_sigma)[:, None, None] for one in parts], share)
-    return Smoothed(*position, *shared, parts[0].post, post[0][:, 0], np.sqrt(post[1][:, 0, 0]))
-
-
-def smooth(observations: Observations, steps: Steps) -> Smoothed:
-    """The best positions and shared errors, with their covariances. Cost: the third power of the number of frames."""
-    n, known = observations.count, np.isfinite(steps.sigma_m)
-    weight = np.where(known, 1.0 / np.square(np.where(known, steps.sigma_m, 1.0)), 0.0)
-    by_each_m = steps.by_each_m
-    size, more = len(observations.target), by_each_m.shape[-1]
-    information, target = np.eye(size + more), np.append(observations.target, np.zeros(more))
-    information[:size, :size] = observations.information
-    for axis in range(2):
-        left, right = 2 * np.arange(n - 1) + axis, 2 * np.arange(n - 1) + 2 + axis
-        for a, b, sign in ((left, left, 1.0), (right, right, 1.0), (left, right, -1.0), (right, left, -1.0)):
-            information[a, b] += sign * weight
-        np.subtract.at(target, left, weight * steps.move_m[:, axis])
-        np.add.at(target, right, weight * steps.move_m[:, axis])
-    if more:
-        by, left = by_each_m.reshape(-1, more), np.arange(2 * (n - 1))
-        weighted = np.repeat(weight, 2)[:, None] * by
-        for at, sign in ((left, 1.0), (left + 2, -1.0)):
-            information[at, size:] += sign * weighted
-            information[size:, at] += sign * weighted.T
-        information[size:, size:] += weighted.T @ by
-        target[size:] -= weighted.T @ steps.move_m.ravel()
-    covariance = inverse(information)
-    best, covariance = (covariance @ target)[:size], covariance[:size, :size]
-    position, blocks = best[: 2 * n].reshape(n, 2), covariance[: 2 * n, : 2 * n].reshape(n, 2, n, 2)
-    pull = observations.inverse_covariance @ observations.value - observations.weighted_design @ best
-    return Smoothed(
-        position, blocks[range(n), :, range(n)], best[2 * n :], covariance[2 * n :, 2 * n :], observations.posts,
-        *_posts(observations, pull, covariance),
-    )  # fmt: skip
-
-
-def _posts(observations: Observations, pull: Array, covariance: Array) -> tuple[Array, Array]:
-    """Errors (c,) of the posts and what is left of them (c,), in standard deviations before."""
-    G = observations.by_post
-    weighted = np.asarray(G.T @ observations.weighted_design)
-    gain = np.asarray((G.T @ observations.inverse_covariance) * G.T.toarray()).sum(axis=1)
-    gain -= np.einsum("ci,ij,cj->c", weighted, covariance, weighted, optimize=True)
-    return np.asarray(G.T @ pull), np.sqrt(np.maximum(1.0 - gain, 0.0))
+def log_normal(residual: Array, covariance: Array) -> Array:
+    """Logarithm of normal densities at residuals (..., p) with covariances (..., p, p)."""
+    chi2 = np.einsum("...i,...i->...", residual, np.linalg.solve(covariance, residual[..., None])[..., 0])
+    size = residual.shape[-1] * np.log(2.0 * np.pi)
+    return np.asarray(-0.5 * (chi2 + size + np.linalg.slogdet(covariance)[1]))
 
 
 def radius_holding(covariance_m2: Array, probability: float) -> Array:

@@ -34,7 +34,6 @@ from startrack.core.statistics import error_ellipse
 from startrack.core.types import Array, Bools
 from startrack.estimation.observations import (
     FrameEstimate,
-    Observations,
     OdometryErrors,
     Steps,
     moves_by_scale_and_heading,
@@ -105,7 +104,7 @@ def add_odometry(position_m: Array, cells: Cells, errors: OdometryErrors) -> Cel
     steps = Steps(move_m, errors.sigma_m(move_m), errors.sigma_1 * moves_by_scale_and_heading(move_m))
     filtered = smoothed = np.full((len(known), 2, 2), np.inf)
     if known.any():
-        state, filtered = TrackFilter(0, steps.by_shared_m.shape[-1]), filtered.copy()
+        state, filtered = TrackFilter.start(0, steps.by_shared_m.shape[-1]), filtered.copy()
         for k, estimate in enumerate(estimates):
             if k:
                 state.predict(steps, k - 1)
@@ -113,7 +112,7 @@ def add_odometry(position_m: Array, cells: Cells, errors: OdometryErrors) -> Cel
                 state.update(estimate)
             if known[: k + 1].any():
                 filtered[k] = state.covariance_m2
-        smoothed = smooth(Observations.of(estimates), steps).covariance_m2
+        smoothed = smooth(estimates, steps).covariance_m2
     radii = (radius_holding(covariance_m2, 0.95) for covariance_m2 in (filtered, smoothed))
     found = (np.where(np.isfinite(radius), radius, np.nan) for radius in radii)
     return cells | dict(zip((FILTERED, SMOOTHED), found, strict=True))

@@ -6,13 +6,13 @@ from startrack.applications.tracking.odometry import Odometry, OdometryFile, rea
 from startrack.applications.tracking.picture import draw_track
 from startrack.applications.tracking.quantities import FRAME_QUANTITIES, TRACK, frame_records
 from startrack.applications.tracking.session import TrackSession, follow_images
-from startrack.applications.tracking.track import CrestHeights, Track, TrackFrame, Trajectory, estimate_track
+from startrack.applications.tracking.track import Track, TrackFrame, Trajectory, estimate_track
 from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.applications.tracking.write import track_page, track_record, write_track
 from startrack.exposure import read_bag_exposures
 
 __all__ = [
-    "FRAME_QUANTITIES", "TRACK", "CrestHeights", "FrameStore",
+    "FRAME_QUANTITIES", "TRACK", "FrameStore",
     "ObservedFrame", "Odometry", "OdometryFile", "Track", "TrackErrors", "TrackFrame", "TrackSession", "Trajectory",
     "draw_track", "estimate_frame", "estimate_track", "follow_images", "frame_records", "observe_frame",
     "read_bag_exposures", "read_odometry", "rows_near_skyline", "track_page", "track_record", "write_track",

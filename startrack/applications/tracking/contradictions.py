@@ -10,7 +10,7 @@ import numpy as np
 from startrack.applications.tracking.explanations import Explanation, Explanations
 from startrack.applications.tracking.moves import Moves
 from startrack.core.types import Array, BadInput, Bools, Ints
-from startrack.estimation.observations import FrameEstimate, Observations, Steps
+from startrack.estimation.observations import FrameEstimate, Steps
 from startrack.estimation.trajectory import Smoothed, mix_smoothed, smooth
 from startrack.localization import AMBIGUOUS_MASS
 
@@ -111,9 +111,9 @@ def _smooth(modes: Sequence[Sequence[FrameEstimate]], one: Explanation, mode: In
     chosen = [of[k] if k >= 0 else None for of, k in zip(modes, mode, strict=True)]
     if all(estimate is None for estimate in chosen):
         return None
-    observations, others = Observations.of(chosen), [each.share for each in one.variants]
+    others = [each.share for each in one.variants]
     share = np.array([1.0 - sum(others), *others])
-    return mix_smoothed([smooth(observations, each.steps) for each in (one, *one.variants)], share)
+    return mix_smoothed([smooth(chosen, each.steps) for each in (one, *one.variants)], share)
 
 
 def _group(one: Explanation, names: Sequence[str], *, has_odometry: bool) -> str:

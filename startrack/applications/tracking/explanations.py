@@ -2,9 +2,10 @@
 
 An explanation states of each image whether it is of this camera, and which of its positions is right; of each move,
 whether the wheels slipped, in it alone or alike in the moves of a leg; and of the odometry, whether it is as stated or
-wrong as a whole. Each has a prior (the constants below) and a likelihood: that of a Kalman filter without posts, whose
+wrong as a whole. Each has a prior (the constants below) and a likelihood: that of the filter without posts, whose
 errors count as the image's own. An image that is not of the track is anywhere, or near its place with a gross error.
-The moves are turned by the attitude of the last image that an explanation takes as right.
+The moves are turned by the attitude of the last image that an explanation takes as right. What the likeliest
+explanation says of images that WINDOW others have followed is settled, so that time and memory stay flat.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from startrack.applications.tracking.branches import Branches
 from startrack.applications.tracking.moves import FREEDOMS, LEG_FREEDOMS, Moves
 from startrack.core.types import Array, Ints
 from startrack.estimation.observations import FrameEstimate, Steps
+from startrack.estimation.trajectory import TrackFilter, log_normal
 
 SLIP_PROBABILITY, SLIP_SIGMA_M = 0.05, 20.0  # of a move by wheel slip, and its size on each axis
 LEG_PROBABILITY, LEG_END_PROBABILITY = 0.05, 0.2  # that a leg begins with a move, and that a move of it is its last
@@ -27,12 +29,16 @@ FOREIGN_SIGMA_M = 5000.0  # of a position anywhere in a search area, about its m
 MIXED_PROBABILITY, MIXED_PART = 1e-3, 0.1  # of a set with images from elsewhere, and how many of its images these are
 ODOMETRY_WRONG_PROBABILITY = 0.01  # as a whole
 LEAST_VARIANT = 0.01  # part of an explanation's probability, by other moves, that counts in its positions
+WINDOW = 200  # frames about which explanations may differ
 KEPT_NATS, MOST_KEPT = 60.0, 60  # of explanations beside the best, and for each kind of odometry
 
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """One explanation of n frames, with the shares of all that differ in no frame and in no use of the odometry."""
+    """One explanation of n frames, with the shares of all that differ in no frame and in no use of the odometry.
+
+    The frames are those that its moves have: all, or the last ones.
+    """
 
     share: float  # of the probability
     moves: Moves
@@ -46,8 +52,9 @@ class Explanation:
 
     @property
     def leg(self) -> Ints:
-        """(n - 1,) number from 1 of the leg, or of the single move, that slipped; 0: none."""
-        return np.where(self.kind > STRAIGHT, np.cumsum((self.kind == SLIPS) | (self.kind == BEGINS)), 0)
+        """(n - 1,) number from 1 of the leg, or of the single move, that slipped; 0: none; -1: begun before them."""
+        number = np.cumsum((self.kind == SLIPS) | (self.kind == BEGINS))
+        return np.where(self.kind > STRAIGHT, np.where(number > 0, number, -1), 0)
 
     @property
     def steps(self) -> Steps:
@@ -63,19 +70,24 @@ class Explanations:
 
     shared_count: int
     may_slip: bool = True
-    _frames: list[Sequence[FrameEstimate]] = field(default_factory=list)
+    _frames: list[Sequence[FrameEstimate]] = field(default_factory=list)  # that are not settled
+    _settled: list[Ints] = field(default_factory=list)  # mode, kind and anchor (3,) of each frame before
+    _with_modes: int = 0  # number of frames that have one
     _moves: Sequence[Moves] = ()
+    _first: int = 0  # frame of the first move
     _found: Branches | None = None
 
-    def add(self, modes: Sequence[FrameEstimate], moves: Sequence[Moves]) -> None:
+    def add(self, modes: Sequence[FrameEstimate], moves: Sequence[Moves], first: int = 0) -> None:
         """One more frame, with one mode, several (ambiguous) or none (refused).
 
-        `moves` are those of each kind of odometry, of all frames so far at least; the first is as stated.
+        `moves` are those of each kind of odometry, from frame number `first`, which may be a settled one, to this one
+        at least; the first is as stated.
         """
         self._frames.append(modes)
-        self._moves, k = moves, len(self._frames) - 1
-        start = self._start() if self._found is None else self._moved(self._found, k - 1)
-        known = np.array([np.isfinite(m.turn[k + 1]).all() for m in moves])[start.odometry]
+        self._with_modes += bool(modes)
+        self._moves, self._first, k = moves, first, len(self._settled) + len(self._frames) - 1
+        start = self._start() if self._found is None else self._moved(self._found, k - 1 - first)
+        known = np.array([np.isfinite(m.turn[k - first + 1]).all() for m in moves])[start.odometry]
         here = np.where(known, k + 1, start.anchor)
         branches = [self._used(start, number, mode, here) for number, mode in enumerate(modes)]
         if modes:
@@ -85,17 +97,26 @@ class Explanations:
             branches += [_decided(start, start.log_likelihood + np.log1p(-np.exp(doubt)), -1, here)]
             branches += [_decided(start, start.log_likelihood + doubt, -1, start.anchor)] if known.any() else []
         self._found = self._likeliest(Branches.join(branches))
+        if len(self._frames) > WINDOW:
+            self._settle(self._found)
+
+    def _settle(self, found: Branches) -> None:
+        """Keep the explanations that take the first frame as the likeliest one does, which is first of them."""
+        agreeing = found.take((found.history[:, 0] == found.history[0, 0]).all(axis=1))
+        self._settled.append(found.history[0, 0].copy())
+        self._frames.pop(0)
+        self._found = replace(agreeing, history=agreeing.history[:, 1:], log_wrong=agreeing.log_wrong[:, 1:])
 
     def ranked(self) -> list[Explanation]:
         """Explanations with their shares, the likeliest first.
 
         Frames that the likeliest one takes as wrong may be those of the track, if they agree with each other as well.
         """
-        found, n = self._branches, len(self._frames)
+        found = self._branches
         total = found.log_likelihood + self._wrong_prior(found.wrong)
         groups: dict[tuple[object, ...], list[int]] = {}
         for b in np.argsort(-total, kind="stable").tolist():
-            key = bool(self._moves[found.odometry[b]].fault), *found.history[b, :, 0].tolist()
+            key = bool(self._moves[found.odometry[b]].fault), found.history[b, :, 0].tobytes()
             groups.setdefault(key, []).append(b)
         weights = [np.logaddexp.reduce(total[group]) for group in groups.values()]
         best = [found.take(np.array(group[:1])) for group in groups.values()]
@@ -110,12 +131,12 @@ class Explanations:
                 best.append(other)
         share = np.exp(np.array(weights) - np.logaddexp.reduce(weights))
         order = np.argsort(-share, kind="stable").tolist()
-        likeliest, *others = (self._explanation(best[g], float(share[g]), n) for g in order)
+        likeliest, *others = (self._explanation(best[g], float(share[g])) for g in order)
         group = list(groups.values())[order[0]] if order[0] < len(groups) else []
         if not likeliest.moves.fault:
             part = np.exp(total[group] - np.logaddexp.reduce(total[group]))
             kept = [(b, p) for b, p in zip(group[1:], part[1:].tolist(), strict=True) if p > LEAST_VARIANT]
-            more = tuple(self._explanation(found.take(np.array([b])), p, n) for b, p in kept)
+            more = tuple(self._explanation(found.take(np.array([b])), p) for b, p in kept)
             likeliest = replace(likeliest, variants=more)
         return [likeliest, *others]
 
@@ -125,20 +146,22 @@ class Explanations:
             raise ValueError("no frame was added")
         return self._found
 
-    def _explanation(self, one: Branches, share: float, n: int) -> Explanation:
-        mode, kind, anchor = one.history[0].T
+    def _explanation(self, one: Branches, share: float) -> Explanation:
+        mode, kind, anchor = np.vstack([*self._settled[self._first :], one.history[0]]).T
+        turned_by = np.maximum(anchor[1:] - self._first, 0)
         return Explanation(
-            share, self._moves[one.odometry[0]], int(one.odometry[0]), mode, kind[1:], anchor[1:n], one.mean[0, :2],
-            one.covariance[0, :2, :2],
+            share, self._moves[one.odometry[0]], int(one.odometry[0]), mode, kind[1:], turned_by,
+            one.state.position_m, one.state.covariance_m2,
         )  # fmt: skip
 
     def _start(self) -> Branches:
-        count, more = len(self._moves), np.ones(FREEDOMS + LEG_FREEDOMS)
-        prior = np.diag(np.square(np.append(self._free_sigma, more)))
+        count = len(self._moves)
+        state = TrackFilter.start(
+            self.shared_count, FREEDOMS, LEG_FREEDOMS, count=count, unknown_m=FOREIGN_SIGMA_M
+        )  # fmt: skip
         nothing, none = np.zeros(count), np.zeros(count, dtype=np.int64)
         return Branches(
-            np.array([m.log_prior for m in self._moves]), nothing, none, np.zeros((count, len(prior))),
-            np.tile(prior, (count, 1, 1)), np.arange(count), none,
+            np.array([m.log_prior for m in self._moves]), nothing[:, None], none, state, np.arange(count), none,
             np.zeros((count, 1, 3), dtype=np.int64),
         )  # fmt: skip
 
@@ -151,25 +174,20 @@ class Explanations:
 
         A leg may begin, and go on, in odometry without a fault as a whole.
         """
-        turn = np.array([m.turn for m in self._moves])[one.odometry, one.anchor]
+        turn = np.array([m.turn for m in self._moves])[one.odometry, np.maximum(one.anchor - self._first, 0)]
         delta = np.array([m.delta_m[step] for m in self._moves])[one.odometry]
         sigma = np.array([m.sigma_m[step] for m in self._moves])[one.odometry]
         freedom = np.array([m.freedom_m[step] for m in self._moves])[one.odometry]
         move = np.einsum("bij,bj->bi", turn, delta)[:, :2]
-        lost = ~(np.isfinite(move).all(axis=1) & np.isfinite(sigma))
-        shift = np.tile(np.eye(one.mean.shape[1]), (len(lost), 1, 1))
-        all_moves = slice(-FREEDOMS - LEG_FREEDOMS, -LEG_FREEDOMS)
-        shift[:, :2, all_moves] = np.where(lost[:, None, None], 0.0, (turn @ freedom)[:, :2])
-        mean = np.einsum("bij,bj->bi", shift, one.mean)
-        covariance = shift @ one.covariance @ shift.swapaxes(1, 2)
-        mean[:, :2] = np.where(lost[:, None], 0.0, mean[:, :2] + move)
-        covariance[lost, :2], covariance[lost, :, :2] = 0.0, 0.0
-        covariance[:, [0, 1], [0, 1]] += np.square(np.where(lost, FOREIGN_SIGMA_M, sigma))[:, None]
+        sigma = np.where(np.isfinite(move).all(axis=1), sigma, np.inf)
+        lost, state = np.isinf(sigma), one.state.take(slice(None))
+        state.move(move, sigma, (turn @ freedom)[:, :2])
         entry = np.stack([np.zeros_like(one.anchor), np.zeros_like(one.anchor), one.anchor], axis=-1)
-        history = np.concatenate([one.history, entry[:, None]], axis=1)
-        moved = Branches(
-            one.log_likelihood, one.log_wrong, one.wrong, mean, covariance, one.odometry, one.anchor, history
+        history, log_wrong = (
+            np.concatenate([one.history, entry[:, None]], axis=1),
+            np.pad(one.log_wrong, ((0, 0), (0, 1))),
         )
+        moved = Branches(one.log_likelihood, log_wrong, one.wrong, state, one.odometry, one.anchor, history)
         if not self.may_slip:
             return moved
         may_begin = ~lost & np.array([m.has_legs and not m.fault for m in self._moves])[one.odometry]
@@ -188,50 +206,36 @@ class Explanations:
             branches.log_likelihood += log_prior[may]
             branches.history[:, -1, 1] = kind
             if kind == SLIPS:
-                branches.covariance[:, [0, 1], [0, 1]] += SLIP_SIGMA_M**2
+                branches.state.add_noise(SLIP_SIGMA_M)
             elif kind != STRAIGHT:
-                branches.move_by_leg(by_leg[may], is_new=kind == BEGINS)
+                branches.state.move_by_leg(by_leg[may], is_new=kind == BEGINS)
             parts.append(branches)
         return Branches.join(parts)
 
     def _used(self, one: Branches, number: int, mode: FrameEstimate, anchor: Ints) -> Branches:
-        residual, covariance, noise = self._innovation(one, mode)
-        seen = np.pad(mode.response, ((0, 0), (0, FREEDOMS + LEG_FREEDOMS)))
-        cross = one.covariance @ seen.T
-        gain = np.linalg.solve(covariance, cross.swapaxes(1, 2)).swapaxes(1, 2)
-        found = _decided(
-            one, one.log_likelihood + np.log(mode.weight) + log_normal(residual, covariance), number, anchor
-        )
-        found.mean = one.mean + np.einsum("bij,bj->bi", gain, residual)
-        rest = np.eye(one.mean.shape[1]) - gain @ seen
-        found.covariance = rest @ one.covariance @ rest.swapaxes(1, 2) + gain @ noise @ gain.swapaxes(1, 2)
+        found = _decided(one, one.log_likelihood + np.log(mode.weight), number, anchor)
+        found.log_likelihood += found.state.update(mode.without_posts)
         return found
 
     def _wrong(self, one: Branches, modes: Sequence[FrameEstimate]) -> Branches:
         """The frame is not of the track: anywhere, or near with a gross error; its shared errors are its own."""
         near, free = np.r_[[WRONG_SIGMA_M**2] * 2, np.ones(self.shared_count)], np.square(self._free_sigma)
         parts = []
-        for mode in modes:
-            residual, covariance, noise = self._innovation(one, mode)
+        for mode in (mode.without_posts for mode in modes):
+            residual, covariance, _ = one.state.innovation(mode)
             gross = covariance + (mode.response * near) @ mode.response.T
-            anywhere = log_normal(mode.mean, (mode.response * free) @ mode.response.T + noise)
+            anywhere = log_normal(mode.mean, (mode.response * free) @ mode.response.T + mode.noise)
             either = np.logaddexp(log_normal(residual, gross), anywhere) - np.log(2.0)
             parts.append(np.log(mode.weight) + either)
         likelihood = np.logaddexp.reduce(parts)
         found = _decided(one, one.log_likelihood + likelihood, -1, one.anchor)
-        found.log_wrong, found.wrong = one.log_wrong + likelihood, one.wrong + 1
+        found.log_wrong, found.wrong = one.log_wrong.copy(), one.wrong + 1
+        found.log_wrong[:, -1] = likelihood
         return found
-
-    def _innovation(self, one: Branches, mode: FrameEstimate) -> tuple[Array, Array, Array]:
-        """Observation less prediction (b, p), its covariance (b, p, p), and the part by the frame itself (p, p)."""
-        noise = mode.noise + mode.by_post @ mode.by_post.T
-        p = mode.parameters
-        covariance = mode.response @ one.covariance[:, :p, :p] @ mode.response.T + noise
-        return mode.mean - one.mean[:, :p] @ mode.response.T, covariance, noise
 
     def _wrong_prior(self, wrong: Ints) -> Array:
         """Logarithm of the prior of so many wrong frames: single ones, or a set with images from elsewhere."""
-        right, parts = sum(bool(modes) for modes in self._frames) - wrong, []
+        right, parts = self._with_modes - wrong, []
         for probability, part in ((1.0 - MIXED_PROBABILITY, WRONG_PROBABILITY), (MIXED_PROBABILITY, MIXED_PART)):
             parts.append(np.log(probability) + wrong * np.log(part) + right * np.log1p(-part))
         return np.asarray(np.logaddexp(*parts))
@@ -247,40 +251,33 @@ class Explanations:
     def _second_group(self, best: Branches) -> tuple[float, Branches] | None:
         """Log-likelihood of `best` where its wrong frames are a track of their own, and the explanation by that one.
 
-        None where fewer than two are wrong, or they do not agree.
+        None where fewer than two are wrong of those that are not settled, or they do not agree.
         """
-        out = best.history[0, :, 0] < 0
-        if best.wrong[0] < 2:
+        has_modes = np.array([bool(modes) for modes in self._frames])
+        out, settled = best.history[0, :, 0] < 0, len(self._settled)
+        wrong = np.count_nonzero(out & has_modes)
+        if wrong < 2:
             return None
         alone = Explanations(self.shared_count, self.may_slip)
-        moves = self._moves[best.odometry[0]]
-        turn = moves.turn.copy()
-        turn[1 : len(out) + 1][~out] = np.nan
-        start = replace(moves, log_prior=0.0, turn=turn)
+        start = replace(self._moves[best.odometry[0]].part(settled - self._first, len(out)), log_prior=0.0)
+        start.turn[1:][~out] = np.nan
         for modes, is_out in zip(self._frames, out, strict=True):
             alone.add(modes if is_out else (), [start])
         other = alone._branches
         other = other.take(other.wrong == 0)
         if not len(other.wrong):
             return None
-        other = other.take(np.argsort(-other.log_likelihood)[:1])
-        if other.log_likelihood[0] < best.log_wrong[0]:
+        other, as_wrong = other.take(np.argsort(-other.log_likelihood)[:1]), float(best.log_wrong[0].sum())
+        if other.log_likelihood[0] < as_wrong:
             return None
-        other.odometry, other.wrong = best.odometry, sum(bool(modes) for modes in self._frames) - best.wrong
-        return float(best.log_likelihood[0] - best.log_wrong[0] + other.log_likelihood[0]), other
+        other.history[..., 2] += np.where(other.history[..., 2] > 0, settled, 0)
+        other.odometry, other.wrong = best.odometry, best.wrong + np.count_nonzero(has_modes) - 2 * wrong
+        return float(best.log_likelihood[0] - as_wrong + other.log_likelihood[0]), other
 
 
 def _decided(one: Branches, log_likelihood: Array, mode: int, anchor: Ints) -> Branches:
     """The same with a decision about the last frame."""
     history = one.history.copy()
     history[:, -1, 0] = mode
-    return Branches(
-        log_likelihood, one.log_wrong, one.wrong, one.mean, one.covariance, one.odometry, anchor, history
-    )  # fmt: skip
-
-
-def log_normal(residual: Array, covariance: Array) -> Array:
-    """Logarithm of normal densities at residuals (..., p) with covariances (..., p, p)."""
-    chi2 = np.einsum("...i,...ij,...j->...", residual, np.linalg.inv(covariance), residual)
-    size = residual.shape[-1] * np.log(2.0 * np.pi)
-    return np.asarray(-0.5 * (chi2 + size + np.linalg.slogdet(covariance)[1]))
+    state = one.state.take(slice(None))
+    return Branches(log_likelihood, one.log_wrong, one.wrong, state, one.odometry, anchor, history)

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from startrack.applications.tracking.contradictions import RobustTrack, disagrees, smooth_robustly
-from startrack.applications.tracking.explanations import Explanations
+from startrack.applications.tracking.explanations import WINDOW, Explanations
 from startrack.applications.tracking.frame_estimate import (
     FRAME_REACH_SIGMAS,
     LEAST_FRAME_HALF_M,
@@ -25,7 +25,7 @@ from startrack.applications.tracking.moves import FREEDOMS, LEG_FREEDOMS, Moves
 from startrack.applications.tracking.observed_frame import ObservedFrame
 from startrack.applications.tracking.track_errors import SIZE_ROUNDS, TrackErrors
 from startrack.core.types import Array, BadInput, Ints
-from startrack.estimation.observations import UNKNOWN_M, FrameEstimate, Observations, Steps
+from startrack.estimation.observations import UNKNOWN_M, FrameEstimate, Steps
 from startrack.estimation.trajectory import Smoothed, TrackFilter, mixed_normal, smooth
 from startrack.localization import AMBIGUOUS_MASS
 from startrack.terrain import Terrain
@@ -39,11 +39,13 @@ class OnlineTrack:
     """Positions at the time of each frame; `add` in the order of time. Without contradictions a Kalman filter."""
 
     def __init__(self, shared_count: int) -> None:
-        self.filter = TrackFilter(shared_count, FREEDOMS + LEG_FREEDOMS)
+        self.filter = TrackFilter.start(shared_count, FREEDOMS, LEG_FREEDOMS)
+        self._before, self._between = self.filter.take(slice(None)), self.filter
+        self._settled = 0  # number of frames that `_before` has; `_between` has WINDOW more
         self.is_vouched = True  # whether explanations of another position of the last frame are unlikely together
         self._explanations = Explanations(shared_count)
-        self._modes: list[Modes] = []
-        self._decided: list[tuple[object, ...]] = []  # of each frame that the filter has
+        self._modes: list[Modes] = []  # of the frames that are not settled
+        self._decided: list[tuple[object, ...]] = []  # of each of them that the filter has
 
     @property
     def mode(self) -> int:
@@ -75,29 +77,47 @@ class OnlineTrack:
     @property
     def is_first(self) -> bool:
         """Whether the last frame is used, and the only one so far."""
-        return self.mode >= 0 and np.count_nonzero(self._best.mode >= 0) == 1
+        return self.mode >= 0 and not self._settled and np.count_nonzero(self._best.mode >= 0) == 1
 
-    def add(self, modes: Modes, moves: Sequence[Moves]) -> None:
-        """One more frame, with one mode, several (ambiguous) or none (refused); `moves` as for `Explanations.add`."""
-        self._explanations.add(modes, moves)
+    @property
+    def first(self) -> int:
+        """Number of the first frame that `moves` must have when the next one is added."""
+        return max(self._settled - 1, 0)
+
+    def add(self, modes: Modes, moves: Sequence[Moves], first: int = 0) -> None:
+        """One more frame, with one mode, several (ambiguous) or none (refused).
+
+        `moves` are as for `Explanations.add`, from the frame `first` on, at most that of the property.
+        """
+        self._explanations.add(modes, moves, first)
         self._modes.append(modes)
         self._best, *others = self._explanations.ranked()
-        best, n = self._best, len(self._modes)
-        steps = best.steps
-        moved = [(), *zip(best.kind.tolist(), best.anchor.tolist(), [best.number] * (n - 1), strict=True)]
-        decided = [(mode, *move) for mode, move in zip(best.mode.tolist(), moved, strict=True)]
-        if decided[:-1] != self._decided:  # another explanation of the frames before is likelier now
-            self.filter = TrackFilter(self.filter.shared_count, FREEDOMS + LEG_FREEDOMS)
-            self._decided = []
-        for k in range(len(self._decided), n):
-            if k:
-                self.filter.predict(steps, k - 1)
-            if best.mode[k] >= 0:
-                self.filter.update(self._modes[k][best.mode[k]])
-        self._decided = decided
+        self._follow_best(first)
+        best = self._best
         away = [disagrees(best.position_m, best.covariance_m2, o.position_m, o.covariance_m2) for o in others]
         doubt = sum(one.share for one, is_away in zip(others, away, strict=True) if is_away)
         self.is_vouched = doubt <= AMBIGUOUS_MASS
+
+    def _follow_best(self, first: int) -> None:
+        """Take into the filter what the likeliest explanation says of the frames, which begin with number `first`."""
+        best, steps, begin = self._best, self._best.steps, self._settled - first
+        turned_by = np.where(best.anchor > 0, best.anchor + first, 0).tolist()
+        moved = [(), *zip(best.kind.tolist(), turned_by, [best.number] * len(best.kind), strict=True)]
+        decided = [(mode, *move) for mode, move in zip(best.mode.tolist(), moved, strict=True)][begin:]
+        if decided[: len(self._decided)] != self._decided:  # another explanation of the frames before is likelier now
+            self.filter, self._decided = self._before.take(slice(None)), []
+        for k in range(len(self._decided), len(decided)):
+            if begin + k:
+                self.filter.predict(steps, begin + k - 1)
+            if best.mode[begin + k] >= 0:
+                self.filter.update(self._modes[k][best.mode[begin + k]])
+            if k + 1 == WINDOW:
+                self._between = self.filter.take(slice(None))
+        self._decided = decided
+        if len(decided) == 2 * WINDOW:
+            self._before, self._between = self._between, self.filter.take(slice(None))
+            self._decided, self._modes = self._decided[WINDOW:], self._modes[WINDOW:]
+            self._settled += WINDOW
 
 
 def filter_positions(
@@ -111,7 +131,8 @@ def filter_positions(
     track, position, covariance, alone, mode = OnlineTrack(shared_count), [], [], [], []
     kinds = [Moves.of(moves)] if isinstance(moves, Steps) else moves
     for k, of in enumerate(modes):
-        track.add(of, kinds)
+        first = track.first
+        track.add(of, [one.part(first, k + 1 - first) for one in kinds], first)
         position.append(track.position_m)
         covariance.append(track.covariance_m2 if track.is_vouched else UNKNOWN_M**2 * np.eye(2))
         alone += [k] if track.is_first else []
@@ -144,10 +165,10 @@ def positions_at_rest(
     position, covariance = np.zeros((n, 2)), np.repeat([UNKNOWN_M**2 * np.eye(2)], n, axis=0)
 
     def take(k: int, estimate: FrameEstimate) -> Smoothed:
-        found = smooth(Observations.of([errors.place(estimate)]), Steps.unknown(1))
+        found = smooth([errors.place(estimate)], Steps.unknown(1))
         for _ in range(SIZE_ROUNDS if errors.bends else 0):
             placed = errors.place(estimate, found.position_m[0], found.shared)
-            found = smooth(Observations.of([placed]), Steps.unknown(1))
+            found = smooth([placed], Steps.unknown(1))
         position[k:], covariance[k:] = found.position_m[0], found.covariance_m2[0]
         return found
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -33,6 +33,13 @@ class Moves:
         n = len(steps.sigma_m) + 1
         turn, none = np.tile(np.eye(3), (n + 1, 1, 1)), np.zeros((n - 1, 3, FREEDOMS))
         return cls("", 0.0, np.pad(steps.move_m, ((0, 0), (0, 1))), turn, steps.sigma_m, none)
+
+    def part(self, first: int, frames: int) -> Moves:
+        """Those between so many frames from number `first` on."""
+        turn, moves = np.concatenate([self.turn[:1], self.turn[first + 1 :][:frames]]), slice(first, first + frames - 1)
+        return replace(
+            self, turn=turn, delta_m=self.delta_m[moves], sigma_m=self.sigma_m[moves], freedom_m=self.freedom_m[moves]
+        )  # fmt: skip
 
     def steps(self, anchor: Ints) -> Steps:
         """The first moves in enu, turned as by the entries `anchor` (m,) of `turn`; none is known with a fault."""

@@ -151,16 +151,17 @@ class TrackSession:
 
     def _filter_to(self, k: int, odometry: Odometry | None, shared: TrackErrors) -> OnlineTrack:
         """The filter with frame k; where positions are not linear in `shared`, of all frames about what they show."""
-        frames = self.frames[: k + 1]
+        online = OnlineTrack(len(shared)) if self._online is None or shared.bends else self._online
+        first = online.first
+        frames = self.frames[first : k + 1]
         moves = odometry_moves(frames, odometry, self.odometry_errors, shows_scale=not shared.bends)
-        modes = [frame.modes for frame in frames]
         if shared.bends:
-            online, placed = None, smooth_placed(modes, moves, shared)[0] if any(modes) else modes
+            modes = [frame.modes for frame in frames]
+            placed = smooth_placed(modes, moves, shared)[0] if any(modes) else modes
         else:
-            online, placed = self._online, [[shared.place(one) for one in modes[k]]]
-        online = online or OnlineTrack(len(shared))
+            placed = [[shared.place(one) for one in frames[-1].modes]]
         for of in placed:
-            online.add(of, moves)
+            online.add(of, moves, first)
         return online
 
     def _load_references(self, exposure: Exposure) -> tuple[Camera, Terrain, TrackErrors]:

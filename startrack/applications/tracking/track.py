@@ -10,21 +10,20 @@ from itertools import pairwise
 import numpy as np
 
 from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions, positions_at_rest
-from startrack.applications.tracking.frame_estimate import FIRST_WAVE
 from startrack.applications.tracking.legs import SlippedLeg, images_outside, legs_about, slipped_legs
 from startrack.applications.tracking.observed_frame import ImageFix, ObservedFrame
 from startrack.applications.tracking.odometry import Odometry
 from startrack.applications.tracking.odometry_moves import odometry_moves, times_s
 from startrack.applications.tracking.track_errors import BIAS, CLOCK, TrackErrors
 from startrack.applications.tracking.unknown_size import SIZES, smooth_placed
-from startrack.core.types import Array, BadInput, Bools, ClockError, Ints
+from startrack.core.types import Array, BadInput, Bools, ClockError
 from startrack.estimation.observations import UNKNOWN_M, USUAL_ODOMETRY, OdometryErrors
 from startrack.estimation.trajectory import Smoothed, radius_holding
 from startrack.frames import quat_xyzw_from_R
 from startrack.localization import camera_at
 from startrack.terrain import Terrain
 
-UNKNOWN_SIGMA_M = 1e-3 * UNKNOWN_M  # a position with a larger error is not known
+UNKNOWN_SIGMA_M = 1000.0  # a position with a larger error is not known
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,16 +57,6 @@ class TrackFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class CrestHeights:
-    """Errors of the map's posts that make the skylines of the track, by all frames together."""
-
-    post: Ints  # (c,) number in the terrain
-    position_enu_m: Array  # (c, 3) by the map
-    error_m: Array  # (c,) true minus map
-    sigma_m: Array  # (c,) the map's own is the prior
-
-
-@dataclass(frozen=True, eq=False)
 class SizeError:
     """The depth or the width of a crater, and by how much it is larger than its file states."""
 
@@ -96,7 +85,6 @@ class Track:
     clock: ClockError | None
     depth: SizeError | None  # None: the file's depth is taken as exact
     width: SizeError | None  # None: the file's diameter is taken as exact
-    crests: CrestHeights | None  # None: a terrain without posts, or without errors of their heights
     slipped: Bools  # (n - 1,) odometry steps judged wheel slip
     at_rest: bool
     terrain: Terrain  # where its size is not known, the crater as estimated
@@ -174,18 +162,13 @@ def estimate_track(
     bias, clock = (_shared_error(found, shared, name) for name in (BIAS, CLOCK))
     crater = terrain.with_shape(_shape_values(found, shared, terrain)) if shared.size_sigma_1 else terrain
     depth, width = (_size_error(found, shared, name, crater.facts().get(key, np.nan)) for name, key in SIZES.items())
-    crests = None
-    if len(posts := np.flatnonzero(found.post < FIRST_WAVE)):
-        number, sigma_m = found.post[posts], terrain.height_sigma_m
-        errors_m = sigma_m * found.post_error[posts], sigma_m * found.post_sigma[posts]
-        crests = CrestHeights(number, terrain.post_positions_m(number), *errors_m)
     return Track(
         tuple(
             _track_frame(*one)
             for one in zip(frames, robust.mode, robust.attitude_fits, is_outside.tolist(), strict=True)
         ),
         _trajectory(position_m, covariance_m2, terrain, alone), smoothed, *(bias or (0.0, 0.0)),
-        clock and ClockError(*clock), depth, width, crests, leg > 0, at_rest,
+        clock and ClockError(*clock), depth, width, leg > 0, at_rest,
         crater if shared.bends else terrain, robust.fault,
         slipped_legs(leg, robust.steps.move_m, smoothed.position_enu_m[:, :2]),
     )  # fmt: skip
@@ -210,7 +193,6 @@ def track_of_newest(
         found,
         0.0,
         0.0,
-        None,
         None,
         None,
         None,

@@ -13,7 +13,7 @@ import numpy as np
 from startrack import __version__, output
 from startrack.applications.tracking.legs import SlippedLeg
 from startrack.applications.tracking.quantities import FORMAT, FRAME_QUANTITIES, STATUSES, frame_records
-from startrack.applications.tracking.track import CrestHeights, SizeError, Track, Trajectory
+from startrack.applications.tracking.track import SizeError, Track, Trajectory
 from startrack.applications.tracking.track_map import known_points, track_extent
 from startrack.core.files import write_atomically
 from startrack.core.types import Array
@@ -85,7 +85,6 @@ def write_track(
         "track.filtered.tum": tum_text(track, track.filtered).encode(),
         "track.ecsv": output.ecsv_text(output.quantity_columns(FRAME_QUANTITIES, columns)).encode(),
         "track.geojson": track_geojson(track, record["frames"]).encode(),
-        "track.crests.ecsv": crests_table(track).encode(),
         **(pictures or {}),
         "track.json": output.json_text(record).encode(),  # last: it exists where all others do
     }
@@ -102,22 +101,6 @@ def tum_text(track: Track, trajectory: Trajectory) -> str:
             R_enu_body = R_from_quat_xyzw(frame.quat_xyzw_body_enu).T
             lines.append(tum_line(frame.time_utc.astimezone(UTC).timestamp(), position_m, R_enu_body))
     return "".join(lines)
-
-
-def crests_table(track: Track) -> str:
-    """track.crests.ecsv: a row for each post of the map whose height the track depends on."""
-    crests = track.crests or CrestHeights(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
-    by_axis = zip(("east", "north", "up"), crests.position_enu_m.T, strict=True)
-    lengths = (
-        *((f"{axis}_m", values, "%.3f", f"{axis} of the post by the map") for axis, values in by_axis),
-        ("error_m", crests.error_m, "%.4f", "height of the ground less the map's"),
-        ("sigma_m", crests.sigma_m, "%.4f", "standard deviation of error_m"),
-    )
-    post = output.Column(
-        "post", crests.post, "int64", form="%d", description="number of the post in the terrain's maps"
-    )
-    return output.ecsv_text([post, *(output.Column(name, values, unit="m", form=form, description=text)
-                              for name, values, form, text in lengths)])  # fmt: skip
 
 
 def track_geojson(track: Track, records: Sequence[dict[str, Any]]) -> str:

@@ -13,7 +13,6 @@ from startrack.core.errors import length_text
 from startrack.core.types import Array, Bools, Fix
 from startrack.output.picture.axes import GAP_PX, NICE, multiples, nice_step
 from startrack.output.picture.canvas import TEXT_PX, Box, Canvas, Colour, Ink, box_around, mix_colours
-from startrack.output.picture.contours import contour_lines
 from startrack.output.picture.relief import (
     Image,
     edge_cover,
@@ -118,11 +117,13 @@ class Map:
 
         `colour` and `width` are those of the lines. A long contour has its text twice, where there is room.
         """
+        from skimage.measure import find_contours
+
         extent = np.subtract(self.box[2:], self.box[:2])
         for level, text in levels.items():
             half_px = 0.36 * TEXT_PX * len(text) + GAP_PX
-            for contour in contour_lines(values, level, inside):
-                line = contour + self.box[:2]
+            for row_column in find_contours(values, level, mask=inside):
+                line = row_column[:, ::-1] + self.box[:2]
                 self.window.line(line, colour, width)
                 at = line[:: int(GAP_PX)]
                 at = at[(np.abs(at - self.middle) < extent / 2 - half_px - GAP_PX).all(axis=1)]

@@ -1,0 +1,73 @@
+"""Measured results say of which program they are: stored with a hash of the sources, and marked once these change."""
+
+import importlib
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture
+def results(monkeypatch):
+    monkeypatch.setattr(sys, "path", [str(ROOT / "benchmarks"), *sys.path])
+    return importlib.import_module("_results")
+
+
+@pytest.fixture
+def sources(results):
+    return importlib.import_module("_sources")
+
+
+def test_the_page_is_that_of_the_stored_results(results):
+    text = results.RESULTS.read_text(encoding="utf-8")
+    assert text == results.results_text(), "make it anew: python benchmarks/run.py --render"
+
+
+def test_each_result_has_its_place_and_a_command_that_exists(results):
+    stored = results.stored_results()
+    assert sorted(one.path.name for one in stored) == sorted(path.name for path in results.STORE.iterdir())
+    assert len({one.place for one in stored}) == len(stored) > 30
+    for one in stored:
+        assert one.benchmark.is_file(), one.section
+        assert re.fullmatch(r"20\d\d-\d\d-\d\d", one.date)
+        for block in one.blocks:
+            assert "text" in block or all(len(row) == len(block["head"]) for row in block["rows"]), one.section
+
+
+def test_a_result_is_marked_when_its_sources_change_and_no_other_is(results, sources, monkeypatch):
+    """As if a line of the detector were another one."""
+    detector = ROOT / "startrack/detection/detector.py"
+    stored = [replace(one, sources=sources.hash_of(one.benchmark)) for one in results.stored_results()]
+    assert all(one.is_fresh for one in stored)
+    code_of = sources.code_of
+    monkeypatch.setattr(sources, "code_of", lambda path: code_of(path) + "\nx = 1" * (path == detector))
+    sources.hash_of.cache_clear()
+    for one in stored:
+        assert one.is_fresh == (detector not in sources.sources_of(one.benchmark)), one.section
+        assert (results.MARK in one.text()) != one.is_fresh
+    names = {one.section for one in stored if one.is_fresh}
+    sources.hash_of.cache_clear()
+    assert "Horizons" in names and not names & {"Chain", "Slips", "Stars: detection", "Installation", "Mutated files"}
+
+
+def test_comments_and_docstrings_are_no_part_of_the_sources(sources, tmp_path):
+    plain, told = tmp_path / "plain.py", tmp_path / "told.py"
+    plain.write_text('def f(x):\n    y = "# no comment"\n    return y\n')
+    lines = ['"""A module."""', "# A comment.", "def f(x):", '    """Text', '    in two lines."""']
+    told.write_text("\n".join([*lines, '    y = "# no comment"  # why', "", "    return y", ""]))
+    assert sources.code_of(plain) == sources.code_of(told)
+    told.write_text('def f(x):\n    y = "#"\n    return y\n')
+    sources.code_of.cache_clear()
+    assert sources.code_of(plain) != sources.code_of(told)
+
+
+def test_markdown_becomes_blocks_and_markdown_again(results):
+    body = "Some text\nin two lines.\n\n| a | b |\n| --- | --- |\n| 1 |  |\n\nMore."
+    blocks = results.blocks_of(body)
+    assert [sorted(one) for one in blocks] == [["text"], ["head", "rows"], ["text"]]
+    one = replace(results.stored_results()[0], blocks=blocks)
+    assert one.text().endswith(body)

@@ -8,7 +8,6 @@ from __future__ import annotations
 from math import ceil, sqrt
 
 import numpy as np
-from scipy.special import ndtr
 
 from startrack.core.types import Array
 
@@ -26,6 +25,8 @@ def edge_profiles(radius: int, width_px: float) -> Array:
     Rows are phases of a pixel between two places of the edge; the column is the number of places from the edge to the
     pixel, from the farthest before it to the farthest behind it.
     """
+    from scipy.special import ndtr
+
     spread_px, step_px = sqrt(width_px * width_px + 1.0 / 12.0), width_px * EDGE_STEP_PX  # pixels have a side of 1
     farthest = ceil(radius * sqrt(2.0) / step_px) + 1 + EDGE_PLACES // 2
     places = np.arange(-farthest, farthest + 1.0) + np.linspace(0.0, 1.0, EDGE_PHASES + 1)[:, None]

@@ -33,7 +33,10 @@ LOG = logging.getLogger(__name__)
 FOLDER = "numba"  # in the user's cache
 VARIABLE = "NUMBA_CACHE_DIR"
 CACHED = "@njit(cache=True"  # of a kernel that is kept on disk
-ABOVE_KERNELS = {"api", "applications", "chain", "cli", "output", "rendering"}  # no kernel uses them
+ABOVE_KERNELS = {  # no kernel of numba is in these packages, or uses them
+    "api", "applications", "chain", "cli", "evidence", "exposure", "kernels", "localization", "output", "rendering",
+    "simulation",
+}  # fmt: skip
 
 
 def choose_cache_folder() -> bool:

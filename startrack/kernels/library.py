@@ -19,10 +19,12 @@ import numpy as np
 from startrack.kernels.build import COMPILED, levels, library_name
 
 VARIABLE = "STARTRACK_KERNELS"
-SCALARS = {"float64": (ctypes.c_double, float), "float32": (ctypes.c_float, float)}
-SCALARS |= {"int64": (ctypes.c_int64, operator.index), "bool": (ctypes.c_bool, bool)}  # type: ignore[dict-item]
+SCALARS: dict[str, tuple[Any, Callable[..., Any]]] = {
+    "float64": (ctypes.c_double, float), "float32": (ctypes.c_float, float), "int64": (ctypes.c_int64, operator.index),
+    "bool": (ctypes.c_bool, bool),
+}  # fmt: skip
 BUFFER: Any = (ctypes.c_char * 0).from_buffer  # a pointer to an array that is not read-only, in a fifth of the time
-FORM = re.compile(r"(\w+): (out )?(\w+)(?:\[(.+)\])?")
+FORM = re.compile(r"\w+: (out )?(\w+)(?:\[(.+)\])?")
 DECLARED: dict[str, tuple[list[Argument], str | None]] = {}  # by the name in the library: arguments and result
 
 
@@ -30,7 +32,6 @@ class Argument(NamedTuple):
     """An argument of a kernel. A dimension is a name or a number, and what is added to it."""
 
     text: str
-    name: str
     is_written: bool
     dtype: str
     shape: tuple[tuple[str, int], ...] | None  # None: a number
@@ -38,21 +39,21 @@ class Argument(NamedTuple):
     @classmethod
     def of(cls, text: str) -> Argument:
         """From `name: dtype`, `name: dtype[n, m + 1, 3]`, or `name: out dtype[n]` of an array that is written to."""
-        name, out, dtype, shape = FORM.fullmatch(text).groups()  # type: ignore[union-attr]
+        out, dtype, shape = FORM.fullmatch(text).groups()  # type: ignore[union-attr]
         parts = [part.split("+") for part in shape.split(",")] if shape else []
         dims = tuple((part[0].strip(), int(part[1]) if len(part) > 1 else 0) for part in parts)
-        return cls(text, name, bool(out), dtype, dims if shape else None)
+        return cls(text, bool(out), dtype, dims if shape else None)
 
 
 def _open(level: str) -> ctypes.CDLL:
+    """The library of a level. Raises ImportError with the command that makes it."""
     path = COMPILED / library_name(level)
-    if not path.is_file():
-        of_level = " sanitized" if level == "sanitized" else ""
-        raise ImportError(
-            f"there is no compiled library ({level}) of the C sources in {path.parent.parent}: type `{sys.executable} "
-            f"-m startrack.kernels.build{of_level}` in {path.parent.parents[2]}, or install startrack"
-        )
-    return ctypes.CDLL(str(path))
+    try:
+        return ctypes.CDLL(str(path))
+    except OSError as cause:
+        why = f"is not for this system ({cause})" if path.is_file() else "does not exist for these C sources"
+        words = f"{sys.executable} -m startrack.kernels.build{' sanitized' if level == 'sanitized' else ''}"
+        raise ImportError(f"{path} {why}: type `{words}` in {COMPILED.parents[2]}, or install startrack anew") from None
 
 
 def _load() -> tuple[str, ctypes.CDLL]:
@@ -74,8 +75,7 @@ LEVEL, LIBRARY = _load()
 
 def compiler() -> str:
     """Name and version of the compiler that made the library."""
-    LIBRARY.compiler_name.restype = ctypes.c_char_p
-    return str(LIBRARY.compiler_name().decode())
+    return str(ctypes.cast(LIBRARY.compiler_name, ctypes.CFUNCTYPE(ctypes.c_char_p))().decode())
 
 
 def kernel(name: str, *declarations: str, result: str | None = None) -> Callable[..., Any]:
@@ -92,35 +92,29 @@ def kernel(name: str, *declarations: str, result: str | None = None) -> Callable
     function = getattr(LIBRARY, name)
     function.argtypes = [ctypes.c_int64] * len(names) + types
     function.restype = SCALARS[result][0] if result else None
-    checks = [
-        (one, np.dtype(one.dtype) if one.shape else SCALARS[one.dtype][1], one.shape, one.is_written)
-        for one in arguments
-    ]
+    kinds: list[Any] = [np.dtype(one.dtype) if one.shape else SCALARS[one.dtype][1] for one in arguments]
 
     def call(*values: Any) -> Any:
         sizes, words = dict.fromkeys(names, -1), []
-        if len(values) != len(checks):
-            raise TypeError(f"{name} takes {len(checks)} arguments, not {len(values)}")
-        for value, (argument, kind, shape, is_written) in zip(values, checks, strict=True):
+        if len(values) != len(arguments):
+            raise TypeError(f"{name} takes {len(arguments)} arguments, not {len(values)}")
+        for value, kind, (text, is_written, _, shape) in zip(values, kinds, arguments, strict=True):
             if shape is None:
-                words.append(kind(value))  # type: ignore[operator]
+                words.append(kind(value))
                 continue
             if not isinstance(value, np.ndarray) or value.dtype != kind or value.ndim != len(shape):
-                raise TypeError(f"{name}: `{argument.text}` is asked for, not {_text(value)}")
+                found = f"{getattr(value, 'dtype', type(value))} {getattr(value, 'shape', '')}"
+                raise TypeError(f"{name}: `{text}` is asked for, not {found}")
             flags = value.flags
-            if not flags.c_contiguous or (is_written and not flags.writeable):
-                raise TypeError(f"{name}: {argument.name} must be C-contiguous, and writable where it is written to")
+            if not (flags.c_contiguous and flags.aligned and (flags.writeable or not is_written)):
+                raise TypeError(f"{name}: `{text}` must be C-contiguous and aligned, and writable where it is written")
             for (dim, more), size in zip(shape, value.shape, strict=True):
                 if sizes.get(dim) == -1:
                     sizes[dim] = size - more
                 wanted = sizes[dim] if dim in sizes else int(dim)
                 if size != wanted + more or wanted < 0:
-                    raise TypeError(f"{name}: `{argument.text}` is asked for, not {value.shape}; sizes: {sizes}")
+                    raise TypeError(f"{name}: `{text}` is asked for, not {value.shape}; sizes: {sizes}")
             words.append(BUFFER(value) if flags.writeable else value.__array_interface__["data"][0])
         return function(*sizes.values(), *words)
 
     return call
-
-
-def _text(value: Any) -> str:
-    return f"{value.dtype}{list(value.shape)}" if isinstance(value, np.ndarray) else type(value).__name__

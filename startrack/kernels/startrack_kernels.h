@@ -269,13 +269,6 @@ KERNEL void fill_averages(int64_t sectors, int64_t count, int64_t n, int64_t see
 
 /* photometry.c */
 
-/* Fill `across` and `down` [n, wide] with the profiles of stars at `xy_px` [n, 2] in x and in y about their middle
-   pixels, which are `centre` [n, 2]. `profiles` [steps + 1, wide] are those at offsets from -1/2 to 1/2. Positions are
-   finite. */
-KERNEL void profiles_of(int64_t n, int64_t steps, int64_t wide, const double *restrict xy_px,
-                        const double *restrict profiles, float *restrict across, float *restrict down,
-                        int64_t *restrict centre);
-
 /* Fill `measured` [n, 4] (flux, its variance, variance per electron of its own light, variance by neighbours) and
    `usable` [n] for stars at `xy_px` [n, 2], whose stamps of 2 radius + 1 pixels lie inside the image [height, width].
    The stars are ordered by square cells of `side_px`, of `columns` a row; `first` [cells + 1] is each cell's first.
@@ -317,5 +310,14 @@ KERNEL void collect_light(int64_t n, int64_t wide, int64_t m, int64_t cells, con
                           const int64_t *restrict number, const double *restrict weight,
                           const double *restrict square_weight, const int64_t *restrict first, int64_t columns,
                           double side_px, double reach_px, int64_t radius, double *restrict found);
+
+/* star_profiles.c */
+
+/* Fill `across` and `down` [n, wide] with the profiles of stars at `xy_px` [n, 2] in x and in y about their middle
+   pixels, which are `centre` [n, 2]. `profiles` [steps + 1, wide] are those at offsets from -1/2 to 1/2. Positions are
+   finite. */
+KERNEL void profiles_of(int64_t n, int64_t steps, int64_t wide, const double *restrict xy_px,
+                        const double *restrict profiles, float *restrict across, float *restrict down,
+                        int64_t *restrict centre);
 
 #endif

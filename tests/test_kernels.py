@@ -387,6 +387,7 @@ def test_the_sources_compile_for_a_rover_and_for_a_browser(tmp_path, target):
 MATH_H = """
 #define INFINITY __builtin_inff()
 #define NAN __builtin_nanf("")
+#define isnan(x) __builtin_isnan(x)
 #define isfinite(x) __builtin_isfinite(x)
 #define signbit(x) __builtin_signbit(x)
 double exp(double), log(double), log10(double), sqrt(double), fabs(double), floor(double), ceil(double), rint(double);

@@ -121,7 +121,7 @@ void sum_cells(int64_t n, int64_t sectors, int64_t cells, const int64_t *restric
     for (int64_t k = 0; k < n; k++) {
         const int64_t i = sector[k], above = SKY * sectors + i, below = GROUND * sectors + i;
         const double h = height[k];
-        if (!covered[i] || !(fabs(h) < half))
+        if (!covered[i] || !(fabs(h) < half) || isnan(light[k]))
             continue;
         const double ground = level[below] + slope[below] * h;
         const double step = level[above] + slope[above] * h - ground;

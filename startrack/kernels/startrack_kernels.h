@@ -80,8 +80,8 @@ KERNEL void score_shifts(int64_t sectors, int64_t cells, int64_t shifts, const d
 
 /* Add to `sums` [sectors, cells, 3] of l, c and c times the height, of pixels [n] in cells of `cell` pixels of height,
    and to `scales` [sectors, 2]: pixels, their scale. Level, slope and variance [2, sectors] are those of ground and
-   sky; the skyline is within `reach` [sectors] (pixels, may be infinite). Pixels of sectors that are not covered, and
-   those that differ by more than `clip` sigma from any fraction of sky, are left out. */
+   sky; the skyline is within `reach` [sectors] (pixels, may be infinite). Pixels of sectors that are not covered,
+   those that differ by more than `clip` sigma from any fraction of sky, and those with NaN are left out. */
 KERNEL void sum_cells(int64_t n, int64_t sectors, int64_t cells, const int64_t *restrict sector,
                       const double *restrict height, const double *restrict light, const double *restrict scale,
                       const bool *restrict covered, const double *restrict level, const double *restrict slope,

@@ -480,7 +480,7 @@ def test_doctor_knows_the_packages_and_extras_of_the_project():
     assert {*REQUIRED} == {re.split("[><=]", one)[0] for one in project["dependencies"]}
     extras = {*project["optional-dependencies"]} - {"test", "dev", "bench", "browser"}
     assert {*OPTIONAL} == extras
-    assert re.findall(r"^\| `(\w+)` \|", (ROOT / "README.md").read_text(), flags=re.MULTILINE) == [*OPTIONAL]
+    assert re.findall(r"^\| `(\w+)` \|", (ROOT / "docs/installation.md").read_text(), flags=re.MULTILINE) == [*OPTIONAL]
 
 
 def test_doctor_finds_all_well(folder, capsys):

@@ -44,6 +44,13 @@ def make_annotated(solution: Any, folder: Path) -> None:
     save_webp(Image.open(folder / "near-wall.annotated.png"), "annotated", width_px=1600)
 
 
+def make_lowell(solution: Any, folder: Path) -> None:
+    """The real photograph of the samples with its stars."""
+    found = startrack.identify(ROOT / "sample_images/lowell-2018-08-06.fits.bz2")
+    found.write(folder)
+    save_webp(Image.open(folder / "lowell-2018-08-06.annotated.png"), "lowell", width_px=1200)
+
+
 def make_skyline(solution: Any, folder: Path) -> None:
     """The panorama of the sample."""
     save_webp(Image.open(folder / "near-wall.skyline.png"), "skyline", width_px=1440)
@@ -152,8 +159,8 @@ def save_figure(figure: Any, name: str) -> None:
 
 
 PICTURES = {
-    "annotated": make_annotated, "skyline": make_skyline, "posterior": make_posterior, "report": make_report,
-    "accuracy": make_accuracy,
+    "annotated": make_annotated, "lowell": make_lowell, "skyline": make_skyline, "posterior": make_posterior,
+    "report": make_report, "accuracy": make_accuracy,
 }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Writes what README.md, docs/formats.md and docs/track.md show of the code: packages, quantities and reasons.
+"""Writes what CONTRIBUTING.md, docs/formats.md and docs/track.md show of the code, and docs/how-good.md of the results.
 
     python docs/make_tables.py
 
@@ -9,7 +9,12 @@ from __future__ import annotations
 
 import ast
 import re
+import sys
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))  # of the module beside this one
+
+from measured_figures import figure_tables
 
 import startrack
 from startrack.applications.prediction import CELL_QUANTITIES, PATH_QUANTITIES
@@ -17,7 +22,7 @@ from startrack.applications.tracking import FRAME_QUANTITIES
 from startrack.core.errors import Reason
 from startrack.output import QUANTITIES, markdown_table
 
-PAGES = [Path(__file__).parent / name for name in ("../README.md", "formats.md", "track.md")]
+PAGES = [Path(__file__).parent / name for name in ("../CONTRIBUTING.md", "formats.md", "track.md", "how-good.md")]
 PACKAGE = Path(startrack.__file__).parent
 
 
@@ -53,6 +58,7 @@ def page_with_tables(text: str) -> str:
     """The page `text` with its tables as the code has them."""
     tables = {
         "packages": package_list(),
+        "figures": figure_tables(),
         "quantities": markdown_table(QUANTITIES, "key"),
         "reasons": reason_table(),
         "track": markdown_table(FRAME_QUANTITIES, "column"),

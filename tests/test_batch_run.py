@@ -175,4 +175,6 @@ def test_bad_input_is_named_with_its_cause_without_any_flag(tmp_path, capsys):
     (tmp_path / "images").mkdir()
     (tmp_path / "images" / "broken.png").write_bytes(b"no picture")
     assert main(["batch", str(tmp_path / "images"), "-D", str(tmp_path / "out"), "-j", "1"]) == 5
-    assert "broken.png: bad_image: " in capsys.readouterr().err
+    out, err = capsys.readouterr()
+    assert err.startswith("broken.png  refused  bad_image: ") and err.count("broken.png") == 1
+    assert out.startswith("1 image: 1 refused (1 bad_image); tables in ")

@@ -71,3 +71,17 @@ def test_markdown_becomes_blocks_and_markdown_again(results):
     assert [sorted(one) for one in blocks] == [["text"], ["head", "rows"], ["text"]]
     one = replace(results.stored_results()[0], blocks=blocks)
     assert one.text().endswith(body)
+
+
+def test_the_front_page_states_measured_figures(monkeypatch):
+    """Errors [m] by stars, with the light of the sky, and by Kua's method, as the stored results have them."""
+    monkeypatch.setattr(sys, "path", [str(ROOT / "docs"), *sys.path])
+    figures = importlib.import_module("measured_figures")
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    stated = re.search(r"to ([\d.]+) m by its stars, and to ([\d.]+) m with the light of the sky", text)
+    kua = re.search(r"gives (\d+) m on such pictures", text)
+    blocks = [block for name in ("Depth", figures.GROUND, "Chain") for block in figures.result_of(name)["blocks"]]
+    cells = {tuple(row[:2]): row for block in blocks for row in block.get("rows", [])}
+    assert float(stated[1]) == round(float(cells["6.0", "as deep as the frame"][4]), 1)
+    assert float(stated[2]) == float(cells["dark", "7 %"][7])
+    assert float(kua[1]) == float(next(row[1] for key, row in cells.items() if key[0].startswith("pseudo-gradient")))

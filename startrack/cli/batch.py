@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -27,6 +28,7 @@ from startrack.core.errors import INTERNAL_ERROR, BadInput
 from startrack.core.files import make_folder, printable
 from startrack.core.runner import Runner, RunStopped, count_cores
 from startrack.exposure import is_bag
+from startrack.output import refusal_line
 
 SHOWN = ("ok", "ambiguous", "refused", "error")
 FINISHING = b"\nstartrack: finishing the images in progress; a second Ctrl-C drops them\n"
@@ -107,6 +109,8 @@ def _locate_images(
         write_page_of(str(out))
     if not args.quiet:
         print(f"{shown.summary()}; {tables}", file=sys.stderr if args.json else sys.stdout)
+        if not (args.json or args.report) and shown.counts["ok"]:
+            print(f"  next: startrack report {shlex.quote(printable(out))}", file=sys.stderr)
     if shown.counts["error"]:
         return errors.EXIT_INTERNAL_ERROR
     return errors.EXIT_OK if shown.counts["ok"] == len(tasks) else errors.EXIT_STOPPED
@@ -142,6 +146,7 @@ class _Shown:
         self.args, self.total, self._stop = args, total, stop
         self.halted: str | None = None  # the cause
         self.counts: Counts = Counter()
+        self.reasons: Counts = Counter()  # of refusals
 
     def halt(self, why: str) -> None:
         """Stop the batch after the images in progress, and keep the first cause."""
@@ -187,6 +192,7 @@ class _Shown:
                 for record, kept in outcomes:
                     records.append(batch.table_values(record))
                     self.counts["error" if record["reason"] == INTERNAL_ERROR else str(record["status"])] += 1
+                    self.reasons.update([record["reason"]] if record["status"] == "refused" else [])
                     self.counts["kept"] += kept
                     self.counts["warned"] += bool(record.get("warnings"))
                     self.counts["beam"] += (record.get("search") or {}).get("outcome") == "beam"
@@ -209,8 +215,8 @@ class _Shown:
                 print(json.dumps(record), flush=True)
             elif args.verbose:
                 print(f"{record['image']}: {record['status']} {record['message']}".rstrip(), flush=True)
-            elif reason and errors.exit_code_of(reason) == errors.EXIT_BAD_INPUT and not args.quiet:
-                print(f"{record['image']}: {reason}: {record['message']}", file=sys.stderr, flush=True)
+            elif record["status"] == "refused" and reason != INTERNAL_ERROR and not args.quiet:
+                print(refusal_line(record["image"], reason, record["message"]), file=sys.stderr, flush=True)
         except BrokenPipeError:
             discard_stdout()
             self.halt("the output is no longer read")
@@ -223,7 +229,9 @@ class _Shown:
         kept = f" ({self.counts['kept']} were there already)" if self.counts["kept"] else ""
         warned = f"; {self.counts['warned']} with warnings (-v shows them)" if self.counts["warned"] else ""
         beam = f"; {self.counts['beam']} with search: beam, not proven" if self.counts["beam"] else ""
-        return f"{self.total} images: {', '.join(self._numbers())}{kept}{warned}{beam}"
+        why = ", ".join(f"{count} {reason}" for reason, count in self.reasons.most_common())
+        images = f"{self.total} image{'' if self.total == 1 else 's'}"
+        return f"{images}: {', '.join(self._numbers())}{f' ({why})' if why else ''}{kept}{warned}{beam}"
 
 
 def _write_tables(args: argparse.Namespace, out: Path, tasks: Sequence[Task], records: list[dict[str, Any]]) -> None:

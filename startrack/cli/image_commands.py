@@ -140,7 +140,7 @@ COMMANDS = (
                 flag("--follow", "take images as they are written into the folder FRAMES"),
                 flag("--until-idle S", "end after S seconds without an image", seconds),
             ),
-            "output": flags.OUTPUT,
+            "output": (*flags.OUTPUT, flag("--report", "as of locate and batch; the page is written without it too")),
             "more": (flags.NO_SEED, *flags.MORE),
         },
         "startrack track DRIVE/ --odometry odometry.tum -c camera.toml -t shackleton",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import math
+import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -49,8 +50,9 @@ def locate(args: argparse.Namespace) -> int:
     check_localizer(args)
     settings = settings_of(args)
     code = _run_images(args, "fix", lambda exposure, _: chain.locate_exposure(exposure, settings), args.time_limit)
-    if args.report:
-        write_page_of_images(args.dir, args.images)
+    page = write_page_of_images(args.dir, args.images) if args.report else None
+    if page is not None and not args.quiet:
+        print(f"page {printable(page)}", file=sys.stderr)
     return code
 
 
@@ -102,6 +104,8 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve, limit_s: floa
             line = f"{printable(name)}  {message}"
         print_warnings(args, name, record.get("warnings", ()))
         codes.add(print_outcome(args, record, line))
+    if not (args.quiet or args.json) and any(Path(args.dir).glob(f"*.{kind}.json")):
+        print(f"files in {printable(args.dir)}", file=sys.stderr, flush=True)
     return worst_code(codes)
 
 

@@ -65,16 +65,15 @@ def _select_tabled(out: str, found: list[Found]) -> list[Found]:
     return [one for one in found if one.stem not in left]
 
 
-def write_page_of_images(out: str, images: Sequence[str]) -> None:
-    """Write the page beside new results: NAME.report.html of one image, OUT/report.html of several.
+def write_page_of_images(out: str, images: Sequence[str]) -> Path | None:
+    """Write the page beside new results: NAME.report.html of one image, OUT/report.html of several; its path.
 
-    An image that could not be read has no result to show.
+    An image that could not be read has no result to show; None where no image has one.
     """
     results = [path for stem in result_stems(images) if (path := Path(out) / f"{stem}.fix.json").is_file()]
-    if len(images) == 1 and results:
-        write_page_of(str(results[0]))
-    elif results:
-        write_page_of(out)
+    if not results:
+        return None
+    return write_page_of(str(results[0]) if len(images) == 1 else out)
 
 
 def _true_positions(found: Sequence[Found], folder: str | None) -> dict[str, tuple[float, float]]:

@@ -67,9 +67,12 @@ def summary_line(result: Outcome, seconds: float | None = None) -> str:
 
 
 def refusal_line(image: str, reason: str, message: str) -> str:
-    """One line about an `image` that was refused at whatever stage: `reason` and `message`, its own name left out."""
-    cause = " ".join(message.split()).removeprefix(f"{printable(image)}: ")
-    return f"{printable(Path(image).name)}  refused  {reason}: {cause}"
+    """One line about an `image` that was refused at whatever stage: `reason` and `message`, its own path left out."""
+    name, cause = printable(Path(image).name), " ".join(message.split())
+    before, named, after = cause.partition(f"{name}: ")
+    if named and (not before or (before.endswith("/") and ": " not in before)):
+        cause = after
+    return f"{name}  refused  {reason}: {cause}"
 
 
 def lens_text(camera: Camera) -> str:

@@ -233,7 +233,7 @@ def _picture(report: Report) -> Any:
     times = s["first_time_utc"][:16].replace("T", " ")
     if s["last_time_utc"] != s["first_time_utc"]:
         times += f" to {s['last_time_utc'][:16].replace('T', ' ')}"
-    draws = f"{s['draws']} draws every {s['spacing_m']:.4g} m"
+    draws = f"{s['draws']} draw{'' if s['draws'] == 1 else 's'} every {s['spacing_m']:.4g} m"
     caption = [f"camera {s['camera']}, {s['exposure_s']:.3g} s, {times} UTC, {draws}"]
     if isinstance(points, AreaCells):
         return output.prediction_picture(report.plan.terrain, points.site, points.raster(radius), title, caption)

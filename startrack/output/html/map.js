@@ -172,11 +172,14 @@ function mapLegend(record, real) {
   return make("ul", { class: "legend" }, ...posterior, ...others, real ? item("plus", "true position") : null);
 }
 
-// Every position of a batch on one terrain, joined in the order of time.
+const JOINED_MS = 6 * 3600e3; // between two positions of one drive; pictures of other days are other visits
+
+// Every position of a batch on one terrain; those of one drive are joined in the order of time.
 function trajectoryView(rows, terrain, open) {
   const value = (row, name) => row[column[name]];
   const placed = rows.filter((row) => known(value(row, "east_m"))).map((row) => ({ x: value(row, "east_m"), y: value(row, "north_m"), row, time: value(row, "time_utc") || "" }));
   const dated = placed.filter((place) => place.time).sort((a, b) => (a.time < b.time ? -1 : a.time > b.time ? 1 : 0));
+  const joins = (k) => k > 0 && Date.parse(dated[k].time) - Date.parse(dated[k - 1].time) <= JOINED_MS;
   const xs = placed.map((place) => place.x);
   const ys = placed.map((place) => place.y);
   const [low, high] = [[least(xs), least(ys)], [-least(xs.map((x) => -x)), -least(ys.map((y) => -y))]];
@@ -185,7 +188,7 @@ function trajectoryView(rows, terrain, open) {
   const draw = (v, g) => {
     drawGroundMap(v, g, terrain);
     g.beginPath();
-    dated.forEach((place, k) => (k ? g.lineTo(...v.screen(place.x, place.y)) : g.moveTo(...v.screen(place.x, place.y))));
+    dated.forEach((place, k) => (joins(k) ? g.lineTo(...v.screen(place.x, place.y)) : g.moveTo(...v.screen(place.x, place.y))));
     g.strokeStyle = colour("skyline");
     g.lineWidth = 1.6;
     g.stroke();
@@ -201,12 +204,12 @@ function trajectoryView(rows, terrain, open) {
     }
     g.font = "13px system-ui, sans-serif";
     g.textBaseline = "middle";
-    const ends = dated.length > 1 ? [["first", dated[0]], ["last", dated[dated.length - 1]]] : [];
+    const ends = dated.some((_, k) => joins(k)) ? [["first", dated[0]], ["last", dated[dated.length - 1]]] : [];
     for (const [word, place] of ends) {
       sideText(v, g, word, v.screen(place.x, place.y), 9);
     }
   };
-  return new View({ label: "Positions in the order of time, north up", world: [x - half, y - half, x + half, y + half], points: placed, most: 5000, axes: METRES, draw,
+  return new View({ label: "Positions, north up; those of one drive are joined", world: [x - half, y - half, x + half, y + half], points: placed, most: 5000, axes: METRES, draw,
     describe: (place) => rowText(place.row), open: (place) => open(place.row) });
 }
 

@@ -49,7 +49,7 @@ function trajectoryCard(open) {
   };
   const select = make("select", { "aria-label": "Terrain", onchange: () => show(select.value) }, ...names.map((name) => make("option", { value: name }, name ? fileName(name) : "terrain not known")));
   show(names[0]);
-  return section("Positions", make("p", { class: "dim" }, "Joined in the order of time. Zoomed in, ellipses hold 95 % of each position's posterior. A click opens the image."), names.length > 1 ? select : null, holder);
+  return section("Positions", make("p", { class: "dim" }, "Positions less than 6 hours apart are joined in the order of time. Zoomed in, ellipses hold 95 % of each position's posterior. A click opens the image."), names.length > 1 ? select : null, holder);
 }
 
 function neighbours(k) {

@@ -1,0 +1,117 @@
+"""The figures of docs/how-good.md, taken from the stored results of the benchmarks (benchmarks/results/)."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+RESULTS = Path(__file__).parent.parent / "benchmarks/results"
+PAGE = "../benchmarks/RESULTS.md"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One line of the page: a question, and the answer by cells of a row of a result's table."""
+
+    question: str
+    section: str
+    row: tuple[str, ...]  # its first cells; empty: the answer is made of the section's first text
+    answer: str  # column names, or a pattern with groups for the text, in braces
+
+    def line(self) -> str:
+        """The line of the table."""
+        stored = result_of(self.section)
+        link = f"[{self.section}]({PAGE}#{re.sub(r'[^a-z0-9 -]', '', self.section.lower()).replace(' ', '-')})"
+        return f"| {self.question} | {self._answer(stored)} | {link}, {stored['date']} |"
+
+    def _answer(self, stored: dict[str, Any]) -> str:
+        if not self.row:
+            return str(next(one["text"] for one in stored["blocks"] if "text" in one)).rstrip(".")
+        for block in stored["blocks"]:
+            for row in block.get("rows", []):
+                if tuple(row[: len(self.row)]) == self.row:
+                    cells = dict(reversed(list(zip(block["head"], row, strict=True))))
+                    return re.sub(r"\{([^}]+)\}", lambda found, cells=cells: cells[found[1]], self.answer)
+        raise LookupError(f"{self.section} has no row {self.row}")
+
+
+GROUND, SHACKLETON = "Ground that is not the map's", "Shackleton's floor"
+ERROR_BEYOND = "{mean error, m} m; NEES {mean NEES}; {beyond the 99.9 % circle} of {answered} beyond the 99.9 % circle"
+SLIPPED = (
+    "{mean error, m} m; {drives with a pose beyond its 99.9 % circle} of {drives} drives beyond a 99.9 % circle; "
+    "leg and factor named in {the first leg named, its factor within 5 %}"
+)
+GROUPS: dict[str, tuple[Figure, ...]] = {
+    "Position from one picture": (
+        Figure("Thesis's crater, stars alone, 5 sigma at magnitude 6", "Depth", ("6.0", "as deep as the frame"),
+               "{mean, m} m; NEES {NEES} (2 is perfect); {95 %} % in the 95 % circle, {frames} frames"),
+        Figure("The same, 5 sigma at magnitude 7.5", "Depth", ("7.5", "as deep as the frame"),
+               "{mean, m} m; NEES {NEES}; {95 %} % in the 95 % circle, {frames} frames"),
+        Figure("Kua 2008, pseudo-gradient, the same kind of pictures", "Chain", ("pseudo-gradient (Kua 2008)",),
+               "{mean} m"),
+        Figure("Thesis's crater, stars and the sky's light (7 % of the background)", GROUND,
+               ("dark", "7 %"), ERROR_BEYOND),
+        Figure("The same, 30 % of the background", GROUND, ("dark", "30 %"), ERROR_BEYOND),
+        Figure(f"{SHACKLETON}, ground as the map has it, stars alone", "Height maps: shackleton", ("the map as it is",),
+               "{mean error, m} m; NEES {NEES}; {located} located"),
+        Figure(f"{SHACKLETON}, ground by another program's horizon, sky 7 %", GROUND, ("reference", "7 %"),
+               ERROR_BEYOND),
+        Figure("A valley of the Earth at night", "Valleys of the Earth", ("exact map",),
+               "{mean error, m} m; NEES {NEES}; {answered} answered"),
+    ),
+    "Real pictures": (
+        Figure("Real starlight over invented craters", "Real starlight", (), ""),
+        Figure("Real skyline by day (Finse, snow), attitude known to 0.02 degrees", "Real ground",
+               ("2019-05-24, snow", "0.02, 0.02"),
+               "{along the line of sight, m} m along, {across, m} m across the line of sight; 95 % within {95 %, m} m"),
+        Figure("The same, heading open and tilt to 3 degrees", "Real ground", ("2019-05-24, snow", "180, 3"),
+               "{along the line of sight, m} m along, {across, m} m across; 95 % within {95 %, m} m"),
+        Figure("Horizon of an all-sky camera, pictures against each other", "Skylines of a camera held out",
+               ("single pictures, each pair",), "RMS {RMS of all} sigma over {azimuths known} azimuths"),
+    ),
+    "Drives": (
+        Figure("Images 50 m apart on Shackleton's floor, with odometry", "Tracks from pixels", ("50 m",),
+               "{one frame, m} m by one image, {filtered, m} m filtered, {smoothed, m} m smoothed"),
+        Figure("A leg of 4 of 9 moves that slips by 20 %", "Slips",
+               ("shackleton-rendered", "4 of 9 moves 20 % too long"), SLIPPED),
+        Figure("Accuracy predicted before a drive, over the one that images state", "Predictions against images",
+               ("shackleton",), "{predicted / stated}; {places within 0.65 to 1.5} places within 0.65 to 1.5"),
+    ),
+    "Stars and lenses": (
+        Figure("Lists of stars, fields of 10 to 180 degrees, false and missing stars", "Stars: identification", (), ""),
+        Figure("A lens from one frame of 100 stars", "Calibration", ("1 frame, 100 stars, 0.2 px", "equidistant"),
+               "{map error px: median} px (median of {trials})"),
+        Figure("Centroids, SNR 10 to 300", "Stars: detection", ("startrack",),
+               "RMS {centroid RMS / bound, SNR 10-20 / 20-50 / 50-100 / 100-300} of the bound; "
+               "{time against sep} of the time of sep"),
+    ),
+    "Speed and safety": (
+        Figure("CPU of one warm frame, file to position, over sep's extraction", "One frame", ("total over sep",),
+               "{median}"),
+        Figure("Mutated PNG files", "Mutated files", ("png",),
+               "{tried} tried: {internal errors} internal errors, {hangs} hangs"),
+    ),
+}  # fmt: skip
+
+
+@cache
+def result_of(section: str) -> dict[str, Any]:
+    """The stored result of a section."""
+    for path in RESULTS.glob("*.json"):
+        stored: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        if stored["section"] == section:
+            return stored
+    raise LookupError(f"no result is stored for {section}")
+
+
+def figure_tables() -> str:
+    """The tables of the page, one for each group."""
+    parts = []
+    for title, figures in GROUPS.items():
+        head = ["| what | figure | measured by, on |", "| --- | --- | --- |"]
+        parts.append("\n".join([f"## {title}", "", *head, *(one.line() for one in figures)]))
+    return "\n\n".join(parts) + "\n"

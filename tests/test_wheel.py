@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 BUILD = "from hatchling.build import build_wheel; import sys; print(build_wheel(sys.argv[1]))"
 MODULES_OF_EXTRAS = (  # that the tests below do not load
     "matplotlib.pyplot", "playwright.sync_api", "axe_playwright_python.sync_playwright", "sphinx", "furo",
-    "myst_parser", "photutils.psf", "sep",
+    "myst_parser", "sphinx_copybutton", "photutils.psf", "sep",
 )  # fmt: skip
 TESTS_OF_EXTRAS = (
     "test_exposure_read.py", "test_terrain_maps.py", "test_catalog_gaia.py", "test_site.py",

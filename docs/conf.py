@@ -22,9 +22,9 @@ author = "The startrack developers"
 copyright = "The startrack developers. Licence: MIT"
 release = version = startrack.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+extensions = ["myst_parser", "sphinx_copybutton", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["images/*"]
-myst_enable_extensions = ["colon_fence", "dollarmath", "attrs_inline"]
+myst_enable_extensions = ["colon_fence", "attrs_inline"]
 myst_heading_anchors = 3
 suppress_warnings = [
     "myst.header",  # included parts of README.md begin below the heading of their page
@@ -41,11 +41,14 @@ smartquotes = False
 default_role = "code"  # `name` in a docstring
 
 html_theme = "furo"
-html_title = "startrack"
+html_title = f"startrack {startrack.__version__}"
+html_logo = html_favicon = "_static/logo.svg"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_show_sphinx = False
-html_copy_source = False
+html_copy_source = True  # the search shows excerpts of it
+html_show_sourcelink = False
+copybutton_selector = "div.highlight-sh pre, div.highlight-python pre, div.highlight-toml pre"
 
 PAGES_OF_FILES = {  # file of the repository to the page that includes it
     "CONVENTIONS.md": "conventions.md",

@@ -21,7 +21,7 @@ BUILD_SOURCES = BUILD.replace("build_wheel", "build_sdist")
 COMPILED_BY = "from startrack.kernels.library import compiler; print(compiler())"
 MODULES_OF_EXTRAS = (  # that the tests below do not load
     "matplotlib.pyplot", "playwright.sync_api", "axe_playwright_python.sync_playwright", "sphinx", "furo",
-    "myst_parser", "photutils.psf", "sep",
+    "myst_parser", "sphinx_copybutton", "photutils.psf", "sep",
 )  # fmt: skip
 TESTS_OF_EXTRAS = (
     "test_exposure_read.py", "test_terrain_maps.py", "test_catalog_gaia.py", "test_site.py",

@@ -91,7 +91,7 @@ def write_section(name: str, command: str, packages: tuple[str, ...], body: str)
     versions = {package: metadata.version(package) for package in ("startrack", *packages)}
     found = Result(
         name, place, command, datetime.date.today().isoformat(), versions, platform.python_version(),
-        os.cpu_count() or 1, commit_name(), hash_of(Path(sys.argv[0]).resolve()), blocks_of(body),
+        os.cpu_count() or 1, *STARTED, blocks_of(body),
     )  # fmt: skip
     found.store()
     write_results()
@@ -114,6 +114,15 @@ def commit_name() -> str:
         return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return ""
+
+
+def program_at_start() -> tuple[str, str]:
+    """Commit and hash of the sources of the benchmark that this process runs; sources may change while it does."""
+    benchmark = Path(sys.argv[0]).resolve()
+    return (commit_name(), hash_of(benchmark)) if benchmark.parent == HERE else ("", "")
+
+
+STARTED = program_at_start()
 
 
 def blocks_of(body: str) -> list[dict[str, Any]]:

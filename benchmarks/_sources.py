@@ -1,8 +1,9 @@
 """The sources that a benchmark depends on, and a hash of them that comments and docstrings do not change.
 
-They are the files that its imports reach, those inside functions included, in benchmarks/ and startrack/, with the C
-sources beside them. Of a package that gathers names only the modules of the names in use count. A benchmark that starts
-processes runs commands: it depends on all of startrack/.
+They are the files that its imports reach, those inside functions included, in benchmarks/, tests/ and startrack/, with
+the C sources beside them, and the files of benchmarks/ that it names. Of a package that gathers names only the modules
+of the names in use count; where a module's name is made at run time, all of that folder count. A benchmark that starts
+processes runs commands: it depends on all of startrack/. Data files (catalogues, terrains, cameras) are no part of it.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ def _places(module: str, name: str) -> list[tuple[Path, str]]:
     """Where a name of a module is looked for; none where it is not ours."""
     for base in (ROOT / "benchmarks", ROOT / "tests", ROOT):
         at = base.joinpath(*module.split("."))
-        if (inner := at / f"{name}.py").is_file() or (inner := at.with_suffix(".py")).is_file():
+        inside = at / f"{name}.py", at / name / "__init__.py", at.with_suffix(".py")
+        if inner := next((one for one in inside if one.is_file()), None):
             return [(inner, EVERYTHING)]
         if (package := at / "__init__.py").is_file():
             return [(package, name)]
@@ -83,22 +85,37 @@ def imports_of(path: Path) -> tuple[tuple[str, str], ...]:
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
             todo += node.orelse
             continue
-        if isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            found += [(node.module, one.name) for one in node.names]
+        if isinstance(node, ast.ImportFrom):
+            above = path.parents[node.level - 1].relative_to(ROOT).parts if node.level else ()
+            module = ".".join([*above, *([node.module] if node.module else [])])
+            found += [(module, one.name) for one in node.names]
         elif isinstance(node, ast.Import):
             is_whole |= any(one.name == "startrack" for one in node.names)
             found += [(one.name, EVERYTHING) for one in node.names if one.name != "startrack"]
         elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "startrack":
             attributes.append(("startrack", node.attr))
+        elif (
+            isinstance(node, ast.Call)
+            and getattr(node.func, "attr", getattr(node.func, "id", "")) == "import_module"
+            and _is_made(node, path)
+        ):
+            found += [(".".join(path.parent.relative_to(ROOT).parts), one.stem) for one in path.parent.glob("*.py")]
+        elif isinstance(node, ast.Constant) and str(node.value).endswith(".py") and path.parent.name == "benchmarks":
+            found.append((Path(str(node.value)).stem, EVERYTHING))
         todo += ast.iter_child_nodes(node)
     return tuple(dict.fromkeys([*found, *(attributes if is_whole else [])]))
 
 
+def _is_made(call: ast.Call, path: Path) -> bool:
+    """Whether a module's name is made at run time, by other means than a table of `lazy_modules`."""
+    return bool(call.args) and not isinstance(call.args[0], ast.Constant) and not lazy_modules(path)
+
+
 @cache
 def lazy_modules(package: Path) -> tuple[tuple[str, str], ...]:
-    """Names that a package loads at their first use, and the module of each: its table _MODULES."""
+    """Names that a package loads at their first use, and the module of each: its table whose name ends in _MODULES."""
     for node in ast.parse(package.read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.Assign) and any(getattr(one, "id", "") == "_MODULES" for one in node.targets):
+        if isinstance(node, ast.Assign) and any(getattr(one, "id", "").endswith("_MODULES") for one in node.targets):
             return tuple(ast.literal_eval(node.value).items())
     return ()
 

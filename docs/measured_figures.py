@@ -98,6 +98,14 @@ GROUPS: dict[str, tuple[Figure, ...]] = {
 }  # fmt: skip
 
 
+FRONT_PAGE = ("Depth", GROUND, "Chain")  # sections whose figures README.md states
+
+
+def cited_sections() -> set[str]:
+    """Sections whose figures the page and README.md state."""
+    return {one.section for figures in GROUPS.values() for one in figures} | set(FRONT_PAGE)
+
+
 @cache
 def result_of(section: str) -> dict[str, Any]:
     """The stored result of a section."""

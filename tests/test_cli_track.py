@@ -48,7 +48,10 @@ def drive(tmp_path_factory):
 @pytest.fixture(scope="module")
 def tracked(drive):
     """The folder of the drive's track."""
-    assert run(drive / "frames", "--odometry", drive / "frames" / "odometry.tum", "-D", drive / "out", "--report", "-q") == 0
+    assert (
+        run(drive / "frames", "--odometry", drive / "frames" / "odometry.tum", "-D", drive / "out", "--report", "-q")
+        == 0
+    )
     return drive / "out"
 
 

@@ -2,6 +2,7 @@
 
 import importlib
 import re
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -54,6 +55,18 @@ def test_a_result_is_marked_when_its_sources_change_and_no_other_is(results, sou
     assert "Horizons" in names and not names & {"Chain", "Slips", "Stars: detection", "Installation", "Mutated files"}
 
 
+def test_what_a_benchmark_loads_is_among_its_sources(sources):
+    """Of one that locates an image: all modules of startrack that it has loaded then."""
+    code = (
+        "import sys, startrack; startrack.locate('sample_images/near-wall.png');"
+        "print(*(m.__file__ for n, m in sys.modules.items() if n.startswith('startrack') and m.__file__), sep='\\n')"
+    )
+    loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    known = {str(path) for path in sources.sources_of(ROOT / "benchmarks/one_frame.py")}
+    faces = {str(path) for path in (ROOT / "startrack").rglob("__init__.py")}  # that only gather names
+    assert set(loaded.split()) - known - faces == set()
+
+
 def test_comments_and_docstrings_are_no_part_of_the_sources(sources, tmp_path):
     plain, told = tmp_path / "plain.py", tmp_path / "told.py"
     plain.write_text('def f(x):\n    y = "# no comment"\n    return y\n')
@@ -80,7 +93,7 @@ def test_the_front_page_states_measured_figures(monkeypatch):
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     stated = re.search(r"to ([\d.]+) m by its stars, and to ([\d.]+) m with the light of the sky", text)
     kua = re.search(r"gives (\d+) m on such pictures", text)
-    blocks = [block for name in ("Depth", figures.GROUND, "Chain") for block in figures.result_of(name)["blocks"]]
+    blocks = [block for name in figures.FRONT_PAGE for block in figures.result_of(name)["blocks"]]
     cells = {tuple(row[:2]): row for block in blocks for row in block.get("rows", [])}
     assert float(stated[1]) == round(float(cells["6.0", "as deep as the frame"][4]), 1)
     assert float(stated[2]) == float(cells["dark", "7 %"][7])

@@ -8,10 +8,10 @@ from synthetic_track import CRATER
 from tracking_helpers import SHARED, attitudes, observed, odometry_of, shifted, simulate_drive
 
 from startrack.applications.tracking import ObservedFrame, Odometry, TrackSession, estimate_track
-from startrack.applications.tracking import explanations as explanations_module
-from startrack.applications.tracking import filtered_positions as filter_module
+from startrack.applications.tracking import session as session_module
 from startrack.applications.tracking.filtered_positions import OnlineTrack
 from startrack.applications.tracking.moves import Moves
+from startrack.core.errors import BadInput
 from startrack.core.types import Array
 
 FRAMES, WINDOW = 44, 9
@@ -19,9 +19,8 @@ LEG = slice(14, 27)  # moves that slip alike, more of them than the window has
 
 
 def set_window(monkeypatch: pytest.MonkeyPatch, frames: int) -> None:
-    """Explanations may differ about so many frames."""
-    for module in (explanations_module, filter_module):
-        monkeypatch.setattr(module, "WINDOW", frames)
+    """In a live track frames are settled that so many have followed."""
+    monkeypatch.setattr(session_module, "WINDOW", frames)
 
 
 def mixed_drive() -> tuple[list[ObservedFrame], Odometry, Array]:
@@ -51,7 +50,6 @@ def newest_positions(frames: list[ObservedFrame], odometry: Odometry) -> tuple[A
 def test_a_window_shorter_than_a_slipped_leg_changes_no_answer(monkeypatch):
     frames, odometry, truth = mixed_drive()
     whole = newest_positions(frames, odometry)
-    smoothed = estimate_track(frames, CRATER, SHARED, odometry=odometry)
     set_window(monkeypatch, WINDOW)
     position, radius, status = newest_positions(frames, odometry)
     assert status == whole[2]
@@ -61,21 +59,77 @@ def test_a_window_shorter_than_a_slipped_leg_changes_no_answer(monkeypatch):
     assert away.max() < 0.3 * whole[1][known].min()
     np.testing.assert_allclose(radius[known], whole[1][known], rtol=0.2)
     assert (np.linalg.norm(position[known, :2] - truth[known], axis=1) < 1.5 * radius[known]).all()
-    short = estimate_track(frames, CRATER, SHARED, odometry=odometry)
-    away = np.linalg.norm(short.smoothed.position_enu_m - smoothed.smoothed.position_enu_m, axis=1)
-    assert (away < 0.3 * smoothed.smoothed.radius999_m).all()  # which move of the leg was its last is settled early
-    assert [(leg.first, leg.last) for leg in short.legs] == [(leg.first, leg.last) for leg in smoothed.legs]
 
 
-def test_what_a_track_keeps_does_not_grow(monkeypatch):
-    set_window(monkeypatch, WINDOW)
+def test_what_a_live_track_keeps_does_not_grow():
     drive = simulate_drive(np.random.default_rng(22), 5 * WINDOW)
-    moves, online, sizes = Moves.of(drive.steps), OnlineTrack(1), []
+    moves, online, sizes = Moves.of(drive.steps), OnlineTrack(1, WINDOW), []
     for k, estimate in enumerate(drive.estimates):
         first = online.first
-        assert k - first <= 2 * WINDOW
         online.add([estimate], [moves.part(first, k + 1 - first)], first)
         explained = online._explanations
-        sizes.append((len(online._modes), len(explained._frames), explained._branches.history.shape[1]))
-    assert np.max(sizes[2 * WINDOW :], axis=0).tolist() == [2 * WINDOW - 1, WINDOW, WINDOW]
+        sizes.append((len(online._modes), len(explained._frames), explained._branches.history.shape[1], k - first))
+    assert np.max(sizes[WINDOW:], axis=0).tolist() == [WINDOW, WINDOW, WINDOW, WINDOW + 1]
     assert np.linalg.norm(online.position_m - drive.position_m[-1]) < 4.0 * np.sqrt(np.trace(online.covariance_m2))
+
+
+def with_groups(*lengths: int, together: bool = True) -> tuple[list[ObservedFrame], Odometry, Array]:
+    """A drive whose frames are, in turn, of it and 1,000 m off; frames of one kind agree with the odometry."""
+    count = sum(lengths)
+    rng = np.random.default_rng(23)
+    drive, R = simulate_drive(rng, count), attitudes(rng, count)
+    estimates, is_off = list(drive.estimates), np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
+    for k in np.flatnonzero(is_off):
+        estimates[k] = shifted(estimates[k], np.array([1000.0, 300.0 + (0.0 if together else 40.0 * k)]))
+    return observed(estimates, R), odometry_of(drive.position_m, R), drive.position_m
+
+
+@pytest.mark.parametrize("lengths", [(3 * WINDOW, WINDOW + 6), (2 * WINDOW, WINDOW + 3, 2 * WINDOW)])
+def test_images_from_elsewhere_do_not_take_over_what_is_settled(monkeypatch, lengths):
+    frames, odometry, truth = with_groups(*lengths)
+    whole = newest_positions(frames, odometry)
+    set_window(monkeypatch, WINDOW)
+    position, radius, status = newest_positions(frames, odometry)
+    assert status == whole[2]
+    known = np.isfinite(radius)
+    assert (np.linalg.norm(position[known, :2] - truth[known], axis=1) < 1.5 * radius[known]).all()
+
+
+def test_two_groups_of_which_neither_is_clearly_right_are_not_settled(monkeypatch):
+    frames, odometry, truth = with_groups(*[1] * (4 * WINDOW))
+    set_window(monkeypatch, WINDOW)
+    position, radius, _ = newest_positions(frames, odometry)
+    known = np.isfinite(radius)
+    off = np.linalg.norm(position[known, :2] - truth[known], axis=1)
+    assert (off < 1.5 * radius[known]).all()
+    with pytest.raises(BadInput, match="contradict each other"):
+        estimate_track(frames, CRATER, SHARED, odometry=odometry)
+
+
+def test_a_gap_longer_than_the_window_is_bridged(monkeypatch):
+    """Refused images without an attitude: the last one before them turns the move of each."""
+    frames, odometry, _ = with_groups(3 * WINDOW)
+    gap = range(WINDOW, 2 * WINDOW + 4)
+    frames = [replace(one, modes=(), R_body_enu=None) if k in gap else one for k, one in enumerate(frames)]
+    whole = newest_positions(frames, odometry)
+    set_window(monkeypatch, WINDOW // 2)
+    position, radius, status = newest_positions(frames, odometry)
+    assert np.isfinite(radius[WINDOW // 2 :]).all() and status == whole[2]
+    np.testing.assert_allclose(position, whole[0], atol=0.5)
+    np.testing.assert_allclose(radius, whole[1], rtol=0.1)
+
+
+def test_odometry_of_which_two_scales_are_likely_keeps_its_errors(monkeypatch):
+    """7 % too long: moves by the usual errors and by larger ones explain it as well, and change places."""
+    set_window(monkeypatch, WINDOW)
+    nees = []
+    for seed in range(6):
+        rng = np.random.default_rng([24, seed])
+        drive, R = simulate_drive(rng, 40), attitudes(rng, 40)
+        odometry = odometry_of(1.068 * (drive.position_m - drive.position_m[0]), R)
+        session = TrackSession(frames=observed(drive.estimates, R), terrain=CRATER, shared=SHARED)
+        for k, one in enumerate(session.newest(odometry, has_ended=True)):
+            off = one.filtered.position_enu_m[0, :2] - drive.position_m[k]
+            if k > 25 and np.isfinite(off).all():
+                nees.append(off @ np.linalg.solve(one.filtered.covariance_m2[0], off))
+    assert np.mean(nees) < 2.8

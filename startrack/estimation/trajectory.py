@@ -121,7 +121,8 @@ class TrackFilter:
         count = len(self.mean)
         self.move(*(np.repeat(of[number : number + 1], count, axis=0) for of in steps.of_all))
         if len(steps.leg) and steps.leg[number] and np.isfinite(steps.sigma_m[number]):
-            is_new = bool(steps.leg[number] > steps.leg[:number].max(initial=0))
+            known = np.isfinite(steps.sigma_m[:number])
+            is_new = bool(steps.leg[number] > steps.leg[:number][known].max(initial=0))
             self.move_by_leg(np.repeat(steps.by_leg_m[number : number + 1], count, axis=0), is_new=is_new)
 
     def move(self, move_m: Array, sigma_m: Array, by_m: Array) -> None:
@@ -156,6 +157,15 @@ class TrackFilter:
             if self.followers is not None:
                 self.followers.cross[:, :, leg] = 0.0
         self._shift(by_m, leg)
+
+    def forget_moves(self) -> None:
+        """The errors that all moves share are not known: those of another kind of odometry, in its sigmas."""
+        first = 2 + self.shared_count
+        moves = slice(first, first + self.moves_count)
+        self.mean[:, moves], self.covariance[:, moves], self.covariance[:, :, moves] = 0.0, 0.0, 0.0
+        self.covariance[:, moves, moves] = np.eye(self.moves_count)
+        if self.followers is not None:
+            self.followers.cross[:, :, moves] = 0.0
 
     def _shift(self, by_m: Array, part: slice) -> None:
         """Move by errors of a `part` of the state: `by_m` (b, 2, f) by one sigma of each."""

@@ -4,8 +4,9 @@ An explanation states of each image whether it is of this camera, and which of i
 whether the wheels slipped, in it alone or alike in the moves of a leg; and of the odometry, whether it is as stated or
 wrong as a whole. Each has a prior (the constants below) and a likelihood: that of the filter without posts, whose
 errors count as the image's own. An image that is not of the track is anywhere, or near its place with a gross error.
-The moves are turned by the attitude of the last image that an explanation takes as right. What the likeliest
-explanation says of images that WINDOW others have followed is settled, so that time and memory stay flat.
+The moves are turned by the attitude of the last image that an explanation takes as right. In a live track the images
+that WINDOW others have followed are settled, unless explanations that matter take them otherwise: time and memory then
+stay flat.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ FOREIGN_SIGMA_M = 5000.0  # of a position anywhere in a search area, about its m
 MIXED_PROBABILITY, MIXED_PART = 1e-3, 0.1  # of a set with images from elsewhere, and how many of its images these are
 ODOMETRY_WRONG_PROBABILITY = 0.01  # as a whole
 LEAST_VARIANT = 0.01  # part of an explanation's probability, by other moves, that counts in its positions
-WINDOW = 200  # frames about which explanations may differ
+WINDOW = 200  # frames of a live track that are not settled
+SETTLED_DOUBT = 1e-3  # probability of explanations that take a frame otherwise, from which on it is not settled
 KEPT_NATS, MOST_KEPT = 60.0, 60  # of explanations beside the best, and for each kind of odometry
 
 
@@ -37,7 +39,7 @@ KEPT_NATS, MOST_KEPT = 60.0, 60  # of explanations beside the best, and for each
 class Explanation:
     """One explanation of n frames, with the shares of all that differ in no frame and in no use of the odometry.
 
-    The frames are those that its moves have: all, or the last ones.
+    The frames are those that its moves have: all, or the last ones. Of settled ones among them nothing is said.
     """
 
     share: float  # of the probability
@@ -70,8 +72,9 @@ class Explanations:
 
     shared_count: int
     may_slip: bool = True
+    window: int | None = None  # frames that are not settled; None: all
+    settled: int = 0  # number of frames before these
     _frames: list[Sequence[FrameEstimate]] = field(default_factory=list)  # that are not settled
-    _settled: list[Ints] = field(default_factory=list)  # mode, kind and anchor (3,) of each frame before
     _with_modes: int = 0  # number of frames that have one
     _moves: Sequence[Moves] = ()
     _first: int = 0  # frame of the first move
@@ -85,7 +88,7 @@ class Explanations:
         """
         self._frames.append(modes)
         self._with_modes += bool(modes)
-        self._moves, self._first, k = moves, first, len(self._settled) + len(self._frames) - 1
+        self._moves, self._first, k = moves, first, self.settled + len(self._frames) - 1
         start = self._start() if self._found is None else self._moved(self._found, k - 1 - first)
         known = np.array([np.isfinite(m.turn[k - first + 1]).all() for m in moves])[start.odometry]
         here = np.where(known, k + 1, start.anchor)
@@ -97,15 +100,33 @@ class Explanations:
             branches += [_decided(start, start.log_likelihood + np.log1p(-np.exp(doubt)), -1, here)]
             branches += [_decided(start, start.log_likelihood + doubt, -1, start.anchor)] if known.any() else []
         self._found = self._likeliest(Branches.join(branches))
-        if len(self._frames) > WINDOW:
-            self._settle(self._found)
+        while self.window is not None and len(self._frames) > self.window and self._settle(self._branches):
+            pass
 
-    def _settle(self, found: Branches) -> None:
-        """Keep the explanations that take the first frame as the likeliest one does, which is first of them."""
-        agreeing = found.take((found.history[:, 0] == found.history[0, 0]).all(axis=1))
-        self._settled.append(found.history[0, 0].copy())
+    def _settle(self, found: Branches) -> bool:
+        """Keep the explanations that take the first frame as the likeliest one does; False where others matter."""
+        total = found.log_likelihood + self._wrong_prior(found.wrong)
+        share, other = np.exp(total - np.logaddexp.reduce(total)), found.history[:, 0, 0] != found.history[0, 0, 0]
+        second = self._second_group(found.take(np.arange(1)))
+        if second is not None:
+            rival = second[0] + self._wrong_prior(second[1].wrong)[0]
+            if rival - total[0] > np.log(SETTLED_DOUBT):
+                return False
+        if share[other].sum() > SETTLED_DOUBT:
+            return False
+        kept = found.take(~other)
+        self.settled += 1
         self._frames.pop(0)
-        self._found = replace(agreeing, history=agreeing.history[:, 1:], log_wrong=agreeing.log_wrong[:, 1:])
+        self._found = replace(kept, history=kept.history[:, 1:], log_wrong=kept.log_wrong[:, 1:])
+        return True
+
+    @property
+    def first(self) -> int:
+        """Number of the first frame that `moves` must have when the next one is added: its attitude turns a move."""
+        if self._found is None:
+            return 0
+        anchors = np.append(self._found.history[..., 2].ravel(), self._found.anchor)
+        return int(max(min(self.settled, anchors[anchors > 0].min(initial=self.settled)) - 1, 0))
 
     def ranked(self) -> list[Explanation]:
         """Explanations with their shares, the likeliest first.
@@ -147,7 +168,8 @@ class Explanations:
         return self._found
 
     def _explanation(self, one: Branches, share: float) -> Explanation:
-        mode, kind, anchor = np.vstack([*self._settled[self._first :], one.history[0]]).T
+        before = np.tile([-1, STRAIGHT, 0], (self.settled - self._first, 1))
+        mode, kind, anchor = np.vstack([before, one.history[0]]).T
         turned_by = np.maximum(anchor[1:] - self._first, 0)
         return Explanation(
             share, self._moves[one.odometry[0]], int(one.odometry[0]), mode, kind[1:], turned_by,
@@ -174,7 +196,8 @@ class Explanations:
 
         A leg may begin, and go on, in odometry without a fault as a whole.
         """
-        turn = np.array([m.turn for m in self._moves])[one.odometry, np.maximum(one.anchor - self._first, 0)]
+        anchor = np.maximum(one.anchor - self._first, 0)
+        turn = np.array([self._moves[m].turn[k] for m, k in zip(one.odometry, anchor, strict=True)])
         delta = np.array([m.delta_m[step] for m in self._moves])[one.odometry]
         sigma = np.array([m.sigma_m[step] for m in self._moves])[one.odometry]
         freedom = np.array([m.freedom_m[step] for m in self._moves])[one.odometry]
@@ -254,7 +277,7 @@ class Explanations:
         None where fewer than two are wrong of those that are not settled, or they do not agree.
         """
         has_modes = np.array([bool(modes) for modes in self._frames])
-        out, settled = best.history[0, :, 0] < 0, len(self._settled)
+        out, settled = best.history[0, :, 0] < 0, self.settled
         wrong = np.count_nonzero(out & has_modes)
         if wrong < 2:
             return None
@@ -271,7 +294,7 @@ class Explanations:
         if other.log_likelihood[0] < as_wrong:
             return None
         other.history[..., 2] += np.where(other.history[..., 2] > 0, settled, 0)
-        other.odometry, other.wrong = best.odometry, best.wrong + np.count_nonzero(has_modes) - 2 * wrong
+        other.odometry, other.wrong = best.odometry, np.full_like(best.wrong, self._with_modes - wrong)
         return float(best.log_likelihood[0] - as_wrong + other.log_likelihood[0]), other
 
 

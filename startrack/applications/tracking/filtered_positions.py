@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from startrack.applications.tracking.contradictions import RobustTrack, disagrees, smooth_robustly
-from startrack.applications.tracking.explanations import WINDOW, Explanations
+from startrack.applications.tracking.explanations import Explanations
 from startrack.applications.tracking.frame_estimate import (
     FRAME_REACH_SIGMAS,
     LEAST_FRAME_HALF_M,
@@ -38,12 +38,14 @@ Modes = Sequence[FrameEstimate]
 class OnlineTrack:
     """Positions at the time of each frame; `add` in the order of time. Without contradictions a Kalman filter."""
 
-    def __init__(self, shared_count: int) -> None:
+    def __init__(self, shared_count: int, window: int | None = None) -> None:
+        """With `shared_count` errors that frames share; `window`: as of `Explanations`."""
         self.filter = TrackFilter.start(shared_count, FREEDOMS, LEG_FREEDOMS)
-        self._before, self._between = self.filter.take(slice(None)), self.filter
-        self._settled = 0  # number of frames that `_before` has; `_between` has WINDOW more
+        self._before, self._number = self.filter.take(slice(None)), 0  # of the settled frames; their kind of odometry
+        self._first = 0  # frame of the first move
+        self._has_used = False  # whether a frame before the last one is used
         self.is_vouched = True  # whether explanations of another position of the last frame are unlikely together
-        self._explanations = Explanations(shared_count)
+        self._explanations = Explanations(shared_count, window=window)
         self._modes: list[Modes] = []  # of the frames that are not settled
         self._decided: list[tuple[object, ...]] = []  # of each of them that the filter has
 
@@ -77,47 +79,60 @@ class OnlineTrack:
     @property
     def is_first(self) -> bool:
         """Whether the last frame is used, and the only one so far."""
-        return self.mode >= 0 and not self._settled and np.count_nonzero(self._best.mode >= 0) == 1
+        return self.mode >= 0 and not self._has_used
 
     @property
     def first(self) -> int:
         """Number of the first frame that `moves` must have when the next one is added."""
-        return max(self._settled - 1, 0)
+        return self._explanations.first
 
     def add(self, modes: Modes, moves: Sequence[Moves], first: int = 0) -> None:
         """One more frame, with one mode, several (ambiguous) or none (refused).
 
         `moves` are as for `Explanations.add`, from the frame `first` on, at most that of the property.
         """
+        settled = self._explanations.settled
         self._explanations.add(modes, moves, first)
         self._modes.append(modes)
+        for number in range(settled, self._explanations.settled):
+            self._settle(number)
         self._best, *others = self._explanations.ranked()
-        self._follow_best(first)
+        self._first = first
+        self._follow_best()
         best = self._best
+        self._has_used |= bool(best.mode[:-1].max(initial=-1) >= 0)
         away = [disagrees(best.position_m, best.covariance_m2, o.position_m, o.covariance_m2) for o in others]
         doubt = sum(one.share for one, is_away in zip(others, away, strict=True) if is_away)
         self.is_vouched = doubt <= AMBIGUOUS_MASS
 
-    def _follow_best(self, first: int) -> None:
-        """Take into the filter what the likeliest explanation says of the frames, which begin with number `first`."""
-        best, steps, begin = self._best, self._best.steps, self._settled - first
-        turned_by = np.where(best.anchor > 0, best.anchor + first, 0).tolist()
+    def _settle(self, number: int) -> None:
+        """The filter that begins anew has the frame of this number, as the last best explanation takes it."""
+        best, at = self._best, number - self._first
+        if best.number != self._number:  # its errors are in standard deviations of another kind of odometry
+            self._before.forget_moves()
+            self._number = best.number
+        if number:
+            self._before.predict(best.steps, at - 1)
+        if best.mode[at] >= 0:
+            self._before.update(self._modes[0][best.mode[at]])
+        del self._modes[0], self._decided[0]
+
+    def _follow_best(self) -> None:
+        """Take into the filter what the likeliest explanation says of the frames that are not settled."""
+        best, steps, begin = self._best, self._best.steps, self._explanations.settled - self._first
+        turned_by = np.where(best.anchor > 0, best.anchor + self._first, 0).tolist()
         moved = [(), *zip(best.kind.tolist(), turned_by, [best.number] * len(best.kind), strict=True)]
         decided = [(mode, *move) for mode, move in zip(best.mode.tolist(), moved, strict=True)][begin:]
-        if decided[: len(self._decided)] != self._decided:  # another explanation of the frames before is likelier now
+        if decided[: len(self._decided)] != self._decided:  # another explanation of these frames is likelier now
             self.filter, self._decided = self._before.take(slice(None)), []
+            if best.number != self._number:
+                self.filter.forget_moves()
         for k in range(len(self._decided), len(decided)):
             if begin + k:
                 self.filter.predict(steps, begin + k - 1)
             if best.mode[begin + k] >= 0:
                 self.filter.update(self._modes[k][best.mode[begin + k]])
-            if k + 1 == WINDOW:
-                self._between = self.filter.take(slice(None))
         self._decided = decided
-        if len(decided) == 2 * WINDOW:
-            self._before, self._between = self._between, self.filter.take(slice(None))
-            self._decided, self._modes = self._decided[WINDOW:], self._modes[WINDOW:]
-            self._settled += WINDOW
 
 
 def filter_positions(
@@ -131,8 +146,7 @@ def filter_positions(
     track, position, covariance, alone, mode = OnlineTrack(shared_count), [], [], [], []
     kinds = [Moves.of(moves)] if isinstance(moves, Steps) else moves
     for k, of in enumerate(modes):
-        first = track.first
-        track.add(of, [one.part(first, k + 1 - first) for one in kinds], first)
+        track.add(of, kinds)
         position.append(track.position_m)
         covariance.append(track.covariance_m2 if track.is_vouched else UNKNOWN_M**2 * np.eye(2))
         alone += [k] if track.is_first else []

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from startrack.applications.tracking.explanations import WINDOW
 from startrack.applications.tracking.filtered_positions import OnlineTrack
 from startrack.applications.tracking.observed_frame import (
     FrameStore,
@@ -151,7 +152,9 @@ class TrackSession:
 
     def _filter_to(self, k: int, odometry: Odometry | None, shared: TrackErrors) -> OnlineTrack:
         """The filter with frame k; where positions are not linear in `shared`, of all frames about what they show."""
-        online = OnlineTrack(len(shared)) if self._online is None or shared.bends else self._online
+        online = self._online
+        if online is None or shared.bends:
+            online = OnlineTrack(len(shared), None if shared.bends else WINDOW)
         first = online.first
         frames = self.frames[first : k + 1]
         moves = odometry_moves(frames, odometry, self.odometry_errors, shows_scale=not shared.bends)

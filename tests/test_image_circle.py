@@ -15,7 +15,7 @@ from startrack.chain import identify_blind
 from startrack.core.types import Exposure
 from startrack.detection import Detector
 from startrack.exposure import read_exposure
-from startrack.identification.lens_guesses import image_circle
+from startrack.identification.image_circle import image_circle
 
 DATA = Path(__file__).parent / "data"
 

@@ -38,9 +38,9 @@ MIN_WIDE, MIN_NARROW = 2 * MIN_MATCHES, MIN_MATCHES + 1  # of a lens with many u
 FIRST_WINDOWS = (Window(0, 10), Window(0, 16), Window(0, 26))
 LAST_WINDOWS = (Window(8, 24), Window(20, 42), Window(0, 40), Window(36, 60))
 # Ratios fx / fy that are tried where square pixels explain nothing, and the windows. A narrow field's triangles allow
-# for 2 % to either side, a wide one's for 4 %; 45/64 is that of anamorphic video.
-NARROW_ASPECTS = (*(float(np.exp(0.04 * k * sign)) for k in range(1, 7) for sign in (-1, 1)), 45 / 64)
-WIDE_ASPECTS = tuple(float(np.exp(0.08 * k * sign)) for k in range(1, 4) for sign in (-1, 1))
+# for 2 % to either side, a wide one's for 4 %; 0.703 is that of anamorphic video.
+WIDE_ASPECTS = (0.923, 1.083, 0.852, 1.174, 0.787, 1.271)
+NARROW_ASPECTS = (0.961, 1.041, 0.923, 1.083, 0.887, 1.127, 0.852, 1.174, 0.819, 1.221, 0.787, 1.271, 0.703)
 ASPECT_WINDOWS = (Window(0, 16), Window(0, 26), Window(20, 42))
 FEWEST_OF_WINDOW = 5  # detections that there are
 LOG_FALSE_ALARM = float(np.log(MAX_FALSE_ALARM))

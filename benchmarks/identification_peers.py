@@ -6,8 +6,8 @@
 All-sky pictures beside allclear, which gets place and time, as startrack does: every fifth star of STARS.csv (columns
 hip, az_deg, alt_deg_refracted, x_px, y_px) is painted over before either program sees the picture, and the residual is
 that of these stars. Narrow pictures, as those of stars_narrow.py, beside tetra3rs and cedar-solve, whose databases are
-for these widths; the width is stated 0, 9 % less and 9 % more than it is, in turn. ruststartracker takes no pictures and
-needs a calibrated camera: it is in stars_identification.py. Programs that are not installed are left out. CPU is that of
+for these widths; the width is stated right, 9 % less and 9 % more. ruststartracker takes no pictures and needs a
+calibrated camera: it is in stars_identification.py. Programs that are not installed are left out. CPU is that of
 detection and identification, warm; of allclear that of its process, which begins with its imports.
 """
 
@@ -121,8 +121,8 @@ WIDE_KINDS = {  # factors of the stated field, or the range; whether place and t
     "all-sky, 2 to 190 degrees": (None, False),
 }
 EXPLANATION = (
-    "Medians over the pictures. The residual is the median distance of held-out stars, which no program saw, from where "
-    "its lens and attitude place them. Wrong: held-out stars 5 px off, or an axis 0.2 degrees from that of most "
+    "Medians over the pictures. The residual is the median distance of held-out stars, which no program saw, from "
+    "where its lens and attitude place them. Wrong: held-out stars 5 px off, or an axis 0.2 degrees from that of most "
     "programs. startrack is run with the field of view right, 9 % less and 9 % more."
 )
 
@@ -149,9 +149,7 @@ def held_out(path: str, stars: str, place: str, when: str) -> SkyPicture:
     )  # fmt: skip
 
 
-def ours_wide(
-    pictures: list[SkyPicture], catalog: StarCatalog, stated: tuple[tuple[float, ...] | None, bool]
-) -> Tally:
+def ours_wide(pictures: list[SkyPicture], catalog: StarCatalog, stated: tuple[tuple[float, ...] | None, bool]) -> Tally:
     """startrack on the all-sky pictures."""
     factors, has_place = stated
     tally = Tally()

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from startrack.camera import Camera, Decentring, KannalaBrandt, Lens, Pinhole
-from startrack.catalog import load_catalog
+from startrack.catalog import is_below_horizon, load_catalog
 from startrack.chain import identify_blind as identify_picture
 from startrack.cli.main import main
 from startrack.core.smooth_image import SmoothImage
@@ -23,7 +23,7 @@ from startrack.core.types import Detections, NotIdentified, Stars
 from startrack.estimation.attitude import solve_attitude
 from startrack.estimation.radial_fit import largest_angle_rad, radius_of
 from startrack.exposure import read_exposure
-from startrack.frames import angle_between_rad
+from startrack.frames import Site, angle_between_rad
 from startrack.identification.unknown_lens import UnknownLensSolution, identify_unknown_lens
 
 DATA = Path(__file__).parent / "data"
@@ -166,6 +166,35 @@ def test_the_lens_is_found_with_the_stars(case: str, wrong_by: float) -> None:
     assert np.linalg.norm(px - again, axis=1)[known].max() < 1.0
 
 
+@pytest.mark.parametrize(
+    ("case", "aspect"),
+    [("equisolid, mirrored", 0.9), ("no ideal lens, 185 degrees", 0.8), ("stereographic", 0.95),
+     ("clipped by the frame", 1.067), ("20 degrees", 0.8), ("20 degrees, mirrored", 1.067)],
+)  # fmt: skip
+def test_squeezed_pictures_are_identified(case: str, aspect: float) -> None:
+    ideal, how, fov = LENSES[case]
+    camera = replace(ideal, focal_px=(ideal.focal_px[0] * aspect, ideal.focal_px[0]))
+    seen, truth, _ = picture(camera, seed=4, **how)
+    found = identify_unknown_lens(seen, camera.size_px, np.radians(fov / (aspect if fov < 100 else 1)), sky())
+    names = found.identification
+    assert np.mean(truth[names.detection] == names.star) >= 0.98
+    focal_px, covariance = np.array(found.camera.focal_px), found.camera.covariance
+    assert covariance is not None
+    by_focal = np.array([1.0, -1.0]) / focal_px
+    sigma = np.sqrt(by_focal @ covariance[:2, :2] @ by_focal)
+    assert abs(np.log(focal_px[0] / focal_px[1] / aspect)) < 4 * sigma < 0.004
+
+
+@pytest.mark.parametrize("case", ["equisolid, mirrored", "70 degrees", "20 degrees", "a third of the sky"])
+def test_a_range_of_fields_is_one_search(case: str) -> None:
+    camera, how, _ = LENSES[case]
+    seen, truth, _ = picture(camera, seed=5, **how)
+    found = identify_unknown_lens(seen, camera.size_px, (np.radians(2.0), np.radians(190.0)), sky())
+    names = found.identification
+    assert np.mean(truth[names.detection] == names.star) >= 0.98
+    assert names.false_alarm_probability < 1e-9
+
+
 @pytest.mark.slow
 def test_noise_is_refused_in_bounded_time() -> None:
     rng = np.random.default_rng(5)
@@ -231,6 +260,19 @@ def test_a_photograph_is_identified_cold(photo) -> None:
     assert np.mean(result.stars.hip[found.star][both] == hip[nearest[both]]) >= 0.99
     assert result.attitude_fit.rms_px < 0.4
     assert result.camera.calibrated_angle_rad > np.radians(70)
+
+
+def test_place_and_time_leave_out_the_sky_below_the_horizon(photo) -> None:
+    site = Site("earth", *np.radians([34.7443, -111.4223]), 2361.0)
+    result = identify_picture(photo, np.radians(170.0), load_catalog(), site=site)
+    assert result.status == "ok" and result.site == site
+    named = result.stars.rays_icrs[result.identification.star]
+    assert not is_below_horizon(named, site, photo.time_utc).any()
+    anywhere = identify_picture(photo, np.radians(170.0), load_catalog())
+    assert len(named) >= len(anywhere.identification)  # refraction is no error of the lens
+    opposite = Site("earth", -site.latitude_rad, site.longitude_rad + np.pi, 0.0)
+    refused = identify_picture(photo, np.radians(170.0), load_catalog(), site=opposite)
+    assert refused.reason == "not_identified" and "check the site (signs) and the time" in refused.message
 
 
 def test_its_half_covered_mirror_image_is_reported_as_mirrored(photo, tmp_path, capsys) -> None:

@@ -15,6 +15,7 @@ from stage_helpers import as_stage
 from star_painter import paint
 from test_unknown_lens import SIZE, lens_camera, picture, sky
 
+from startrack.api.centroids import identify_centroids
 from startrack.camera import Camera, Decentring, KannalaBrandt, Pinhole
 from startrack.catalog import load_catalog
 from startrack.chain import Oriented, identify_blind
@@ -23,7 +24,6 @@ from startrack.estimation.attitude import solve_attitude
 from startrack.estimation.misfit import solve_with_misfit
 from startrack.estimation.normal_equations import observations_of_image
 from startrack.exposure import read_exposure
-from startrack.identification import identify_centroids
 from startrack.identification.found_lens import fit_found_lens
 from startrack.identification.unknown_lens import identify_unknown_lens
 from startrack.output import identification_dict

@@ -11,9 +11,11 @@ import numpy as np
 from startrack.camera import REFRACTION_CONTAINED, Camera
 from startrack.catalog import StarCatalog, apparent_bodies, apparent_stars, is_below_horizon
 from startrack.chain.bright_stars import name_bright_sources
+from startrack.chain.second_field import check_single_field
 from startrack.chain.sky_state import stating_sky
 from startrack.chain.source_names import identified_names
 from startrack.chain.stages import Detected, Identified, Inputs, Oriented, Settings
+from startrack.core import FIELD_TOLERANCE_1
 from startrack.core.compilation import announce_compilation
 from startrack.core.types import (
     BadInput,
@@ -23,12 +25,12 @@ from startrack.core.types import (
     Identification,
     Stars,
 )  # fmt: skip
-from startrack.detection import Detector
+from startrack.detection import Detector, image_circle
 from startrack.estimation.lens_correction import correct_lens
 from startrack.estimation.misfit import solve_with_misfit
 from startrack.exposure import NO_TIME, are_fractions
 from startrack.frames import Site
-from startrack.identification import NearSky, check_single_field
+from startrack.identification import WIDE_FIELD_RAD, NearSky
 from startrack.terrain import Terrain, site_of_terrain
 
 
@@ -154,11 +156,10 @@ def identify_unknown_lens(
         above = np.flatnonzero(~is_below_horizon(stars.rays_icrs, place, when))
     narrowest_rad = float(np.min(fov_rad))
     more = "" if place is None else "; check the site (signs) and the time, as the sky below the horizon is left out"
+    is_wide = np.max(fov_rad) * (1 + FIELD_TOLERANCE_1) >= WIDE_FIELD_RAD
+    circle = image_circle(sources.background_e) if is_wide else None
     with stating_sky(detected.exposure, sources, v_mag=stars.v_mag, fov_rad=narrowest_rad, more=more):
-        found = solve(
-            sources, detected.exposure.size_px, fov_rad, stars.take(above), background=sources.background_e,
-            near_sky=near_sky,
-        )  # fmt: skip
+        found = solve(sources, detected.exposure.size_px, fov_rad, stars.take(above), circle=circle, near_sky=near_sky)
     bodies = apparent_bodies(place, when) if place is not None and when is not None else ()
     identification = replace(found.identification, star=above[found.identification.star])
     return _identified(detected, found.camera, stars, bodies, place, identification)

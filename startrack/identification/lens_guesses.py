@@ -12,9 +12,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from startrack.core.types import Array
+from startrack.core.types import Array, ImageCircle
 from startrack.estimation.radial_fit import PINHOLE_BEND, radius_of
-from startrack.identification.image_circle import ImageCircle
 
 WIDE_FIELD_RAD = float(np.radians(100.0))  # from here up, a field of view is the angle of the image circle
 NARROW_FIELD_RAD = float(np.radians(40.0))  # up to here all lenses are nearly pinholes

@@ -23,7 +23,7 @@ from startrack.identification.lens_guesses import Field
 UNKNOWN_LENS = "unknown"  # name of a camera that no file states
 FEWEST = 5  # matches
 GATE_OVER_SIGMA = 4.0  # the gate over the sigma of the loss
-STEPS = 3  # of the fit, for each set of matches
+GROWTH_STEPS = 3  # of the fit, for each set of matches
 VIEW_MARGIN = 1.15  # of the frame: the focal length is not known
 STARS_PER_DETECTION = 1.5
 STARS_AT_HAND = 4.0  # times as many of the brightest of the whole sky as the field has of those that take part
@@ -72,7 +72,7 @@ class LensView:
         R, lens = self.R_cam_icrs.copy(), self.lens.copy()
         away = BENT_AWAY / min(self.corner_rad, 1.0) ** 2
         sigma = np.array([FOCAL_SIGMA, ASPECT_SIGMA, max(BEND_SIGMA, away), CENTRE_SIGMA, CENTRE_SIGMA])
-        fit_radial(xy_px, rays_icrs, self.handedness, sigma_px, STEPS, free, expected, sigma, R, lens)
+        fit_radial(xy_px, rays_icrs, self.handedness, sigma_px, GROWTH_STEPS, free, expected, sigma, R, lens)
         return replace(self, R_cam_icrs=R, lens=lens)
 
     def camera(self, coefficients: int, widest_rad: float) -> Camera:

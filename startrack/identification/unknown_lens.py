@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from startrack.camera import Camera
 from startrack.core import FIELD_TOLERANCE_1, NARROWEST_DEG, WIDEST_DEG
 from startrack.core.time_limit import check_time, stating_work
-from startrack.core.types import Array, Centroids, Identification, NotIdentified, Stars
+from startrack.core.types import Array, Centroids, Identification, ImageCircle, NotIdentified, Stars
 from startrack.estimation.false_alarm import probability
 from startrack.estimation.normal_equations import observations_of_image
 from startrack.estimation.radial_fit import radius_of
@@ -25,8 +23,7 @@ from startrack.identification.hypotheses import (
     Window,
     remove_clumps,
 )
-from startrack.identification.image_circle import image_circle
-from startrack.identification.lens_guesses import WIDE_FIELD_RAD, Field, guess_fields
+from startrack.identification.lens_guesses import Field, guess_fields
 from startrack.identification.lens_view import grow
 from startrack.identification.lost_in_space import MAX_FALSE_ALARM
 from startrack.identification.near_sky import NearSky
@@ -59,19 +56,19 @@ class UnknownLensSolution:
 
 def identify_unknown_lens(
     centroids: Centroids, size_px: tuple[int, int], fov_rad: float | tuple[float, float], stars: Stars, *,
-    tolerance: float = FIELD_TOLERANCE_1, background: NDArray[Any] | None = None, near_sky: NearSky | None = None,
+    tolerance: float = FIELD_TOLERANCE_1, circle: ImageCircle | None = None, near_sky: NearSky | None = None,
 ) -> UnknownLensSolution:  # fmt: skip
     """Lens, attitude and matches of `centroids` in a frame of `size_px` (W, H), its field of view roughly known.
 
     `fov_rad`: a field of view, known to `tolerance`, or the smallest and the largest that it may have. Below 100
     degrees it is the angle across the frame's width, from there up that of the whole image circle, whether the frame
-    clips it or not. `stars` are sorted, brightest first. `background` (H, W): smooth background of the frame, in which
-    the image circle of a fisheye lens is looked for; it narrows the search. `near_sky`: part of the sky into which the
+    clips it or not. `stars` are sorted, brightest first. `circle`: the image circle of a fisheye lens as it
+    shows in the frame; it narrows the search. `near_sky`: part of the sky into which the
     optical axis points; attitudes elsewhere are not tried. An answer is accepted where chance would give as many
     coincidences with a probability below 1e-9, all trials included. Raises NotIdentified, and ValueError for an
     impossible field of view.
     """
-    search = _Search(centroids, size_px, _range_of(fov_rad, tolerance), stars, background, near_sky)
+    search = _Search(centroids, size_px, _range_of(fov_rad, tolerance), stars, circle, near_sky)
     for lens, field in search.lenses():
         if lens.log_p < LOG_FALSE_ALARM and len(lens.star) >= _least_matches(field):
             lens, camera, R = search.settle(lens, field)
@@ -128,12 +125,11 @@ class _Search:
 
     def __init__(
         self, centroids: Centroids, size_px: tuple[int, int], range_rad: tuple[float, float], stars: Stars,
-        background: NDArray[Any] | None, near_sky: NearSky | None,
+        circle: ImageCircle | None, near_sky: NearSky | None,
     ) -> None:  # fmt: skip
         self.centroids, self.size_px, self.range_rad, self.stars = centroids, size_px, range_rad, stars
-        is_wide = range_rad[1] >= WIDE_FIELD_RAD
-        self.circle = image_circle(background) if is_wide and background is not None else None
-        circles = (None,) if self.circle is None else (self.circle, None)
+        self.circle = circle
+        circles = (None,) if circle is None else (circle, None)
         self.fields = guess_fields(size_px, *range_rad, circles)
         self.inside = np.arange(len(centroids))  # detections that may be stars
         if self.circle is not None and all(field.is_wide for field in self.fields):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.types import Array
+from startrack.core.types import Array, ImageCircle
 
 REDUCED_SIDE_PX = 160  # longer side of the reduced background
 EDGE_POINTS = 72  # in which the edge is looked for
@@ -19,14 +18,6 @@ DISC_STEP_PX = 2.0
 MIN_CONTRAST_1 = 0.2  # median over the directions; moonlit photographs with trees reach 0.3
 MIN_SEEN_1 = 0.5  # of the directions that lie in the frame
 DARKEST_PERCENTILE = 0.5
-
-
-@dataclass(frozen=True)
-class ImageCircle:
-    """Disc of the frame that the lens illuminates."""
-
-    centre_px: tuple[float, float]
-    radius_px: float
 
 
 def image_circle(background: NDArray[Any]) -> ImageCircle | None:

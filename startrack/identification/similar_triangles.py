@@ -16,7 +16,8 @@ from startrack.identification.triangles import Triangles, number_runs, separate_
 
 CELL_LENGTH = 16.0  # range of the logarithm of the size within a cell of the key
 SMALLEST_LOG = -0.75 * CELL_LENGTH  # most of it for sizes below a radian
-MOST_PATTERN_STARS = 25_000
+MOST_TRIANGLES = 800_000  # of an index, which take half a second
+TRIANGLES_1 = 0.0134  # over the cube of the number of stars and the fourth power of the side; of Hipparcos, 3 to 10 deg
 MOST_CANDIDATES = 200_000  # pairs of triangles in a cell, a tenth of which agree; beyond it more stars do not decide
 
 
@@ -40,8 +41,10 @@ class PatternKind:
     def sizes(self, field_sr: float) -> PatternSizes:
         """The sizes for a field of this solid angle."""
         diameter_rad = float(np.sqrt(4 * field_sr / np.pi))
-        stars = int(min(self.stars_in_field * 4 * np.pi / field_sr, MOST_PATTERN_STARS))
-        return PatternSizes(stars, self.side_of_field * diameter_rad, self.shape_tolerance)
+        side_rad = self.side_of_field * diameter_rad
+        most = (MOST_TRIANGLES / TRIANGLES_1 / side_rad**4) ** (1 / 3)
+        stars = int(min(self.stars_in_field * 4 * np.pi / field_sr, most))
+        return PatternSizes(stars, side_rad, self.shape_tolerance)
 
 
 BENT = PatternKind(60, 0.278, 0.02)  # of a lens whose bend is not known

@@ -167,17 +167,15 @@ class _Search:
         low, high = np.degrees(self.range_rad)
         field = f"{low:.3g} to {high:.3g} degrees, {len(self.centroids)} point sources"
         with stating_work(lambda: f"{field}: {self.tried_text}"):
-            for windows in (FIRST_WINDOWS, LAST_WINDOWS):
-                for one in self.fields:
-                    kind = STRAIGHT if one.is_narrow else BENT
-                    yield from self._lenses_of(one, kind, (1.0,), windows)
             for one in self.fields:
+                yield from self._lenses_of(one, STRAIGHT if one.is_narrow else BENT, (1.0,), FIRST_WINDOWS)
+            for one in reversed(self.fields):  # the patterns of the last fields are at hand
+                kind, aspects = (STRAIGHT, NARROW_ASPECTS) if one.is_narrow else (BENT, WIDE_ASPECTS)
+                yield from self._lenses_of(one, kind, (1.0,), LAST_WINDOWS)
                 if one.is_narrow:
                     yield from self._lenses_of(one, LONG, (1.0,), FIRST_WINDOWS)
-            for one in self.fields:
-                self.aspects = NARROW_ASPECTS if one.is_narrow else WIDE_ASPECTS
-                kind = STRAIGHT if one.is_narrow else BENT
-                yield from self._lenses_of(one, kind, self.aspects, ASPECT_WINDOWS)
+                self.aspects += aspects
+                yield from self._lenses_of(one, kind, aspects, ASPECT_WINDOWS)
 
     def _lenses_of(
         self, field: Field, kind: PatternKind, aspects: tuple[float, ...], windows: tuple[Window, ...]

@@ -190,7 +190,10 @@ def allclear(pictures: list[SkyPicture], python: str) -> Tally:
     for picture in pictures:
         with tempfile.TemporaryDirectory() as folder:
             frame, directions = Path(folder) / "frame.fits", Path(folder) / "directions.json"
-            fits.writeto(frame, np.asarray(picture.exposure.pixels_adu, np.float32))
+            header = fits.Header(
+                [("DATE-OBS", picture.when.rstrip("Z")), ("EXPTIME", picture.exposure.exposure_s or 1.0)]
+            )
+            fits.writeto(frame, np.asarray(picture.exposure.pixels_adu, np.float32), header)
             directions.write_text(json.dumps(picture.azalt_deg.tolist()), encoding="utf-8")
             latitude, longitude = np.degrees([picture.site.latitude_rad, picture.site.longitude_rad])
             words = [str(frame), f"{latitude:.6f}", f"{longitude:.6f}", picture.when.rstrip("Z"), str(directions)]

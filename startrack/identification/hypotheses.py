@@ -17,19 +17,19 @@ from startrack.identification.similar_triangles import ShapePatterns
 from startrack.identification.triangles import Triangles, triad_attitude, triangles
 
 MOST_DETECTIONS = 100  # of which patterns are made
-MOST_VOTED = 150  # triangles with the most votes whose attitudes are compared
 # Difference of views that agree, over the tolerance of the shapes: of the attitudes, and of the logarithm of the scale.
 SAME_VIEW_1, SAME_SCALE_1 = 5.0, 2.5
-MIN_AGREEING = 3
-VIEWS_OF_WINDOW = 4
+MIN_AGREEING = 2
+VOTED_EACH = 40  # triangles with the most votes whose attitudes are compared, for each view
 
 
 @dataclass(frozen=True)
 class Window:
-    """Ranks of brightness, `first` to `end`, whose triangles vote together."""
+    """Ranks of brightness, `first` to `end`, whose triangles vote together, and how many views of them are grown."""
 
     first: int
     end: int
+    views: int = 4
 
 
 class HypothesisSearch:
@@ -71,9 +71,10 @@ class HypothesisSearch:
         reflected = image.handedness[left] != catalogue.handedness[right]
         pair = (image.vertices[left] + len(xy) * reflected[:, None]) * len(patterns.star) + catalogue.vertices[right]
         votes = np.bincount(pair.ravel())[pair].min(axis=1)
-        last = max(len(votes) - MOST_VOTED, 0)
+        most_voted = VOTED_EACH * window.views
+        last = max(len(votes) - most_voted, 0)
         most = np.flatnonzero(votes >= np.partition(votes, last)[last])
-        most = most[np.argsort(-votes[most], kind="stable")[:MOST_VOTED]]
+        most = most[np.argsort(-votes[most], kind="stable")[:most_voted]]
         focal_px, mirrored, cam, R = _solve_triangles(
             patterns, guess, xy, image.take(left[most]), catalogue.take(right[most])
         )
@@ -83,7 +84,7 @@ class HypothesisSearch:
         same &= (np.abs(log_focal[:, None] - log_focal) < SAME_SCALE_1 * tolerance) & (mirrored[:, None] == mirrored)
         found = []
         free = np.ones(len(R), dtype=bool)
-        for _ in range(VIEWS_OF_WINDOW):
+        for _ in range(window.views):
             count = np.where(free, np.count_nonzero(same & free, axis=1), 0)
             best = int(np.argmax(count))
             if count[best] < MIN_AGREEING:

@@ -38,6 +38,7 @@ LAST_WINDOWS = (Window(8, 24), Window(20, 42), Window(0, 40), Window(36, 60))
 # for 2 % to either side, a wide one's for 4 %; 0.703 is that of anamorphic video.
 WIDE_ASPECTS = (0.923, 1.083, 0.852, 1.174, 0.787, 1.271)
 NARROW_ASPECTS = (0.961, 1.041, 0.923, 1.083, 0.887, 1.127, 0.852, 1.174, 0.819, 1.221, 0.787, 1.271, 0.703)
+LONG_WINDOWS = (Window(0, 16, 30), Window(0, 26, 30), Window(0, 40, 30))  # where few of the detections are stars
 ASPECT_WINDOWS = (Window(0, 16), Window(0, 26), Window(20, 42))
 FEWEST_OF_WINDOW = 5  # detections that there are
 LOG_FALSE_ALARM = float(np.log(MAX_FALSE_ALARM))
@@ -173,7 +174,7 @@ class _Search:
                 kind, aspects = (STRAIGHT, NARROW_ASPECTS) if one.is_narrow else (BENT, WIDE_ASPECTS)
                 yield from self._lenses_of(one, kind, (1.0,), LAST_WINDOWS)
                 if one.is_narrow:
-                    yield from self._lenses_of(one, LONG, (1.0,), FIRST_WINDOWS)
+                    yield from self._lenses_of(one, LONG, (1.0,), LONG_WINDOWS)
                 self.aspects += aspects
                 yield from self._lenses_of(one, kind, aspects, ASPECT_WINDOWS)
 

@@ -17,9 +17,10 @@ print("ready", flush=True)
 for line in sys.stdin:
     request = json.loads(line)
     centroids, fov_deg = np.array(request["xy_px"])[:, ::-1], request["fov_deg"]
+    error_deg = request.get("error_1", 0.02) * fov_deg
     start = time.process_time()
     found = solver.solve_from_centroids(
-        centroids, tuple(request["size_px"][::-1]), fov_estimate=fov_deg, fov_max_error=0.02 * fov_deg
+        centroids, tuple(request["size_px"][::-1]), fov_estimate=fov_deg, fov_max_error=error_deg
     )
     ms = 1e3 * (time.process_time() - start)
     print(json.dumps({"ms": ms, **{key: found[key] for key in ("RA", "Dec", "Roll")}}), flush=True)

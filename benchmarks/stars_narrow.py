@@ -30,7 +30,7 @@ from startrack.catalog import load_catalog  # noqa: E402
 from startrack.core.types import Exposure, NoSolution, Stars  # noqa: E402
 from startrack.detection import Detector  # noqa: E402
 from startrack.exposure import read_exposure  # noqa: E402
-from startrack.identification.unknown_lens import identify_unknown_lens  # noqa: E402
+from startrack.identification import UnknownLensSolution, identify_unknown_lens  # noqa: E402
 
 FIELDS_DEG = {  # across the width
     "2019-07-29": 11.4, "crappy": 10.2, "orion": 10.2, "pleiades": 10.2, "roof": 10.2, "tree": 10.2, "jan1": 10.9,
@@ -154,7 +154,13 @@ def _count_wrong(tally: Tally, other: Tally, pictures: list[Picture]) -> int:
 def solve_ours(found: object, picture: Picture, stars: Stars) -> np.ndarray | None:
     size = picture.exposure.size_px
     answer = identify_unknown_lens(found, size, np.radians(picture.fov_deg), stars)  # type: ignore[arg-type]
-    return np.asarray(answer.identification.R_cam_icrs[2])
+    return middle_of(answer)
+
+
+def middle_of(answer: UnknownLensSolution) -> np.ndarray:
+    """The direction of the frame's middle: a lens need not be centred there."""
+    middle = (np.array(answer.camera.size_px) - 1) / 2
+    return np.asarray(answer.camera.unproject(middle) @ answer.identification.R_cam_icrs)
 
 
 def extract_quick(exposure: Exposure) -> object:

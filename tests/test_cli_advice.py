@@ -183,7 +183,7 @@ def test_only_wide_sources_lead_to_the_focus() -> None:
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "text"), [(8.0, 25.0, "--fov 4..50"), (3.0, 280.0, ""), (2.0, 200.0, "--fov 3..280")]
+    ("low", "high", "text"), [(8.0, 25.0, "--fov 4..50"), (2.0, 280.0, ""), (3.0, 200.0, "--fov 2..280")]
 )
 def test_fields_that_were_tried_are_not_advised(low: float, high: float, text: str) -> None:
     advice = advise_on_fields(*np.radians([low, high]), None)

@@ -11,11 +11,11 @@ import pytest
 from startrack.camera import Camera, load_camera
 from startrack.catalog import StarCatalog, load_catalog
 from startrack.chain import Oriented, pipeline
+from startrack.chain.second_field import find_second_field
 from startrack.core.types import Array, Exposure, NotLocated
 from startrack.evidence import StarPhotometry
 from startrack.evidence.double_exposure import DECISIVE, check_single_skyline, find_double_exposure
 from startrack.frames import R_from_rotvec
-from startrack.identification.second_field import find_second_field
 from startrack.rendering import Scene, Series
 from startrack.rendering.compose import ADC_MAX_ADU, light_e, read_out
 from startrack.simulation import simulate_rays

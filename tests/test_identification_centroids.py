@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from test_identification import ARCSEC, FISHEYE, NARROW, frame, random_positions, sky
 
+from startrack.api.centroids import identify_centroids
 from startrack.core.types import NotIdentified
-from startrack.identification import identify_centroids
 
 
 @pytest.mark.parametrize("camera", [FISHEYE, NARROW], ids=lambda camera: camera.name)

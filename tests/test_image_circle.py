@@ -13,9 +13,8 @@ from scipy.spatial import cKDTree
 from startrack.catalog import load_catalog
 from startrack.chain import identify_blind
 from startrack.core.types import Exposure
-from startrack.detection import Detector
+from startrack.detection import Detector, image_circle
 from startrack.exposure import read_exposure
-from startrack.identification.lens_guesses import image_circle
 
 DATA = Path(__file__).parent / "data"
 

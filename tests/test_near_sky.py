@@ -20,8 +20,8 @@ from startrack.frames import angle_between_rad
 from startrack.identification import Identifier, NearSky, identify_unknown_lens
 from startrack.identification.attitude_search import MIN_MATCHES, MIN_MATCHES_NEAR_SKY
 from startrack.identification.hypotheses import HypothesisSearch, Window
-from startrack.identification.lens_guesses import PINHOLE, guess_lenses
-from startrack.identification.similar_triangles import narrow_sizes, patterns_for
+from startrack.identification.lens_guesses import guess_fields
+from startrack.identification.similar_triangles import STRAIGHT, patterns_for
 
 SAMPLES = Path(__file__).parents[1] / "sample_images"
 BACKGROUND_E, PSF_PX = 100.0, 1.2
@@ -241,11 +241,11 @@ def test_a_part_of_the_sky_ends_the_search_of_a_lens_sooner() -> None:
         size = TEN_DEGREES.size_px
         for name, near in (("whole", None), ("part", near_sky(one.R_cam_icrs, 3.0, seed))):
             search = HypothesisSearch(one.detections.xy_px[:20], size, near, np.radians(0.5))
-            sizes = narrow_sizes(0.03, 10, 0.8)
-            (guess,) = guess_lenses(size, np.radians(10), (PINHOLE,))
-            hypotheses = search.likely_hypotheses(patterns_for(sky(), sizes), guess, Window(0, 0, 20))
+            (field,) = guess_fields(size, *np.radians([9.0, 11.0]), (None,))
+            patterns = patterns_for(sky(), STRAIGHT.sizes(field.solid_angle_sr))
+            hypotheses = search.voted_hypotheses(patterns, field.guesses[0], Window(0, 20))
             assert search.near_sky is None or all(
-                search.near_sky.contains(h.R_cam_icrs, search.margin_rad) for h in hypotheses
+                search.near_sky.contains(h.view.R_cam_icrs, search.margin_rad) for h in hypotheses
             )
             tried[name].append(len(hypotheses))
             assert search.log_trials == pytest.approx(

@@ -111,12 +111,12 @@ def test_a_refused_search_states_what_it_saw_and_tried(questions: StepClock, ask
     """In detection, and among the patterns."""
     image = points(60)
     settings = Settings(time_limit_s=asked)
-    outcome = identify_blind(exposure_of(image), np.radians([30.0, 36.0]), load_catalog(), settings)
+    outcome = identify_blind(exposure_of(image), (np.radians(30.0), np.radians(60.0)), load_catalog(), settings)
     assert isinstance(outcome, Refused) and outcome.reason is Reason.TIME_LIMIT
     assert questions.now < asked + 3
     is_among_patterns = "at the stage identify" in outcome.message
     assert is_among_patterns == (asked == 20)
-    for text in ("58 point sources", "patterns of the", "0 of 2 fields done", "in 400 x 400 px"):
+    for text in ("58 point sources", "patterns of the", "in 400 x 400 px"):
         assert (text in outcome.message) == is_among_patterns, outcome.message
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from astropy.units import Quantity
     from numpy.typing import ArrayLike
 
-    from startrack.identification import IdentifiedCentroids
+    from startrack.api.centroids import IdentifiedCentroids
 
 
 def locate(
@@ -214,7 +214,7 @@ def identify(
     if given and isinstance(image, str | os.PathLike | Exposure):
         raise ValueError(f"{' and '.join(given)}: for lists of centroids only, and this is an image")
     if given or chain.is_list_of_centroids(image):
-        from startrack.identification import identify_centroids
+        from startrack.api.centroids import identify_centroids
 
         if camera is None and (fov is None or size_px is None):
             raise ValueError("centroids: give a camera, or fov= with size_px=")

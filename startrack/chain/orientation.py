@@ -9,29 +9,28 @@ from datetime import datetime
 import numpy as np
 
 from startrack.camera import REFRACTION_CONTAINED, Camera
-from startrack.catalog import StarCatalog, apparent_bodies, apparent_stars
+from startrack.catalog import StarCatalog, apparent_bodies, apparent_stars, is_below_horizon
 from startrack.chain.bright_stars import name_bright_sources
+from startrack.chain.second_field import check_single_field
 from startrack.chain.sky_state import stating_sky
 from startrack.chain.source_names import identified_names
 from startrack.chain.stages import Detected, Identified, Inputs, Oriented, Settings
+from startrack.core import FIELD_TOLERANCE_1
 from startrack.core.compilation import announce_compilation
-from startrack.core.time_limit import stating_work
 from startrack.core.types import (
-    Array,
     BadInput,
     Body,
     Detections,
     Exposure,
     Identification,
-    NotIdentified,
     Stars,
 )  # fmt: skip
-from startrack.detection import Detector
+from startrack.detection import Detector, image_circle
 from startrack.estimation.lens_correction import correct_lens
 from startrack.estimation.misfit import solve_with_misfit
 from startrack.exposure import NO_TIME, are_fractions
 from startrack.frames import Site
-from startrack.identification import NearSky, check_single_field
+from startrack.identification import WIDE_FIELD_RAD, NearSky
 from startrack.terrain import Terrain, site_of_terrain
 
 
@@ -138,58 +137,32 @@ def _identified(
 
 
 def identify_unknown_lens(
-    detected: Detected, fovs_rad: Array, catalog: StarCatalog, near_sky: NearSky | None
-) -> Identified:
+    detected: Detected, fov_rad: float | tuple[float, float], catalog: StarCatalog, near_sky: NearSky | None,
+    site: Site | None,
+) -> Identified:  # fmt: skip
     """The same as `identify_stars`, with the camera found from an approximate field of view.
 
-    `detected` has the point sources, `catalog` the stars. The first of `fovs_rad` (n,) that identifies the image is
-    taken: an identification is accepted at any of them only where chance would not give it. `near_sky` (None: not
-    known) is where the optical axis points. Raises NotIdentified, TooFewStars.
+    `detected` has the point sources, `catalog` the stars. `fov_rad` is one field of view, or the smallest and the
+    largest. `near_sky` (None: not known) is where the optical axis points, `site` (None: not known) where the camera
+    stands: with the time it leaves out the sky below the horizon. Raises NotIdentified, TooFewStars.
     """
-    stars = apparent_stars(catalog, detected.exposure.time_utc, None)
-    fov_rad = float(np.min(fovs_rad))
-    with stating_sky(detected.exposure, detected.detections, v_mag=stars.v_mag, fov_rad=fov_rad):
-        return _identify_at_fovs(detected, fovs_rad, stars, near_sky)
-
-
-def _identify_at_fovs(detected: Detected, fovs_rad: Array, stars: Stars, near_sky: NearSky | None) -> Identified:
-    from startrack.identification import ASPECTS, NARROW_FIELD_RAD, advise_on_fields, pixels_text
     from startrack.identification import identify_unknown_lens as solve
 
-    sources, size_px = detected.detections, detected.exposure.size_px
-    tried: list[int] = []  # patterns, of each field done
-    refusal: NotIdentified | None = None
-
-    def done() -> str:
-        return f"{len(tried)} of {len(fovs_rad)} fields done"
-
-    for fov_rad in fovs_rad:
-        try:
-            with stating_work(done):
-                found = solve(
-                    sources, size_px, float(fov_rad), stars, background=sources.background_e, near_sky=near_sky
-                )
-        except NotIdentified as cause:
-            refusal = cause
-            tried += [cause.evidence["tried"]] if "tried" in cause.evidence else []  # else the sources are too few
-            continue
-        return _identified(detected, found.camera, stars, (), None, found.identification)
-    if refusal is not None and (len(fovs_rad) == 1 or not tried):
-        raise refusal
-    step = (fovs_rad[-1] / fovs_rad[0]) ** (1 / (len(fovs_rad) - 1))  # each is the middle of a part of the range
-    low_rad, high_rad = fovs_rad[0] * 2 / (1 + step), fovs_rad[-1] * step * 2 / (1 + step)
-    where = "" if near_sky is None else f" within {near_sky}"
-    narrow = fovs_rad <= NARROW_FIELD_RAD
-    pixels = pixels_text(ASPECTS) if np.any(narrow) else ""
-    pixels += f" (up to {np.degrees(NARROW_FIELD_RAD):g} degrees)" if pixels and not np.all(narrow) else ""
-    raise NotIdentified(
-        f"no lens of {np.degrees(low_rad):.3g} to {np.degrees(high_rad):.3g} degrees{where} explains the "
-        f"{len(sources)} point sources better than chance ({len(fovs_rad)} fields, "
-        f"{sum(tried)} patterns{pixels} tried)",
-        advice=advise_on_fields(low_rad, high_rad, near_sky),
-        detected=len(sources),
-        tried=sum(tried),
-    )
+    sources, when = detected.detections, detected.exposure.time_utc
+    place = site if when is not None else None
+    stars = apparent_stars(catalog, when, place)
+    above = np.arange(len(stars))
+    if place is not None and when is not None:
+        above = np.flatnonzero(~is_below_horizon(stars.rays_icrs, place, when))
+    narrowest_rad = float(np.min(fov_rad))
+    more = "" if place is None else "; check the site (signs) and the time, as the sky below the horizon is left out"
+    is_wide = np.max(fov_rad) * (1 + FIELD_TOLERANCE_1) >= WIDE_FIELD_RAD
+    circle = image_circle(sources.background_e) if is_wide else None
+    with stating_sky(detected.exposure, sources, v_mag=stars.v_mag, fov_rad=narrowest_rad, more=more):
+        found = solve(sources, detected.exposure.size_px, fov_rad, stars.take(above), circle=circle, near_sky=near_sky)
+    bodies = apparent_bodies(place, when) if place is not None and when is not None else ()
+    identification = replace(found.identification, star=above[found.identification.star])
+    return _identified(detected, found.camera, stars, bodies, place, identification)
 
 
 def solve_orientation(identified: Identified, has_file: bool = True) -> Oriented:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-
-import numpy as np
 
 from startrack.camera import Camera, load_camera
 from startrack.catalog import StarCatalog, load_catalog
@@ -134,13 +132,18 @@ def identify(
 
 
 def identify_blind(
-    exposure: Exposure, fov_rad: float | Sequence[float], catalog: StarCatalog, settings: Settings | None = None
+    exposure: Exposure,
+    fov_rad: float | tuple[float, float],
+    catalog: StarCatalog,
+    settings: Settings | None = None,
+    site: Site | None = None,
 ) -> Oriented | Refused:
     """Stars, attitude and lens of an `exposure` without a camera file, from an approximate field of view alone.
 
-    `fov_rad` [rad], one or several that are tried in their order, is the angle across the image's width below 100
+    `fov_rad` [rad], one to 10 % or the smallest and the largest, is the angle across the image's width below 100
     degrees, from there up that of the whole image circle. `catalog` is the list of stars; `settings` has the detector
-    and the part of the sky. The lens found is the value's `camera`.
+    and the part of the sky. `site` is where the camera stands: with the time of the exposure the sky below the horizon
+    is left out, and the lens does not contain the refraction. The lens found is the value's `camera`.
     """
     settings = settings or Settings()
     inputs = Inputs(exposure=exposure, catalog_name=catalog.name)
@@ -148,8 +151,9 @@ def identify_blind(
         with run.stage("detect"):
             detected = run.reached = detect_sources(inputs, None, settings.detector)
         with run.stage("identify"):
-            fovs_rad, near_sky = np.atleast_1d(fov_rad), settings.identifier.near_sky
-            identified = run.reached = identify_unknown_lens(detected, fovs_rad, catalog, near_sky)
+            where = None if site is None else site.with_air(exposure.air)
+            near_sky = settings.identifier.near_sky
+            identified = run.reached = identify_unknown_lens(detected, fov_rad, catalog, near_sky, where)
         with run.stage("attitude"):
             oriented = solve_orientation(identified, has_file=False)
         return run.finish(oriented)

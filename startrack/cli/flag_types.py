@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeVar
 
-from startrack.core import FIELD_TOLERANCE_1, MAX_COUNT, MAX_EXPOSURE_S
+from startrack.core import MAX_COUNT, MAX_EXPOSURE_S
 from startrack.core.declaration import LARGEST, SHOWN_CHARS
 
 if TYPE_CHECKING:
@@ -101,25 +101,17 @@ def field_of_view_rad(text: str, narrowest_deg: float = 0.5, widest_deg: float =
     return math.radians(number(text))
 
 
-def fields_of_view_rad(text: str, narrowest_deg: float, widest_deg: float) -> tuple[float, ...]:
-    """An angle, or every angle to try between two, MIN..MAX, given in degrees [rad].
-
-    The identifier allows for FIELD_TOLERANCE_1 to both sides of an angle: geometric steps as wide leave no gap.
-    """
+def field_or_range_rad(text: str, narrowest_deg: float, widest_deg: float) -> float | tuple[float, float]:
+    """An angle, or the smallest and the largest that it may be, MIN..MAX, given in degrees [rad]."""
     first, between, last = text.partition("..")
     try:
         low = field_of_view_rad(first, narrowest_deg, widest_deg)
         high = field_of_view_rad(last, narrowest_deg, widest_deg) if between else low
     except argparse.ArgumentTypeError as cause:
         raise argparse.ArgumentTypeError(f"{cause}: give DEG or MIN..MAX") from cause
-    if not between:
-        return (low,)
     if high < low:
         raise argparse.ArgumentTypeError(f"{text}: the first field of view is wider than the last")
-    step = (1 + FIELD_TOLERANCE_1) / (1 - FIELD_TOLERANCE_1)
-    count = max(math.ceil(math.log(high / low) / math.log(step)), 1)
-    ends = [low * (high / low) ** (k / count) for k in range(count + 1)]
-    return tuple(0.5 * (ends[k] + ends[k + 1]) for k in range(count))  # the middle is as far from both ends
+    return (low, high) if between else low
 
 
 def geo_formats(text: str) -> list[str]:

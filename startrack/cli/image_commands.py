@@ -8,7 +8,7 @@ from startrack.cli import flags
 from startrack.cli.flag_types import (
     cluster_address,
     count,
-    fields_of_view_rad,
+    field_or_range_rad,
     geo_formats,
     half_turn,
     seconds,
@@ -75,13 +75,13 @@ COMMANDS = (
                 *INPUT,
                 flag(
                     "--fov DEG|MIN..MAX",
-                    "no camera file: field of view in degrees, good to 10 %%, or a range that is tried in steps; below "
-                    "100 across the image's width, from there up of the whole image circle, even where the frame clips "
-                    "it. Takes 12 stars, 7 below 100 degrees",
-                    lambda text: fields_of_view_rad(text, NARROWEST_DEG, WIDEST_DEG),
+                    "no camera file: field of view in degrees, good to 10 %%, or the least and the largest; "
+                    "below 100 across the image's width, from there up of the whole image circle, even where the "
+                    "frame clips it. Takes 12 stars, 7 below 100 degrees",
+                    lambda text: field_or_range_rad(text, NARROWEST_DEG, WIDEST_DEG),
                 ),
             ),
-            "method": (flags.POINTING, flags.TIME_LIMIT),
+            "method": (flags.POINTING, flags.SITE, flags.TIME_LIMIT),
             "output": (
                 *flags.OUTPUT,
                 flag("--catalog-table", "list in NAME.stars.ecsv the stars in the frame that were not identified too"),

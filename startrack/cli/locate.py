@@ -20,7 +20,7 @@ from startrack.camera import Camera, load_camera
 from startrack.catalog import load_catalog
 from startrack.cli.console import Outcome, print_outcome, print_warnings, wait_lines, worst_code
 from startrack.cli.flags import check_localizer
-from startrack.cli.images import check_fov, compile_beside, near_attitude_of, prepare, read, settings_of
+from startrack.cli.images import check_fov, compile_beside, flag_site, near_attitude_of, prepare, read, settings_of
 from startrack.cli.report import write_page_of_images
 from startrack.core.errors import INTERNAL_ERROR, BadInput, BadOutput
 from startrack.core.files import make_folder, printable
@@ -62,11 +62,12 @@ def identify(args: argparse.Namespace) -> int:
     if args.fov is not None and args.near_attitude is not None:
         args.usage_error("--near-attitude needs a camera file: with --fov the lens is not known")
     settings = chain.Settings(identifier=Identifier(near_sky=args.near_sky), near_attitude=near_attitude_of(args))
+    site = flag_site(args)
 
     def solve(exposure: Exposure, camera: Camera | None) -> chain.Outcome:
         if camera is None:
-            return chain.identify_blind(exposure, args.fov, load_catalog(), settings)
-        return chain.identify(exposure, camera, load_catalog(), settings)
+            return chain.identify_blind(exposure, args.fov, load_catalog(), settings, site)
+        return chain.identify(exposure, camera, load_catalog(), settings, site)
 
     return _run_images(args, "identification", solve, args.time_limit)
 
@@ -168,11 +169,11 @@ def _camera_of(args: argparse.Namespace, exposure: Exposure) -> Camera | None:
     raise BadInput("no_calibration", "no camera file is known: give -c FILE, a sidecar with camera, or --fov DEG")
 
 
-def _found_fov_text(camera: Camera, fovs_rad: tuple[float, ...]) -> str:
-    """The field of view in degrees, of those tried [rad], that is closest to that of the `camera` found."""
+def _found_fov_text(camera: Camera, fov_rad: float | tuple[float, float]) -> str:
+    """The field of view in degrees: the stated one, or of a range that of the `camera` found."""
+    if not isinstance(fov_rad, tuple):
+        return f"{math.degrees(fov_rad):.4g}"
     middle, right = camera.centre_px[1], camera.size_px[0] - 0.5
     width_rad = float(camera.angle_rad(np.array([[-0.5, middle], [right, middle]])).sum())
-    closest = min(
-        fovs_rad, key=lambda fov: abs(math.log(fov / (width_rad if fov < WIDE_FIELD_RAD else 2 * camera.max_angle_rad)))
-    )
-    return f"{math.degrees(closest):.4g}"
+    found_rad = width_rad if width_rad < WIDE_FIELD_RAD else max(2 * camera.calibrated_angle_rad, WIDE_FIELD_RAD)
+    return f"{math.degrees(found_rad):.4g}"

@@ -162,6 +162,14 @@ class Detections(Centroids):
         return self.noise.whole()
 
 
+@dataclass(frozen=True)
+class ImageCircle:
+    """Disc of the frame that a fisheye lens illuminates."""
+
+    centre_px: tuple[float, float]
+    radius_px: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class Stars(Rows):
     """Catalogue stars as seen at one time and position: proper motion and aberration applied."""

@@ -14,11 +14,13 @@ import numpy as np
 
 from startrack.camera import Camera, Decentring, with_covariance
 from startrack.core.types import Array
-from startrack.estimation.adjust import HUBER_WITH_CUT, Scheme, Solution, State, adjust
+from startrack.estimation.adjust import HUBER_WITH_CUT, Prior, Scheme, Solution, State, adjust
 from startrack.estimation.normal_equations import Observations
 from startrack.estimation.prior_choice import solve_with_best_prior
-from startrack.identification.region_growing import prior_of
 
+LENGTH_SIGMAS = {"f": 0.1, "fy": 0.1, "cx": 0.06, "cy": 0.06}  # prior sigmas in focal lengths; "fy": of fy - fx
+# Of the polynomial, and of decentring, which also describes refraction that differs over a narrow field.
+PRIOR_SIGMAS = {"k1": 0.1, "k2": 0.1, "k3": 0.05, "k4": 0.02, "p1": 0.002, "p2": 0.002}
 SCHEME = Scheme(loss=HUBER_WITH_CUT, steps=12, settled_px=3e-4, estimates_extra=True)
 CHOICES = (("cx", "cy"), ("fy",), ("p1", "p2"))  # what an ideal lens does not have; "fy": beyond the ratio of 1
 
@@ -69,3 +71,16 @@ def fit_found_lens(
 def _fit(camera: Camera, R_cam_icrs: Array, points: Observations, free: tuple[str, ...], expected: Camera) -> Solution:
     start = State(camera=camera, R_cam_icrs=R_cam_icrs[None])
     return adjust(start, points, free, SCHEME, prior=prior_of(camera, expected, free))
+
+
+def prior_of(camera: Camera, expected: Camera, free: tuple[str, ...]) -> Prior:
+    """Prior of the free parameters: that of the camera `expected`, the adjustment starting at `camera`."""
+    sigma = PRIOR_SIGMAS | {name: part * expected.focal_px[0] for name, part in LENGTH_SIGMAS.items()}
+    now, then = (
+        {
+            "f": c.focal_px[0], "fy": c.focal_px[1] - c.focal_px[0], "cx": c.centre_px[0], "cy": c.centre_px[1],
+            "p1": c.decentring.p1, "p2": c.decentring.p2, **c.lens.parameters,
+        }
+        for c in (camera, expected)
+    )  # fmt: skip
+    return Prior(np.array([sigma[n] for n in free]), np.array([then[n] - now[n] for n in free]))

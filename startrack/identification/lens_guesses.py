@@ -1,212 +1,132 @@
-"""What an unknown lens may be before any star is known: its law, focal length and centre.
+"""What an unknown lens may be before any star is known: its bend, focal length, centre and pixel aspect.
 
-The laws are a family of one parameter: all ideal fisheyes, the pinhole, and the laws between them. Focal length and
-centre follow from the field of view and the frame, or from the image circle of a fisheye lens, whose edge shows in the
-background of the frame.
+A small angle of any lens is that of a pinhole: narrow fields have one guess of the bend, wide ones several. The focal
+length follows from the field of view and the frame, or from the image circle of a fisheye lens; where a range of fields
+is stated, or the image circle is not seen, a ladder of focal lengths leaves no gap.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from startrack.camera import Camera, Lens
-from startrack.core.types import Array
+from startrack.core.types import Array, ImageCircle
+from startrack.estimation.radial_fit import PINHOLE_BEND, radius_of
 
-UNKNOWN_LENS = "unknown"  # name of a camera that no file states
-PINHOLE = 1.0  # shape
-LINEAR_SHAPE = 1e-4  # below this the law is the equidistant one
-STEEPEST_RAD = 1.55  # of the argument of sine or tangent
-STEEPEST_SINE = float(np.sin(STEEPEST_RAD))
-WIDEST_SHAPE = 1.2  # of a fit
-SHAPE_STEP = 1e-6  # for the numerical derivative by the shape
-WIDE_SHAPES = (-0.35, 0.25, -0.8, 0.7)
-MIDDLE_SHAPES = (PINHOLE, 0.4, -0.4)
-CIRCLES = (0.5, 0.62, 0.42, 0.78, 1.0)  # radius of the image circle over the frame's shorter side
+WIDE_FIELD_RAD = float(np.radians(100.0))  # from here up, a field of view is the angle of the image circle
+NARROW_FIELD_RAD = float(np.radians(40.0))  # up to here all lenses are nearly pinholes
+WIDE_BENDS = (-0.02, 0.02, -0.107, 0.16)
+MIDDLE_BENDS = (PINHOLE_BEND, 0.053, -0.027)
+WIDEST_ARGUMENT_RAD = np.radians(80.0)  # of sine or tangent, at the edge of the field
+CIRCLES = (0.42, 1.0)  # radius of the image circle over the frame's shorter side: between these
+LARGEST_CIRCLE = 0.56  # of the frame's diagonal
 SEEN_CIRCLES = (1.0, 1.25)  # radius at half the field over that of the visible disc: a dome may hide the horizon
-REDUCED_SIDE_PX = 160  # longer side of the reduced background
-EDGE_POINTS = 72  # in which the edge is looked for
-LARGEST_OFFSET_1 = 0.1  # of the centre from the frame's, over the shorter side
-SMALLEST_RADIUS_1, LARGEST_RADIUS_1 = 0.28, 0.62  # over the frame's shorter side
-RING_1 = 0.05  # of the radius: distance of the rings inside and outside the edge
-DISC_STEP_PX = 2.0
-MIN_CONTRAST_1 = 0.2  # median over the directions; moonlit photographs with trees reach 0.3
-MIN_SEEN_1 = 0.5  # of the directions that lie in the frame
-DARKEST_PERCENTILE = 0.5
+LADDER_STEP = 0.4  # of the logarithm of the field of view, in a range of them
+FOCAL_STEP = 0.26  # of the logarithm of the focal length: triangles of a wide lens agree to half of it
+SLACK = 0.02  # of the logarithm of the focal length, beyond the range
+FIELD_STEPS_PER_E = 4.0  # indexes are made for solid angles a fourth part of a factor e apart
 
 
 @dataclass(frozen=True)
 class LensGuess:
-    """A lens of the family; its focal length is uncertain by the size tolerance of the patterns."""
+    """A lens whose focal length is known to a factor."""
 
-    focal_px: float
-    shape: float
+    focal_px: float  # geometric mean of fx and fy
+    log_spread: float  # largest difference of the logarithm of the focal length
+    bend: float
     centre_px: tuple[float, float]
+    aspect: float = 1.0  # fx / fy
 
-
-def unknown_camera(
-    size_px: tuple[int, int], focal_px: float, centre_px: tuple[float, float], lens: Lens, mirrored: bool
-) -> Camera:
-    """A camera of a frame (W, H), as wide as its lens."""
-    widest = lens.max_invertible_rad
-    return Camera(
-        name=UNKNOWN_LENS, size_px=size_px, focal_px=(focal_px, focal_px), centre_px=centre_px, max_angle_rad=widest,
-        calibrated_angle_rad=widest, lens=lens, mirrored=mirrored,
-    )  # fmt: skip
-
-
-def guess_lenses(size_px: tuple[int, int], fov_rad: float, shapes: tuple[float, ...]) -> list[LensGuess]:
-    """Lenses of these shapes with a field of view across the width of a frame (W, H), centred on it."""
-    width, height = size_px
-    centre_px = ((width - 1) / 2, (height - 1) / 2)
-    return [LensGuess(width / 2 / float(family_radius(np.array(fov_rad / 2), q)), q, centre_px) for q in shapes]
-
-
-def guess_fisheyes(size_px: tuple[int, int], fov_rad: float, circle: ImageCircle | None) -> list[LensGuess]:
-    """Fisheye lenses, likelier ones first: as large as the visible `circle` or somewhat larger, or by the frame."""
-    width, height = size_px
-    if circle is not None:
-        centre_px, circles_px = circle.centre_px, [c * circle.radius_px for c in SEEN_CIRCLES]
-    else:
-        centre_px = ((width - 1) / 2, (height - 1) / 2)
-        circles_px = [c * min(size_px) for c in CIRCLES if c * min(size_px) < 0.56 * np.hypot(width, height)]
-    return [
-        LensGuess(circle_px / float(family_radius(np.array(fov_rad / 2), shape)), shape, centre_px)
-        for circle_px in circles_px
-        for shape in WIDE_SHAPES
-        if abs(shape) * fov_rad / 2 < np.radians(80.0)
-    ]
-
-
-def family_radius(angle_rad: Array, shape: float) -> Array:
-    """Radius [focal lengths] at the angles: sin(|q| a) / |q| for q < 0, a for q = 0, tan(q a) / q for q > 0.
-
-    Orthographic is q = -1, equisolid -1/2, equidistant 0, stereographic 1/2, pinhole 1; real lenses lie between.
-    """
-    q = abs(shape)
-    if q < LINEAR_SHAPE:
-        return angle_rad
-    x = np.minimum(q * angle_rad, STEEPEST_RAD)
-    return (np.sin(x) if shape < 0 else np.tan(x)) / q
-
-
-def family_angle(radius_focal: Array, shape: float) -> Array:
-    """Inverse of `family_radius` [rad]; the steepest angle where the radius is outside the image circle."""
-    q = abs(shape)
-    if q < LINEAR_SHAPE:
-        return radius_focal
-    x = q * radius_focal
-    return (np.arcsin(np.minimum(x, STEEPEST_SINE)) if shape < 0 else np.arctan(x)) / q
-
-
-@dataclass(frozen=True)
-class RadialFamily(Lens):
-    """A lens of the family; used only during identification, not in camera files."""
-
-    model: ClassVar[str] = "radial_family"
-    label: ClassVar[str] = "one-parameter family"
-    parameter_names: ClassVar[tuple[str, ...]] = ("shape",)
-
-    shape: float
+    def with_aspect(self, aspect: float, keeps_width: bool) -> LensGuess:
+        """The guess with other pixels, fx as it is where the field of view is that across the width."""
+        focal_px = self.focal_px * (aspect**-0.5 if keeps_width else 1.0)
+        return replace(self, aspect=aspect, focal_px=focal_px)
 
     @property
-    def max_invertible_rad(self) -> float:  # type: ignore[override]
-        """Angle up to which the radius rises [rad]."""
-        return float(min(np.pi, STEEPEST_RAD / max(abs(self.shape), LINEAR_SHAPE)))
-
-    def rho(self, angle_rad: Array) -> Array:
-        """Radius [focal lengths] at the angles off the axis [rad]."""
-        return family_radius(np.asarray(angle_rad, dtype=np.float64), self.shape)
-
-    def slope(self, angle_rad: Array) -> Array:
-        """d rho / d angle [1/rad]."""
-        x = np.minimum(abs(self.shape) * np.asarray(angle_rad, dtype=np.float64), STEEPEST_RAD)
-        return np.cos(x) if self.shape < 0 else 1.0 / np.square(np.cos(x))
-
-    def angle_rad(self, rho: Array) -> Array:
-        """Angle off the axis [rad] at the radii [focal lengths]."""
-        return family_angle(np.asarray(rho, dtype=np.float64), self.shape)
-
-    def derivative(self, name: str, angle_rad: Array) -> Array:
-        """d rho / d shape at the angles off the axis [rad]."""
-        above, below = (family_radius(angle_rad, self.shape + step) for step in (SHAPE_STEP, -SHAPE_STEP))
-        return (above - below) / (2 * SHAPE_STEP)
-
-    def with_update(self, step: Mapping[str, float]) -> RadialFamily:
-        """The lens with `step` added to its shape, kept within the family."""
-        return RadialFamily(float(np.clip(self.shape + step.get("shape", 0.0), -WIDEST_SHAPE, WIDEST_SHAPE)))
+    def scale_px(self) -> Array:
+        """(fx, fy) over the focal length: (2,)"""
+        return np.array([self.aspect**0.5, self.aspect**-0.5])
 
 
 @dataclass(frozen=True)
-class ImageCircle:
-    """Disc of the frame that the lens illuminates."""
+class Field:
+    """A field of view, and the guesses of lenses that have it."""
 
-    centre_px: tuple[float, float]
-    radius_px: float
+    fov_rad: float  # across the frame's width, or that of the whole image circle if the field is wide
+    largest_rad: float  # likewise, the largest
+    is_wide: bool
+    guesses: tuple[LensGuess, ...]
+    solid_angle_sr: float  # of the frame or the image circle, rounded so that indexes serve many fields
+
+    @property
+    def is_narrow(self) -> bool:
+        """Whether all lenses are nearly pinholes in it."""
+        return self.fov_rad <= NARROW_FIELD_RAD
 
 
-def image_circle(background: NDArray[Any]) -> ImageCircle | None:
-    """The bright disc in a background (H, W); None without a clear edge, or where the frame lies within the disc.
+def guess_fields(
+    size_px: tuple[int, int], lowest_rad: float, highest_rad: float, circles: tuple[ImageCircle | None, ...]
+) -> list[Field]:
+    """The fields of view between two, wide ones first, with the lenses that a frame (W, H) may have there.
 
-    It is the disc with the largest median contrast (bright - dark) / (bright + dark - 2 darkest) across its edge, of
-    which walls and trees may hide almost half.
+    `circles`: image circles that are assumed for a wide field, in turn; None: by the frame.
     """
-    import cv2
-
-    height, width = background.shape
-    if min(height, width) < REDUCED_SIDE_PX // 4:
-        return None
-    scale = max(height, width) / REDUCED_SIDE_PX
-    shape = max(round(width / scale), 1), max(round(height / scale), 1)
-    small = np.asarray(cv2.resize(background.astype(np.float32), shape, interpolation=cv2.INTER_AREA), dtype=np.float32)
-    small -= np.percentile(small, DARKEST_PERCENTILE)
-    if float(small.max()) <= 0.0:
-        return None
-    middle, shorter = 0.5 * (np.array(shape) - 1), min(shape)
-    radii = np.arange(SMALLEST_RADIUS_1 * shorter, LARGEST_RADIUS_1 * shorter, DISC_STEP_PX)
-    best = _best_disc(small, middle, LARGEST_OFFSET_1 * shorter, radii, DISC_STEP_PX)
-    if best is None:
-        return None
-    radii = best[1] + np.arange(-DISC_STEP_PX, DISC_STEP_PX + 0.1, 0.5)
-    best = _best_disc(small, best[0], DISC_STEP_PX, radii, 0.5)
-    if best is None or best[2] < MIN_CONTRAST_1:
-        return None
-    (x, y), radius, _ = best
-    return ImageCircle((float((x + 0.5) * scale - 0.5), float((y + 0.5) * scale - 0.5)), radius * scale)
+    found = []
+    if highest_rad >= WIDE_FIELD_RAD:
+        found += [_wide_field(size_px, max(lowest_rad, WIDE_FIELD_RAD), highest_rad, circle) for circle in circles]
+    top = min(highest_rad, WIDE_FIELD_RAD)
+    if lowest_rad < WIDE_FIELD_RAD:
+        steps = max(int(np.ceil(np.log(top / lowest_rad) / LADDER_STEP)), 1)
+        edges = np.geomspace(top, lowest_rad, steps + 1).tolist()
+        found += [_plane_field(size_px, low, high) for high, low in pairwise(edges)]
+    return found
 
 
-def _best_disc(
-    image: NDArray[Any], middle: Array, offset: float, radii: Array, step: float
-) -> tuple[Array, float, float] | None:
-    """Centre, radius and median contrast of the best disc of these radii, its centre up to `offset` from `middle`."""
-    direction = np.arange(EDGE_POINTS) * 2 * np.pi / EDGE_POINTS
-    around = np.stack([np.cos(direction), np.sin(direction)], axis=1)
-    shift = np.arange(-offset, offset + 0.5 * step, step)
-    centres = middle + np.stack(np.meshgrid(shift, shift), axis=-1).reshape(-1, 2)
-    # A faint reflection in the dark is no edge.
-    bright = max(float(np.median(image[image > np.median(image)])), 1e-6)
-    best = None
-    for radius in radii:
-        inner, _ = _sample(image, centres[:, None] + (1 - RING_1) * radius * around)
-        outer, seen = _sample(image, centres[:, None] + (1 + RING_1) * radius * around)
-        contrast = np.where(seen, (inner - outer) / np.maximum(inner + outer, bright), np.nan)
-        enough = seen.mean(axis=1) >= MIN_SEEN_1
-        if not enough.any():
+def _plane_field(size_px: tuple[int, int], low_rad: float, high_rad: float) -> Field:
+    """A field of less than 100 degrees across the width of the frame."""
+    width, height = size_px
+    fov_rad = float(np.sqrt(low_rad * high_rad))
+    bends = (PINHOLE_BEND,) if fov_rad <= NARROW_FIELD_RAD else MIDDLE_BENDS
+    centre_px = ((width - 1) / 2, (height - 1) / 2)
+    guesses = tuple(
+        _guess(width / 2 / radius_of(np.array([high_rad / 2, low_rad / 2]), bend), bend, centre_px) for bend in bends
+    )
+    half = np.tan(fov_rad / 2)
+    other = half * height / width
+    solid_sr = 4 * np.arcsin(half * other / np.sqrt((1 + half**2) * (1 + other**2)))
+    return Field(fov_rad, high_rad, False, guesses, _rounded(solid_sr))
+
+
+def _guess(focal_px: Array, bend: float, centre_px: tuple[float, float]) -> LensGuess:
+    """The guess of focal lengths between two (2,)."""
+    low, high = np.log(focal_px).tolist()
+    return LensGuess(float(np.exp(0.5 * (low + high))), 0.5 * (high - low) + SLACK, bend, centre_px)
+
+
+def _wide_field(size_px: tuple[int, int], low_rad: float, high_rad: float, circle: ImageCircle | None) -> Field:
+    """A field from 100 degrees up, that of an image circle: as large as the visible one, or by the frame."""
+    fov_rad = float(np.sqrt(low_rad * high_rad))
+    if circle is not None:
+        centre_px, radii_px = circle.centre_px, circle.radius_px * np.array(SEEN_CIRCLES)
+    else:
+        centre_px = ((size_px[0] - 1) / 2, (size_px[1] - 1) / 2)
+        radii_px = np.minimum(min(size_px) * np.array(CIRCLES), LARGEST_CIRCLE * np.hypot(*size_px))
+    guesses = []
+    for bend in WIDE_BENDS:
+        most_rad = WIDEST_ARGUMENT_RAD / np.sqrt(3 * bend if bend > 0 else -6 * bend)
+        if low_rad / 2 > most_rad:
             continue
-        median = np.nanmedian(contrast[enough], axis=1) * np.sqrt(seen[enough].mean(axis=1))
-        i = int(np.argmax(median))
-        if best is None or median[i] > best[2]:
-            best = (centres[enough][i], float(radius), float(median[i]))
-    return best
+        half_rad = np.minimum(np.array([high_rad, low_rad]) / 2, most_rad)
+        low, high = np.log(radii_px / radius_of(half_rad, bend)).tolist()
+        steps = max(int(np.ceil((high - low) / FOCAL_STEP)), 1)
+        logs = low + (np.arange(steps) + 0.5) * (high - low) / steps
+        spread = 0.5 * (high - low) / steps + SLACK
+        guesses += [LensGuess(float(np.exp(one)), spread, bend, centre_px) for one in logs]
+    solid_sr = 2 * np.pi * (1 - np.cos(min(fov_rad / 2, np.pi / 2)))
+    return Field(fov_rad, high_rad, True, tuple(guesses), _rounded(solid_sr))
 
 
-def _sample(image: NDArray[Any], xy_px: Array) -> tuple[Array, Any]:
-    """Values of the nearest pixels, at least 0, and whether the positions lie in the image."""
-    column, row = np.rint(xy_px).astype(np.int64).transpose(2, 0, 1)
-    seen = (column >= 0) & (row >= 0) & (column < image.shape[1]) & (row < image.shape[0])
-    values = image[np.clip(row, 0, image.shape[0] - 1), np.clip(column, 0, image.shape[1] - 1)]
-    return np.maximum(values, 0.0), seen
+def _rounded(solid_sr: float) -> float:
+    return float(np.exp(np.round(FIELD_STEPS_PER_E * np.log(solid_sr)) / FIELD_STEPS_PER_E))

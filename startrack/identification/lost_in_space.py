@@ -32,7 +32,7 @@ from startrack.identification.attitude_search import (
     Sources,
 )
 from startrack.identification.index import patterns_of, pixel_scale_of
-from startrack.identification.lens_guesses import UNKNOWN_LENS
+from startrack.identification.lens_view import UNKNOWN_LENS
 from startrack.identification.near_sky import NearSky
 
 MAX_FALSE_ALARM = 1e-9  # probability that chance gives an accepted identification

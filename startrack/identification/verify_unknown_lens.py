@@ -8,40 +8,43 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.core.types import Array, Bools, Centroids, Ints, Stars
+from startrack.estimation.adjust import Scheme, State, adjust, cauchy_loss
 from startrack.estimation.false_alarm import (
     PATTERN_MATCHES,
     coincidence_probability,
-    density_per_sr,
+    density_per_px2,
     log_p_value,
 )
-from startrack.estimation.match import (
-    DEPTH_BELOW_THRESHOLD_MAG,
-    MIN_UNSATURATED,
-    SIGNIFICANT_SNR,
-    instrumental_mag,
-    is_isolated,
-    match_by_brightness,
-)
-from startrack.estimation.match_kernel import BRIGHTER_MAG
+from startrack.estimation.match import CandidatePairs, PhotometricScale
+from startrack.estimation.normal_equations import observations_of_image
+from startrack.estimation.radial_fit import HALF_WEIGHT_CHI2, PINHOLE_BEND
 from startrack.identification.attitude_refinement import agreement_of
 from startrack.identification.attitude_search import GATE_PX, INLIER_PX, ONE_SOURCE_SIGMAS
-from startrack.identification.region_growing import FEWEST, GATE_OVER_SIGMA, fit_camera, match_in_view, with_file_lens
+from startrack.identification.found_lens import prior_of
+from startrack.identification.lens_guesses import Field
+from startrack.identification.lens_view import (
+    FEWEST,
+    GATE_OVER_SIGMA,
+    MATCHES_FOR_ASPECT,
+    MATCHES_FOR_BEND,
+    LensView,
+)
 
-# Gate [px] and number of brightest detections; None: all, which match by brightness too.
-FITS = ((4.0, 200), (2.5, 500), (1.8, 3000), (2.0, None), (INLIER_PX, None))
+BENT_GATES_PX, STRAIGHT_GATES_PX = (4.0, 2.5, 2.0, INLIER_PX), (INLIER_PX,)  # of the fits, in turn
 TESTED = 400  # brightest detections that the p-value rests on
 SMALLEST_COINCIDENCE_PX, RADIUS_SIGMAS = 0.6, 2.5
-ON_PLACE_FRACTION = 0.5  # of the stars near their predicted pixels, where the lens is right
-STARS_OF_A_RING, MAX_RINGS = 8, 12
+ON_PLACE_FRACTION = 0.7  # of the stars near their predicted pixels, where the lens is right
+STARS_OF_A_RING = 10
 FREE_MATCHES = 8  # that a fit of attitude and lens produces by itself; a lens of fixed shape: as a triangle
 MIN_TIMES_CHANCE = 3.0  # matches over those expected by chance
 ORDERS = ((150, 4), (60, 3), (25, 2), (0, 1))  # coefficients of the polynomial from this many matches on
 MIN_FOR_CENTRE = 30
 FITTED_BEYOND_1 = 1.3  # of half the field of view: up to here a fitted lens may have stars
 WIDEST_PSF_PX = 1.5  # for blends
-RIVAL_MAG = float(-2.5 * np.log10(0.25))  # a neighbour with more than this part of a star's flux makes it ambiguous
-STARS_FOR_SCALE, MATCHES_FOR_SCALE = 5000, 200  # brightest stars predicted, and matches used, for the photometric scale
-UNEXPLAINED_MARGIN_MAG = 2.0  # fainter stars than this below a detection do not explain it
+MATCHES_FOR_SCALE = 200  # brightest matches used for the photometric scale
+SMALLEST_ERROR_PX = 0.1  # of a centroid against the lens
+DISTORTED_RMS_1 = 0.7  # a distorted lens leaves less than this part of the residual of a pinhole
+FIT = Scheme(loss=cauchy_loss(HALF_WEIGHT_CHI2), steps=4, settled_px=1e-3)
 
 
 @dataclass(frozen=True)
@@ -54,106 +57,138 @@ class VerifiedLens:
     star: Ints
     log_p: float  # that a random sky would be matched as well by one of all trials
     unexplained: int
+    scale: PhotometricScale
 
 
 @dataclass(frozen=True)
-class FluxMatches:
-    """Matches by position and flux, and the photometric scale of the frame."""
+class Verifier:
+    """What grown lenses are verified with."""
 
-    detection: Ints  # (n,)
-    star: Ints  # (n,)
-    distance_px: Array  # (n,)
-    zero_mag: float  # V of a star of unit flux
-    predicted: int  # stars in the field brighter than the faintest detection
-    coincident_px: Array  # (m,) distances of all matches, blends included
-    agreement: float  # fraction of random pairs of a star and a detection that agree in brightness
+    centroids: Centroids
+    stars: Stars
+
+    def __call__(
+        self, view: LensView, detection: Ints, star: Ints, log_trials: float, field: Field
+    ) -> VerifiedLens | None:
+        """The grown `view`, refined with all stars and verified; None where too few agree.
+
+        `detection` and `star` (n,) are its matches, `field` is that of its guess. `log_trials`: logarithm of the number
+        of hypotheses so far.
+        """
+        largest_rad = 0.5 * field.largest_rad
+        xy_px, rays_icrs = self.centroids.xy_px[detection], self.stars.rays_icrs[star]
+        if field.is_narrow:
+            view = _straighten(view, xy_px, rays_icrs)
+        start = camera = _limit_angles(view.camera(1, largest_rad), largest_rad)
+        R = view.R_cam_icrs
+        bright = np.argsort(star, kind="stable")[:MATCHES_FOR_SCALE]
+        scale = PhotometricScale.from_matches(
+            self.centroids.flux_e, self.centroids.saturated, self.stars.v_mag[star[bright]], detection[bright]
+        )
+        for gate_px in BENT_GATES_PX if camera.lens.parameters else STRAIGHT_GATES_PX:
+            pairs = self._pairs(camera, R, scale)
+            chosen = pairs.one_to_one_pairs[pairs.distance_px[pairs.one_to_one_pairs] < gate_px]
+            if len(chosen) < FEWEST:
+                return None
+            if camera is start:
+                coefficients = next(order for fewest, order in ORDERS if len(chosen) >= fewest)
+                start = camera = _limit_angles(view.camera(coefficients, largest_rad), largest_rad)
+            camera, R = self._fit(camera, R, pairs, chosen, gate_px, start)
+            camera = _limit_angles(camera, largest_rad)
+        return self.match_lens(camera, R, scale, log_trials, field)
+
+    def match_lens(
+        self, camera: Camera, R: Array, scale: PhotometricScale, log_trials: float, field: Field
+    ) -> VerifiedLens | None:
+        """The lens with all stars that lie where it and `R` place them; None where too few do.
+
+        `scale`: of the brightness; the other arguments are those of the call.
+        """
+        centroids = self.centroids
+        camera = _limit_angles(camera, 0.5 * field.largest_rad)
+        pairs = self._pairs(camera, R, scale)
+        matched = pairs.one_to_one_pairs
+        off_axis = camera.angle_rad(centroids.xy_px)
+        tested = matched[pairs.detection[matched] < TESTED]
+        trusted_rad = trusted_radius(off_axis[pairs.detection[tested]], pairs.distance_px[tested] < INLIER_PX)
+        if trusted_rad is None:
+            return None
+        trusted_rad = min(trusted_rad, camera.max_angle_rad)
+        chosen = matched[pairs.distance_px[matched] < INLIER_PX]
+        chosen = chosen[off_axis[pairs.detection[chosen]] <= trusted_rad]
+        if len(chosen) < FEWEST:
+            return None
+        radius_px = coincidence_radius_px(pairs.distance_px[chosen])
+        hits = int(np.count_nonzero((pairs.detection[chosen] < TESTED) & (pairs.distance_px[chosen] < radius_px)))
+        measured = scale.measured_mag[:TESTED]
+        rays_icrs = self.stars.rays_icrs[: np.searchsorted(self.stars.v_mag, measured.max())]
+        ahead = np.flatnonzero(rays_icrs @ R[2] >= np.cos(trusted_rad))
+        _, inside = camera.project(rays_icrs[ahead] @ R.T)
+        bright = self.stars.v_mag[ahead[inside]]
+        known_px = centroids.xy_px[:TESTED][off_axis[:TESTED] <= trusted_rad]
+        expected = density_per_px2(known_px, camera.size_px) * np.pi * radius_px**2
+        each = float(coincidence_probability(expected)) * agreement_of(centroids, bright, measured)
+        free = FREE_MATCHES if camera.lens.parameters else PATTERN_MATCHES
+        named = self._select_unambiguous(pairs, chosen)
+        return VerifiedLens(
+            camera=replace(camera, calibrated_angle_rad=trusted_rad),
+            R_cam_icrs=R,
+            detection=pairs.detection[named],
+            star=pairs.star[named],
+            log_p=significance(hits, max(len(bright), hits), each, free) + log_trials,
+            unexplained=pairs.count_unexplained(centroids.snr, INLIER_PX),
+            scale=scale,
+        )
+
+    def _pairs(self, camera: Camera, R: Array, scale: PhotometricScale) -> CandidatePairs:
+        """All pairs of a detection and a star near it that is bright enough to be seen."""
+        from scipy.spatial import cKDTree
+
+        centroids, stars = self.centroids, self.stars
+        rays_icrs = stars.rays_icrs[: np.searchsorted(stars.v_mag, scale.limit_mag)]
+        ahead = np.flatnonzero(rays_icrs @ R[2] > np.cos(min(camera.max_angle_rad, np.pi)))
+        px, inside = camera.project(rays_icrs[ahead] @ R.T)
+        seen = ahead[inside]
+        found = cKDTree(centroids.xy_px).sparse_distance_matrix(cKDTree(px[inside]), GATE_PX, output_type="ndarray")
+        found = found[np.lexsort((found["j"], found["i"]))]
+        detection, star = found["i"].astype(np.int64), seen[found["j"]]
+        v_sigma_mag = stars.v_sigma_mag[star] + centroids.brightness_sigma_mag
+        return CandidatePairs(detection, star, found["v"], stars.v_mag[star], v_sigma_mag, scale)
+
+    def _fit(
+        self, camera: Camera, R: Array, pairs: CandidatePairs, chosen: Ints, gate_px: float, start: Camera
+    ) -> tuple[Camera, Array]:
+        """Camera and attitude fitted to the pairs `chosen` (n,), some of them wrong; `start`: before any fit."""
+        free = ("f", *camera.lens.parameters)
+        if len(chosen) >= (MIN_FOR_CENTRE if camera.lens.parameters else MATCHES_FOR_ASPECT):
+            free += ("fy", "cx", "cy") if camera.lens.parameters else ("fy",)
+        n, sigma_px = len(chosen), gate_px / GATE_OVER_SIGMA
+        points = observations_of_image(
+            self.centroids.xy_px[pairs.detection[chosen]], np.tile(sigma_px**2 * np.eye(2), (n, 1, 1)),
+            self.stars.rays_icrs[pairs.star[chosen]],
+        )  # fmt: skip
+        state = State(camera=camera, R_cam_icrs=R[None])
+        found = adjust(state, points, free, FIT, prior=prior_of(camera, start, free)).state
+        return found.camera, found.R_cam_icrs[0]
+
+    def _select_unambiguous(self, pairs: CandidatePairs, which: Ints) -> Ints:
+        """The one-to-one pairs with an unambiguous star."""
+        some = self.centroids.covariance_px2[pairs.detection[which]]
+        variance_px2 = 0.5 * (some[:, 0, 0] + some[:, 1, 1]) + SMALLEST_ERROR_PX**2
+        return pairs.select_unambiguous(which, variance_px2, blend_radius_px(self.centroids))
 
 
-def match_by_flux(
-    centroids: Centroids, camera: Camera, stars: Stars, R_cam_icrs: Array, gate_px: float, blend_px: float
-) -> FluxMatches:
-    """Nearest pairs within the gate whose brightness agrees; blends within `blend_px` are left out.
-
-    The photometric scale is the median over the brightest predicted stars of the frame itself.
-    """
-    from scipy.spatial import cKDTree
-
-    tree, brightness = cKDTree(centroids.xy_px), instrumental_mag(centroids.flux_e)
-    px, inside = camera.project(stars.rays_icrs[:STARS_FOR_SCALE] @ R_cam_icrs.T)
-    seen = np.flatnonzero(inside)
-    distance, nearest = tree.query(px[seen], distance_upper_bound=gate_px)
-    hit = np.isfinite(distance)
-    usable = hit.copy()
-    usable[hit] = ~centroids.saturated[nearest[hit]]
-    first = np.flatnonzero(usable if np.count_nonzero(usable) >= MIN_UNSATURATED else hit)[:MATCHES_FOR_SCALE]
-    if len(first) < MIN_UNSATURATED:
-        none = np.zeros(0, dtype=np.int64)
-        return FluxMatches(none, none, np.zeros(0), 0.0, len(seen), np.zeros(0), 1.0)
-    zero_mag = float(np.median(stars.v_mag[seen[first]] - brightness[nearest[first]]))
-    faintest = zero_mag + float(np.max(brightness))
-    limit = faintest + DEPTH_BELOW_THRESHOLD_MAG
-    count = int(np.searchsorted(stars.v_mag, limit + RIVAL_MAG))
-    px, inside = camera.project(stars.rays_icrs[:count] @ R_cam_icrs.T)
-    seen = np.flatnonzero(inside)
-    detection, star, distance = match_by_brightness(
-        tree, px, seen, gate_px, star_mag=stars.v_mag,
-        star_sigma_mag=stars.v_sigma_mag + centroids.brightness_sigma_mag, detection_mag=brightness + zero_mag,
-        saturated=centroids.saturated, limit_mag=limit, tolerance_mag=BRIGHTER_MAG,
-    )  # fmt: skip
-    alone = is_isolated(centroids.xy_px[detection], star, px, seen, stars.v_mag, blend_px, RIVAL_MAG)
-    bright = stars.v_mag[seen][stars.v_mag[seen] < limit - DEPTH_BELOW_THRESHOLD_MAG]
-    return FluxMatches(
-        detection[alone], star[alone], distance[alone], zero_mag, len(bright), distance,
-        agreement_of(centroids, bright, brightness + zero_mag),
-    )  # fmt: skip
-
-
-def verify(
-    camera: Camera, R: Array, matched: int, centroids: Centroids, stars: Stars, log_trials: float, widest_rad: float
-) -> VerifiedLens | None:
-    """The grown lens refined with all stars and verified; None where too few stars agree.
-
-    `camera`, `R` and the number `matched` are the result of `grow`. `log_trials`: logarithm of the number of
-    hypotheses so far. `widest_rad`: half the field of view, its tolerance added.
-    """
-    refined = _refine(camera, R, matched, centroids, stars, widest_rad)
-    return None if refined is None else match_lens(*refined, centroids, stars, log_trials, widest_rad)
-
-
-def match_lens(
-    camera: Camera, R: Array, centroids: Centroids, stars: Stars, log_trials: float, widest_rad: float
-) -> VerifiedLens | None:
-    """The lens with all stars that lie where it and `R` place them; None where too few do.
-
-    The other arguments are those of `verify`.
-    """
-    camera = _limit_angles(camera, widest_rad)
-    tested = centroids.take(slice(TESTED))
-    near = match_by_flux(tested, camera, stars, R, GATE_PX, 0.0)
-    trusted_rad = trusted_radius(camera.angle_rad(centroids.xy_px[near.detection]), near.distance_px < INLIER_PX)
-    if trusted_rad is None:
-        return None
-    trusted_rad = min(trusted_rad, camera.max_angle_rad)
-    camera = replace(camera, calibrated_angle_rad=trusted_rad)
-    matches = match_by_flux(centroids, camera, stars, R, INLIER_PX, blend_radius_px(centroids))
-    inside = camera.angle_rad(centroids.xy_px[matches.detection]) <= trusted_rad
-    if np.count_nonzero(inside) < FEWEST:
-        return None
-    some = match_by_flux(tested, replace(camera, max_angle_rad=trusted_rad), stars, R, INLIER_PX, 0.0)
-    radius_px = coincidence_radius_px(matches.distance_px[inside])
-    hits = int(np.count_nonzero(some.coincident_px < radius_px))
-    rays = camera.unproject(tested.xy_px[camera.angle_rad(tested.xy_px) <= trusted_rad])
-    radius_rad = radius_px * float(camera.mean_scale_rad_per_px(np.array(trusted_rad / 2)))
-    each = some.agreement * float(coincidence_probability(density_per_sr(rays) * np.pi * radius_rad**2))
-    free = FREE_MATCHES if camera.lens.parameters else PATTERN_MATCHES
-    return VerifiedLens(
-        camera=camera,
-        R_cam_icrs=R,
-        detection=matches.detection[inside],
-        star=matches.star[inside],
-        log_p=significance(hits, max(some.predicted, hits), each, free) + log_trials,
-        unexplained=_count_unexplained(centroids, camera, stars, R, matches.zero_mag),
-    )
+def _straighten(view: LensView, xy_px: Array, rays_icrs: Array) -> LensView:
+    """A pinhole fitted to the stars (n, 3) at the pixels (n, 2), unless the bent lens `view` fits much better."""
+    if view.lens[2] == PINHOLE_BEND:
+        return view
+    free = np.array([True, len(xy_px) >= MATCHES_FOR_ASPECT, len(xy_px) >= MATCHES_FOR_BEND, False, False])
+    sigma_px = INLIER_PX / GATE_OVER_SIGMA
+    straight = replace(view, lens=np.where(np.arange(len(view.lens)) == 2, PINHOLE_BEND, view.lens))
+    straight = straight.fit(xy_px, rays_icrs, sigma_px, free & (np.arange(len(free)) != 2), straight.lens)
+    bent = view.fit(xy_px, rays_icrs, sigma_px, free, view.lens)
+    left = [np.sum(np.square(xy_px - one.project(rays_icrs)[0])) for one in (bent, straight)]
+    return bent if left[0] < DISTORTED_RMS_1**2 * left[1] else straight
 
 
 def trusted_radius(off_axis: Array, on_place: Bools) -> float | None:
@@ -165,7 +200,7 @@ def trusted_radius(off_axis: Array, on_place: Bools) -> float | None:
     order = np.argsort(off_axis)
     on_place = on_place[order]
     trusted = None
-    for ring in np.array_split(np.arange(len(order)), max(min(len(order) // STARS_OF_A_RING, MAX_RINGS), 1)):
+    for ring in np.array_split(np.arange(len(order)), max(len(order) // STARS_OF_A_RING, 1)):
         if not len(ring) or on_place[ring].mean() < ON_PLACE_FRACTION:
             break
         trusted = float(off_axis[order[ring[on_place[ring]][-1]]])
@@ -179,35 +214,12 @@ def significance(hits: int, predicted: int, each: float, free: int) -> float:
     return float(log_p_value(hits, predicted, each, free))
 
 
-def _refine(
-    camera: Camera, R: Array, matched: int, centroids: Centroids, stars: Stars, widest_rad: float
-) -> tuple[Camera, Array] | None:
-    """Camera and attitude after smaller gates and longer lists; the last matches are by brightness too."""
-    order = next(order for fewest, order in ORDERS if matched >= fewest)
-    prior = camera = _limit_angles(with_file_lens(camera, order, widest_rad), widest_rad)
-    for gate_px, count in FITS:
-        if count is None:
-            by_flux = match_by_flux(centroids, camera, stars, R, gate_px, blend_radius_px(centroids))
-            detection, star = by_flux.detection, by_flux.star
-        else:
-            detection, star, _ = match_in_view(camera, R, centroids.xy_px[:count], stars.rays_icrs, gate_px)
-        if len(star) < FEWEST:
-            return None
-        # Of a lens of fixed shape the focal length alone is free.
-        centre = ("fy", "cx", "cy") if camera.lens.parameters and len(star) >= MIN_FOR_CENTRE else ()
-        free = ("f", *camera.lens.parameters, *centre)
-        xy_px, sigma_px = centroids.xy_px[detection], gate_px / GATE_OVER_SIGMA
-        camera, R, _ = fit_camera(camera, R, xy_px, stars.rays_icrs[star], free, sigma_px, prior)
-        camera = _limit_angles(camera, widest_rad)
-    return camera, R
-
-
-def _limit_angles(camera: Camera, widest_rad: float) -> Camera:
+def _limit_angles(camera: Camera, largest_rad: float) -> Camera:
     """The camera with its largest angles where the frame ends or the polynomial turns."""
     width, height = camera.size_px
     corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=float)
     corner_rad = float(np.max(camera.angle_rad(corners)))
-    allowed = FITTED_BEYOND_1 * widest_rad if camera.lens.parameters else corner_rad
+    allowed = FITTED_BEYOND_1 * largest_rad if camera.lens.parameters else corner_rad
     widest = min(allowed, corner_rad, camera.lens.max_invertible_rad)
     return replace(camera, max_angle_rad=widest, calibrated_angle_rad=widest)
 
@@ -221,16 +233,3 @@ def coincidence_radius_px(distance_px: Array) -> float:
     """Distance [px] within which a star coincides with a detection, by those of the matches, `distance_px` (n,)."""
     rms_px = float(np.sqrt(np.mean(np.square(distance_px))))
     return float(np.clip(RADIUS_SIGMAS * rms_px, SMALLEST_COINCIDENCE_PX, INLIER_PX))
-
-
-def _count_unexplained(centroids: Centroids, camera: Camera, stars: Stars, R: Array, zero_mag: float) -> int:
-    """Number of significant detections without a catalogue star near that is bright enough to contribute."""
-    from scipy.spatial import cKDTree
-
-    significant = np.flatnonzero(centroids.snr > SIGNIFICANT_SNR)
-    if not len(significant):
-        return 0
-    faintest = zero_mag - 2.5 * np.log10(centroids.flux_e[significant].min()) + UNEXPLAINED_MARGIN_MAG
-    px, inside = camera.project(stars.rays_icrs[: int(np.searchsorted(stars.v_mag, faintest))] @ R.T)
-    distance, _ = cKDTree(px[inside]).query(centroids.xy_px[significant], distance_upper_bound=INLIER_PX)
-    return int(np.count_nonzero(~np.isfinite(distance)))

@@ -18,8 +18,7 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.core.types import Centroids, Identification, NotIdentified, NotLocated, Stars
 from startrack.estimation.match import SIGNIFICANT_SNR
-from startrack.identification.attitude_search import INLIER_PX, MIN_MATCHES
-from startrack.identification.lost_in_space import Identifier
+from startrack.identification import INLIER_PX, MIN_MATCHES, Identifier
 
 LEAST_UNEXPLAINED = 2 * MIN_MATCHES  # significant sources; untouched frames have 0 to 4
 # Of them, to the identified stars: second exposures of 30 to 50 % had 0.11 to 0.39, ghosts to 0.015.

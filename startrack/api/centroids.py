@@ -16,8 +16,7 @@ from startrack.core.errors import Reason
 from startrack.core.types import Array, Attitude, Centroids, Identification, Ints, NotIdentified, Stars
 from startrack.estimation.attitude import AttitudeFit, solve_attitude
 from startrack.estimation.misfit import solve_with_misfit
-from startrack.identification.lost_in_space import Identifier
-from startrack.identification.unknown_lens import identify_unknown_lens
+from startrack.identification import Identifier, identify_unknown_lens
 
 DEFAULT_SIGMA_PX = 0.3  # centroid error per axis where none is given
 

@@ -110,7 +110,7 @@ def order_by_cell(xy_px: Array, shape: tuple[int, ...], side_px: float) -> tuple
 
 
 def profiles_of(xy_px: Array, profiles: Array) -> tuple[Image, Image, Ints]:
-    """Profiles (n, 2 k + 1) of the sources in x and in y about their middle pixels, and these pixels (n, 2).
+    """Profiles (n, 2 k + 1) of sources at `xy_px` (n, 2), in x and in y, about their middle pixels, and these (n, 2).
 
     `profiles` (steps + 1, 2 k + 1) are those at offsets from -1/2 to 1/2.
     """

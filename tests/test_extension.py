@@ -225,10 +225,10 @@ def test_it_is_located(folder):
 
 def test_a_batch_locates_again_where_a_file_of_the_terrain_has_changed(folder):
     words = ("batch", "night", "-D", "batch", "-j", "1", "--no-plots")
-    assert "1 images: 1 ok;" in startrack(folder, *words)
+    assert "1 image: 1 ok;" in startrack(folder, *words)
     assert "(1 were there already)" in startrack(folder, *words)
     (folder / "height.txt").write_text("150.01")
-    assert "1 images: 1 ok;" in startrack(folder, *words)
+    assert "1 image: 1 ok;" in startrack(folder, *words)
 
 
 def test_it_is_tracked(folder):

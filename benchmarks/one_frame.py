@@ -32,7 +32,7 @@ from startrack.exposure import read_exposure
 SEP_THRESHOLD_SIGMA = 2.0
 SEP_WINDOW_PX = 1.2  # sigma of the window of the centroids
 SAMPLE = "sample_images/near-wall.png"
-PACKAGES = ("numpy", "numba", "opencv-contrib-python-headless", "sep")
+PACKAGES = ("numpy", "opencv-contrib-python-headless", "sep")
 
 
 def main() -> None:

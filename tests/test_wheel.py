@@ -36,12 +36,16 @@ TESTS_OF_EXTRAS = (
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory):
-    out = tmp_path_factory.mktemp("wheel")
-    done = subprocess.run([sys.executable, "-c", BUILD, str(out)], cwd=ROOT, capture_output=True, text=True)
+def build_archive(code, out):
+    """The archive that `code` makes of the project in the folder `out`."""
+    done = subprocess.run([sys.executable, "-c", code, str(out)], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return out / done.stdout.splitlines()[-1]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    return build_archive(BUILD, tmp_path_factory.mktemp("wheel"))
 
 
 @pytest.fixture(scope="module")
@@ -153,10 +157,7 @@ class Environment:
 
 @pytest.fixture(scope="module")
 def source_archive(tmp_path_factory):
-    out = tmp_path_factory.mktemp("sources")
-    done = subprocess.run([sys.executable, "-c", BUILD_SOURCES, str(out)], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return out / done.stdout.splitlines()[-1]
+    return build_archive(BUILD_SOURCES, tmp_path_factory.mktemp("sources"))
 
 
 def locate_elsewhere(unpacked, folder):

@@ -91,12 +91,6 @@ class Steps:
     leg: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # (n - 1,) number, rising; 0: none
     by_leg_m: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))  # (n - 1, 2, l) by one sigma of its errors
 
-    @property
-    def of_all(self) -> tuple[Array, Array, Array]:
-        """Moves, standard deviations, and changes by the errors that all moves share."""
-        shared = self.by_shared_m if len(self.by_shared_m) else np.zeros((*self.move_m.shape, 0))
-        return self.move_m, self.sigma_m, shared
-
     @classmethod
     def unknown(cls, frames: int) -> Steps:
         """No move is known."""

@@ -105,15 +105,15 @@ class Explanations:
 
     def _settle(self, found: Branches) -> bool:
         """Keep the explanations that take the first frame as the likeliest one does; False where others matter."""
-        total = found.log_likelihood + self._wrong_prior(found.wrong)
+        total = self._log_posterior(found)
         share, other = np.exp(total - np.logaddexp.reduce(total)), found.history[:, 0, 0] != found.history[0, 0, 0]
+        if share[other].sum() > SETTLED_DOUBT:
+            return False
         second = self._second_group(found.take(np.arange(1)))
         if second is not None:
             rival = second[0] + self._wrong_prior(second[1].wrong)[0]
             if rival - total[0] > np.log(SETTLED_DOUBT):
                 return False
-        if share[other].sum() > SETTLED_DOUBT:
-            return False
         kept = found.take(~other)
         self.settled += 1
         self._frames.pop(0)
@@ -134,7 +134,7 @@ class Explanations:
         Frames that the likeliest one takes as wrong may be those of the track, if they agree with each other as well.
         """
         found = self._branches
-        total = found.log_likelihood + self._wrong_prior(found.wrong)
+        total = self._log_posterior(found)
         groups: dict[tuple[object, ...], list[int]] = {}
         for b in np.argsort(-total, kind="stable").tolist():
             key = bool(self._moves[found.odometry[b]].fault), found.history[b, :, 0].tobytes()
@@ -256,6 +256,10 @@ class Explanations:
         found.log_wrong[:, -1] = likelihood
         return found
 
+    def _log_posterior(self, found: Branches) -> Array:
+        """Logarithm (b,) of the posterior of each explanation, without its norm."""
+        return np.asarray(found.log_likelihood + self._wrong_prior(found.wrong))
+
     def _wrong_prior(self, wrong: Ints) -> Array:
         """Logarithm of the prior of so many wrong frames: single ones, or a set with images from elsewhere."""
         right, parts = self._with_modes - wrong, []
@@ -264,7 +268,7 @@ class Explanations:
         return np.asarray(np.logaddexp(*parts))
 
     def _likeliest(self, found: Branches) -> Branches:
-        total = found.log_likelihood + self._wrong_prior(found.wrong)
+        total = self._log_posterior(found)
         order = np.argsort(-total, kind="stable")
         order = order[total[order] > total.max() - KEPT_NATS]
         kind = found.odometry[order]

@@ -34,30 +34,38 @@ class CustomBuildHook(BuildHookInterface[Any]):
     scratch: tempfile.TemporaryDirectory[str] | None = None
 
     def dependencies(self) -> list[str]:
-        """ziglang, where no other compiler works."""
+        """ziglang, where no other compiler works, or for another system."""
         build = load_build(self.root)
         try:
+            if os.environ.get(build.VARIABLE):
+                return [build.ZIGLANG]
             build.find_compiler(with_zig=False)
         except build.BuildFailed:
             return [build.ZIGLANG]
         return []
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Compile, and put the libraries into a wheel for this system and any Python. Ends with a message."""
+        """Compile, and put the libraries into a wheel for a system and any Python. Ends with a message.
+
+        The system is this one, or the one that the variable STARTRACK_PLATFORM names.
+        """
         build = load_build(self.root)
+        tag = os.environ.get(build.VARIABLE)
+        if tag and tag not in build.TARGETS:
+            sys.exit(f"{build.VARIABLE} is {tag!r}; it may be one of: {', '.join(build.TARGETS)}")
         try:
             if version == "editable":
                 build.build()
                 return
             folder = build.COMPILED
-            if not os.access(build.FOLDER, os.W_OK):
+            if tag or not os.access(build.FOLDER, os.W_OK):
                 self.scratch = tempfile.TemporaryDirectory()
                 folder = Path(self.scratch.name)
-            made = build.build(folder)
+            made = build.build(folder, target=build.TARGETS[tag] if tag else None)
         except build.BuildFailed as cause:
             sys.exit(f"startrack cannot be installed. {cause}")
         build_data["pure_python"] = False
-        build_data["tag"] = f"py3-none-{_platform()}"
+        build_data["tag"] = f"py3-none-{tag or _platform()}"
         build_data["force_include"].update({str(path): f"{PLACE}/{path.name}" for path in made})
 
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:

@@ -7,6 +7,8 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the command: more threads sum in another order
 
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -15,6 +17,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from startrack.kernels import build
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 
@@ -39,6 +43,16 @@ def chromium() -> Iterator[Any]:
         browser = driver.chromium.launch(executable_path=path, args=["--no-sandbox", "--disable-gpu"])
         yield browser
         browser.close()
+
+
+@pytest.fixture(scope="session")
+def zig_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the package ziglang, a compiler for all systems. Skips without an index of packages."""
+    folder = tmp_path_factory.mktemp("zig")
+    words = ["install", "-q", "--no-deps", "--disable-pip-version-check", "--target", str(folder), build.ZIGLANG]
+    if subprocess.run([sys.executable, "-m", "pip", *words], capture_output=True).returncode:
+        pytest.skip("no index of packages is reached")
+    return folder
 
 
 @pytest.fixture(scope="module")

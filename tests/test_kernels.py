@@ -332,9 +332,10 @@ def test_the_sources_compile_without_a_warning(tmp_path, compiler):
         assert run.returncode == 0, run.stderr
 
 
-@pytest.mark.slow
-def test_no_kernel_reads_or_writes_beside_its_arrays(tmp_path):
-    """The random arguments again, in a library with AddressSanitizer and UndefinedBehaviorSanitizer."""
+@pytest.fixture(scope="module")
+def run_sanitized(tmp_path_factory):
+    """Runs code with a library of AddressSanitizer and UndefinedBehaviorSanitizer. Skips without a compiler of both."""
+    folder = tmp_path_factory.mktemp("sanitized")
     compiler = next((one for one in ("gcc", "clang") if has(one)), None)
     if compiler is None:
         pytest.skip("neither gcc nor clang is installed, which have the sanitizers")
@@ -342,42 +343,65 @@ def test_no_kernel_reads_or_writes_beside_its_arrays(tmp_path):
     found = subprocess.run([compiler, f"-print-file-name={name}"], capture_output=True, text=True).stdout.strip()
     if not Path(found).is_absolute() or Path(found).read_bytes()[:4] != b"\x7fELF":
         pytest.skip(f"{compiler} has no AddressSanitizer on this machine")
-    copy_kernels(tmp_path)
-    made = run_copy(tmp_path, "-m", "startrack.kernels.build", "sanitized", CC=compiler)
+    copy_kernels(folder)
+    made = run_copy(folder, "-m", "startrack.kernels.build", "sanitized", CC=compiler)
     assert made.returncode == 0, made.stderr
-    library_path = made.stdout.strip()
-    code = (
-        "import startrack.kernels.build as b; from pathlib import Path; "
-        f"b.COMPILED = Path({str(Path(library_path).parent)!r}); {LEVEL_SCRIPT}"
+    place = str(Path(made.stdout.strip()).parent)
+    begin = f"import startrack.kernels.build as b; from pathlib import Path; b.COMPILED = Path({place!r}); "
+    checks = {
+        "LD_PRELOAD": f"{found} libstdc++.so.6",  # whose exceptions other libraries throw
+        "ASAN_OPTIONS": "detect_leaks=0:allocator_may_return_null=1",
+        "UBSAN_OPTIONS": "print_stacktrace=1",
+    }
+
+    def run(code):
+        done = run_level("sanitized", begin + code, **checks)
+        assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-9000:]
+        return done.stdout
+
+    return run
+
+
+@pytest.mark.slow
+def test_no_kernel_reads_or_writes_beside_its_arrays(run_sanitized):
+    """The random arguments again, and the comparisons with slow references."""
+    assert run_sanitized(LEVEL_SCRIPT) == run_level("baseline", LEVEL_SCRIPT).stdout
+    references = str(ROOT / "tests" / "test_kernels_references.py")
+    run_sanitized(f"import pytest; raise SystemExit(pytest.main(['-q', '-p', 'no:cacheprovider', {references!r}]))")
+
+
+@pytest.mark.slow
+def test_no_mutated_file_makes_a_kernel_read_or_write_beside_its_arrays(run_sanitized, tmp_path):
+    """2,000 files, of which some are read; an outcome that no reader may have is another test's matter."""
+    assert "2000 files" in run_sanitized(
+        f"from fuzz import targets; folder = Path({str(tmp_path)!r}); targets.prepare(folder); kinds = "
+        "[*targets.READERS]; [targets.read(kinds[i % len(kinds)], *targets.mutated(kinds[i % len(kinds)], 3, i), "
+        "folder) for i in range(2000)]; print('2000 files')"
     )
-    checks = {"LD_PRELOAD": found, "ASAN_OPTIONS": "detect_leaks=0", "UBSAN_OPTIONS": "print_stacktrace=1"}
-    run = run_level("sanitized", code, **checks)
-    assert run.returncode == 0, run.stderr[-3000:]
-    assert run.stdout == run_level("baseline", LEVEL_SCRIPT).stdout
+
+
+@pytest.mark.slow
+def test_no_kernel_uses_memory_that_was_not_written():
+    """New memory is filled with other bytes by the C library: the results are the same."""
+    if sys.platform != "linux":
+        pytest.skip("MALLOC_PERTURB_ is a variable of glibc")
+    plain, poisoned = (run_level("baseline", LEVEL_SCRIPT, MALLOC_PERTURB_=fill) for fill in ("0", "165"))
+    assert len(plain.stdout.strip()) == 64
+    assert plain.stdout == poisoned.stdout
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("target", ["aarch64-freestanding", "riscv64-freestanding", "wasm32-freestanding"])
-def test_the_sources_compile_for_a_rover_and_for_a_browser(tmp_path, target):
+def test_the_sources_compile_for_a_rover_and_for_a_browser(tmp_path, target, zig_site):
     """They need no operating system: `math.h` and a few integers are all."""
-    if importlib.util.find_spec("ziglang") is None:
-        pytest.skip("the package ziglang, a compiler for other processors, is not installed")
-    zig = [
-        sys.executable,
-        "-m",
-        "ziglang",
-        "cc",
-        "-target",
-        target.replace("-none", ""),
-        "-ffreestanding",
-        *build.FLAGS,
-    ]
+    zig = [*build.ZIG, "-target", target, "-ffreestanding", *build.FLAGS]
     (tmp_path / "math.h").write_text(MATH_H)
-    cache = dict.fromkeys(("ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR"), str(tmp_path / "zig"))
+    own = dict.fromkeys(("ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR"), str(tmp_path / "zig"))
+    own["PYTHONPATH"] = str(zig_site)
     for source in sorted(build.FOLDER.glob("*.c")):
         run = subprocess.run(
             [*zig, "-I", str(tmp_path), "-c", str(source), "-o", str(tmp_path / f"{source.stem}.o")],
-            capture_output=True, text=True, env={**os.environ, **cache},
+            capture_output=True, text=True, env={**os.environ, **own},
         )  # fmt: skip
         assert run.returncode == 0, run.stderr
     assert len(list(tmp_path.glob("*.o"))) == len(list(build.FOLDER.glob("*.c")))

@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shutil
+import struct
 import subprocess
 import sys
 import tarfile
@@ -84,8 +85,9 @@ def test_catalogue_cameras_and_terrains_are_inside(wheel):
 
 def test_the_compiled_kernels_are_inside_for_this_system_and_any_python(wheel):
     assert re.fullmatch(r"startrack-[\d.]+-py3-none-(?!any)\w+\.whl", wheel.name)
+    target = build.this_target()
     libraries = sorted(name for name in names(wheel) if "/compiled/" in name)
-    assert libraries == [f"startrack/kernels/compiled/{build.library_name(level)}" for level in build.levels()]
+    assert libraries == [f"startrack/kernels/compiled/{target.library_name(level)}" for level in target.levels]
 
 
 def test_nothing_else_is_inside(wheel):
@@ -175,6 +177,36 @@ def test_a_wheel_of_the_sources_is_compiled_by_a_package_where_there_is_no_compi
     with zipfile.ZipFile(made) as archive:
         archive.extractall(tmp_path / "site")
     assert "Clang" in locate_elsewhere(tmp_path / "site", tmp_path)
+
+
+@pytest.mark.parametrize("tag", ["manylinux_2_17_aarch64", "macosx_13_0_arm64", "win_amd64"])
+def test_a_wheel_for_another_system_holds_its_libraries(tag, zig_site, tmp_path):
+    """An archive for that system's processor, by the first bytes of its libraries; they are not run here."""
+    path = os.pathsep.join([str(zig_site), str(ROOT)])
+    environment = {**os.environ, build.VARIABLE: tag, "PYTHONPATH": path}
+    done = subprocess.run(
+        [sys.executable, "-c", BUILD, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, env=environment
+    )
+    assert done.returncode == 0, done.stderr
+    (made,) = tmp_path.glob(f"startrack-*-py3-none-{tag}.whl")
+    with zipfile.ZipFile(made) as archive:
+        libraries = {Path(name).name: archive.read(name) for name in archive.namelist() if "/compiled/" in name}
+    target = build.TARGETS[tag]
+    assert set(libraries) == {target.library_name(level) for level in target.levels}
+    for content in libraries.values():
+        assert processor(content) == (target.system, "x86_64" if "v3" in target.levels else "aarch64")
+
+
+def processor(content):
+    """The system and the processor that the bytes of a library are for, by the formats' published numbers."""
+    if content[:4] == b"\x7fELF":
+        return "linux", {62: "x86_64", 183: "aarch64"}[struct.unpack_from("<H", content, 18)[0]]
+    if content[:4] == b"\xcf\xfa\xed\xfe":
+        return "darwin", {0x01000007: "x86_64", 0x0100000C: "aarch64"}[struct.unpack_from("<I", content, 4)[0]]
+    assert content[:2] == b"MZ"
+    (header,) = struct.unpack_from("<I", content, 60)
+    assert content[header : header + 4] == b"PE\0\0"
+    return "win32", {0x8664: "x86_64", 0xAA64: "aarch64"}[struct.unpack_from("<H", content, header + 4)[0]]
 
 
 def test_an_editable_installation_of_the_sources_compiles_beside_them(source_archive, tmp_path):

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from startrack.kernels.build import COMPILED, levels, library_name
+from startrack.kernels.build import COMPILED, this_target
 
 VARIABLE = "STARTRACK_KERNELS"
 SCALARS: dict[str, tuple[Any, Callable[..., Any]]] = {
@@ -47,7 +47,7 @@ class Argument(NamedTuple):
 
 def _open(level: str) -> ctypes.CDLL:
     """The library of a level. Raises ImportError with the command that makes it."""
-    path = COMPILED / library_name(level)
+    path = COMPILED / this_target().library_name(level)
     try:
         return ctypes.CDLL(str(path))
     except OSError as cause:
@@ -64,7 +64,7 @@ def _load() -> tuple[str, ctypes.CDLL]:
     if level == "sanitized":
         return level, _open(level)
     baseline = _open("baseline")
-    has_v3 = "v3" in levels() and bool(baseline.has_x86_64_v3())
+    has_v3 = "v3" in this_target().levels and bool(baseline.has_x86_64_v3())
     if level == "v3" and not has_v3:
         raise ImportError(f"{VARIABLE} is v3, which this processor is not")
     return ("v3", _open("v3")) if has_v3 and level != "baseline" else ("baseline", baseline)

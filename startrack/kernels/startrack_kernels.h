@@ -22,6 +22,34 @@
 #define KERNEL
 #endif
 
+/* Height maps as one ground, the finest first. See terrain/ground.py. */
+struct ground {
+    int64_t maps, numbers, coordinates, all_posts, all_blocks, most_levels;
+    const double *grid;     /* [maps, numbers, coordinates]: coordinates 1 on the Moon, 2 on the Earth */
+    const float *heights;   /* [all_posts] above the sphere through the origin of enu (m); NaN: a void */
+    const int64_t *posts;   /* [maps, 3]: where a map's posts begin, rows, columns (2 at least) */
+    const float *tops;      /* [all_blocks]: highest post of each block of cells */
+    const float *wide_tops; /* [all_blocks]: of each block and its neighbours */
+    const int8_t *slopes;   /* [all_blocks, 8]: most fall and rise per step along column, row, both, -column +row */
+    const int64_t *blocks;  /* [maps, most_levels, 3]: where a level's blocks begin, block rows, block columns */
+    const int64_t *levels;  /* [maps] */
+    const double *slope_unit; /* [maps] (m per post) */
+    const double *post_m;     /* [maps]: spacing of the posts */
+    double radius, highest;   /* of that sphere; highest post of all maps (m) */
+    double sag;               /* half the curvature of a sight line in air (1/m) */
+};
+
+/* A table of horizons. See terrain/horizon_table.py. */
+struct table {
+    int64_t cells, bins;
+    const uint16_t *values;        /* [cells, bins, 11] of a square of cells, the north running fastest */
+    const double *tangents;        /* [65536] of its elevations */
+    const double *sines, *cosines; /* [bins] of the middles of its bins */
+    int64_t across;                /* cells to a side of the square; 0: there is no table */
+    double reach;                  /* half the side (m) */
+    double angle_step, distance_step, rise_step;
+};
+
 /* levels.c */
 
 /* Whether processor and system have all of x86-64-v3: AVX2, FMA, BMI, F16C, LZCNT, MOVBE. */
@@ -266,6 +294,90 @@ KERNEL void fill_averages(int64_t sectors, int64_t count, int64_t n, int64_t see
                           const double *restrict hidden, const double *restrict low, const double *restrict high,
                           double lowest, double step, double epsilon, double hide, double stop,
                           double *restrict scratch, double *restrict found);
+
+/* crests.c */
+
+/* Fill the moments of skylines [n] seen from `points` [n, 2] at `azimuths` [n], on ground whose posts err by `sigma` (m).
+   `tan` and `distance` [n] are those of the map. `mean` and `own` [n]: mean tangent, and its variance that follows no
+   post. `post` and `response` [n, 64]: posts, and the mean rise of the tangent by a metre of each, as of a camera that
+   stays where it is; post -1: none. Where no place of a map makes the skyline, as at the edge where a ray leaves the
+   maps, it is the map's own, wrong by `sigma` at its distance. `cdf` [4097]: see common.h. */
+KERNEL void crests(int64_t n, const struct ground *restrict ground, double camera_height, double sigma,
+                   const double *restrict points, const double *restrict azimuths, const double *restrict tan,
+                   const double *restrict distance, const double *restrict cdf, double *restrict mean,
+                   double *restrict own, int64_t *restrict post, double *restrict response);
+
+/* horizons.c */
+
+/* Fill `up` [n] with the height in enu of the ground at `points` [n, 2] (m). Beyond the maps: 0. */
+KERNEL void surfaces(int64_t n, const struct ground *restrict ground, const double *restrict points,
+                     double *restrict up);
+
+/* Fill `found` [n, m] with the horizon (radians) at `points` [n, 2] and columns [rows, m], of each point or of all
+   (rows 1): bilinear between nodes [azimuths, across, across], the east first, about (east, north) from -half to half,
+   less `per_height` [azimuths] times the ground's height above `middle`. */
+KERNEL void interpolate_horizons(int64_t azimuths, int64_t across, int64_t n, int64_t rows, int64_t m,
+                                 const struct ground *restrict ground, const double *restrict nodes,
+                                 const double *restrict per_height, double middle, double east, double north,
+                                 double half, const double *restrict points, const int64_t *restrict column,
+                                 double *restrict found);
+
+/* Fill `found` [n, m] with elevations (radians) of a circular rim about the origin, `wall` above `points` [n, 2], at
+   azimuths [m]; pi/2 from beyond the rim. */
+KERNEL void horizons_of_circle(int64_t n, int64_t m, const double *restrict points, const double *restrict sines,
+                               const double *restrict cosines, double radius, double wall, double *restrict found);
+
+/* horizon_table.c */
+
+/* Fill `tan`, `distance` and `edge` [n] with the horizon of each of `points` [n, 2] at its azimuth [n]: its tangent, its
+   distance, and the distance at which maps end or have a void (1e9: beyond the horizon). Of a table that is not the
+   map's own (`is_own`), but of a similar one, only first sight lines are taken. */
+KERNEL void trace_horizons(int64_t n, const struct ground *restrict ground, const struct table *restrict table,
+                           double camera_height, bool is_own, const double *restrict points,
+                           const double *restrict azimuths, double *restrict tan, double *restrict distance,
+                           double *restrict edge);
+
+/* Fill `low` and `high` [n] (radians) with bounds over boxes of `half` sides [n] at `centres` [n, 2] and azimuths [n]
+   within `turn` [n], traced anew. */
+KERNEL void box_bounds(int64_t n, const struct ground *restrict ground, const struct table *restrict table,
+                       double camera_height, const double *restrict centres, const double *restrict half,
+                       const double *restrict azimuths, const double *restrict turn, double *restrict low,
+                       double *restrict high);
+
+/* Fill `low` and `high` [n, m] (radians) with bounds over boxes, and azimuths [rows, m] within `turn` of each box or of
+   all (rows 1), from the table. `lows` and `highs` [blocks, blocks, bins]: of its level that fits. Boxes smaller than a
+   cell take the lines and points of the cells they touch, larger ones the bounds of the level's blocks. */
+KERNEL void sector_bounds(int64_t blocks, int64_t bins, int64_t rows, int64_t m, int64_t n,
+                          const struct ground *restrict ground, const struct table *restrict table,
+                          const uint16_t *restrict lows, const uint16_t *restrict highs, double camera_height,
+                          const double *restrict azimuths, const double *restrict turn, const double *restrict centres,
+                          const double *restrict half, double *restrict low, double *restrict high);
+
+/* Fill `found` [n, m, 11] for boxes of one size at `centres` [n, 2] and azimuths [m] within `turn`:
+   0, 1: bounds of the horizon's tangent; 2, 3: range of distances s from the middle of the ground that may make the
+   horizon; 4: s of the middle's horizon; 5: its tangent t; 6: a such that this ground is no higher than a + t s on the
+   middle line, and 9: g such that it is no higher than that plus g w at w aside; 7, 8: an s and a height that the
+   ground reaches everywhere there, and 10: the slope to the side that this assumes. */
+KERNEL void fill_table(int64_t n, int64_t m, const struct ground *restrict ground, const double *restrict centres,
+                       double half, double camera_height, const double *restrict sines, const double *restrict cosines,
+                       double turn, double *restrict found);
+
+/* Fill `low` and `high` [n, azimuths] from the `bounds` [slots, 2, azimuths] kept in the slots of the `keys`
+   [n, numbers], where the numbers kept there are the same; `missing` [n]: they are not. */
+KERNEL void recall_bounds(int64_t slots, int64_t numbers, int64_t azimuths, int64_t n, const uint64_t *restrict kept,
+                          const double *restrict bounds, const uint64_t *restrict keys, double *restrict low,
+                          double *restrict high, bool *restrict missing);
+
+/* Keep these in the slots of their keys. */
+KERNEL void keep_bounds(int64_t slots, int64_t numbers, int64_t azimuths, int64_t n, uint64_t *restrict kept,
+                        double *restrict bounds, const uint64_t *restrict keys, const double *restrict low,
+                        const double *restrict high);
+
+/* Fill `found` [n, m] with the largest of the values [across, across, bins], or 0, of the cells from the first to the
+   last [n, 2, 2] of each box, in bins [rows, m, turns] of each box or of all (rows 1). */
+KERNEL void largest_of_cells(int64_t across, int64_t bins, int64_t n, int64_t rows, int64_t m, int64_t turns,
+                             const float *restrict values, const int64_t *restrict cells,
+                             const int64_t *restrict bin, double *restrict found);
 
 /* photometry.c */
 

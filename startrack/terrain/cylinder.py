@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import atan2, sqrt
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from startrack.core.declaration import Flag
-from startrack.core.kernels import njit
 from startrack.core.obstacles import Obstacles
 from startrack.core.types import Array, BadInput
+from startrack.kernels.library import kernel
 from startrack.terrain.crater import Crater, DeformedCrater, distance_bounds, distance_to_circle, slopes_of_round_crater
 from startrack.terrain.ground_brightness import GroundBrightness
 from startrack.terrain.protocol import Terrain
@@ -90,9 +89,10 @@ class Cylinder(Crater):
         """Horizon elevation [rad]; pi/2 from inside the wall. See `Terrain`."""
         points, azimuths = np.asarray(points_m, dtype=np.float64), np.asarray(azimuths_rad, dtype=np.float64)
         if points.ndim == 3 and points.shape[1] == 1 and azimuths.ndim == 1:  # each point with each azimuth
-            return _horizons_of_circle(  # the copy can be written to: the kernel is compiled for one kind of data
-                points[:, 0].copy(), np.sin(azimuths), np.cos(azimuths), self.radius_m, self.wall_m
-            )
+            found = np.empty((len(points), len(azimuths)))
+            rays = np.ascontiguousarray(points[:, 0]), np.sin(azimuths), np.cos(azimuths)
+            _horizons_of_circle(*rays, self.radius_m, self.wall_m, found)
+            return found
         return np.arctan2(self.wall_m, distance_to_circle(points, azimuths, self.radius_m))
 
     def horizon_bounds_rad(
@@ -174,15 +174,7 @@ class Cylinder(Crater):
         return -np.minimum(rho, 1e12)[:, None] * u, self.radius_m
 
 
-@njit(cache=True)
-def _horizons_of_circle(points, sines, cosines, radius, wall):  # type: ignore[no-untyped-def]
-    """Elevations (n, m) [rad] of a rim `wall` above points (n, 2), at azimuths (m,) by their sines and cosines."""
-    found = np.empty((len(points), len(sines)))
-    for i in range(len(points)):
-        x, y = points[i, 0], points[i, 1]
-        inner = radius * radius - x * x - y * y
-        for k in range(len(sines)):
-            along = x * sines[k] + y * cosines[k]
-            distance = max(sqrt(along * along + inner) - along, 0.0) if inner > 0.0 else 0.0
-            found[i, k] = atan2(wall, distance)
-    return found
+_horizons_of_circle = kernel(
+    "horizons_of_circle", "points: float64[n, 2]", "sines: float64[m]", "cosines: float64[m]", "radius: float64",
+    "wall: float64", "found: out float64[n, m]",
+)  # fmt: skip

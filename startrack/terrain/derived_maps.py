@@ -11,7 +11,7 @@ import numpy as np
 
 from startrack.core.types import Array
 from startrack.frames import R_from_rotvec
-from startrack.terrain.horizon_kernel import interpolate
+from startrack.kernels.library import kernel
 from startrack.terrain.protocol import ForwardingTerrain, Terrain
 from startrack.terrain.rays import rows_of_rays
 from startrack.terrain.shape import wave_slopes_rad
@@ -63,7 +63,7 @@ class DeformedMap(ForwardingTerrain):
         refraction_1 = min(self.whole.terrestrial_refraction_1 + self._refraction_1, MOST_REFRACTION_1)
         raised = replace(self.whole, camera_height_m=self.camera_height_m, terrestrial_refraction_1=refraction_1)
         same = self.whole.ground
-        raised.__dict__["ground"] = same._replace(sag_per_m=refraction_1 / (2 * same.radius_m))
+        raised.__dict__["ground"] = replace(same, sag_per_m=refraction_1 / (2 * same.radius_m))
         raised.__dict__["_similar_table"] = TABLES_IN_MEMORY.get(self.whole.table_key)
         return raised
 
@@ -178,9 +178,16 @@ class HorizonInterpolator(ForwardingTerrain):
         near = np.abs(points - self.centre_m).max(axis=-1) <= self.half_m * (1 + 1e-9)
         prepared = self.azimuths_rad[column] == azimuths
         found = np.empty((len(points), azimuths.shape[1]))
-        interpolate(self.whole.ground, self.nodes, points, column, found)
+        _interpolate(self.whole.ground.record, *self.nodes, points, column, found)
         if not (near.all() and prepared.all()):
             point, azimuth = np.nonzero(~(near[:, None] & prepared))
             own = np.broadcast_to(azimuths, found.shape)[point, azimuth]
             found[point, azimuth] = self.whole.horizon_rad(points[point], own)
         return found.reshape(shape)
+
+
+_interpolate = kernel(
+    "interpolate_horizons", "ground: ground", "nodes: float64[azimuths, across, across]",
+    "per_height: float64[azimuths]", "middle: float64", "east: float64", "north: float64", "half: float64",
+    "points: float64[n, 2]", "column: int64[rows, m]", "found: out float64[n, m]",
+)  # fmt: skip

@@ -9,14 +9,15 @@ highest post, the highest of it and its eight neighbours, and the range of the s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.types import Array, Bools, Ints
 from startrack.frames import Site, enu_from_latlon, latlon_from_enu, sphere_radius_m
+from startrack.kernels.library import Record, declare_record, kernel
 from startrack.terrain.protocol import NO_POST
 from startrack.terrain.raster import Raster
 
@@ -25,8 +26,9 @@ SURFACE_ROUNDS = 6  # of the height of the ground, each with the place of the la
 SMALLEST_BLOCKS = 4  # a pyramid ends where a level has no more blocks than this along an axis
 
 
-class Ground(NamedTuple):
-    """The maps as the kernels read them: plain arrays in a tuple, which numba takes."""
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """The maps as the kernels read them: plain arrays."""
 
     grid: Array  # (maps, 16) on the Moon, (maps, n, 2) on the Earth, see Raster.grid_numbers
     heights: NDArray[np.float32]  # all posts [m above the sphere through the origin of enu]
@@ -41,6 +43,24 @@ class Ground(NamedTuple):
     radius_m: float  # of that sphere
     highest_m: float  # highest post of all maps
     sag_per_m: float = 0.0  # half the curvature of a sight line in air
+
+    @cached_property
+    def record(self) -> Record:
+        """The maps as a struct of the compiled library."""
+        return Record(
+            "ground", self.grid.reshape(*self.grid.shape[:2], -1), self.heights, self.posts, self.tops, self.wide_tops,
+            self.slopes, self.blocks, self.levels, self.slope_unit, self.post_m, self.radius_m, self.highest_m,
+            self.sag_per_m,
+        )  # fmt: skip
+
+
+declare_record(
+    "ground", "grid: float64[maps, numbers, coordinates]", "heights: float32[all_posts]", "posts: int64[maps, 3]",
+    "tops: float32[all_blocks]", "wide_tops: float32[all_blocks]", "slopes: int8[all_blocks, 8]",
+    "blocks: int64[maps, most_levels, 3]", "levels: int64[maps]", "slope_unit: float64[maps]", "post_m: float64[maps]",
+    "radius: float64", "highest: float64", "sag: float64",
+)  # fmt: skip
+surfaces = kernel("surfaces", "ground: ground", "points: float64[n, 2]", "up: out float64[n]")
 
 
 def pack_maps(site: Site, maps: Sequence[Raster], *, keep_voids: bool = False) -> Ground:

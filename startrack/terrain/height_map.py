@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.kernels import NORMAL_CDF
 from startrack.core.types import MIDDLES_RAD, Array, Bools, Ints
+from startrack.kernels.library import kernel
 from startrack.terrain import shape
-from startrack.terrain.block_kernel import NUDGE_M
-from startrack.terrain.crest_kernel import POSTS, crests
 from startrack.terrain.derived_maps import DeformedMap, HorizonInterpolator
 from startrack.terrain.ground import cell_posts, number_of_maps, post_positions
 from startrack.terrain.horizon_table import AZIMUTH_BINS, HorizonSigma
@@ -23,6 +23,8 @@ from startrack.terrain.table_cache import load_table
 from startrack.terrain.traced_map import TracedMap
 
 COMMON_PER_POST = 3.0
+POSTS = 64  # that the skyline of one ray follows; in crests.c too
+NUDGE_M = 0.05  # nearer crests count as so far away
 BETWEEN_POSTS = 2.0 / 3.0  # RMS over a cell of the bilinear mean of independent errors at four posts, in that of one
 GLARE, OFF_MAP = "glare of a lit rim", "ground off the map"
 Sectors = tuple[tuple[float, float], ...]  # azimuth ranges [rad], each from the first eastward to the second
@@ -223,14 +225,15 @@ class HeightMap(TracedMap):
         return HorizonInterpolator(self, centre, half_m, np.unique(azimuths_rad), across)
 
     def expected_crests(self, point_m: Array, azimuths_rad: Array) -> ExpectedCrests | None:
-        """By the places along each ray that may stand highest; see `crest_kernel.crests` and `Terrain`."""
+        """By the places along each ray that may stand highest; see kernels/crests.c and `Terrain`."""
         if self.height_sigma_m == 0.0:
             return None
         tan, distance, _ = self.horizons(point_m, azimuths_rad)
         points, count = np.tile(np.asarray(point_m, dtype=np.float64), (len(tan), 1)), len(tan)
         mean, own, post, response = *np.empty((2, count)), np.empty((count, POSTS), np.int64), np.empty((count, POSTS))
-        fixed = self.ground, self.camera_height_m, self.height_sigma_m
-        crests(*fixed, points, azimuths_rad, tan, distance, mean, own, post, response)
+        fixed = self.ground.record, self.camera_height_m, self.height_sigma_m
+        rays = points, np.array(azimuths_rad, dtype=np.float64), tan, distance
+        _crests(*fixed, *rays, NORMAL_CDF, mean, own, post, response)
         flat = 1.0 / (1.0 + mean * mean)
         rise = np.arctan(mean) - np.arctan(tan)
         return ExpectedCrests(rise, flat * np.sqrt(own), post, flat[:, None] * response)
@@ -288,3 +291,11 @@ def _range_text(start_rad: float, end_rad: float) -> str:
     if end_rad - start_rad >= 2 * np.pi - 1e-9:
         return "0 to 360 degrees"
     return f"{np.degrees(start_rad) % 360:.0f} to {np.degrees(end_rad) % 360:.0f} degrees"
+
+
+_crests = kernel(
+    "crests", "ground: ground", "camera_height: float64", "sigma: float64", "points: float64[n, 2]",
+    "azimuths: float64[n]", "tan: float64[n]", "distance: float64[n]", f"cdf: float64[{len(NORMAL_CDF)}]",
+    "mean: out float64[n]", "own: out float64[n]", f"post: out int64[n, {POSTS}]",
+    f"response: out float64[n, {POSTS}]",
+)  # fmt: skip

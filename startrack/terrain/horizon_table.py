@@ -14,12 +14,13 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.kernels import njit
 from startrack.core.types import SECTORS, Array, Bools, Ints
+from startrack.kernels.library import Record, declare_record, kernel
 from startrack.terrain.ground import merge_blocks
 from startrack.terrain.rays import rows_of_rays
 
 AZIMUTH_BINS = 360  # azimuths; the localizer's sectors are 1.5 degrees wide
+MIDDLES_RAD = (np.arange(AZIMUTH_BINS) + 0.5) * 2 * np.pi / AZIMUTH_BINS
 DISTANCE_STEP_M = 4.0
 ANGLE_STEP_RAD = np.pi / 65_000
 FIELDS = 11
@@ -30,7 +31,6 @@ NEAREST_M = 50.0  # sigmas do not distinguish crests closer by
 SLOTS = 2**18  # boxes and azimuths that are kept: 15 MB; a draw on Shackleton's floor traces 20,000 to 110,000
 SECTOR_SLOTS = 2**14  # boxes whose bounds in all sectors are kept: 63 MB; a draw there looks 6000 up
 NEW = np.uint64(np.iinfo(np.uint64).max)  # a NaN, which no box has
-MIX, SHIFT = np.uint64(0xBF58_476D_1CE4_E5B9), np.uint64(29)  # of a hash
 
 
 @dataclass(frozen=True)
@@ -82,13 +82,13 @@ class BoxMemory:
         keys = np.ascontiguousarray(numbers).view(np.uint64)
         missing = np.empty(len(low), dtype=np.bool_)
         with self._lock:
-            _recall(self._keys, self._bounds, keys, low, high, missing)
+            _recall_bounds(self._keys, self._bounds, keys, low, high, missing)
         if not missing.any():
             return
         results = compute(missing)
         low[missing], high[missing] = results
         with self._lock:
-            _keep(self._keys, self._bounds, keys[missing], *results)
+            _keep_bounds(self._keys, self._bounds, keys[missing], *results)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +125,14 @@ class HorizonTable:
         return found
 
     @cached_property
+    def record(self) -> Record:
+        """The table as a struct of the compiled library."""
+        return Record(
+            "table", self.values, self.tangents, np.sin(MIDDLES_RAD), np.cos(MIDDLES_RAD), self.square.across,
+            self.square.reach_m, ANGLE_STEP_RAD, DISTANCE_STEP_M, RISE_STEP,
+        )  # fmt: skip
+
+    @cached_property
     def pyramid(self) -> list[tuple[NDArray[np.uint16], NDArray[np.uint16]]]:
         """Least and most elevation (n, n, AZIMUTH_BINS) of the cells, then of ever larger blocks of them."""
         n = self.square.across
@@ -144,6 +152,11 @@ class HorizonTable:
         while level < len(self.pyramid) - 1 and self.square.half_m * 2**level * (1 + 1e-9) < half_m:
             level += 1
         return level
+
+
+NO_TABLE = HorizonTable(
+    Square(0.0, 0), np.zeros((0, AZIMUTH_BINS, FIELDS), dtype=np.uint16), np.full(AZIMUTH_BINS, -np.pi / 2)
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,12 +190,13 @@ class HorizonSigma:
         return found.reshape(shape)
 
     @cached_property
-    def blocks_rad(self) -> list[Array]:
+    def blocks_rad(self) -> list[NDArray[np.float32]]:
         """(m, m, AZIMUTH_BINS) the sigma of the cells, then the largest of ever larger blocks of them."""
         n, values = self.table.square.across, self.table.values
         distance = np.maximum(values[..., 4].astype(np.float32) * DISTANCE_STEP_M, NEAREST_M)
         middle = (values[..., 0].astype(np.float32) + values[..., 1]) / 2 * ANGLE_STEP_RAD - np.pi / 2
-        levels = [np.asarray(self.height_sigma_m * np.cos(middle) ** 2 / distance).reshape(n, n, AZIMUTH_BINS)]
+        sigma = np.float32(self.height_sigma_m) * np.cos(middle) ** 2 / distance
+        levels = [np.asarray(sigma).reshape(n, n, AZIMUTH_BINS)]
         while len(levels[-1]) > 1:
             levels.append(merge_blocks(levels[-1], np.maximum))
         return levels
@@ -215,51 +229,39 @@ def quantize_fields(found: Array) -> NDArray[np.uint16]:
     return np.stack(fields, axis=-1).astype(np.uint16)
 
 
-@njit(cache=True, inline="always")
-def _slot(keys, k, slots):  # type: ignore[no-untyped-def]
-    mixed = keys[k, 0] * MIX
-    for number in range(1, keys.shape[1]):
-        mixed = ((mixed ^ (mixed >> SHIFT)) + keys[k, number]) * MIX
-    return (mixed ^ (mixed >> SHIFT)) % np.uint64(slots)
-
-
-@njit(cache=True)
-def _recall(kept, bounds, keys, low, high, missing):  # type: ignore[no-untyped-def]
-    for k in range(len(low)):
-        s = _slot(keys, k, len(kept))
-        missing[k] = False
-        for number in range(keys.shape[1]):
-            missing[k] |= kept[s, number] != keys[k, number]
-        if not missing[k]:
-            for a in range(low.shape[1]):
-                low[k, a], high[k, a] = bounds[s, 0, a], bounds[s, 1, a]
-
-
-@njit(cache=True)
-def _keep(kept, bounds, keys, low, high):  # type: ignore[no-untyped-def]
-    for k in range(len(low)):
-        s = _slot(keys, k, len(kept))
-        for number in range(keys.shape[1]):
-            kept[s, number] = keys[k, number]
-        for a in range(low.shape[1]):
-            bounds[s, 0, a], bounds[s, 1, a] = low[k, a], high[k, a]
-
-
-@njit(cache=True)
-def _largest_of_cells(values, cells, bins, found):  # type: ignore[no-untyped-def]
-    """Fill found (n, m) with the largest values (a, a, bins) at the corners of boxes, their cells (n, 2, 2) given.
-
-    `bins` (n, m, turns) are those of the azimuths; (1, m, turns): of all boxes.
-    """
-    for k in range(len(found)):
-        row = min(k, len(bins) - 1)
-        if k > 0 and len(bins) == 1 and (cells[k] == cells[k - 1]).all():
-            found[k] = found[k - 1]
-            continue
-        for m in range(found.shape[1]):
-            most = 0.0
-            for i in range(cells[k, 1, 0] - cells[k, 0, 0] + 1):
-                for j in range(cells[k, 1, 1] - cells[k, 0, 1] + 1):
-                    for b in bins[row, m]:
-                        most = max(most, values[cells[k, 0, 0] + i, cells[k, 0, 1] + j, b])
-            found[k, m] = most
+declare_record(
+    "table", f"values: uint16[cells, bins, {FIELDS}]", f"tangents: float64[{FARTHEST + 1}]", "sines: float64[bins]",
+    "cosines: float64[bins]", "across: int64", "reach: float64", "angle_step: float64", "distance_step: float64",
+    "rise_step: float64",
+)  # fmt: skip
+trace_horizons = kernel(
+    "trace_horizons", "ground: ground", "table: table", "camera_height: float64", "is_own: bool",
+    "points: float64[n, 2]", "azimuths: float64[n]", "tan: out float64[n]", "distance: out float64[n]",
+    "edge: out float64[n]",
+)  # fmt: skip
+box_bounds = kernel(
+    "box_bounds", "ground: ground", "table: table", "camera_height: float64", "centres: float64[n, 2]",
+    "half: float64[n]", "azimuths: float64[n]", "turn: float64[n]", "low: out float64[n]", "high: out float64[n]",
+)  # fmt: skip
+sector_bounds = kernel(
+    "sector_bounds", "ground: ground", "table: table", "lows: uint16[blocks, blocks, bins]",
+    "highs: uint16[blocks, blocks, bins]", "camera_height: float64", "azimuths: float64[rows, m]",
+    "turn: float64[rows, m]", "centres: float64[n, 2]", "half: float64[n]", "low: out float64[n, m]",
+    "high: out float64[n, m]",
+)  # fmt: skip
+fill_table = kernel(
+    "fill_table", "ground: ground", "centres: float64[n, 2]", "half: float64", "camera_height: float64",
+    "sines: float64[m]", "cosines: float64[m]", "turn: float64", f"found: out float64[n, m, {FIELDS}]",
+)  # fmt: skip
+_recall_bounds = kernel(
+    "recall_bounds", "kept: uint64[slots, numbers]", "bounds: float64[slots, 2, azimuths]", "keys: uint64[n, numbers]",
+    "low: out float64[n, azimuths]", "high: out float64[n, azimuths]", "missing: out bool[n]",
+)  # fmt: skip
+_keep_bounds = kernel(
+    "keep_bounds", "kept: out uint64[slots, numbers]", "bounds: out float64[slots, 2, azimuths]",
+    "keys: uint64[n, numbers]", "low: float64[n, azimuths]", "high: float64[n, azimuths]",
+)  # fmt: skip
+_largest_of_cells = kernel(
+    "largest_of_cells", "values: float32[across, across, bins]", "cells: int64[n, 2, 2]", "bin: int64[rows, m, turns]",
+    "found: out float64[n, m]",
+)  # fmt: skip

@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from startrack.core.runner import count_cores
-from startrack.terrain.horizon_table import AZIMUTH_BINS, FIELDS
-from startrack.terrain.map_ends import MIDDLES_RAD
-from startrack.terrain.table_kernel import fill_cells
+from startrack.terrain.horizon_table import AZIMUTH_BINS, FIELDS, MIDDLES_RAD, fill_table
 
 if TYPE_CHECKING:
     from startrack.terrain.traced_map import TracedMap
@@ -37,7 +35,7 @@ def seconds_of_table(ground: TracedMap) -> float:
     def trace(part: float) -> None:
         cell = cells[int(part * len(cells))]
         place = square.centres_m[cell : cell + 1], square.half_m, ground.camera_height_m
-        fill_cells(ground.ground, *place, sines, cosines, np.pi / AZIMUTH_BINS, found)
+        fill_table(ground.ground.record, *place, sines, cosines, np.pi / AZIMUTH_BINS, found)
 
     return ENDS_S + _mean_seconds(trace) * len(cells) / count_cores()
 
@@ -55,9 +53,8 @@ def seconds_of_frame(ground: TracedMap) -> float:
 
 
 def _mean_seconds(work: Callable[[float], None]) -> float:
-    """Mean time of `work` on parts all over the whole, which it takes by a number from 0 to 1; compiled before."""
+    """Mean time of `work` on parts all over the whole, which it takes by a number from 0 to 1."""
     parts = [(0.618 * number + 0.5) % 1.0 for number in range(PROBES)]  # evenly spread, the first of them too
-    work(parts[0])
     start, done = clock.perf_counter(), 0
     while done < PROBES and clock.perf_counter() - start < PROBE_S:
         work(parts[done])

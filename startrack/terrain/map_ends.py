@@ -8,14 +8,13 @@ import numpy as np
 
 from startrack.core.types import Array, Bools
 from startrack.frames import latlon_from_enu
-from startrack.terrain.horizon_table import AZIMUTH_BINS
+from startrack.terrain.horizon_table import AZIMUTH_BINS, MIDDLES_RAD
 
 if TYPE_CHECKING:
     from startrack.terrain.traced_map import TracedMap
 
 UNKNOWN_FROM, RIM_PLACES = 12, 48  # places across the search area, and on its rim, at which ends are looked up
 LEAST_END_M = 1.0  # distance from a camera to the ends of the maps: nearer ones count as at it
-MIDDLES_RAD = (np.arange(AZIMUTH_BINS) + 0.5) * 2 * np.pi / AZIMUTH_BINS
 STEPS_A_BIN = 4  # from place to place along an azimuth, in the width of a bin there; at least the spacing of posts
 
 

@@ -26,22 +26,23 @@ from startrack.terrain.horizon_table import (
     AZIMUTH_BINS,
     FARTHEST,
     FIELDS,
+    MIDDLES_RAD,
     NOT_KNOWN_M,
     HorizonTable,
     Square,
+    fill_table,
     quantize_fields,
 )
 from startrack.terrain.map_cost import seconds_of_table
 from startrack.terrain.map_ends import unknown_elevations_rad
 from startrack.terrain.protocol import Progress
-from startrack.terrain.table_kernel import fill_cells
 
 if TYPE_CHECKING:
     from startrack.terrain.traced_map import TracedMap
 
 LOG = logging.getLogger(__name__)
 FOLDER, SUFFIX = "horizons", ".table"  # of the tables in the cache
-VERSION = 7  # of the tracing and of the table's format
+VERSION = 8  # of the tracing and of the table's format
 PART_CELLS = 64  # at least, of a part that is traced and kept by itself: 0.5 MB
 
 # Terrains that need the same table share one in memory, for as long as one of them lives.
@@ -159,13 +160,12 @@ def build_table(ground: TracedMap, progress: Progress | None = None) -> HorizonT
     Cells that contain no position within reach have bounds of -+ pi/2. Parts of it that are traced lie on disk, if that
     takes them, so that a build that was stopped goes on where it was.
     """
-    square, packed, height_m = ground.square, ground.ground, ground.camera_height_m
+    square, packed, height_m = ground.square, ground.ground.record, ground.camera_height_m
     values = np.zeros((square.across**2, AZIMUTH_BINS, FIELDS), dtype=np.uint16)
     values[..., 1] = values[..., 3] = FARTHEST
     values[..., 8] = np.array(NOT_KNOWN_M, dtype=np.int16).view(np.uint16)
     centres, half_turn = square.centres_m, np.pi / AZIMUTH_BINS
-    middles = (np.arange(AZIMUTH_BINS) + 0.5) * 2 * np.pi / AZIMUTH_BINS
-    sines, cosines = np.sin(middles), np.cos(middles)
+    sines, cosines = np.sin(MIDDLES_RAD), np.cos(MIDDLES_RAD)
     cells = square.cells_within_reach
     done = 0
 
@@ -177,7 +177,7 @@ def build_table(ground: TracedMap, progress: Progress | None = None) -> HorizonT
             values[part] = np.frombuffer(kept, np.uint16).reshape(-1, AZIMUTH_BINS, FIELDS)
             return len(part)
         found = np.empty((len(part), AZIMUTH_BINS, FIELDS))
-        fill_cells(packed, centres[part], square.half_m, height_m, sines, cosines, half_turn, found)
+        fill_table(packed, centres[part], square.half_m, height_m, sines, cosines, half_turn, found)
         values[part] = quantize_fields(found)
         with suppress(BadInput):
             write_sealed(path, values[part].tobytes())

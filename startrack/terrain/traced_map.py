@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
@@ -14,10 +14,17 @@ from startrack.core.obstacles import Obstacles
 from startrack.core.types import SECTORS, Array, BadInput, Bools
 from startrack.frames import Site
 from startrack.terrain.earth_projection import EarthProjection
-from startrack.terrain.ground import Ground, ground_up_m, pack_maps
+from startrack.terrain.ground import Ground, ground_up_m, pack_maps, surfaces
 from startrack.terrain.ground_brightness import GroundBrightness
-from startrack.terrain.horizon_kernel import surfaces
-from startrack.terrain.horizon_table import AZIMUTH_BINS, FIELDS, HorizonTable, Square
+from startrack.terrain.horizon_table import (
+    AZIMUTH_BINS,
+    NO_TABLE,
+    HorizonTable,
+    Square,
+    box_bounds,
+    sector_bounds,
+    trace_horizons,
+)
 from startrack.terrain.map_cost import costs_of
 from startrack.terrain.projection import Projection
 from startrack.terrain.protocol import Progress, Terrain
@@ -30,7 +37,6 @@ from startrack.terrain.table_cache import (
     load_or_build_table,
     path_of_table,
 )
-from startrack.terrain.table_kernel import box_bounds, horizons, sector_bounds
 
 CELL_M = 200.0  # cells of the table are no wider
 MAX_CELLS_ACROSS = 128
@@ -40,7 +46,6 @@ POINT_M, WIDE_RAD = 1.0, np.radians(2.0)  # boxes up to this half side are point
 MAX_TRACED_TURN_RAD = 0.25 * 2 * np.pi / AZIMUTH_BINS  # half widths of azimuths: bounds over wider ones are looked up
 SECTOR_AZIMUTHS_RAD = (2 * np.arange(SECTORS) + 1)[None] * np.pi / SECTORS  # the localizer's, (1, SECTORS)
 SECTOR_TURN_RAD = np.pi / SECTORS
-NO_VALUES = np.zeros((0, AZIMUTH_BINS, FIELDS), dtype=np.uint16)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -108,7 +113,8 @@ class TracedMap(Terrain):
 
     def _pack(self, keep_voids: bool) -> Ground:
         packed = pack_maps(self.site, self.maps, keep_voids=keep_voids)
-        return packed._replace(
+        return replace(
+            packed,
             sag_per_m=self.terrestrial_refraction_1 / (2 * packed.radius_m),
             highest_m=max(packed.highest_m, self.highest_beyond_m - self.site.height_m),
         )
@@ -194,7 +200,7 @@ class TracedMap(Terrain):
         table = TABLES_IN_MEMORY.get(self.table_key) if self._uses_table else None
         similar = self._similar_table if self._uses_table and table is None else None
         fixed = (*self._kernel_arguments(table or similar), similar is None)
-        run_in_threads(horizons, fixed, (points, azimuths, *found))
+        run_in_threads(trace_horizons, fixed, (points, azimuths, *found))
         tan, distance, edge = found.reshape(3, *shape)
         return tan, distance, edge
 
@@ -279,13 +285,12 @@ class TracedMap(Terrain):
 
     def _look_up_arguments(self, half_m: float) -> tuple[Any, ...]:
         """The first arguments of `sector_bounds` for boxes of this half side."""
-        ground, values, *square = self._kernel_arguments(self.table)
-        return ground, values, *self.table.pyramid[self.table.level_for(half_m)], *square, self.table.tangents
+        ground, table, height_m = self._kernel_arguments(self.table)
+        return ground, table, *self.table.pyramid[self.table.level_for(half_m)], height_m
 
     def _kernel_arguments(self, table: HorizonTable | None) -> tuple[Any, ...]:
-        """The first arguments of kernels: maps, table, number of its cells and half its side, height of the camera."""
-        cells = (NO_VALUES, 0, 0.0) if table is None else (table.values, table.square.across, table.square.reach_m)
-        return self.ground, *cells, self.camera_height_m
+        """The first arguments of kernels: maps, table, height of the camera."""
+        return self.ground.record, (table or NO_TABLE).record, self.camera_height_m
 
     def horizon_spread_rad(self, points_m: Array, half_m: float, azimuths_rad: Array) -> tuple[Array, Array]:
         """From the horizon of the middle and its distance d: a move by `half_m` changes tan H by slopes half_m / d."""
@@ -298,7 +303,7 @@ class TracedMap(Terrain):
         """Height of the ground in enu (...) [m]."""
         points = np.array(points_m, dtype=np.float64, order="C")
         up = np.empty(points.shape[:-1])
-        surfaces(self.ground, points.reshape(-1, 2), up.reshape(-1))
+        surfaces(self.ground.record, points.reshape(-1, 2), up.reshape(-1))
         return up
 
     def slope_rad(self, points_m: Array) -> Array:

@@ -23,14 +23,19 @@ from test_identification import (
 )
 
 from startrack.core.types import NotIdentified
-from startrack.estimation.match import CandidatePairs, PhotometricScale, brightness_agreement
-from startrack.estimation.match_kernel import BRIGHTER_MAG, pair_mutually
+from startrack.estimation.match import (
+    BRIGHTER_MAG,
+    DIMMED_MAG,
+    PX_PER_MAG,
+    CandidatePairs,
+    PhotometricScale,
+    brightness_agreement,
+)
 from startrack.frames import R_from_rotvec, wahba
 from startrack.identification import Identifier
 from startrack.identification.attitude_search import AttitudeSearch
 from startrack.identification.index import CatalogPatterns, PerObject
-from startrack.identification.triangle_kernel import are_same_handed, sides_of_few
-from startrack.identification.triangles import build_pairs, triangles
+from startrack.identification.triangles import are_same_handed, build_pairs, sides_of_few, triangles
 
 
 def hundred_stars(seed: int, false: int = 20, true: int = 80, noise_px: float = 0.2) -> Frame:
@@ -140,6 +145,13 @@ def test_a_mirror_image_of_a_triangle_has_the_other_hand() -> None:
     assert not are_same_handed(one, one * [1, -1, 1]).any()
 
 
+def test_few_rays_have_no_triangle() -> None:
+    for n in range(3):
+        vertices, sides = sides_of_few(np.eye(3)[:n], 0, 2.0)
+        assert vertices.shape == sides.shape == (0, 3)
+    assert len(are_same_handed(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)))) == 0
+
+
 def test_wahba_solutions_are_the_best_rotations() -> None:
     rng = np.random.default_rng(6)
     icrs = rng.normal(size=(5, 40, 3))
@@ -199,14 +211,24 @@ def test_pairs_are_the_cheapest_of_their_star_and_of_their_detection() -> None:
     rng = np.random.default_rng(7)
     for _ in range(50):
         detection = np.sort(rng.integers(0, 15, 40))
-        star, cost = 1000 * rng.integers(0, 20, 40), rng.random(40)
-        cost[rng.random(40) < 0.1] = np.inf
-        agrees = rng.random(40) < 0.8
-        best = [i for i in range(40) if np.isfinite(cost[i]) and cost[i] == cost[star == star[i]].min() and agrees[i]]
+        star, distance, v_mag = 1000 * rng.integers(0, 20, 40), rng.random(40), rng.normal(5.0, 1.0, 40)
+        distance[rng.random(40) < 0.1] = np.inf
+        measured, saturated, sigma = (
+            rng.normal(5.0, 1.0, 15),
+            rng.random(15) < 0.2,
+            rng.choice([0.1, np.inf], 40, p=[0.9, 0.1]),
+        )
+        pairs = CandidatePairs(detection, star, distance, v_mag, sigma, PhotometricScale(measured, saturated, 6.0, 5.0))
+        dimmed = measured[detection] - v_mag
+        beyond = np.where(saturated[detection] & (dimmed > 0), 0.0, np.maximum(np.abs(dimmed) - 2.0 * sigma, 0.0))
+        misfit = beyond / np.where(dimmed > 0, DIMMED_MAG, BRIGHTER_MAG)
+        np.testing.assert_allclose(pairs.brightness_misfit, misfit, rtol=1e-14)
+        cost = distance + PX_PER_MAG * beyond
+        best = [i for i in np.flatnonzero(np.isfinite(cost) & (misfit < 1.0)) if cost[i] == cost[star == star[i]].min()]
         expected = [i for i in best if cost[i] == min(cost[j] for j in best if detection[j] == detection[i])]
-        assert pair_mutually(detection, star, cost, agrees).tolist() == expected
-    none = np.zeros(0, dtype=np.int64)
-    assert pair_mutually(none, none, np.zeros(0), np.zeros(0, dtype=bool)).tolist() == []
+        assert pairs.one_to_one_pairs.tolist() == expected
+    nothing = CandidatePairs(*np.zeros((2, 0), np.int64), *np.zeros((3, 0)), pairs.scale)
+    assert nothing.one_to_one_pairs.tolist() == []
 
 
 @pytest.mark.parametrize("ascending", [True, False])

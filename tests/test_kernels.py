@@ -151,25 +151,26 @@ def random_arguments(arguments, rng):
 # Kernels that trust more of their arguments than random ones can keep: a stamp lies in its image, cells are in order.
 RANDOM = (
     "interpolate_circle", "filter_patches", "join_patches", "sum_sides", "score_shifts", "sum_cells", "clear_disks",
-    "profiles_of",
+    "profiles_of", "are_same_handed", "count_alike", "rotation_between", "project_radial",
 )  # fmt: skip
 
 
 def bytes_of_all_kernels():
-    """A hash of what kernels make of random arguments, and of a star's stamp."""
-    importlib.import_module("startrack.evidence")
+    """A hash of what kernels make of random arguments, and of scenes where they trust their arguments."""
+    for package in ("evidence", "identification"):
+        importlib.import_module(f"startrack.{package}")
     rng, key = np.random.default_rng(3), hashlib.sha256()
     for name in RANDOM:
-        arguments, _ = library.DECLARED[name]
-        call = library.kernel(name, *(one.text for one in arguments))
+        arguments, result = library.DECLARED[name]
+        call = library.kernel(name, *(one.text for one in arguments), result=result)
         for _ in range(20):
             values = random_arguments(arguments, rng)
             values = [np.linspace(0.0, 1.0, 4097) if np.shape(v) == (4097,) else v for v in values]
-            call(*values)
+            key.update(repr(call(*values)).encode())
             for one, value in zip(arguments, values, strict=True):
                 if one.is_written:
                     key.update(value.tobytes())
-    for array in (*photometry_of(rng), *chain_of(rng)):
+    for array in (*photometry_of(rng), *chain_of(rng), *identification_of(rng), *columns_of(rng)):
         key.update(array.tobytes())
     return key.hexdigest()
 
@@ -225,6 +226,56 @@ def chain_of(rng):
     curve = free_skyline.list_free_logs(hard, shifts[1], 0.2, np.array([1e-4, 1e-3]))
     assert np.isfinite(likely).all() and np.isfinite(curve).all()
     return (*soft, *hard, likely, states, logs, *found, *moments, curve)
+
+
+def identification_of(rng):
+    """Stars and triangles near random rays, the attitude and the lens by their pairs, and which pairs agree."""
+    from startrack.estimation.match import CandidatePairs, PhotometricScale
+    from startrack.estimation.radial_fit import fit_radial, project_radial
+    from startrack.identification.attitude_refinement import rotate_by_inliers
+    from startrack.identification.star_grid import StarGrid, settle_rotation
+    from startrack.identification.triangles import PatternIndex, sides_of_few, to_cube
+
+    stars = rng.normal(size=(2000, 3))
+    stars /= np.linalg.norm(stars, axis=1)[:, None]
+    rays = stars[:40] + rng.normal(0.0, 3e-3, (40, 3))
+    near = StarGrid(stars).neighbours(rays, 0.05)
+    vertices, sides = sides_of_few(stars[:40], 20, 1.5)
+    index = PatternIndex(stars, 1.5, vertices, sides, StarGrid(to_cube(sides, 1.5)))
+    row, found = index.candidates(sides[:300] + rng.normal(0.0, 1e-3, (300, 3)), 5e-3, 3)
+    cam, icrs = rays.take(near.ray, axis=0), stars.take(near.star, axis=0)
+    R, hit = settle_rotation(cam, icrs, near.chord < 0.01, 1e-4)
+    light = PhotometricScale(rng.normal(5.0, 1.0, 40), rng.random(40) < 0.1, 6.0, 5.0)
+    v_mag, v_sigma = rng.normal(5.0, 1.0, len(near.ray)), np.full(len(near.ray), 0.3)
+    pairs = CandidatePairs(near.ray, near.star, 200.0 * near.chord, v_mag, v_sigma, light)
+    which = pairs.one_to_one_pairs
+    agree, variance, refined, _ = rotate_by_inliers(
+        which, near.ray, pairs.distance_px, np.full(40, 0.04), rays, icrs, np.eye(3)
+    )
+    lens, turned = np.array([np.log(500.0), 0.05, -0.05, 300.0, 250.0]), np.eye(3)
+    view = stars[stars[:, 2] > 0.5]
+    px, inside = project_radial(view, turned, lens, 1.0, 600, 500)
+    free, known = np.array([True, True, False, True, True]), np.full(5, 0.1)
+    fit_radial(px + rng.normal(0.0, 0.5, px.shape), view, 1.0, 1.0, 3, free, lens.copy(), known, turned, lens)
+    assert len(which) > 9 and len(row) > 99 and agree.any() and np.isfinite([*lens, *refined.ravel()]).all()
+    return (
+        near.ray, near.star, near.chord, vertices, sides, row, found, R, hit, which, pairs.brightness_misfit, agree,
+        variance, refined, px, inside, lens, turned,
+    )  # fmt: skip
+
+
+def columns_of(rng):
+    """Log-likelihoods of steps of light, and messages around the compass."""
+    from startrack.applications.horizon.posterior import add_steps, pass_messages
+
+    n, total = 83, np.zeros((9, 83), np.float32)
+    column, place = np.sort(rng.integers(0, 9, 30)), rng.uniform(-0.3, 1.0, 30)
+    weight, passed = rng.random(30), rng.normal(size=30)
+    add_steps(0.6, -0.1, 0.01, column, place, rng.uniform(1e-3, 0.1, 30), weight, passed, 0.3, np.empty(n), total)
+    likelihood, landing = rng.uniform(0.1, 1.0, (3, 9, n)).astype(np.float32), rng.random(n)
+    change = np.array([0.2, 0.7, 0.95]), np.array([0.5, 0.3, 0.15]), 0.05, landing / landing.sum()
+    kinds = np.array([0.7, 0.1, 0.2]), 0.02
+    return total, *(pass_messages(likelihood, forward, *change, *kinds) for forward in (True, False))
 
 
 def run_level(level, code, **more):
@@ -416,6 +467,7 @@ MATH_H = """
 #define signbit(x) __builtin_signbit(x)
 double exp(double), log(double), log10(double), sqrt(double), fabs(double), floor(double), ceil(double), rint(double);
 double fmod(double, double), erf(double), copysign(double, double);
+double sin(double), cos(double), atan2(double, double);
 """
 
 

@@ -10,6 +10,8 @@ from startrack.core import circle, table_text
 from startrack.core.kernels import NORMAL_CDF
 from startrack.evidence import sky_levels, sky_light, sky_pixels
 from startrack.exposure.png_rows import unfilter
+from startrack.frames import wahba
+from startrack.identification import attitude_refinement, star_grid
 from startrack.localization import free_skyline, search_profiles
 
 SEEDS = range(3)
@@ -148,3 +150,43 @@ def test_columns_of_different_lengths_are_refused():
 @pytest.mark.parametrize("height", [0, 3])
 def test_rows_without_pixels_are_no_error(height):
     assert unfilter(np.zeros((height, 1), np.uint8), 1, 1, np.empty((height, 0), np.float32))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_inliers_turn_the_attitude_and_outliers_do_not(seed):
+    rng = np.random.default_rng(seed)
+    gate_px, outlier = attitude_refinement.FIRST_GATE_PX, attitude_refinement.STAR_OUTLIER_CHI2
+    R, change = np.linalg.qr(rng.normal(size=(3, 3)))[0], np.eye(3) + 1e-3 * rng.normal(size=(3, 3))
+    rays_cam = rng.normal(size=(30, 3))
+    rays_cam /= np.linalg.norm(rays_cam, axis=1)[:, None]
+    detection = np.sort(rng.integers(0, 30, 90))
+    rays_icrs, distance = rays_cam[detection] @ R @ change, np.abs(rng.normal(0.0, 2.0, 90))
+    distance[rng.random(90) < 0.2] = np.inf
+    stated, which = rng.uniform(0.01, 0.1, 30), np.sort(rng.choice(90, 41, replace=False))
+    agree, variance, refined, most = attitude_refinement.rotate_by_inliers(
+        which, detection, distance, stated, rays_cam, rays_icrs, R
+    )
+    squared, own = distance[which] ** 2, stated[detection[which]]
+    first = distance[which] < gate_px
+    middles = (np.sort(one[first])[np.count_nonzero(first) // 2] for one in (squared, own))
+    extra = next(middles) / attitude_refinement.CHI2_2DOF_MEDIAN - next(middles)
+    np.testing.assert_allclose(variance, own + max(extra, attitude_refinement.SMALLEST_EXTRA_PX2))
+    np.testing.assert_array_equal(agree, first & (squared < outlier * variance))
+    cam, icrs = rays_cam[detection[which[agree]]], rays_icrs[which[agree]]
+    np.testing.assert_allclose(refined, wahba(cam, icrs, 1.0 / variance[agree]), atol=1e-9)
+    assert most == np.abs(refined - R).max() > 1e-6
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_an_attitude_of_far_pairs_is_none(count):
+    which, far = np.arange(count), np.full(count, np.inf)
+    rays = np.ones((count, 3))
+    agree, _, refined, change = attitude_refinement.rotate_by_inliers(which, which, far, far, rays, rays, np.eye(3))
+    assert not agree.any() and not refined.any() and change == np.inf
+    R, hit = star_grid.settle_rotation(rays, rays, np.zeros(count, bool), 1.0)
+    assert not hit.any() and np.array_equal(R, np.eye(3))
+
+
+def test_rays_of_no_number_are_near_no_star():
+    rays = np.array([[np.nan, 0.0, 1.0], [0.0, 0.0, 1.0]])
+    assert star_grid.StarGrid(np.array([[0.0, 0.0, 1.0]])).neighbours(rays, 0.1).ray.tolist() == [1]

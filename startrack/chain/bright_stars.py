@@ -18,8 +18,7 @@ from startrack.chain.source_names import NamedStars, SourceNames, identified_nam
 from startrack.core.types import Array, Body, Bools, Detections, Identification, Ints, Stars
 from startrack.detection import disc_px, find_blobs, light_at
 from startrack.estimation.false_alarm import coincidence_probability
-from startrack.estimation.match import DISTINCT_MAG, SIGNIFICANT_SNR
-from startrack.estimation.match_kernel import BRIGHTER_MAG, DIMMED_MAG
+from startrack.estimation.match import BRIGHTER_MAG, DIMMED_MAG, DISTINCT_MAG, SIGNIFICANT_SNR
 from startrack.identification import coincidence_radius_px
 
 ALIKE = 7  # named stars of nearly one magnitude, whose median light is that of such a star

@@ -121,7 +121,6 @@ def _library() -> str:
 
 def _kernels(args: argparse.Namespace) -> str:
     """Compile the kernels of a cylinder, a map, the flag's terrain, and of commands that the self-test leaves out."""
-    from startrack.applications.horizon import compile_columns
     from startrack.cli.images import compile_kernels, prepare
     from startrack.cli.warm_up import compile_narrow_field, small_map
     from startrack.terrain import load_terrain
@@ -138,7 +137,6 @@ def _kernels(args: argparse.Namespace) -> str:
         compile_kernels(terrain)
         _locate_rendered(terrain)
     compile_narrow_field()
-    compile_columns()
     return f"compiled for {', '.join(names)} and maps ({time.perf_counter() - start:.1f} s)"
 
 

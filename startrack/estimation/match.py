@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from startrack.core.types import Array, Bools, Ints
-from startrack.estimation.match_kernel import BRIGHTER_MAG, compare_pairs, count_alike
+from startrack.kernels.library import kernel
 
 DEPTH_BELOW_THRESHOLD_MAG = (
     0.7  # about the faintest detections: fainter stars are not detected, brighter ones are in open sky
@@ -24,6 +24,9 @@ DECISIVE_BLEND_NATS = 12.0  # log-likelihood ratio that decides between two posi
 SIGNIFICANT_SNR = 10.0  # detections above this should have a catalogue star
 MIN_UNSATURATED = 3  # for the photometric scale; below this, saturated stars are used too
 SMALLEST_FLUX = 1e-9
+BRIGHTER_MAG = 0.8  # a detection is at most this much brighter than its star
+DIMMED_MAG = 1.6  # and at most this much fainter: haze, branches, the edge of the lens
+PX_PER_MAG = 0.6  # distance with the same cost as a difference of one magnitude
 
 
 def instrumental_mag(flux: Array) -> Array:
@@ -136,7 +139,7 @@ class PhotometricScale:
 def brightness_agreement(v_mag: Array, measured_mag: Array, dimmed_mag: float = BRIGHTER_MAG) -> float:
     """Fraction of all pairs (star, detection) that agree in brightness, stars dimmed by at most `dimmed_mag`."""
     pairs = len(v_mag) * len(measured_mag)
-    return float(count_alike(v_mag, np.sort(measured_mag), dimmed_mag) / pairs) if pairs else 1.0
+    return _count_alike(v_mag, np.sort(measured_mag), BRIGHTER_MAG, dimmed_mag) / pairs if pairs else 1.0
 
 
 @dataclass(frozen=True)
@@ -165,11 +168,15 @@ class CandidatePairs:
 
     @cached_property
     def _compared(self) -> tuple[Array, Ints]:
-        found: tuple[Array, Ints] = compare_pairs(
-            self.detection, self.star, self.distance_px, self.v_mag, self.v_sigma_mag,
-            self.scale.measured_mag[self.detection], self.scale.saturated[self.detection],
+        k = len(self.star)
+        slots = max(4, 1 << (2 * k - 1).bit_length())
+        misfit, kept = np.empty(k), np.empty(k, np.int64)
+        count = _compare_pairs(
+            self.detection, self.star, self.distance_px, self.v_mag, self.v_sigma_mag, self.scale.measured_mag,
+            self.scale.saturated, BRIGHTER_MAG, DIMMED_MAG, PX_PER_MAG, np.empty(k), np.empty(slots, np.int64), misfit,
+            kept,
         )  # fmt: skip
-        return found
+        return misfit, kept[:count]
 
     def select_unambiguous(self, which: Ints, variance_px2: Array, radius_px: float) -> Ints:
         """The one-to-one pairs `which` (m,) with an unambiguous star; `variance_px2` (m,) is per axis.
@@ -211,3 +218,15 @@ class CandidatePairs:
         significant = snr > SIGNIFICANT_SNR
         significant[self.detection[self.distance_px < gate_px]] = False
         return int(np.count_nonzero(significant))
+
+
+_compare_pairs = kernel(
+    "compare_pairs", "detection: int64[n]", "star: int64[n]", "distance: float64[n]", "v_mag: float64[n]",
+    "v_sigma_mag: float64[n]", "measured_mag: float64[m]", "saturated: bool[m]", "brighter_mag: float64",
+    "dimmed_mag: float64", "px_per_mag: float64", "cost: out float64[n]", "of_slot: out int64[slots]",
+    "misfit: out float64[n]", "kept: out int64[n]", result="int64",
+)  # fmt: skip
+_count_alike = kernel(
+    "count_alike", "v_mag: float64[n]", "measured_mag: float64[m]", "brighter_mag: float64", "dimmed_mag: float64",
+    result="int64",
+)  # fmt: skip

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.core.kernels import njit
 from startrack.core.types import Array, Bools, Centroids, Ints
 from startrack.estimation.adjust import CHI2_2DOF_MEDIAN, SMALLEST_EXTRA_PX2, STAR_OUTLIER_CHI2
-from startrack.estimation.match import CandidatePairs, PhotometricScale, brightness_agreement
-from startrack.estimation.match_kernel import BRIGHTER_MAG
+from startrack.estimation.match import BRIGHTER_MAG, CandidatePairs, PhotometricScale, brightness_agreement
 from startrack.identification.attitude_search import FIRST_GATE_PX, GATE_PX, INLIER_PX, AttitudeHypothesis, Sources
-from startrack.identification.star_grid import rotation_between
+from startrack.kernels.library import kernel
 
 MATCH_ROUNDS = 4  # of matching and rotating; one suffices if the bright stars determine the attitude
 SETTLED_PX = 0.15
@@ -65,95 +63,55 @@ def refine_attitude(sources: Sources, hypothesis: AttitudeHypothesis) -> Attitud
         R = refined
     visible = stars.rays_icrs[:complete] @ R[2] > np.cos(sources.camera.max_angle_rad)
     inlier, named = name_matches(
-        matched, detection, distance, pairs.brightness_misfit, sources.variance_px2, agree, variance
-    )
+        np.square(distance[matched]), sources.variance_px2[detection[matched]], pairs.brightness_misfit[matched], agree,
+        variance,
+    )  # fmt: skip
     return AttitudeMatch(refined, pairs, matched, named, inlier, variance, stars.v_mag[:complete][visible])
 
 
-@njit(cache=True)
-def distances_in_gate(xy_px, px, inside):  # type: ignore[no-untyped-def]
+def distances_in_gate(xy_px: Array, px: Array, inside: Bools) -> Array:
     """Distances (k,) of detections (k, 2) and predicted stars (k, 2); infinite beyond GATE_PX and outside the frame."""
-    distance = np.empty(len(px))
-    for i in range(len(px)):
-        x, y = px[i, 0] - xy_px[i, 0], px[i, 1] - xy_px[i, 1]
-        distance[i] = np.sqrt(x * x + y * y)
-        if not inside[i] or distance[i] > GATE_PX:
-            distance[i] = np.inf
-    return distance
+    off = px - xy_px
+    distance = np.sqrt(off[:, 0] * off[:, 0] + off[:, 1] * off[:, 1])
+    return np.where(inside & (distance <= GATE_PX), distance, np.inf)
 
 
-@njit(cache=True)
-def rotate_by_inliers(which, detection, distance, variance_px2, rays_cam, rays_icrs, R):  # type: ignore[no-untyped-def]
+def rotate_by_inliers(
+    which: Ints, detection: Ints, distance: Array, variance_px2: Array, rays_cam: Array, rays_icrs: Array, R: Array
+) -> tuple[Bools, Array, Array, float]:
     """Which of the pairs `which` (m,) are no outliers (m,), their variance (m,), their attitude, its change from `R`.
 
     The variance is per axis [px^2], the common error added. This is estimated as in `extra_variance_px2`, but in closed
     form: for one variance per star. `detection`, `distance` (k,) and `rays_icrs` (k, 3) are of all pairs.
     """
-    m, n = len(which), 0
-    agree, variance, squared = np.zeros(m, np.bool_), np.empty(m), np.empty(m)
-    first_squared, first_stated = np.empty(m), np.empty(m)
-    for i in range(m):
-        variance[i], squared[i] = variance_px2[detection[which[i]]], distance[which[i]] ** 2
-        if distance[which[i]] < FIRST_GATE_PX:
-            first_squared[n], first_stated[n] = squared[i], variance[i]
-            n += 1
-    if n == 0:
-        return agree, variance, np.zeros((3, 3)), np.inf
-    extra = upper_median_of(first_squared[:n]) / CHI2_2DOF_MEDIAN - upper_median_of(first_stated[:n])
-    cam, icrs, weight, n = np.empty((m, 3)), np.empty((m, 3)), np.empty(m), 0
-    for i in range(m):
-        variance[i] += max(extra, SMALLEST_EXTRA_PX2)
-        agree[i] = distance[which[i]] < FIRST_GATE_PX and squared[i] < STAR_OUTLIER_CHI2 * variance[i]
-        if agree[i]:
-            weight[n] = 1.0 / variance[i]
-            for a in range(3):
-                cam[n, a], icrs[n, a] = rays_cam[detection[which[i]], a], rays_icrs[which[i], a]
-            n += 1
-    refined, change = rotation_between(cam[:n], icrs[:n], weight[:n]), 0.0
-    for a in range(3):
-        for b in range(3):
-            change = max(change, abs(refined[a, b] - R[a, b]))
+    m = len(which)
+    agree, variance, refined = np.empty(m, bool), np.empty(m), np.empty((3, 3))
+    change = _rotate_by_inliers(
+        which, detection, distance, variance_px2, rays_cam, rays_icrs, R, FIRST_GATE_PX, CHI2_2DOF_MEDIAN,
+        SMALLEST_EXTRA_PX2, STAR_OUTLIER_CHI2, np.empty((2, m)), agree, variance, refined,
+    )  # fmt: skip
     return agree, variance, refined, change
 
 
-@njit(cache=True, inner=True)
-def upper_median_of(values):  # type: ignore[no-untyped-def]
-    """The upper median of values (n,), which are reordered; numpy's sort takes five times as long to compile.
-
-    Source: Hoare 1961, Communications of the ACM 4, 321 (FIND).
-    """
-    low, high, middle = 0, len(values) - 1, len(values) // 2
-    while low < high:
-        pivot, i, j = values[middle], low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while pivot < values[j]:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i, j = i + 1, j - 1
-        if j < middle:
-            low = i
-        if middle < i:
-            high = j
-    return values[middle]
-
-
-@njit(cache=True)
-def name_matches(which, detection, distance, misfit, variance_px2, agree, variance):  # type: ignore[no-untyped-def]
-    """`inlier` and `named` (m,) of AttitudeMatch, of the pairs `which` (m,), of which some `agree` (m,)."""
-    inlier, named = np.empty(len(which), np.bool_), np.empty(len(which), np.bool_)
-    for i in range(len(which)):
-        squared, limit = distance[which[i]] ** 2, STAR_OUTLIER_CHI2 * variance_px2[detection[which[i]]]
-        inlier[i] = squared < max(INLIER_PX**2, limit)
-        # Position and brightness may not both be at the edge of what is allowed.
-        edge = squared / (STAR_OUTLIER_CHI2 * variance[i]) + misfit[which[i]] ** 2
-        named[i] = inlier[i] and agree[i] and edge < 1.0
-    return inlier, named
+def name_matches(
+    squared_px2: Array, stated_px2: Array, misfit: Array, agree: Bools, variance_px2: Array
+) -> tuple[Bools, Bools]:
+    """`inlier` and `named` (m,) of AttitudeMatch, of pairs of a squared distance and a stated variance (m,)."""
+    inlier = squared_px2 < np.maximum(INLIER_PX**2, STAR_OUTLIER_CHI2 * stated_px2)
+    # Position and brightness may not both be at the edge of what is allowed.
+    edge = squared_px2 / (STAR_OUTLIER_CHI2 * variance_px2) + np.square(misfit)
+    return inlier, inlier & agree & (edge < 1.0)
 
 
 def agreement_of(centroids: Centroids, v_mag: Array, measured_mag: Array, dimmed_mag: float = BRIGHTER_MAG) -> float:
     """Fraction of random pairs that agree in brightness; 1 where the brightness is not known."""
     known = np.isfinite(centroids.brightness_sigma_mag)
     return brightness_agreement(v_mag, measured_mag, dimmed_mag) if known else 1.0
+
+
+_rotate_by_inliers = kernel(
+    "rotate_by_inliers", "which: int64[m]", "detection: int64[k]", "distance: float64[k]", "variance_px2: float64[n]",
+    "rays_cam: float64[n, 3]", "rays_icrs: float64[k, 3]", "R: float64[3, 3]", "gate_px: float64",
+    "median_chi2: float64", "least_extra: float64", "outlier_chi2: float64", "scratch: out float64[2, m]",
+    "agree: out bool[m]", "variance: out float64[m]", "refined: out float64[3, 3]", result="float64",
+)  # fmt: skip

@@ -21,8 +21,13 @@ from startrack.identification.index import CatalogPatterns, PixelScale
 from startrack.identification.near_attitude import agreeing_pairs
 from startrack.identification.near_sky import NearSky
 from startrack.identification.star_grid import Neighbours, rotation_between, settle_rotation
-from startrack.identification.triangle_kernel import are_same_handed, sides_of_few
-from startrack.identification.triangles import PatternIndex, triad_attitude, triangles
+from startrack.identification.triangles import (
+    PatternIndex,
+    are_same_handed,
+    sides_of_few,
+    triad_attitude,
+    triangles,
+)
 
 PREFIXES = (0, 7, 10, 14, 20, 28)  # number of brightest detections that form triangles, round by round
 WINDOW_RANKS = 24  # ranks of brightness that form triangles beyond these, half of them new in each window

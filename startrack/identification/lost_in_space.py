@@ -19,8 +19,7 @@ from startrack.estimation.false_alarm import (
     log_trials,
     probability,
 )
-from startrack.estimation.match import SIGNIFICANT_SNR, upper_median
-from startrack.estimation.match_kernel import DIMMED_MAG
+from startrack.estimation.match import DIMMED_MAG, SIGNIFICANT_SNR, upper_median
 from startrack.identification.attitude_refinement import AttitudeMatch, agreement_of, refine_attitude
 from startrack.identification.attitude_search import (
     FIRST_GATE_PX,

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from startrack.core.types import Array, Ints, Stars
+from startrack.core.types import Array, Bools, Ints, Stars
 from startrack.identification.star_grid import StarGrid
-from startrack.identification.triangle_kernel import keep_closest, largest_differences
+from startrack.kernels.library import kernel
 
 CLOSE_PAIR_RAD = np.radians(0.05)  # stars this close are one detection
 LONGEST_SIDE_OF_FIELD = 0.8  # of a field's diameter: longer sides seldom fit into it
@@ -55,6 +55,26 @@ def triangles(rays: Array, longest_rad: float, most: int = 2_000_000) -> Triangl
     volume = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
     good = (np.abs(volume) > 0.05 * sides[:, 2] ** 2 * 0.5) & (np.diff(sides, axis=1).min(axis=1) > 0.01 * sides[:, 2])
     return Triangles(vertices=vertices[good], sides_rad=sides[good], handedness=np.sign(volume[good]))
+
+
+def sides_of_few(rays: Array, fresh: int, longest: float) -> tuple[Ints, Array]:
+    """Triples (m, 3) of a few dozen rays (n, 3) with sides below `longest` and a vertex from index `fresh` on.
+
+    And their sides (m, 3), which are chords, ascending. Vertices are in the order of the opposite side, as in
+    Triangles.
+    """
+    n = len(rays)
+    room = n * (n - 1) * (n - 2) // 6
+    vertices, sides = np.empty((room, 3), np.int64), np.empty((room, 3))
+    m = _sides_of_few(np.ascontiguousarray(rays), fresh, longest, np.empty((n, n)), vertices, sides)
+    return vertices[:m], sides[:m]
+
+
+def are_same_handed(one: Array, other: Array) -> Bools:
+    """Which of the triples of rays (m, 3, 3) have triple products of the same sign."""
+    same = np.empty(len(one), bool)
+    _are_same_handed(np.ascontiguousarray(one), np.ascontiguousarray(other), same)
+    return same
 
 
 def triad_attitude(cam: Array, icrs: Array) -> Array:
@@ -156,8 +176,10 @@ class PatternIndex:
         tolerance = min(tolerance, 0.25 * self.longest_chord / max(density, 1.0) ** (1 / 3))
         reach = CUBE_DIAGONAL * tolerance * 2.0 / self.longest_chord
         near = self.grid.neighbours(to_cube(sides, self.longest_chord), reach)
-        off = largest_differences(sides, self.sides, near.ray, near.star, tolerance)
-        kept = keep_closest(off.argsort(kind="stable"), off, near.ray, len(sides), most)
+        off, kept = np.empty(len(near.ray)), np.empty(len(near.ray), np.int64)
+        _largest_differences(sides, self.sides, near.ray, near.star, tolerance, off)
+        order, count = off.argsort(kind="stable"), np.empty(len(sides), np.int64)
+        kept = kept[: _keep_closest(order, off, near.ray, most, count, kept)]
         return near.ray[kept], near.star[kept]
 
 
@@ -239,3 +261,18 @@ def separate_bright_stars(stars: Stars, depth: int) -> Ints:
     if len(pairs):
         keep[pairs.max(axis=1)] = False
     return np.flatnonzero(keep)[:depth]
+
+
+_sides_of_few = kernel(
+    "sides_of_few", "rays: float64[n, 3]", "fresh: int64", "longest: float64", "chord: out float64[n, n]",
+    "vertices: out int64[room, 3]", "sides: out float64[room, 3]", result="int64",
+)  # fmt: skip
+_are_same_handed = kernel("are_same_handed", "one: float64[m, 3, 3]", "other: float64[m, 3, 3]", "same: out bool[m]")
+_largest_differences = kernel(
+    "largest_differences", "sides: float64[m, 3]", "known: float64[n, 3]", "row: int64[k]", "found: int64[k]",
+    "tolerance: float64", "off: out float64[k]",
+)  # fmt: skip
+_keep_closest = kernel(
+    "keep_closest", "order: int64[n]", "off: float64[n]", "row: int64[n]", "each: int64", "count: out int64[rows]",
+    "kept: out int64[n]", result="int64",
+)  # fmt: skip

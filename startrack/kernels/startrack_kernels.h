@@ -58,6 +58,52 @@ KERNEL bool has_x86_64_v3(void);
 /* Name and version of the compiler, as it gives them. */
 KERNEL const char *compiler_name(void);
 
+/* attitudes.c */
+
+/* Fill `R` [3, 3] with the rotation that minimises sum weight |cam - R icrs|^2 over pairs of rays [n, 3]. */
+KERNEL void rotation_between(int64_t n, const double *restrict cam, const double *restrict icrs,
+                             const double *restrict weight, double *restrict R);
+
+/* Fill `R` [3, 3] with the rotation of the pairs of rays [n, 3] that it places within a radius (squared; chords), and
+   `hit` [n] with which pairs these are; from the pairs that it names, some of them wrong. At most so many `rounds`;
+   fewer hits than `fewest` end them. Without a round: the unit matrix. */
+KERNEL void settle_rotation(int64_t n, const double *restrict cam, const double *restrict icrs, double squared_radius,
+                            int64_t rounds, int64_t fewest, bool *restrict hit, double *restrict R);
+
+/* Of the pairs `which` [m] of a detection and a star: whether they `agree` [m], their `variance` [m] (pixels squared,
+   per axis, the common error added) and the rotation `refined` [3, 3] that they agree on, 0 where none is nearer than
+   `gate_px`; the greatest change of an element from `R`, or infinity. `detection`, `distance` (pixels) and `rays_icrs`
+   are those of all pairs [k]; `variance_px2` and `rays_cam` those of detections [n]. The common error is estimated by
+   medians: that of chi^2 of two degrees of freedom is `median_chi2`. Scratch: [2, m]. */
+KERNEL double rotate_by_inliers(int64_t m, int64_t k, int64_t n, const int64_t *restrict which,
+                                const int64_t *restrict detection, const double *restrict distance,
+                                const double *restrict variance_px2, const double *restrict rays_cam,
+                                const double *restrict rays_icrs, const double *restrict R, double gate_px,
+                                double median_chi2, double least_extra, double outlier_chi2,
+                                double *restrict scratch, bool *restrict agree, double *restrict variance,
+                                double *restrict refined);
+
+/* column_chain.c */
+
+/* Add to log-likelihoods `total` [columns, n] of skylines at elevations from `lowest` on, `step` apart (radians), those
+   of steps of light [k], ordered by column, times `temper`. A skyline at a step has the likelihood `weight` times a
+   normal density, one above it the factor exp(`passed`), and one that shows no step the likelihood `nothing`.
+   Scratch: `mixture`. Places are finite. */
+KERNEL void add_steps(int64_t k, int64_t n, int64_t columns, double temper, double lowest, double step,
+                      const int64_t *restrict column, const double *restrict place, const double *restrict sigma,
+                      const double *restrict weight, const double *restrict passed, double nothing,
+                      double *restrict mixture, float *restrict total);
+
+/* Fill `found` [kinds, columns, n] with the messages that reach each column around the circle: what those before it
+   say, or, not `forward`, those after it, of a kind and an elevation. From column to column an elevation changes by
+   three Laplace distributions that fall by `ratio` a sample, with the sums `weight`; with the probability `renew` the
+   kind is drawn anew from the shares `part`; with the probability `jump` both are, the elevation from `landing`.
+   Scratch: [kinds + 6, n]. */
+KERNEL void pass_messages(int64_t kinds, int64_t columns, int64_t n, const float *restrict likelihood, bool forward,
+                          const double *restrict ratio, const double *restrict weight, double jump,
+                          const double *restrict landing, const double *restrict part, double renew,
+                          double *restrict scratch, float *restrict found);
+
 /* core.c */
 
 /* Replace the azimuths in `found` [n] (radians, any turn) by the linear interpolation of `values` [m], which stand at
@@ -379,6 +425,25 @@ KERNEL void largest_of_cells(int64_t across, int64_t bins, int64_t n, int64_t ro
                              const float *restrict values, const int64_t *restrict cells,
                              const int64_t *restrict bin, double *restrict found);
 
+/* matches.c */
+
+/* Ascending indices `kept` [n] of the pairs of a detection and a star [n] that are each other's cheapest and agree in
+   brightness; how many there are. The cost is the distance (infinite: none) and `px_per_mag` for a magnitude by which
+   the measured one [m] of the detection differs beyond 2 sigma. `misfit` [n]: that difference, 1 at `dimmed_mag` or
+   `brighter_mag`. A saturated detection [m] may be fainter by any amount. Detections ascend. Scratch: `cost`; `of_slot`,
+   whose size is a power of 2, at least 2 n. */
+KERNEL int64_t compare_pairs(int64_t n, int64_t m, int64_t slots, const int64_t *restrict detection,
+                             const int64_t *restrict star, const double *restrict distance,
+                             const double *restrict v_mag, const double *restrict v_sigma_mag,
+                             const double *restrict measured_mag, const bool *restrict saturated, double brighter_mag,
+                             double dimmed_mag, double px_per_mag, double *restrict cost, int64_t *restrict of_slot,
+                             double *restrict misfit, int64_t *restrict kept);
+
+/* Number of pairs of a star [n] and an ascending measured magnitude [m] that is less than `dimmed_mag` fainter and at
+   most `brighter_mag` brighter. Fast where the stars ascend. */
+KERNEL int64_t count_alike(int64_t n, int64_t m, const double *restrict v_mag, const double *restrict measured_mag,
+                           double brighter_mag, double dimmed_mag);
+
 /* photometry.c */
 
 /* Fill `measured` [n, 4] (flux, its variance, variance per electron of its own light, variance by neighbours) and
@@ -406,6 +471,24 @@ KERNEL void measure_sources(int64_t height, int64_t width, int64_t background_ro
                             int64_t *restrict near, float *restrict stamp, double *restrict sums,
                             double *restrict measured, bool *restrict usable);
 
+/* radial_fit.c */
+
+/* Fill `px` [n, 2] with the pixels of rays [n, 3] that `R` [3, 3] turns into the camera's frame, and `inside` [n] with
+   which lie in the frame and in the image circle. `lens`: logarithms of focal length (pixels) and aspect, bend, centre
+   x and y (pixels). `mirror`: -1 for a mirror image, else 1. */
+KERNEL void project_radial(int64_t n, const double *restrict rays_icrs, const double *restrict R,
+                           const double *restrict lens, double mirror, double width, double height,
+                           double *restrict px, bool *restrict inside);
+
+/* Change `R` and the `free` parameters of the `lens` by Gauss-Newton steps to matches of pixels [n, 2] and rays [n, 3],
+   some of them wrong: one counts half where its squared residual is `half_chi2` sigma_px^2. The parameters are
+   `expected` to a sigma, those of the centre in focal lengths. No step is longer than `longest` (radians, logarithms,
+   focal lengths). `ridge`: added to the diagonal of the normal equations, which is 1. */
+KERNEL void fit_radial(int64_t n, const double *restrict xy_px, const double *restrict rays_icrs, double mirror,
+                       double sigma_px, double half_chi2, int64_t steps, const bool *restrict free,
+                       const double *restrict expected, const double *restrict expected_sigma, double longest,
+                       double ridge, double *restrict R, double *restrict lens);
+
 /* simulation.c */
 
 /* Fill `found` [n, 5] for stars at `xy_px` [n, 2] with sums over others [m] within `reach_px`, at most `side_px`; the
@@ -431,5 +514,39 @@ KERNEL void collect_light(int64_t n, int64_t wide, int64_t m, int64_t cells, con
 KERNEL void profiles_of(int64_t n, int64_t steps, int64_t wide, const double *restrict xy_px,
                         const double *restrict profiles, float *restrict across, float *restrict down,
                         int64_t *restrict centre);
+
+/* triangles.c */
+
+/* Fill `first` [places + 1] with the begin of each cell in the list `star` [n] of rays [n, 3] by cells, which keeps their
+   order. A cube from -1 to 1 has `cells` cells on a side, places = cells^3. NaN counts as -1. */
+KERNEL void bin_stars(int64_t n, int64_t places, const double *restrict rays, int64_t cells, int32_t *restrict first,
+                      int64_t *restrict star);
+
+/* The number of pairs of a ray [m, 3] and a star [n] closer than the `chord`, by the cells of `bin_stars`; `star_rays`
+   [n, 3] are in the order of `star`. Ray, star and distance of each are written, as far as there is `room`. */
+KERNEL int64_t find_stars(int64_t m, int64_t places, int64_t n, int64_t room, const double *restrict rays,
+                          double chord, int64_t cells, const int32_t *restrict first, const int64_t *restrict star,
+                          const double *restrict star_rays, int64_t *restrict of_ray, int64_t *restrict of_star,
+                          double *restrict apart);
+
+/* Write the triangles [room, 3] of rays [n, 3] with sides (chords) below `longest` and a vertex from `fresh` on, and
+   their ascending sides [room, 3]; vertices are in the order of the opposite side. Their number. Scratch: `chord`. */
+KERNEL int64_t sides_of_few(int64_t n, int64_t room, const double *restrict rays, int64_t fresh, double longest,
+                            double *restrict chord, int64_t *restrict vertices, double *restrict sides);
+
+/* Fill `same` [m] with which triples of rays [m, 3, 3] have triple products of the same sign. */
+KERNEL void are_same_handed(int64_t m, const double *restrict one, const double *restrict other, bool *restrict same);
+
+/* Fill `off` [k] with the greatest difference of a side of pairs of triangles, a `row` of `sides` [m, 3] and one `found`
+   among the `known` [n, 3], relative to the shortest side; infinite from the `tolerance` on. */
+KERNEL void largest_differences(int64_t m, int64_t n, int64_t k, const double *restrict sides,
+                                const double *restrict known, const int64_t *restrict row,
+                                const int64_t *restrict found, double tolerance, double *restrict off);
+
+/* Write into `kept` [n] the pairs of finite difference `off` [n], in their `order` [n], that are the first `each` of
+   their row; how many there are. Scratch: `count` [rows]. */
+KERNEL int64_t keep_closest(int64_t n, int64_t rows, const int64_t *restrict order, const double *restrict off,
+                            const int64_t *restrict row, int64_t each, int64_t *restrict count,
+                            int64_t *restrict kept);
 
 #endif

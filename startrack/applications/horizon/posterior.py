@@ -16,7 +16,7 @@ from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, GRID_STEP_RA
 from startrack.applications.horizon.skylight import MIN_SIGNIFICANCE, Steps
 from startrack.core.runner import map_in_threads
 from startrack.core.types import Array, Evidence
-from startrack.estimation.column_chain import add_steps, pass_messages
+from startrack.kernels.library import kernel
 
 CHANGES_RAD = np.radians(np.array([0.02, 0.12, 0.8]))  # Laplace scales of the change between columns: hill, wood, tree
 CHANGE_WEIGHTS = (0.55, 0.25, 0.18)
@@ -132,7 +132,7 @@ def steps_at(steps: Steps, skyline_rad: Array) -> Steps:
     return steps.take((np.abs(off) < NEAR_EDGE_RAD) & (own * here > _noise_density(steps)))
 
 
-def add_step_log_likelihood(total: NDArray[np.floating[Any]], steps: Steps, temper: float) -> None:
+def add_step_log_likelihood(total: NDArray[np.float32], steps: Steps, temper: float) -> None:
     """Add that of an image's steps of light, times `temper`, to the log-likelihood `total` (KINDS, AZIMUTH_COLUMNS, n).
 
     It is of each kind of ground: darker than the sky above it, brighter, or hardly either.
@@ -148,14 +148,10 @@ def add_step_log_likelihood(total: NDArray[np.floating[Any]], steps: Steps, temp
     of_kind = zip(SHOWN_PROBABILITY, _skyline_likelihoods(steps.contrast), strict=True)
     for kind, (shown, likelihood) in enumerate(of_kind):
         weight = (shown * likelihood / in_ground)[order]
-        add_steps(total[kind], temper, LOWEST_RAD, GRID_STEP_RAD, column, elevation, sigma, weight, passed, 1 - shown)
-
-
-def compile_columns() -> None:
-    """Compile the kernels of the chain, by a skyline with one step of light."""
-    one, total = np.ones(1), np.zeros((len(KINDS), AZIMUTH_COLUMNS, len(elevations_rad())), np.float32)
-    add_step_log_likelihood(total, Steps(np.zeros(1, np.int64), 0.1 * one, 0.01 * one, one, one, 10.0 * one), 1.0)
-    combine_columns(total)
+        add_steps(
+            temper, LOWEST_RAD, GRID_STEP_RAD, column, elevation, sigma, weight, passed, 1 - shown,
+            np.empty(total.shape[-1]), total[kind],
+        )  # fmt: skip
 
 
 def combine_columns(log_likelihood: NDArray[np.floating[Any]]) -> tuple[Array, Array]:
@@ -171,3 +167,35 @@ def combine_columns(log_likelihood: NDArray[np.floating[Any]]) -> tuple[Array, A
     mean = posterior @ elevation
     variance = np.maximum(posterior @ np.square(elevation) - np.square(mean), 0.0)
     return mean, np.sqrt(variance)
+
+
+def pass_messages(
+    likelihood: NDArray[np.float32], forward: bool, ratio: Array, weight: Array, jump: float, landing: Array,
+    part: Array, renew: float,
+) -> NDArray[np.float32]:  # fmt: skip
+    """Messages (kinds, columns, n) that reach each column: what those before it say, or, not `forward`, those after it.
+
+    The product of both with the `likelihood` (kinds, columns, n) is the posterior of kind and elevation, to a factor in
+    each column. Between columns a kind and an elevation change by one matrix: the elevation by three Laplace
+    distributions that fall by `ratio` (3,) per sample, with the sums `weight` (3,), within the n samples. With the
+    probability `renew` the kind is drawn anew from the shares `part` (kinds,), and so are, with the probability `jump`,
+    kind and elevation, this by the probabilities `landing` (n,). Backward messages go through the transposed matrix.
+    """
+    found = np.empty_like(likelihood)
+    scratch = np.empty((len(part) + 6, len(landing)))
+    _pass_messages(likelihood, forward, ratio, weight, jump, landing, part, renew, scratch, found)
+    return found
+
+
+# Adds the log-likelihoods of steps of light (k,), sorted by column, times `temper` to `total` (columns, n). A skyline
+# at a step has the likelihood `weight`, one above it the factor exp(`passed`), one that shows no step `nothing`.
+add_steps = kernel(
+    "add_steps", "temper: float64", "lowest: float64", "step: float64", "column: int64[k]", "place: float64[k]",
+    "sigma: float64[k]", "weight: float64[k]", "passed: float64[k]", "nothing: float64", "mixture: out float64[n]",
+    "total: out float32[columns, n]",
+)  # fmt: skip
+_pass_messages = kernel(
+    "pass_messages", "likelihood: float32[kinds, columns, n]", "forward: bool", "ratio: float64[3]",
+    "weight: float64[3]", "jump: float64", "landing: float64[n]", "part: float64[kinds]", "renew: float64",
+    "scratch: out float64[kinds + 6, n]", "found: out float32[kinds, columns, n]",
+)  # fmt: skip

@@ -8,8 +8,8 @@ from functools import cache
 import cv2
 import numpy as np
 
-from startrack.core.kernels import njit, read_only
 from startrack.core.smooth_image import Image, SmoothImage
+from startrack.kernels.library import kernel
 
 BAND_PIXELS = 2**18
 BLOCK_PX = 16  # side of the blocks for a PSF up to 1.5 WIDEST_PX
@@ -67,14 +67,17 @@ def _measure_blocks(
 ) -> list[Image]:
     """The results (blocks,) of `measure` for the ordered pixels (n, BLOCK_PX^2) of square blocks, row by row.
 
+    Medians of whole numbers are whole numbers, and a spread would be wrong by up to half a step in 8-bit images: the
+    same pattern of part-steps, of mean zero, is added to every block; its variance must be subtracted.
+
     A few rows of blocks at a time fit into the processor's cache.
     """
     rows, columns = (-(-length // side) for length in image.shape)
-    at_a_time = max(1, BAND_PIXELS // (columns * BLOCK_PX**2))
+    at_a_time, image = max(1, BAND_PIXELS // (columns * BLOCK_PX**2)), np.ascontiguousarray(image)
     blocks, bands = np.empty((at_a_time, columns, BLOCK_PX, BLOCK_PX), dtype=np.float32), []
     for first in range(0, rows, at_a_time):
         band = blocks[: rows - first]
-        _fill_blocks(read_only(image), side, first, np.float32(quantum) * PART_STEPS, band)
+        _fill_blocks(image, side, first, np.float32(quantum) * PART_STEPS, band)
         ordered = band.reshape(-1, BLOCK_PX**2)
         ordered.sort(axis=1)
         bands.append(measure(ordered))
@@ -84,40 +87,6 @@ def _measure_blocks(
 def _median_and_spread(ordered: Image) -> tuple[Image, Image]:
     middle = ordered.shape[1] // 2
     return np.float32(0.5) * (ordered[:, middle - 1] + ordered[:, middle]), ordered @ _scale_weights()
-
-
-@njit(cache=True)
-def _fill_blocks(image, side, first, part_steps, blocks):  # type: ignore[no-untyped-def]
-    """Fill blocks (rows, columns, BLOCK_PX, BLOCK_PX) with those of an image, from the row of blocks `first` on.
-
-    The border is reflected to fill the last blocks. Of larger blocks some pixels, spread evenly, are enough: squares of
-    two by two, for colour filters' sake.
-
-    Medians of whole numbers are whole numbers, and a spread would be wrong by up to half a step in 8-bit images: the
-    same pattern of part-steps, of mean zero, is added to every block; its variance must be subtracted.
-    """
-    height, width = image.shape
-    apart = 2 * side // BLOCK_PX  # the squares
-    for i in range(blocks.shape[0]):
-        for r in range(BLOCK_PX):
-            line, steps = image[_reflect((first + i) * side + r // 2 * apart + r % 2, height)], part_steps[r]
-            for j in range(blocks.shape[1]):
-                block, left = blocks[i, j, r], j * side
-                if left + side > width or apart > 2:
-                    for c in range(BLOCK_PX):
-                        block[c] = line[_reflect(left + c // 2 * apart + c % 2, width)] + steps[c]
-                else:
-                    part = line[left : left + side]
-                    for c in range(BLOCK_PX):
-                        block[c] = part[c] + steps[c]
-
-
-@njit(inline="always")
-def _reflect(at, length):  # type: ignore[no-untyped-def]
-    """The pixel of `length` that stands for one at or beyond the end: a mirror image about the last one."""
-    period = max(2 * (length - 1), 1)
-    at %= period
-    return at if at < length else period - at
 
 
 @cache
@@ -141,3 +110,9 @@ def smallest_step(image: Image) -> float:
     values = np.unique(image[:: max(1, image.shape[0] // 64), :: max(1, image.shape[1] // 64)])
     step = float(np.diff(values).min()) if len(values) > 1 else 1.0
     return max(step, 1e-6)
+
+
+_fill_blocks = kernel(
+    "fill_blocks", "image: float32[height, width]", "side: int64", "first: int64", "part_steps: float32[px, px]",
+    "blocks: out float32[rows, columns, px, px]",
+)  # fmt: skip

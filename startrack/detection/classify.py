@@ -13,9 +13,17 @@ import numpy as np
 from startrack.core.types import Array, Bools, Ints
 from startrack.detection.background import CLIPPED_SIGMA
 from startrack.detection.deblend import Fitted
-from startrack.detection.fit import FIT_ROUNDS_AGAIN, PointFits, Stamps, fit_points
+from startrack.detection.fit import (
+    FIT_ROUNDS_AGAIN,
+    PointFits,
+    Stamps,
+    fit_points,
+    pixel_scratch,
+    profile_scratch,
+)
 from startrack.detection.frame import Frame
 from startrack.detection.psf_width import MIN_BRIGHT_SOURCES, WIDTH_SNR
+from startrack.kernels.library import kernel
 
 # Of stars of a width [px]; measured at USUAL_SKEWNESS: equal rates of false stars.
 HEIGHTS = {0.6: 5.80, 0.8: 5.70, 1.0: 5.54, 1.2: 5.43, 1.5: 5.33, 2.0: 5.18, 3.0: 5.09}
@@ -156,20 +164,20 @@ def _psf_and_edge_misfit(fitted: Fitted, which: Ints, width_px: Array) -> tuple[
     as a skyline, the edge of the image circle, a bad column, a satellite's trail. The number of stripes is added to
     chi^2 so that many stripes are not preferred to few.
     """
-    from startrack.detection.shape_kernel import compare_shapes
-
-    s, fits, own = fitted.stamps, fitted.fits, fitted.source_noise
+    s, fits, own, side = fitted.stamps, fitted.fits, fitted.source_noise, fitted.stamps.data.shape[1]
+    stripe, ends = _stripes(side)
     misfit, edge = np.empty((2, len(which)))
-    compare_shapes(
+    _compare_shapes(
         *s.pixels, which, fits.xy_px[which] - s.centres[which], fits.flux[which], fits.level[which], width_px,
-        own.per_unit, own.model_error, *_stripes(s.data.shape[1]), misfit, edge,
+        own.per_unit, own.model_error, stripe, ends, profile_scratch(side), np.empty((ends[-1], 2), np.float32),
+        pixel_scratch(4, side), misfit, edge,
     )  # fmt: skip
     return misfit, edge
 
 
 @lru_cache(maxsize=16)
 def _stripes(side: int) -> tuple[Ints, Ints]:
-    """Number (s^2, d) of the stripe, one pixel wide, of each pixel of a stamp in d directions; the numbers' ends."""
+    """Number (s, s, d) of the stripe, one pixel wide, of each pixel of a stamp in d directions; the numbers' ends."""
     offset = np.arange(side) - side // 2
     x, y = np.tile(offset, side), np.repeat(offset, side)
     numbers, ends = [], [0]
@@ -177,4 +185,13 @@ def _stripes(side: int) -> tuple[Ints, Ints]:
         _, number = np.unique(np.rint(x * np.cos(turn) + y * np.sin(turn)), return_inverse=True)
         numbers.append(number + ends[-1])
         ends.append(ends[-1] + number.max() + 1)
-    return np.stack(numbers, axis=1), np.array(ends[1:])
+    return np.stack(numbers, axis=1).reshape(side, side, -1), np.array(ends[1:])
+
+
+_compare_shapes = kernel(
+    "compare_shapes", "data: float32[n, side, side]", "variance: float32[n, side, side]",
+    "usable: bool[usable_rows, side, side]", "which: int64[m]", "offset_px: float64[m, 2]", "flux: float64[m]",
+    "level: float64[m]", "width_px: float64[m]", "per_unit: float64", "model_error: float64",
+    "stripe: int64[side, side, directions]", "ends: int64[directions]", "profiles: out float64[7, side]",
+    "sums: out float32[stripes, 2]", "pixels: out float32[4, room]", "misfit: out float64[m]", "edge: out float64[m]",
+)  # fmt: skip

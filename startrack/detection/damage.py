@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
-from startrack.core.kernels import njit
 from startrack.core.smooth_image import Image
 from startrack.core.statistics import NORMAL_BY_MEDIAN
 from startrack.core.types import Array, Bools, Exposure, Ints, TooFewStars
 from startrack.detection.background import BLOCK_PX, CLIPPED_SIGMA, MIN_NOISE_STEPS, smallest_step
+from startrack.kernels.library import kernel
 
 PROBE_PX, STRIDE_PX = BLOCK_PX // 2, 4 * BLOCK_PX  # of the tiles looked at first: dead parts of 72 px hold one
 LOST_NOISE = "the noise is lost (rounding, compression or a filter)"
@@ -176,32 +176,14 @@ def fill_masked(image: Image, masked: Bools) -> Image:
     if poor.all():
         raise TooFewStars("the mask leaves too few pixels of the frame")
     source = distance_transform_edt(poor, return_distances=False, return_indices=True)
-    filled = np.array(image)
-    _fill_from_blocks(filled, masked, good, source.astype(np.int64))
+    filled = np.array(image, order="C")
+    _fill_from_blocks(
+        filled, np.ascontiguousarray(masked), good, source.astype(np.int64), BLOCK_PX, np.empty(BLOCK_PX**2, np.float32)
+    )
     return filled
 
 
-@njit(cache=True)
-def _fill_from_blocks(image, masked, good, source) -> None:  # type: ignore[no-untyped-def]
-    """Replace masked pixels of the image by those of the block `source` (2, rows, columns), one after another."""
-    height, width = image.shape
-    values = np.empty(BLOCK_PX * BLOCK_PX, image.dtype)
-    for row in range(good.shape[0]):
-        bottom = min((row + 1) * BLOCK_PX, height)
-        for column in range(good.shape[1]):
-            right = min((column + 1) * BLOCK_PX, width)
-            if good[row, column] == (bottom - row * BLOCK_PX) * (right - column * BLOCK_PX):
-                continue
-            top, left = source[0, row, column] * BLOCK_PX, source[1, row, column] * BLOCK_PX
-            count = 0
-            for y in range(top, min(top + BLOCK_PX, height)):
-                for x in range(left, min(left + BLOCK_PX, width)):
-                    if not masked[y, x]:
-                        values[count] = image[y, x]
-                        count += 1
-            next_value = 0
-            for y in range(row * BLOCK_PX, bottom):
-                for x in range(column * BLOCK_PX, right):
-                    if masked[y, x]:
-                        image[y, x] = values[next_value]
-                        next_value = (next_value + 1) % count
+_fill_from_blocks = kernel(
+    "fill_from_blocks", "image: out float32[height, width]", "masked: bool[height, width]", "good: int64[rows, columns]",
+    "source: int64[2, rows, columns]", "side: int64", "values: out float32[room]",
+)  # fmt: skip

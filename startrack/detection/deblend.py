@@ -15,9 +15,11 @@ from startrack.detection.fit import (
     Stamps,
     fit_points,
     measure_source_noise,
+    profile_scratch,
 )
 from startrack.detection.frame import Frame, Pixels, SourceNoise, cut_stamps, radius_for
 from startrack.detection.peaks import MAX_STAMP_PIXELS, Peaks
+from startrack.kernels.library import kernel
 from startrack.psf import pixel_profile_single
 
 CROWDED_ROUNDS = 3  # of subtracting neighbours and fitting again
@@ -98,13 +100,14 @@ def _changed_signal(
 
     `star` and `other` (m,) are pairs of a candidate and a neighbour, sorted by the first.
     """
-    from startrack.detection.fit_kernel import sum_neighbours
-
     crowded = star[np.flatnonzero(np.diff(star, prepend=-1))]
     signal = np.empty((len(crowded), *last.shape[1:]), dtype=np.float32)
     offset_px = fits.xy_px[other] - s.centres[star]
     changed = np.zeros(len(crowded), dtype=np.bool_)
-    sum_neighbours(star, offset_px, fits.flux[other], sigma, s.variance, NEIGHBOUR_SIGMA, last, signal, changed)
+    _sum_neighbours(
+        star, offset_px, fits.flux[other], sigma, s.variance, NEIGHBOUR_SIGMA, last, profile_scratch(last.shape[1]),
+        signal, changed,
+    )  # fmt: skip
     return crowded[changed], signal[changed]
 
 
@@ -142,3 +145,10 @@ def paint_sources(fits: PointFits, sigma: float, shape: tuple[int, int]) -> Pixe
         for (column, row), signal in zip(centres[here] + side - radius, signals, strict=True):
             image[row : row + side, column : column + side] += signal
     return image[side:-side, side:-side]
+
+
+_sum_neighbours = kernel(
+    "sum_neighbours", "star: int64[m]", "offset_px: float64[m, 2]", "flux: float64[m]", "sigma_px: float64",
+    "variance: float32[n, side, side]", "limit_sigma: float64", "last: float32[n, side, side]",
+    "profiles: out float64[7, side]", "signal: out float32[count, side, side]", "changed: out bool[count]",
+)  # fmt: skip

@@ -9,6 +9,7 @@ import numpy as np
 from startrack.core.types import Array, Bools, Ints
 from startrack.core.values import Rows, array
 from startrack.detection.frame import MODEL_ERROR, RESIDUAL_FRACTION, Pixels, SourceNoise
+from startrack.kernels.library import kernel
 
 FIT_ROUNDS = 3  # iterations of a first fit
 FIT_ROUNDS_AGAIN = FIT_ROUNDS - 1
@@ -20,7 +21,10 @@ NOISE_BINS, MIN_PIXELS_PER_BIN = 12, 15
 MAX_CORRELATION = 2.0
 MEDIAN_OF_SQUARE = 0.4549  # of a unit Gaussian
 MIN_MODEL_ERROR = 0.005
-NO_PIXELS, NO_SIGNAL = np.zeros((0, 0), dtype=np.bool_), np.zeros((0, 0), dtype=np.float32)
+MAX_STEP_PX = 0.5
+POSITION_PRIOR = 0.1  # per px^2: positions within about 3 px of the start keep sources without light solvable
+FLUX_PRIOR = 1e-12
+STAMP_LANES = 8  # pixels that kernels sum together: stamps are filled up
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,15 +55,24 @@ class Stamps:
 
     @property
     def pixels(self) -> tuple[Pixels, Pixels, Bools]:
-        """Light, variance and usability (n, s^2) for kernels; the last has no rows where all pixels are usable."""
-        size = self.data[0].size
-        usable = NO_PIXELS if self.usable is None else self.usable.reshape(-1, size)
-        return self.data.reshape(-1, size), self.variance.reshape(-1, size), usable
+        """Light, variance and usability (n, s, s) for kernels; the last has no rows where all pixels are usable."""
+        none = np.empty((0, *self.data.shape[1:]), np.bool_)
+        return self.data, self.variance, none if self.usable is None else self.usable
 
     def take(self, which: slice | Ints) -> Stamps:
         """Some of them."""
         usable = None if self.usable is None else self.usable[which]
         return Stamps(self.data[which], self.variance[which], usable, self.centres[which], self.surround[which])
+
+
+def profile_scratch(side: int) -> Array:
+    """Room for profiles of a PSF in stamps of this side."""
+    return np.empty((7, side))
+
+
+def pixel_scratch(rows: int, side: int) -> Pixels:
+    """Room for so many rows of a stamp's pixels."""
+    return np.empty((rows, -(-side * side // STAMP_LANES) * STAMP_LANES), np.float32)
 
 
 def fit_points(
@@ -74,15 +87,14 @@ def fit_points(
     pixel-integrated Gaussian from `start_xy_px` (n, 2); steps are limited to half a pixel, so that diverging fits stay
     near their start. Weights: the pixels' variance and the variance of the source's own signal.
     """
-    from startrack.detection.fit_kernel import fit_stamps
-
-    n, pixels = len(which), stamps.pixels
+    n, side = len(which), stamps.data.shape[1]
     offset, values, covariance = np.empty((n, 2)), np.empty((n, 8)), np.empty((n, 4, 4))
-    light = NO_SIGNAL if signal is None else signal.reshape(n, -1)
+    light = np.empty((0, side, side), np.float32) if signal is None else signal
     centres, surround = stamps.centres[which], stamps.surround[which]
-    fit_stamps(
-        *pixels, light, RESIDUAL_FRACTION, which, start_xy_px - centres, sigma_px, source_noise.per_unit,
-        source_noise.model_error, rounds, surround, offset, values, covariance,
+    _fit_stamps(
+        *stamps.pixels, light, RESIDUAL_FRACTION, which, start_xy_px - centres, sigma_px, source_noise.per_unit,
+        source_noise.model_error, rounds, MAX_STEP_PX, POSITION_PRIOR, FLUX_PRIOR, surround, profile_scratch(side),
+        pixel_scratch(6, side), offset, values, covariance,
     )  # fmt: skip
     columns = np.ascontiguousarray(values.T)
     columns.flags.writeable = covariance.flags.writeable = False  # locked values need no copy
@@ -163,14 +175,28 @@ def _squared_residuals(s: Stamps, fits: PointFits, sigma: float) -> tuple[Array,
 
     Last, the correlation of the stars' residuals: 1 for independent ones.
     """
-    from startrack.detection.shape_kernel import fill_squared_residuals
-
-    light, variance, _ = s.pixels
-    signal, squared, relative = np.empty((3, *light.shape))
-    lit = np.empty(light.shape, dtype=np.bool_)
-    fill_squared_residuals(
-        light, variance, fits.xy_px - s.centres, fits.flux, fits.level, fits.covariance, sigma, MODEL_ERROR,
-        FAINT_FRACTION, MAX_LEVERAGE, signal, squared, relative, lit,
+    signal, squared, relative = np.empty((3, *s.data.shape))
+    lit = np.empty(s.data.shape, dtype=np.bool_)
+    _fill_squared_residuals(
+        s.data, s.variance, fits.xy_px - s.centres, fits.flux, fits.level, fits.covariance, sigma, MODEL_ERROR,
+        FAINT_FRACTION, MAX_LEVERAGE, profile_scratch(s.data.shape[1]), signal, squared, relative, lit,
     )  # fmt: skip
     correlation = float(np.sum(np.square(relative.sum(axis=0))) / np.sum(np.square(relative)))
-    return signal[lit], squared[lit], variance[lit].astype(np.float64), correlation
+    return signal[lit], squared[lit], s.variance[lit].astype(np.float64), correlation
+
+
+_fit_stamps = kernel(
+    "fit_stamps", "data: float32[n, side, side]", "variance: float32[n, side, side]",
+    "usable: bool[usable_rows, side, side]", "signal: float32[signals, side, side]", "signal_error: float64",
+    "which: int64[m]", "start_px: float64[m, 2]", "sigma_px: float64", "per_unit: float64", "model_error: float64",
+    "rounds: int64", "max_step_px: float64", "position_prior: float64", "flux_prior: float64", "surround: float64[m]",
+    "profiles: out float64[7, side]", "pixels: out float32[6, room]", "xy_px: out float64[m, 2]",
+    "values: out float64[m, 8]", "covariance: out float64[m, 4, 4]",
+)  # fmt: skip
+_fill_squared_residuals = kernel(
+    "fill_squared_residuals", "data: float32[n, side, side]", "variance: float32[n, side, side]",
+    "offset_px: float64[n, 2]", "flux: float64[n]", "level: float64[n]", "covariance: float64[n, 4, 4]",
+    "sigma_px: float64", "model_error: float64", "faint: float64", "most_leverage: float64",
+    "profiles: out float64[7, side]", "signal: out float64[n, side, side]", "squared: out float64[n, side, side]",
+    "relative: out float64[n, side, side]", "lit: out bool[n, side, side]",
+)  # fmt: skip

@@ -10,17 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
-from startrack.core.kernels import read_only
 from startrack.core.smooth_image import Image, SmoothImage
 from startrack.core.types import Bools, Exposure, Ints
-from startrack.detection.residual_kernel import convert_counts, cut_light
+from startrack.kernels.library import kernel
 from startrack.psf import stamp_radius
 
 Pixels = NDArray[np.floating[Any]]  # stamps, in either precision
 SATURATED_FRACTION = 0.98
 MIN_BINNED_SIGMA_PX = 1.8  # PSF width from which the frame is binned
 RESIDUAL_FRACTION = 0.1  # of a known star's signal: error of its subtraction
-NOTHING = np.zeros((0, 0), dtype=np.float32)
 MODEL_ERROR = 0.03  # of a star's signal: difference between real PSFs and the Gaussian
 
 
@@ -51,16 +49,21 @@ class Frame:
 
     @property
     def light_and_noise(self) -> tuple[Any, ...]:
-        """The arguments of `fill_row`, as of all kernels that compare the image with its background and noise."""
+        """The arguments LIGHT_AND_NOISE of kernels that compare the image with its background and noise."""
+        found = np.empty((0, self.shape[1]), np.float32) if self.found is None else np.ascontiguousarray(self.found)
         return (
-            read_only(self.image), self.background.rows, self.noise.rows, self.noise.side,
-            read_only(NOTHING if self.found is None else self.found), np.float32(self.source_noise.per_unit),
-            np.float32(RESIDUAL_FRACTION),
+            np.ascontiguousarray(self.image), self.background.rows, self.noise.rows, self.noise.side, found,
+            self.source_noise.per_unit, RESIDUAL_FRACTION,
         )  # fmt: skip
 
     def cut_light(self, centres: Ints, radius: int) -> tuple[Image, Image]:
-        """Stamps (n, s, s) without their background, and their variance without the sources' own signal."""
-        return cut_light(self.image, self.background, self.noise, centres, radius)
+        """Stamps (n, s, s) without their background, and their variance without the sources' own signal.
+
+        s is 2 `radius` + 1. The stamps around the pixels `centres` (n, 2), x and y, must lie in the image.
+        """
+        light, variance = np.empty((2, len(centres), 2 * radius + 1, 2 * radius + 1), dtype=np.float32)
+        _cut_light(*self.light_and_noise[:4], centres, light, variance)
+        return light, variance
 
     def usable_pixels(self, centres: Ints, radius: int) -> Bools | None:
         """Stamps (n, s, s) of the pixels that may be used; None where all may."""
@@ -72,22 +75,20 @@ def electrons(exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray
 
     Saturation shows in the counts as recorded, before dark frame and flat field.
     """
-    pixels_adu, recorded_adu, correction = exposure.pixels_adu, exposure.recorded_adu, exposure.correction
+    pixels_adu, recorded_adu = (np.ascontiguousarray(p) for p in (exposure.pixels_adu, exposure.recorded_adu))
+    correction = exposure.correction
     ceiling = exposure.saturation_adu or np.inf
     sensor = None if camera is None else camera.sensor
     highest = SATURATED_FRACTION * (ceiling if sensor is None else min(ceiling, sensor.saturation_adu))
-    gain, bias_e, image = np.float32(1.0), np.zeros((1, 1), dtype=np.float32), pixels_adu
+    gain, bias_e, image = 1.0, np.zeros((1, 1), dtype=np.float32), pixels_adu
     if sensor is not None and (sensor.gain_e_per_adu != 1.0 or sensor.bias_adu != 0.0):
-        gain, image = np.float32(sensor.gain_e_per_adu), np.empty_like(pixels_adu)
+        gain, image = sensor.gain_e_per_adu, np.empty_like(pixels_adu)
         bias_e += np.float32(sensor.bias_adu * sensor.gain_e_per_adu)
         if correction is not None and correction.scales_black and correction.sensitivity_1 is not None:
             bias_e = bias_e / correction.sensitivity_1
     saturated = np.zeros(recorded_adu.shape, dtype=np.bool_)
-    converted = np.zeros((0, 0), dtype=np.float32) if image is pixels_adu else image
-    convert_counts(
-        read_only(pixels_adu), read_only(recorded_adu), gain, read_only(bias_e), np.float32(highest), converted,
-        saturated,
-    )  # fmt: skip
+    converted = np.empty((0, image.shape[1]), np.float32) if image is pixels_adu else image
+    _convert_counts(pixels_adu, recorded_adu, gain, bias_e, highest, converted, saturated)
     return image, saturated
 
 
@@ -98,7 +99,7 @@ def cut_stamps(image: NDArray[Any], centres: Ints, radius: int) -> NDArray[Any]:
     positions = np.lib.stride_tricks.as_strided(
         image, (height - side + 1, width - side + 1, side, side), image.strides * 2, writeable=False
     )
-    return positions[centres[:, 1] - radius, centres[:, 0] - radius]
+    return np.ascontiguousarray(positions[centres[:, 1] - radius, centres[:, 0] - radius])
 
 
 def radius_for(sigma_px: float) -> int:
@@ -137,3 +138,19 @@ def _sums(image: Image, side: int) -> Image:
     size = image.shape[1] // side, image.shape[0] // side
     small: Any = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     return np.asarray(small * np.float32(side * side), dtype=np.float32)
+
+
+# Of an image with its background and noise, and of known stars' light with its noise.
+LIGHT_AND_NOISE = (
+    "image: float32[height, width]", "background: float32[blocks, width]", "noise: float32[blocks, width]",
+    "side: int64", "found: float32[known, width]", "per_unit: float32", "found_error: float32",
+)  # fmt: skip
+_cut_light = kernel(
+    "cut_light", *LIGHT_AND_NOISE[:4], "centres: int64[n, 2]", "light: out float32[n, stamp, stamp]",
+    "variance: out float32[n, stamp, stamp]",
+)  # fmt: skip
+_convert_counts = kernel(
+    "convert_counts", "pixels_adu: float32[height, width]", "recorded_adu: float32[height, width]", "gain: float32",
+    "bias_e: float32[bias_rows, bias_columns]", "highest_adu: float32", "image: out float32[converted, width]",
+    "saturated: out bool[height, width]",
+)  # fmt: skip

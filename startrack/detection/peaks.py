@@ -8,14 +8,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.kernels import read_only
 from startrack.core.smooth_image import Image
 from startrack.core.types import Array, Bools, Ints
-from startrack.detection.frame import Frame, radius_for
-from startrack.detection.peak_kernel import COARSE_PX, PAIRS, find_maxima
+from startrack.detection.background import BLOCK_PX, CLIPPED_SIGMA
+from startrack.detection.frame import LIGHT_AND_NOISE, Frame, radius_for
+from startrack.kernels.library import kernel
 from startrack.psf import filter_kernel
 
-NO_PIXELS = np.zeros((0, 0), dtype=np.bool_)
+COARSE_PX = BLOCK_PX // 4  # the local level is a mean over squares of this side
+TAPS, WORD_PX = 4, 64  # taps on one side of the filter, and pixels of a row, that the kernel takes together
+PIXELS_PER_PEAK = 64  # room for peaks: more of them are looked for again
 ONE_TAP = np.ones(1, dtype=np.float32)
 MAX_STAMP_PIXELS = 2_500_000  # of all candidates together: bounds time and memory, for any content of the frame
 MAX_BLOBS = 1000  # saturated; the largest
@@ -104,19 +106,31 @@ def _squares_beside(width_px: int) -> int:
 
 def _peaks_above(
     frame: Frame, lowest: float, kernel: Image, beside: int = 0, level_factor: float = 0.0
-) -> tuple[Ints, Array, Array, Array]:
+) -> tuple[Ints, Image, Image, Image]:
     """Local maxima above `lowest` of the residuals, filtered by a `kernel` in x and in y, less a level by a factor.
 
     The level is the background that block medians miss, in units of the noise: the mean over a box of squares, so many
     `beside` the middle one. Returns pixels (n, 2), heights, the offsets (n, 2) [px] of the tops of parabolas through
     their neighbours, and the level (n,) times the factor. Those that need light from beyond the border are left out.
     """
-    radius, dead = len(kernel) // 2, NO_PIXELS if frame.dead is None else frame.dead
-    found = find_maxima(
-        *frame.light_and_noise, np.pad(kernel[radius:], (0, -radius % PAIRS)), beside, np.float32(level_factor),
-        np.float32(lowest), read_only(dead), radius + 1,
-    )  # fmt: skip
-    return found[:, :2].astype(np.int64), found[:, 2], found[:, 3:5], found[:, 5]
+    (height, width), radius = frame.shape, len(kernel) // 2
+    reach = -(-radius // TAPS) * TAPS
+    taps = np.zeros(reach + 1, np.float32)
+    taps[: radius + 1] = kernel[radius:]
+    lag = max(reach, COARSE_PX * (beside + 2) if level_factor else 0)
+    squares, columns = -(-height // COARSE_PX), -(-width // COARSE_PX)
+    stride = -(-max(width + 2 * reach, columns + 2 * beside) // WORD_PX) * WORD_PX
+    scratch = np.empty((lag + 2 * reach + 11, stride), np.float32), np.empty((squares, columns), np.float32)
+    dead = np.zeros((0, width), np.bool_) if frame.dead is None else frame.dead
+    room = count = height * width // PIXELS_PER_PEAK
+    while count >= room:
+        room = count + 1
+        pixels, values = np.empty((room, 2), np.int64), np.empty((room, 4), np.float32)
+        count = _find_maxima(
+            *frame.light_and_noise, taps, COARSE_PX, beside, CLIPPED_SIGMA, level_factor, lowest, dead, radius + 1,
+            *scratch, pixels, values,
+        )  # fmt: skip
+    return pixels[:count], values[:count, 0], values[:count, 1:3], values[:count, 3]
 
 
 def _saturated_blobs(dead: NDArray[np.bool_] | None, margin: int) -> Array:
@@ -150,3 +164,11 @@ def _without_gaps(at: Ints) -> Ints:
     kept = np.bincount(at, minlength=at.max() + 2) > 0
     kept[1:] |= kept[:-1].copy()
     return np.asarray(np.cumsum(kept)[at] - 1)
+
+
+_find_maxima = kernel(
+    "find_maxima", *LIGHT_AND_NOISE, "taps: float32[reach + 1]", "coarse: int64", "beside: int64", "clipped: float32",
+    "level_factor: float32", "lowest: float32", "dead: bool[dead_rows, width]", "margin: int64",
+    "rows: out float32[count, stride]", "means: out float32[squares, columns]", "pixels: out int64[room, 2]",
+    "values: out float32[room, 4]", result="int64",
+)  # fmt: skip

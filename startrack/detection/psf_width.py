@@ -7,9 +7,10 @@ from collections.abc import Callable
 import numpy as np
 
 from startrack.core.types import Array, Bools, Ints
-from startrack.detection.fit import FIT_ROUNDS_AGAIN, PointFits, Stamps, fit_points
+from startrack.detection.fit import FIT_ROUNDS_AGAIN, PointFits, Stamps, fit_points, profile_scratch
 from startrack.detection.frame import Frame, Pixels, radius_for
 from startrack.detection.peaks import bright_pixels, find_peaks, lie_inside
+from startrack.kernels.library import kernel
 
 WIDTH_SNR = 12.0  # of the sources from which the width is measured
 WIDTH_TOLERANCE = 0.12  # a measured PSF that differs by more than this fraction from the expected one replaces it
@@ -62,10 +63,8 @@ def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array
     that the fit explains, about 1 for a star. Refined by a parabola through chi^2; flux and level are free, the
     position is `offset_px` from the middle pixel.
     """
-    from startrack.detection.shape_kernel import explain_by_widths
-
     size, explained, variance = data[0].size, np.empty((len(data), len(widths_px))), np.empty(len(data))
-    explain_by_widths(data.reshape(-1, size), weights.reshape(-1, size), offset_px, widths_px, explained, variance)
+    _explain_by_widths(data, weights, offset_px, widths_px, profile_scratch(data.shape[1]), explained, variance)
     best = np.argmax(explained, axis=1)
     inside = (best > 0) & (best < len(widths_px) - 1)
     best = np.clip(best, 1, len(widths_px) - 2)
@@ -123,3 +122,10 @@ def _width_by_fall(frame: Frame, pixels: Ints) -> float | None:
     if not MIN_FALL < falls < MAX_FALL:
         return None
     return float(np.sqrt(1.0 / falls - 1.0 / 12.0))
+
+
+_explain_by_widths = kernel(
+    "explain_by_widths", "data: float32[n, side, side]", "weights: float32[n, side, side]", "offset_px: float64[n, 2]",
+    "widths_px: float64[m]", "profiles: out float64[7, side]", "explained: out float64[n, m]",
+    "variance: out float64[n]",
+)  # fmt: skip

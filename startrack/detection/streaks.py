@@ -12,9 +12,9 @@ from startrack.core.types import Array, Bools, Ints
 from startrack.core.values import Rows, array
 from startrack.detection.background import CLIPPED_SIGMA
 from startrack.detection.fit import BRIGHT_STAR_SNR
-from startrack.detection.frame import Frame
+from startrack.detection.frame import LIGHT_AND_NOISE, Frame
 from startrack.detection.psf_width import MAX_BRIGHT_SOURCES
-from startrack.detection.residual_kernel import fill_residuals
+from startrack.kernels.library import kernel
 
 SMOOTH_PX = 1.0
 MIN_AREA_PX, MAX_AREA_PX = 12, 20_000
@@ -71,8 +71,8 @@ def find_streaks(frame: Frame) -> Streaks | None:
     """
     check_time()
     height, width = frame.shape
-    whole = np.empty_like(frame.image)
-    fill_residuals(*frame.light_and_noise, whole)
+    whole = np.empty(frame.shape, np.float32)
+    _fill_residuals(*frame.light_and_noise, whole)
     if frame.dead is not None:
         whole = np.where(frame.dead, np.float32(50.0), whole)
     smooth = cv2.GaussianBlur(whole, (0, 0), SMOOTH_PX)
@@ -145,3 +145,6 @@ def _resemble_neighbours(xy: Array, along: Array, length: Array) -> Bools:
     parallel = np.abs(np.einsum("ni,nki->nk", along, along[near[:, 1:]])) > SAME_DIRECTION
     as_long = np.abs(np.log(length[near[:, 1:]] / length[:, None])) < SAME_LENGTH
     return np.asarray((parallel & as_long).any(axis=1))
+
+
+_fill_residuals = kernel("fill_residuals", *LIGHT_AND_NOISE, "residuals: out float32[height, width]")

@@ -121,6 +121,62 @@ KERNEL int64_t join_columns(int64_t n, int64_t columns, const uint8_t *restrict 
 KERNEL int64_t write_numbers(int64_t n, int64_t room, const double *restrict values, int64_t digits, bool is_general,
                              uint8_t *restrict out);
 
+/* detection.c */
+
+/* Fill `image` [converted, width], unless it has no rows, with counts `pixels_adu` in electrons, less `bias_e` [1, 1] or
+   [height, width], and mark in `saturated`, which begins as false, the recorded counts from `highest_adu` on. */
+KERNEL void convert_counts(int64_t height, int64_t width, int64_t bias_rows, int64_t bias_columns, int64_t converted,
+                           const float *restrict pixels_adu, const float *restrict recorded_adu, float gain,
+                           const float *restrict bias_e, float highest_adu, float *restrict image,
+                           bool *restrict saturated);
+
+/* Fill `blocks` [rows, columns, px, px] with those of an image, from the row of blocks `first` on, plus `part_steps`
+   [px, px]. The border is reflected to fill the last blocks. Of blocks of more pixels (`side`) some, spread evenly, are
+   taken: squares of two by two, for colour filters' sake. */
+KERNEL void fill_blocks(int64_t height, int64_t width, int64_t px, int64_t rows, int64_t columns,
+                        const float *restrict image, int64_t side, int64_t first, const float *restrict part_steps,
+                        float *restrict blocks);
+
+/* Replace `masked` pixels of an image by the others of the block `source` [2, rows, columns], one after another. Blocks
+   have this `side`, and so many `good` pixels. Scratch: `values` [side^2]. */
+KERNEL void fill_from_blocks(int64_t height, int64_t width, int64_t rows, int64_t columns, int64_t room,
+                             float *restrict image, const bool *restrict masked, const int64_t *restrict good,
+                             const int64_t *restrict source, int64_t side, float *restrict values);
+
+/* Fill `residuals` [height, width] with the light of an image above its `background`, in units of its `noise`. Of both
+   there are rows in the middles of blocks of `side` rows. `found`: light of known stars, subtracted, whose noise is
+   `per_unit` of it and the part `found_error`; it may have no rows. */
+KERNEL void fill_residuals(int64_t height, int64_t width, int64_t blocks, int64_t known, const float *restrict image,
+                           const float *restrict background, const float *restrict noise, int64_t side,
+                           const float *restrict found, float per_unit, float found_error, float *restrict residuals);
+
+/* Fill stamps [n, stamp, stamp] around the pixels `centres` [n, 2], x and y, with the light of an image above its
+   background and with the variance of its noise. The stamps lie in the image. */
+KERNEL void cut_light(int64_t height, int64_t width, int64_t blocks, int64_t n, int64_t stamp,
+                      const float *restrict image, const float *restrict background, const float *restrict noise,
+                      int64_t side, const int64_t *restrict centres, float *restrict light, float *restrict variance);
+
+/* The number of local maxima above `lowest`, at least 0, and `margin`, at least 1, inside the image; the first ones, row
+   by row, fill `pixels` [room, 2], x and y, and `values` [room, 4]: height, offsets (pixels) of the top of a parabola in
+   x and y, level.
+
+   Residuals (see `fill_residuals`), zero beyond the border, are filtered in x and in y by a symmetric kernel, of which
+   `taps` [reach + 1] has the middle and one side; reach is a multiple of 4. The local level, times `level_factor`, is
+   subtracted: the mean, without values beyond `clipped`, over a square of `coarse` pixels and so many `beside` on each
+   side of it, interpolated between their middles. `dead` pixels are no maxima; it may have no rows.
+
+   A filtered row follows `lag` rows after that of the image: reach, or with a level coarse (beside + 2), if that is
+   more. Scratch: `rows` [lag + 2 reach + 11, stride], stride: a multiple of 64, at least width + 2 reach and columns +
+   2 beside; `means` [squares, columns], those that cover the image. */
+KERNEL int64_t find_maxima(int64_t height, int64_t width, int64_t blocks, int64_t known, int64_t reach,
+                           int64_t dead_rows, int64_t count, int64_t stride, int64_t squares, int64_t columns,
+                           int64_t room, const float *restrict image, const float *restrict background,
+                           const float *restrict noise, int64_t side, const float *restrict found, float per_unit,
+                           float found_error, const float *restrict taps, int64_t coarse, int64_t beside, float clipped,
+                           float level_factor, float lowest, const bool *restrict dead, int64_t margin,
+                           float *restrict rows, float *restrict means, int64_t *restrict pixels,
+                           float *restrict values);
+
 /* evidence.c */
 
 /* Fill `weight`, `mean` and `spread` (variance) [n, longest] of the light of the ground, by its sector and those before
@@ -470,6 +526,61 @@ KERNEL void measure_sources(int64_t height, int64_t width, int64_t background_ro
                             int64_t places, float *restrict across, float *restrict down, int64_t *restrict centre,
                             int64_t *restrict near, float *restrict stamp, double *restrict sums,
                             double *restrict measured, bool *restrict usable);
+
+/* point_sources.c: stamps [n, side, side] of an odd side, of light above the background and of its variance; places are
+   pixels from the middle pixel, at most 4 radii of a stamp (NaN: the lowest); `usable` may have no rows: all pixels are.
+   Scratch: `profiles` [7, side], `pixels` of `room`: the pixels of a stamp, filled up to a multiple of 8. */
+
+/* Fit one source of a PSF `sigma_px` wide to each of the stamps `which` [m], in so many `rounds` from `start_px` on.
+   `signal` [m, side, side], light of neighbours with the relative error `signal_error`, is subtracted; it may have no
+   rows. `per_unit` and `model_error`: noise of the source's own light; `surround` [m]: level of its surroundings. A step
+   is at most `max_step_px`; priors (1 / variance) of a step in place and in flux, and of the level, keep sources without
+   light solvable. Outputs: places `xy_px` [m, 2]; `covariance` of x, y, flux and level; `values` [m, 8]: flux, level,
+   chi^2, chi^2 of a single pixel, usable pixels, and the sums of the matched filter times the light above the
+   surroundings, times the profile, and times the profile with the noise of the own photons. */
+KERNEL void fit_stamps(int64_t n, int64_t side, int64_t usable_rows, int64_t signals, int64_t m, int64_t room,
+                       const float *restrict data, const float *restrict variance, const bool *restrict usable,
+                       const float *restrict signal, double signal_error, const int64_t *restrict which,
+                       const double *restrict start_px, double sigma_px, double per_unit, double model_error,
+                       int64_t rounds, double max_step_px, double position_prior, double flux_prior,
+                       const double *restrict surround, double *restrict profiles, float *restrict pixels,
+                       double *restrict xy_px, double *restrict values, double *restrict covariance);
+
+/* Fill `signal` [count, side, side] with the light of sources in the stamps of the different ones among `star` [m],
+   which is sorted. The sources are at `offset_px` [m, 2] there. `changed` [count]: whether the light and its difference
+   from `last` exceed `limit_sigma` of a pixel's noise. */
+KERNEL void sum_neighbours(int64_t m, int64_t n, int64_t side, int64_t count, const int64_t *restrict star,
+                           const double *restrict offset_px, const double *restrict flux, double sigma_px,
+                           const float *restrict variance, double limit_sigma, const float *restrict last,
+                           double *restrict profiles, float *restrict signal, bool *restrict changed);
+
+/* Fill `misfit` [m] to the PSF, and chi^2 as an `edge` [m], for the sources of the stamps `which` [m], of widths
+   `width_px`. `stripe`: the number of the stripe of each pixel in each direction, counted on from one direction to the
+   next; `ends` [directions]: the number behind each direction's last. Scratch: `sums` [stripes, 2], `pixels` [4, room]. */
+KERNEL void compare_shapes(int64_t n, int64_t side, int64_t usable_rows, int64_t m, int64_t directions, int64_t stripes,
+                           int64_t room, const float *restrict data, const float *restrict variance,
+                           const bool *restrict usable, const int64_t *restrict which, const double *restrict offset_px,
+                           const double *restrict flux, const double *restrict level, const double *restrict width_px,
+                           double per_unit, double model_error, const int64_t *restrict stripe,
+                           const int64_t *restrict ends, double *restrict profiles, float *restrict sums,
+                           float *restrict pixels, double *restrict misfit, double *restrict edge);
+
+/* Fill for the fitted sources of all stamps: their `signal`; the `squared` residual, corrected by the leverage of the
+   pixel; the `relative` residual, of unit mean square in each stamp; which pixels are `lit` by more than `faint` of their
+   variance, with a leverage below `most_leverage`. `covariance` is that of place, flux and level. */
+KERNEL void fill_squared_residuals(int64_t n, int64_t side, const float *restrict data, const float *restrict variance,
+                                   const double *restrict offset_px, const double *restrict flux,
+                                   const double *restrict level, const double *restrict covariance, double sigma_px,
+                                   double model_error, double faint, double most_leverage, double *restrict profiles,
+                                   double *restrict signal, double *restrict squared, double *restrict relative,
+                                   bool *restrict lit);
+
+/* Fill `explained` [n, m]: how much a star of each width on a constant level reduces chi^2 of the stamps, whose pixels
+   have `weights` (1 / variance); and `variance` [n]: chi^2 of a constant level alone. */
+KERNEL void explain_by_widths(int64_t n, int64_t side, int64_t m, const float *restrict data,
+                              const float *restrict weights, const double *restrict offset_px,
+                              const double *restrict widths_px, double *restrict profiles, double *restrict explained,
+                              double *restrict variance);
 
 /* radial_fit.c */
 

@@ -9,7 +9,6 @@ from scipy.special import ndtr
 from startrack.core import circle, table_text
 from startrack.core.kernels import NORMAL_CDF
 from startrack.evidence import sky_levels, sky_light, sky_pixels
-from startrack.exposure.png_rows import unfilter
 from startrack.localization import free_skyline, search_profiles
 
 SEEDS = range(3)
@@ -143,8 +142,3 @@ def test_columns_of_different_lengths_are_refused():
     for columns in ([b"1\n2\n", b"3\n"], [b"1\n", b"3\n4\n"]):
         with pytest.raises(ValueError, match="different numbers of lines"):
             table_text.join_columns(columns)
-
-
-@pytest.mark.parametrize("height", [0, 3])
-def test_rows_without_pixels_are_no_error(height):
-    assert unfilter(np.zeros((height, 1), np.uint8), 1, 1, np.empty((height, 0), np.float32))

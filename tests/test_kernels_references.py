@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from startrack.core import circle, table_text
+from startrack.core import circle
 from startrack.core.kernels import NORMAL_CDF
 from startrack.evidence import sky_levels, sky_light, sky_pixels
 from startrack.localization import free_skyline, search_profiles
@@ -134,11 +134,3 @@ def test_a_curve_passes_from_sector_to_sector_by_a_full_matrix():
         expected.append(np.log(state.sum()))
         state /= state.sum()
     np.testing.assert_allclose(free_skyline._pass(likelihood, heights, cells, rough), expected, rtol=1e-9)
-
-
-def test_columns_of_different_lengths_are_refused():
-    assert table_text.join_columns([b"1\n2\n", b"\n4\n"]) == b"1,\n2,4\n"
-    assert table_text.join_columns([b"", b""]) == b""
-    for columns in ([b"1\n2\n", b"3\n"], [b"1\n", b"3\n4\n"]):
-        with pytest.raises(ValueError, match="different numbers of lines"):
-            table_text.join_columns(columns)

@@ -36,17 +36,6 @@ KERNEL const char *compiler_name(void);
    even steps around the circle from azimuth 0 on. No value: 0. A NaN or infinite azimuth gives NaN. */
 KERNEL void interpolate_circle(int64_t m, int64_t n, const double *restrict values, double *restrict found);
 
-/* Rows of comma-separated fields `rows` [n] from the lines [n] of several columns one after another, which begin at
-   `at` [columns]; `at` is advanced. The end of the rows, or -1 where a column has fewer lines than another. */
-KERNEL int64_t join_columns(int64_t n, int64_t columns, const uint8_t *restrict lines, int64_t *restrict at,
-                            uint8_t *restrict rows);
-
-/* Write the `values` [n] into `out` [room], 32 bytes for each, a line break after each, as %.<digits>g where
-   `is_general`, else as %.<digits>f; nothing for NaN. Digits: 1 to 9. Magnitudes: below 1e15 / 10**digits, or of general
-   ones 0 and 1e-12 to 1e15. The end of what was written. */
-KERNEL int64_t write_numbers(int64_t n, int64_t room, const double *restrict values, int64_t digits, bool is_general,
-                             uint8_t *restrict out);
-
 /* evidence.c */
 
 /* Fill `weight`, `mean` and `spread` (variance) [n, longest] of the light of the ground, by its sector and those before

@@ -20,7 +20,7 @@ from PIL import Image
 from startrack.camera import load_camera
 from startrack.core.types import BadInput
 from startrack.exposure import read_exposure
-from startrack.exposure.png import SIGNATURE, chunk
+from startrack.exposure.png import ADAM7, SIGNATURE, chunk
 from startrack.terrain import load_terrain
 
 FRAME = np.random.default_rng(1).integers(0, 1000, (40, 60)).astype(np.uint16)
@@ -124,10 +124,10 @@ def test_the_size_of_interlaced_rows_is_that_of_opencv(tmp_path, shape, colour):
     """Pillow's own encoder writes no interlaced files: rows of zeros, of the length that the format states."""
     import cv2
 
-    from startrack.exposure.png import _pass_bytes
-
-    size = sum(_pass_bytes(shape[1], shape[0], 48 if colour else 16))
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", shape[1], shape[0], 16, 2 if colour else 0, 0, 0, 1))
+    height, width = shape
+    passes = [(-(-(height - y0) // dy), -(-(width - x0) // dx)) for x0, y0, dx, dy in ADAM7]
+    size = sum(rows * (1 + columns * (6 if colour else 2)) for rows, columns in passes if rows > 0 and columns > 0)
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 2 if colour else 0, 0, 0, 1))
     for change, ok in ((0, True), (-1, False)):
         raw = SIGNATURE + header + chunk(b"IDAT", zlib.compress(bytes(size + change))) + chunk(b"IEND", b"")
         path = tmp_path / f"{ok}.png"

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from startrack.core import circle, table_text
+from startrack.core import circle
 from startrack.core.kernels import NORMAL_CDF
 from startrack.evidence import sky_levels, sky_light, sky_pixels
-from startrack.exposure.png_rows import unfilter
 from startrack.frames import wahba
 from startrack.identification import attitude_refinement, star_grid
 from startrack.localization import free_skyline, search_profiles
@@ -137,19 +136,6 @@ def test_a_curve_passes_from_sector_to_sector_by_a_full_matrix():
         expected.append(np.log(state.sum()))
         state /= state.sum()
     np.testing.assert_allclose(free_skyline._pass(likelihood, heights, cells, rough), expected, rtol=1e-9)
-
-
-def test_columns_of_different_lengths_are_refused():
-    assert table_text.join_columns([b"1\n2\n", b"\n4\n"]) == b"1,\n2,4\n"
-    assert table_text.join_columns([b"", b""]) == b""
-    for columns in ([b"1\n2\n", b"3\n"], [b"1\n", b"3\n4\n"]):
-        with pytest.raises(ValueError, match="different numbers of lines"):
-            table_text.join_columns(columns)
-
-
-@pytest.mark.parametrize("height", [0, 3])
-def test_rows_without_pixels_are_no_error(height):
-    assert unfilter(np.zeros((height, 1), np.uint8), 1, 1, np.empty((height, 0), np.float32))
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -15,7 +15,7 @@ import pytest
 from batch_helpers import task_of
 
 from startrack.applications.batch import locate_images
-from startrack.core.runner import Died, Runner, RunStopped
+from startrack.core.runner import TASKS_PER_PROCESS, Died, Runner, RunStopped
 
 JOBS = 2
 
@@ -51,23 +51,25 @@ def test_a_task_that_kills_its_process_costs_the_others_nothing():
     assert len(processes) <= 3 * JOBS + 2 * 2
 
 
-def test_few_tasks_are_repeated_after_a_death():
+def noted_work(task: tuple[str, str]) -> None:
+    """As `work`, after a line in the file that the task names."""
+    file, name = task
+    with open(file, "a", encoding="ascii") as notes:
+        notes.write(f"{name}\n")
+    work(name)
+
+
+def test_few_tasks_are_repeated_after_a_death(tmp_path):
+    """Those that were handed out, one after the other."""
     names = [f"{number:02d}" for number in range(12)]
     names[3] = "03-deadly"
-    runner: Runner[str, tuple[str, int]] = Runner(work, jobs=JOBS)
-    with runner:
-        ends: list[list[str]] = []
-
-        def until_failure():
-            from startrack.core.runner import TASKS_PER_PROCESS, _Pool
-
-            ends.append((yield from runner._run_until_failure(iter(names), _Pool(JOBS), TASKS_PER_PROCESS * JOBS)))
-
-        done = [name for name, _ in until_failure()]
-    (suspects,) = ends
-    assert "03-deadly" in suspects
-    assert len(suspects) <= 2 * JOBS
-    assert not {*done} & {*suspects}
+    notes = str(tmp_path / "notes")
+    with Runner(noted_work, jobs=JOBS) as runner:
+        done = {name: outcome for (_, name), outcome in runner.results([(notes, name) for name in names])}
+    assert [name for name in names if isinstance(done[name], Died)] == ["03-deadly"]
+    started = (tmp_path / "notes").read_text().splitlines()
+    assert started.count("03-deadly") == 2
+    assert len(started) <= len(names) + TASKS_PER_PROCESS * JOBS
 
 
 @pytest.mark.slow
@@ -136,8 +138,11 @@ def test_a_task_that_died_is_an_internal_error_of_its_image(tmp_path):
 def test_a_scheduler_that_goes_stops_the_run():
     """For the client it ends after the first outcome."""
     distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(1, processes=True, threads_per_worker=1, dashboard_address=None) as cluster:
-        results = Runner(work, cluster=cluster.scheduler_address).results([str(number) for number in range(200)])
+    with (
+        distributed.LocalCluster(1, processes=True, threads_per_worker=1, dashboard_address=None) as cluster,
+        Runner(work, cluster=cluster.scheduler_address) as runner,
+    ):
+        results = runner.results([str(number) for number in range(200)])
         next(results)
         cluster.close()
         with pytest.raises(RunStopped, match=r"the Dask scheduler has gone [^\n]*$"):

@@ -24,14 +24,23 @@ FILES = ("camera", "terrain", *IMAGE_KEYS)  # facts that may be paths
 
 
 def sha256_of(path: str | os.PathLike[str]) -> str:
-    """SHA-256 of a file's content in hex; `MISSING` if it cannot be read, which the reader of the file reports."""
+    """SHA-256 of a file's content in hex; `MISSING` if it cannot be read, which the reader of the file reports.
+
+    A height map is read once, not for every image.
+    """
     try:
-        if not stat.S_ISREG(os.stat(path).st_mode):  # opening a pipe would block
+        found = os.stat(path)
+        if not stat.S_ISREG(found.st_mode):  # opening a pipe would block
             return MISSING
-        with Path(path).open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        return _sha256_at_stamp(os.fspath(path), (found.st_ino, found.st_size, found.st_mtime_ns))
     except (OSError, ValueError):  # a NUL in the name
         return MISSING
+
+
+@lru_cache(maxsize=64)
+def _sha256_at_stamp(path: str, stamp: tuple[int, ...]) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def content_sha256(image: str, bag_image: BagImage | None) -> str:
@@ -62,7 +71,7 @@ def _correction_hashes(image: Path, facts: dict[str, Any]) -> list[str]:
         files = {key: facts.get(key) or sidecar.value(key) for key in ("dark", "flat")}
     except BadInput:  # refused when the image is read
         return []
-    return [f"{key} {_cached_sha256(Path(file))}" for key, file in files.items() if file]
+    return [f"{key} {sha256_of(file)}" for key, file in files.items() if file]
 
 
 def input_hashes(image: str, cameras: Iterable[str | None], terrain: str | None, *others: object) -> dict[str, str]:
@@ -77,13 +86,13 @@ def input_hashes(image: str, cameras: Iterable[str | None], terrain: str | None,
     ]
     files += [one for camera in named for one in _files_of_camera(Path(camera))]
     files += files_of_terrain(terrain) if terrain and is_path(terrain) else ()
-    return {relative_path(file, Path(image).parent): _cached_sha256(file) for file in files}
+    return {relative_path(file, Path(image).parent): sha256_of(file) for file in files}
 
 
 def are_unchanged(image: str, hashes: dict[str, str]) -> bool:
     """Whether the files have the content they had: `hashes` is what `input_hashes` returned for the `image`."""
     folder = os.path.realpath(Path(image).parent)
-    return all(_cached_sha256(Path(folder, path)) == sha256 for path, sha256 in hashes.items())
+    return all(sha256_of(Path(folder, path)) == sha256 for path, sha256 in hashes.items())
 
 
 def _files_of_camera(camera: Path) -> list[Path]:
@@ -93,17 +102,3 @@ def _files_of_camera(camera: Path) -> list[Path]:
     except BadInput:  # refused when it is loaded
         return []
     return [camera.parent / str(values[key]) for key in ("mask", "obstacles") if key in values]
-
-
-def _cached_sha256(path: Path) -> str:
-    """The same as `sha256_of`; a height map is read once, not for every image."""
-    try:
-        found = path.stat()
-    except (OSError, ValueError):
-        return MISSING
-    return _sha256_at_stamp(path, (found.st_ino, found.st_size, found.st_mtime_ns))
-
-
-@lru_cache(maxsize=64)
-def _sha256_at_stamp(path: Path, stamp: tuple[int, ...]) -> str:
-    return sha256_of(path)

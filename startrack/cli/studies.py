@@ -53,8 +53,6 @@ def predict(args: argparse.Namespace) -> int:
     bar = partial(progress, shown=not args.quiet, jobs=jobs)
     try:
         with prediction.draw_store(out, draws=args.draws, jobs=jobs, progress=bar, cluster=args.cluster) as store:
-            if args.cluster is not None:
-                store.connect()
             predictions = prediction.Predictions(plan.points.places, store, inputs, args.overwrite)
             if args.depth:
                 conditions, depth = predictions.depth(conditions, args.target_radius95)
@@ -137,8 +135,6 @@ def reproduce(args: argparse.Namespace) -> int:
     if args.ours is not None:
         size = size.limit_our_positions(args.ours)
     with reproduction.fix_store(out, jobs=args.jobs or count_cores(), progress=progress, cluster=args.cluster) as store:
-        if args.cluster is not None:
-            store.connect()
         for name in (name for name in ARTEFACTS if name in args.what or "all" in args.what):
             start = time.perf_counter()
             artefact = ARTEFACTS[name](reproduction.Context(size, args.seed, store))

@@ -1,18 +1,21 @@
 """Tables as ECSV.
 
 ECSV 1.0 (Astropy Proposal for Enhancement 6) is a table that astropy, TOPCAT, pandas and spreadsheets read. It is
-written here in a tenth of the time that astropy takes. Comma-separated; an empty field is a masked value.
+written here in a fifth of the time that astropy takes. Comma-separated; an empty field is a masked value.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from startrack.core.table_text import column_lines, join_columns
+import numpy as np
 
-QUOTED = b',"#'  # characters whose texts are in quotes; # would begin a comment
+from startrack.core.errors import one_line
+
+QUOTED = re.compile('[,"#]')  # characters whose texts are in quotes; # would begin a comment
 
 
 @dataclass(frozen=True)
@@ -38,25 +41,25 @@ class Column:
 
 def ecsv_text(columns: Sequence[Column]) -> str:
     """The table as ECSV. Raises ValueError for columns of different lengths."""
-    head, bodies, lengths = ["# %ECSV 1.0", "# ---", "# delimiter: ','", "# datatype:"], [], set()
+    head, bodies = ["# %ECSV 1.0", "# ---", "# delimiter: ','", "# datatype:"], []
     for one in columns:
         unit, description = f"unit: {one.unit}, " if one.unit else "", one.description.replace("'", "''")
         head.append(f"# - {{name: '{one.name}', {unit}datatype: {one.datatype}, description: '{description}'}}")
-        lines = column_lines(one.form, one.values)
-        if one.datatype == "string" and _needs_quotes(lines):
-            lines = b"\n".join([_quoted(line) for line in lines.split(b"\n")])
-        bodies.append(lines)
-        lengths.add(lines.count(b"\n"))
-    if len(lengths) > 1:
+        texts = column_texts(one.form, one.values)
+        bodies.append([_field(text) for text in texts] if one.datatype == "string" else texts)
+    if len(lengths := {*map(len, bodies)}) > 1:
         raise ValueError(f"columns of different lengths: {sorted(lengths)}")
     head += ["# schema: astropy-2.0", ",".join(column.name for column in columns)]
-    return "\n".join([*head, join_columns(bodies).decode()])
+    return "\n".join([*head, *map(",".join, zip(*bodies, strict=True)), ""])
 
 
-def _needs_quotes(text: bytes) -> bool:
-    return any(character in text for character in QUOTED)
+def column_texts(form: str, values: Iterable[Any]) -> list[str]:
+    """The `values` (n,) in the %-format `form`; an empty text for None and nan."""
+    listed = values.tolist() if isinstance(values, np.ndarray) else values
+    return ["" if one is None or one != one else form % one for one in listed]
 
 
-def _quoted(text: bytes) -> bytes:
-    """A text in quotes if it needs them."""
-    return b'"%b"' % text.replace(b'"', b'""') if _needs_quotes(text) else text
+def _field(text: str) -> str:
+    """A text in one line, and in quotes if it needs them."""
+    text = one_line(text)
+    return '"' + text.replace('"', '""') + '"' if QUOTED.search(text) else text

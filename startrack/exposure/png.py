@@ -1,11 +1,12 @@
-"""PNG: strict check of all chunks; interlaced pixels by OpenCV.
+"""PNG: strict check of all chunks and of the size of the picture's data; pixels by OpenCV.
 
-Each chunk has a checksum: zlib.crc32 finds truncation and damage in about a millisecond, without decoding twice.
+Each chunk has a checksum: zlib.crc32 finds truncation and damage in about a millisecond.
 Format: W3C PNG specification (third edition, 2025).
 """
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -13,9 +14,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from startrack.core.compilation import announce_compilation
 from startrack.exposure.decoding import Decoded, bad_image, check_size, exif_warnings, grey_float32
 from startrack.exposure.facts import HEADER_KEYS
 
@@ -23,7 +22,11 @@ SIGNATURE = b"\x89PNG\r\n\x1a\n"
 COLOUR_TYPES = {0: "grey", 2: "colour", 3: "palette", 4: "grey with alpha", 6: "colour with alpha"}
 MAX_FACT_BYTES = 4096  # of one fact; a compressed chunk is not inflated beyond it
 MAX_CHUNKS = 200_000  # libpng's of 8 KiB for a colour picture of 200 Mpx and 16 bits: 146,000
+DAMAGED = "damaged PNG: its picture data cannot be decoded"
+FILTERS = 5  # none, the byte to the left, above, their mean, and Paeth's predictor
+WHOLE = ((0, 0, 1, 1),)  # first column and row of a pass over the picture, and their steps
 ADAM7 = (0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2)
+Passes = tuple[tuple[int, int, int, int], ...]
 IHDR_END = len(SIGNATURE) + 12 + 13  # text is spliced in after the header chunk
 
 
@@ -33,9 +36,6 @@ def decode(raw: bytes) -> Decoded:
     `BadInput` if truncated or damaged, with alpha or palette, animated, or of fewer bits.
     """
     import cv2
-
-    announce_compilation()
-    from startrack.exposure.png_rows import DAMAGED, decode_rows, inflate_rows
 
     header: dict[str, str] = {}
     warnings: tuple[str, ...] = ()
@@ -58,15 +58,13 @@ def decode(raw: bytes) -> Decoded:
         elif kind[:1].isupper() and kind != b"PLTE":
             raise bad_image(f"PNG needs a feature that startrack does not know ({kind!r})")
     # Gamma, colour profile and orientation are left out: they cannot change the pixels.
-    if interlaced:
-        inflate_rows(b"".join(picture), sum(_pass_bytes(width, height, depth * channels)))
-        bare = b"".join((raw[:IHDR_END], chunk(b"IDAT", b"".join(picture)), chunk(b"IEND", b"")))
-        stored: NDArray[Any] | None = cv2.imdecode(np.frombuffer(bare, np.uint8), cv2.IMREAD_UNCHANGED)
-        if stored is None or stored.shape[:2] != (height, width) or stored.dtype.itemsize * 8 != depth:
-            raise bad_image(DAMAGED)
-    else:
-        stored = decode_rows(b"".join(picture), width, height, depth, channels)
-    pixels, colour = (stored.astype(np.float32, copy=False), ()) if stored.dtype == np.float32 else grey_float32(stored)
+    rows = _inflate_rows(b"".join(picture), width, height, depth * channels, ADAM7 if interlaced else WHOLE)
+    packed = zlib.compress(rows, 0)  # as they are: OpenCV need not inflate them again
+    bare = b"".join((raw[:IHDR_END], chunk(b"IDAT", packed), chunk(b"IEND", b"")))
+    stored = cv2.imdecode(np.frombuffer(bare, np.uint8), cv2.IMREAD_UNCHANGED)
+    if stored is None or stored.shape[:2] != (height, width) or stored.dtype.itemsize * 8 != depth:
+        raise bad_image(DAMAGED)
+    pixels, colour = grey_float32(np.asarray(stored))
     return Decoded(pixels_adu=pixels, saturation_adu=2.0**depth - 1.0, header=header, warnings=warnings + colour)
 
 
@@ -116,12 +114,28 @@ def _check_ihdr(body: memoryview) -> tuple[int, int, int, int, bool]:
     return width, height, depth, 3 if colour_type == 2 else 1, body[12] != 0
 
 
-def _pass_bytes(width: int, height: int, pixel_bits: int) -> Iterator[int]:
-    """Bytes of the seven passes of an interlaced picture: rows of whole bytes, each after the number of its filter."""
-    for x0, y0, dx, dy in ADAM7:
-        columns, rows = -(-(width - x0) // dx), -(-(height - y0) // dy)
-        if columns > 0 and rows > 0:
-            yield rows * (1 + columns * pixel_bits // 8)
+def _inflate_rows(compressed: bytes, width: int, height: int, pixel_bits: int, passes: Passes) -> bytes:
+    """The filtered rows of all `passes`, each of whole bytes after the number of its filter; no more is inflated.
+
+    Raises BadInput bad_image for data that are damaged, too short or too long, or name an unknown filter: libpng would
+    print a line about each.
+    """
+    sides = [(-(-(height - y0) // dy), -(-(width - x0) // dx)) for x0, y0, dx, dy in passes]
+    shapes = [(rows, 1 + columns * pixel_bits // 8) for rows, columns in sides if rows > 0 and columns > 0]
+    size, stream = sum(map(math.prod, shapes)), zlib.decompressobj()
+    try:
+        data = stream.decompress(compressed, size + 1)
+    except zlib.error as cause:
+        raise bad_image(DAMAGED) from cause
+    if len(data) != size or not stream.eof:
+        raise bad_image(DAMAGED)
+    at = 0
+    for rows, row_bytes in shapes:
+        filters = np.frombuffer(data, np.uint8, rows * row_bytes, at)[::row_bytes]
+        if filters.max() >= FILTERS:
+            raise bad_image(DAMAGED)
+        at += rows * row_bytes
+    return data
 
 
 def _read_text(kind: bytes, body: bytes, header: dict[str, str]) -> None:

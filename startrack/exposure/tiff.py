@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
@@ -14,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.declaration import value_text
-from startrack.core.tiff_strips import TIFF_COMPRESSIONS, check_packed_strips
 from startrack.exposure.decoding import (
     Decoded,
     bad_image,
@@ -29,6 +29,11 @@ MOSAIC = 32803
 REFUSED = {0: "white-is-zero", 3: "palette", 4: "a mask", 5: "CMYK", 6: "YCbCr", 8: "CIELab"}  # by photometric type
 CHANNELS = {1: 1, 2: 3, MOSAIC: 1}  # 1: black is zero, 2: red, green, blue
 MAX_PAGES = 1000  # with reduced copies of the picture
+DEFLATE = (8, 32946)
+PACK_BITS = 32773
+COMPRESSIONS = {1, PACK_BITS, *DEFLATE}  # 1: none; tifffile needs nothing more for these
+MAX_STRIPS = 2**16  # tiles of 64 px of a picture of 200 Mpx are 49,000
+MAX_SPARE_BYTES = 2**26  # of a tile beyond the picture that it is cropped to
 PREDICTORS = {1, 2}  # none, horizontal: tifffile has these itself
 NOWHERE = logging.NullHandler()  # added once
 READ = "integers of 8, 16 or 32 bits and floating point"
@@ -49,7 +54,7 @@ def decode(raw: bytes) -> Decoded:
         page = _only_page(tiff)
         _check_kind(page)
         _check_strips(page, len(raw))
-        check_packed_strips(page, BytesIO(raw))
+        _check_packed_strips(page, raw)
         stored = _pixels(page, raw)
         orientation = page.tags.get(274)
         header, mosaic = facts_in_text(page.description), int(page.photometric) == MOSAIC
@@ -117,9 +122,25 @@ def _check_strips(page: Any, file_bytes: int) -> None:
         raise bad_image("damaged TIFF: its strips are shorter than the picture")
 
 
+def _check_packed_strips(page: Any, raw: bytes) -> None:
+    """Check that no strip or tile decodes to more than its part of the picture: tifffile inflates each one whole."""
+    part_bytes = math.prod(page.chunks) * page.dtype.itemsize
+    if len(page.dataoffsets) > MAX_STRIPS:
+        raise bad_image(f"damaged TIFF: {len(page.dataoffsets)} strips, more than the {MAX_STRIPS} allowed")
+    if part_bytes > page.nbytes + MAX_SPARE_BYTES:
+        raise bad_image(f"damaged TIFF: tiles of {part_bytes} bytes for a picture of {page.nbytes}")
+    for start, count in zip(page.dataoffsets, page.databytecounts, strict=True):
+        if page.compression in DEFLATE:
+            packed = memoryview(raw)[start : start + count]
+            if len(zlib.decompressobj().decompress(packed, part_bytes + 1)) > part_bytes:
+                raise bad_image("damaged TIFF: a strip inflates to more than its part of the picture")
+        if page.compression == PACK_BITS and count > 2 * part_bytes:
+            raise bad_image("damaged TIFF: a strip has more bytes than its part of the picture")
+
+
 def _pixels(page: Any, raw: bytes) -> NDArray[Any]:
     """(H, W) or (H, W, 3) as stored, native byte order."""
-    if page.compression in TIFF_COMPRESSIONS and page.predictor in PREDICTORS:
+    if page.compression in COMPRESSIONS and page.predictor in PREDICTORS:
         stored = page.asarray()
         if page.axes == "SYX":  # channels in separate planes
             stored = np.moveaxis(stored, 0, -1)

@@ -110,17 +110,6 @@ KERNEL void pass_messages(int64_t kinds, int64_t columns, int64_t n, const float
    even steps around the circle from azimuth 0 on. No value: 0. A NaN or infinite azimuth gives NaN. */
 KERNEL void interpolate_circle(int64_t m, int64_t n, const double *restrict values, double *restrict found);
 
-/* Rows of comma-separated fields `rows` [n] from the lines [n] of several columns one after another, which begin at
-   `at` [columns]; `at` is advanced. The end of the rows, or -1 where a column has fewer lines than another. */
-KERNEL int64_t join_columns(int64_t n, int64_t columns, const uint8_t *restrict lines, int64_t *restrict at,
-                            uint8_t *restrict rows);
-
-/* Write the `values` [n] into `out` [room], 32 bytes for each, a line break after each, as %.<digits>g where
-   `is_general`, else as %.<digits>f; nothing for NaN. Digits: 1 to 9. Magnitudes: below 1e15 / 10**digits, or of general
-   ones 0 and 1e-12 to 1e15. The end of what was written. */
-KERNEL int64_t write_numbers(int64_t n, int64_t room, const double *restrict values, int64_t digits, bool is_general,
-                             uint8_t *restrict out);
-
 /* detection.c */
 
 /* Fill `image` [converted, width], unless it has no rows, with counts `pixels_adu` in electrons, less `bias_e` [1, 1] or
@@ -223,23 +212,6 @@ KERNEL void sum_cells(int64_t n, int64_t sectors, int64_t cells, const int64_t *
    to 1e9 pixels away. Disks up to `large_px` whose middle the mask lacks at first are left out. Scratch: `touching`. */
 KERNEL void clear_disks(int64_t height, int64_t width, int64_t n, bool *restrict mask, const int64_t *restrict xy_px,
                         const int64_t *restrict radius_px, double large_px, bool *restrict touching);
-
-/* exposure.c */
-
-/* Undo the filters of the rows [height, length + 1] of a PNG (W3C PNG, section 9), the kind of each in its first byte,
-   and write the samples; false where a filter is unknown, whose row counts as unfiltered. `pixel_bytes`: of a pixel, at
-   least 1. `scratch` [2, room] is zero; room = length + pixel_bytes, length = samples times their bytes. */
-KERNEL bool unfilter_grey_8(int64_t height, int64_t length, int64_t room, int64_t samples, const uint8_t *restrict rows,
-                            int64_t pixel_bytes, uint8_t *restrict scratch, float *restrict found);
-KERNEL bool unfilter_grey_16(int64_t height, int64_t length, int64_t room, int64_t samples,
-                             const uint8_t *restrict rows, int64_t pixel_bytes, uint8_t *restrict scratch,
-                             float *restrict found);
-KERNEL bool unfilter_colour_8(int64_t height, int64_t length, int64_t room, int64_t samples,
-                              const uint8_t *restrict rows, int64_t pixel_bytes, uint8_t *restrict scratch,
-                              uint8_t *restrict found);
-KERNEL bool unfilter_colour_16(int64_t height, int64_t length, int64_t room, int64_t samples,
-                               const uint8_t *restrict rows, int64_t pixel_bytes, uint8_t *restrict scratch,
-                               uint16_t *restrict found);
 
 /* localization.c */
 

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from startrack.catalog import star_names
 from startrack.chain import Inputs, Measured, Oriented
-from startrack.core.ecsv import Column, ecsv_text
-from startrack.core.table_text import column_lines
+from startrack.core.ecsv import Column, column_texts, ecsv_text
 from startrack.core.types import Array, Bools, Ints, MeasuredSkyline
 from startrack.evidence import SEEN_LLR
 from startrack.output.quantity import Quantity
@@ -147,8 +146,7 @@ def skyline_texts_deg(skyline: MeasuredSkyline) -> tuple[list[str], list[str], l
         np.where(skyline.known, np.degrees(values), np.nan) for values in (skyline.elevation_rad, skyline.sigma_rad)
     )
     azimuth = [f"{value:g}" for value in np.round(np.degrees(skyline.azimuth_rad), 6)]
-    elevations, sigmas = (column_lines("%.4f", values).decode().split("\n")[:-1] for values in (elevation, sigma))
-    return azimuth, elevations, sigmas
+    return azimuth, column_texts("%.4f", elevation), column_texts("%.4f", sigma)
 
 
 def cloud_texts(skyline: MeasuredSkyline) -> list[str]:

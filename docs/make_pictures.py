@@ -20,11 +20,11 @@ import numpy as np
 from PIL import Image
 
 import startrack
+from startrack.chain import Settings
 from startrack.core.types import Array, Evidence
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
-from matplotlib.patches import Circle
 
 ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / "docs/images"
@@ -76,15 +76,15 @@ def make_report(solution: Any, folder: Path) -> None:
 
 
 def make_posterior(solution: Any, folder: Path) -> None:
-    """Posterior by the stars on the whole floor and enlarged, with the final 95 % circle and the truth."""
+    """Posterior by the stars on the whole floor and enlarged, the 95 % circles by stars and by all, the truth."""
+    by_stars = startrack.locate(SAMPLE, settings=Settings(evidence_sources="stars")).result.fix
     located, terrain = solution.result, solution.result.terrain
     rows, middle_m = located.evidence(), np.asarray(located.fix.position_enu_m[:2])
-    radius_m = located.fix.radius95_m
     horizon = terrain.horizon_rad(middle_m[None], rows.azimuth_rad)
     near = np.abs(rows.elevation_rad - horizon.ravel()) < NEAR_RAD
     panels = [
         ("Whole crater floor", np.zeros(2), 10_000.0, 1e-3, rows.take(np.abs(rows.llr) > WIDE_LLR)),
-        ("Enlarged", middle_m, 4 * radius_m, 1.0, rows.take(near)),
+        ("Enlarged", middle_m, 2 * by_stars.radius95_m, 1.0, rows.take(near)),
     ]
     with plt.rc_context(DARK):
         figure, all_axes = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained")
@@ -107,9 +107,14 @@ def make_posterior(solution: Any, folder: Path) -> None:
             axes.locator_params(nbins=4)
             figure.colorbar(drawn, ax=axes, fraction=0.046, label=density)
             axes.plot(TRUE_M[0] * scale, TRUE_M[1] * scale, "+", color="#4fd1c5", ms=14, mew=2, label="true position")
-        circle = Circle(tuple(middle_m), radius_m, fill=False, color="#63b3ed", lw=1.8, label="95 % circle of the fix")
-        all_axes[1].add_patch(circle)
-        all_axes[1].legend(loc="upper right", fontsize=9)
+        for fix, style, label in (
+            (by_stars, "--", "95 % by the stars alone"),
+            (located.fix, "-", "95 % with the light of the sky"),
+        ):
+            turn = np.linspace(0, 2 * np.pi, 121)
+            circle_m = np.asarray(fix.position_enu_m[:2]) + fix.radius95_m * np.stack([np.sin(turn), np.cos(turn)], -1)
+            all_axes[1].plot(*circle_m.T, style, color="#63b3ed", lw=1.8, label=label)
+        all_axes[1].legend(loc="upper left", fontsize=9)
         save_figure(figure, "posterior")
 
 

@@ -24,7 +24,17 @@ def rows_of(page: str, table: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()[2:]]
 
 
-CONSTANTS = rows_of((DOCS / "constants.md").read_text(encoding="utf-8"), "table of constants")
+def value_and_unit(cell: str) -> tuple[str, str]:
+    """Numbers with commas between, and the unit after them; empty where there is none."""
+    found = re.fullmatch(r"([-\d.e, ]*[\d.])(?: (\D.*))?", cell)
+    assert found, cell
+    return found[1], found[2] or ""
+
+
+CONSTANTS = [
+    (name, *value_and_unit(shown), meaning)
+    for name, shown, meaning in rows_of((DOCS / "constants.md").read_text(encoding="utf-8"), "table of constants")
+]
 
 
 @pytest.mark.parametrize(("name", "shown", "unit"), [row[:3] for row in CONSTANTS], ids=[row[0] for row in CONSTANTS])

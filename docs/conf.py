@@ -12,6 +12,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.pycode import ModuleAnalyzer
 
@@ -87,6 +88,19 @@ def restore_attribute(app: Sphinx, what: str, name: str, one: Any, options: Any,
     lines[:] = kept.pop(name, lines)
 
 
+def link_figures(app: Sphinx, doctree: nodes.document, docname: str) -> None:
+    """Make each figure a link to its file, and keep short code on one line."""
+    for image in list(doctree.findall(nodes.image)):
+        if image["uri"] in app.env.images and not isinstance(image.parent, nodes.reference):
+            file = "../" * docname.count("/") + f"_images/{app.env.images[image['uri']][1]}"
+            link = nodes.reference("", "", internal=True, refuri=file, classes=["figure"])
+            image.replace_self(link)
+            link += image
+    for code in doctree.findall(nodes.literal):
+        if len(code.astext()) <= LONGEST_UNBROKEN:
+            code["classes"].append("unbroken")
+
+
 def source_with_field_comments(module: str) -> tuple[str | None, str | None]:
     """File and source of a module for autodoc, where the comment after a field of a dataclass documents the field."""
     path, source = module_source(module)
@@ -95,6 +109,7 @@ def source_with_field_comments(module: str) -> tuple[str | None, str | None]:
     return path, None if source is None else FIELD.sub(r"\1  #: ", source)
 
 
+LONGEST_UNBROKEN = 30  # characters of code in a line of text: what a phone shows in one line
 FIELD = re.compile(r"^(    \w+: [^#\n]*\S)  # (?!fmt|type|noqa)", re.MULTILINE)
 kept: dict[str, list[str]] = {}
 module_source = ModuleAnalyzer.get_module_source
@@ -105,5 +120,6 @@ def setup(app: Sphinx) -> None:
     """Connect the handlers."""
     app.connect("source-read", link_to_pages)
     app.connect("include-read", link_in_included)
+    app.connect("doctree-resolved", link_figures)
     app.connect("autodoc-process-docstring", keep_attribute, priority=400)  # Napoleon has 500
     app.connect("autodoc-process-docstring", restore_attribute, priority=600)

@@ -64,13 +64,7 @@ def main() -> None:
 def draw_sky(axes: Axes, layers: Layers, stars: Table) -> None:
     """The picture with the wall in one colour, bright stars, the figure of Orion behind the wall, and the skyline."""
     width, height = layers.overlay["size"]
-    axes.imshow(layers.bare, extent=(0, width, height, 0), interpolation="lanczos")
-    (skyline,) = layers.overlay["skyline"]
-    edge = np.array(skyline)
-    frame = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]])
-    outside = np.vstack([frame, edge[::-1] if is_clockwise(edge) == is_clockwise(frame) else edge])
-    axes.add_patch(Polygon(outside, closed=True, facecolor=WALL, alpha=0.82, lw=0))
-    axes.plot(*edge.T, color=EDGE, lw=2.2)
+    draw_wall(axes, layers)
     place = {str(row["name"]): (row["x_px"], row["y_px"], str(row["status"])) for row in stars if row["name"]}
     bright = stars[(stars["v_mag"] < FAINTEST_RING) & (stars["status"] == "seen")]
     axes.scatter(bright["x_px"], bright["y_px"], s=90, facecolors="none", edgecolors=SEEN, lw=1.4)
@@ -91,6 +85,18 @@ def draw_sky(axes: Axes, layers: Layers, stars: Table) -> None:
                       path_effects=[patheffects.withStroke(linewidth=4, foreground=DARK)])  # fmt: skip
     axes.set(xlim=(0, width), ylim=(height, 0))
     axes.axis("off")
+
+
+def draw_wall(axes: Axes, layers: Layers) -> None:
+    """The picture with all that lies below the skyline in one colour."""
+    width, height = layers.overlay["size"]
+    axes.imshow(layers.bare, extent=(0, width, height, 0), interpolation="lanczos")
+    (skyline,) = layers.overlay["skyline"]
+    edge = np.array(skyline)
+    frame = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]])
+    outside = np.vstack([frame, edge[::-1] if is_clockwise(edge) == is_clockwise(frame) else edge])
+    axes.add_patch(Polygon(outside, closed=True, facecolor=WALL, alpha=0.82, lw=0))
+    axes.plot(*edge.T, color=EDGE, lw=2.2)
 
 
 def write_name(axes: Axes, name: str, x: float, y: float, status: str, width: float) -> None:

@@ -1,4 +1,4 @@
-"""Makes the pictures of README.md and docs/ from a sample and from benchmarks/results/.
+"""Makes the pictures of README.md and docs/ from samples, tutorials and benchmarks/results/.
 
     python docs/make_pictures.py [NAME ...]
 
@@ -8,6 +8,7 @@ Needs the extras `plots` and, for `report`, `browser` with Chromium. The figures
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import sys
@@ -20,11 +21,11 @@ import numpy as np
 from PIL import Image
 
 import startrack
+from startrack.chain import Settings
 from startrack.core.types import Array, Evidence
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
-from matplotlib.patches import Circle
 
 ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / "docs/images"
@@ -60,10 +61,7 @@ def make_report(solution: Any, folder: Path) -> None:
     """The HTML page of the sample, as a browser shows it."""
     from playwright.sync_api import sync_playwright
 
-    from startrack.cli.main import main as command
-
-    if command(["report", str(folder / "near-wall.fix.json")]) != 0:
-        raise SystemExit("the page could not be made")
+    run("report", str(folder / "near-wall.fix.json"))
     with sync_playwright() as driver:
         path = next(filter(None, map(shutil.which, BROWSERS)), None)
         browser = driver.chromium.launch(executable_path=path, args=["--no-sandbox"])
@@ -76,15 +74,15 @@ def make_report(solution: Any, folder: Path) -> None:
 
 
 def make_posterior(solution: Any, folder: Path) -> None:
-    """Posterior by the stars on the whole floor and enlarged, with the final 95 % circle and the truth."""
+    """Posterior by the stars on the whole floor and enlarged, the 95 % circles by stars and by all, the truth."""
+    by_stars = startrack.locate(SAMPLE, settings=Settings(evidence_sources="stars")).result.fix
     located, terrain = solution.result, solution.result.terrain
     rows, middle_m = located.evidence(), np.asarray(located.fix.position_enu_m[:2])
-    radius_m = located.fix.radius95_m
     horizon = terrain.horizon_rad(middle_m[None], rows.azimuth_rad)
     near = np.abs(rows.elevation_rad - horizon.ravel()) < NEAR_RAD
     panels = [
         ("Whole crater floor", np.zeros(2), 10_000.0, 1e-3, rows.take(np.abs(rows.llr) > WIDE_LLR)),
-        ("Enlarged", middle_m, 4 * radius_m, 1.0, rows.take(near)),
+        ("Enlarged", middle_m, 2 * by_stars.radius95_m, 1.0, rows.take(near)),
     ]
     with plt.rc_context(DARK):
         figure, all_axes = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained")
@@ -107,9 +105,14 @@ def make_posterior(solution: Any, folder: Path) -> None:
             axes.locator_params(nbins=4)
             figure.colorbar(drawn, ax=axes, fraction=0.046, label=density)
             axes.plot(TRUE_M[0] * scale, TRUE_M[1] * scale, "+", color="#4fd1c5", ms=14, mew=2, label="true position")
-        circle = Circle(tuple(middle_m), radius_m, fill=False, color="#63b3ed", lw=1.8, label="95 % circle of the fix")
-        all_axes[1].add_patch(circle)
-        all_axes[1].legend(loc="upper right", fontsize=9)
+        for fix, style, label in (
+            (by_stars, "--", "95 % by the stars alone"),
+            (located.fix, "-", "95 % with the light of the sky"),
+        ):
+            turn = np.linspace(0, 2 * np.pi, 121)
+            circle_m = np.asarray(fix.position_enu_m[:2]) + fix.radius95_m * np.stack([np.sin(turn), np.cos(turn)], -1)
+            all_axes[1].plot(*circle_m.T, style, color="#63b3ed", lw=1.8, label=label)
+        all_axes[1].legend(loc="upper left", fontsize=9)
         save_figure(figure, "posterior")
 
 
@@ -140,6 +143,39 @@ def make_accuracy(solution: Any, folder: Path) -> None:
     save_figure(figure, "accuracy")
 
 
+def make_horizon(solution: Any, folder: Path) -> None:
+    """The skyline of the photograph of the samples."""
+    image, site = str(ROOT / "sample_images/lowell-2018-08-06.fits.bz2"), "--site=34.7443,-111.4223,2361"
+    run("horizon", image, "-c", "lowell-ldt", site, "-o", str(folder / "horizon.png"))
+    save_webp(Image.open(folder / "horizon.png"), "horizon", width_px=1440)
+
+
+def make_terrain(solution: Any, folder: Path) -> None:
+    """Relief of the real Shackleton and the panorama from its floor, one below the other."""
+    run("terrain", "show", "shackleton", "--at", "1000", "-500", "-D", str(folder))
+    save_webp(Image.open(folder / "shackleton.relief.png"), "relief", width_px=800)
+    save_webp(Image.open(folder / "shackleton.horizon.png"), "panorama", width_px=1440)
+
+
+def run(*words: str) -> None:
+    """Run a command of startrack."""
+    from startrack.cli.main import main as command
+
+    if command(list(words)) != 0:
+        raise SystemExit(f"startrack {' '.join(words)} failed")
+
+
+def make_tutorial(page: str, picture: str, name: str) -> None:
+    """A picture that the commands of a tutorial write, made in a folder of its own."""
+    sys.path.insert(0, str(ROOT / "tests"))
+    from page_helpers import run_page
+
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        Path("sample_images").symlink_to(ROOT / "sample_images")
+        run_page(ROOT / f"docs/tutorials/{page}.md")
+        save_webp(Image.open(picture), name, width_px=1440)
+
+
 def save_webp(image: Image.Image, name: str, width_px: int) -> None:
     """The image in docs/images/, at the best quality below MAX_BYTES."""
     image = image.convert("RGB")
@@ -160,8 +196,14 @@ def save_figure(figure: Any, name: str) -> None:
 
 PICTURES = {
     "annotated": make_annotated, "lowell": make_lowell, "skyline": make_skyline, "posterior": make_posterior,
-    "report": make_report, "accuracy": make_accuracy,
+    "report": make_report, "accuracy": make_accuracy, "horizon": make_horizon, "terrain": make_terrain,
 }  # fmt: skip
+TUTORIALS = {  # name: page, and the file that its commands write
+    "crater": ("own-terrain", "startrack-out/crater.horizon.png"),
+    "valley": ("earth-valley", "startrack-out/night.annotated.png"),
+    "ridge": ("place-from-a-photograph", "startrack-out/ridge.skyline.png"),
+    "lens": ("calibrate-your-camera", "my-camera.report.png"),
+}
 
 
 def main() -> None:
@@ -169,8 +211,11 @@ def main() -> None:
     solution = startrack.locate(SAMPLE)
     with tempfile.TemporaryDirectory() as folder:
         solution.write(folder)
-        for name in sys.argv[1:] or PICTURES:
-            PICTURES[name](solution, Path(folder))
+        for name in sys.argv[1:] or [*PICTURES, *TUTORIALS]:
+            if name in TUTORIALS:
+                make_tutorial(*TUTORIALS[name], name)
+            else:
+                PICTURES[name](solution, Path(folder))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Writes what CONTRIBUTING.md, docs/formats.md and docs/track.md show of the code, and docs/how-good.md of the results.
+"""Writes what CONTRIBUTING.md, docs/formats.md and docs/track.md show of the code, and two pages of the results.
 
     python docs/make_tables.py
 
@@ -14,7 +14,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))  # of the module beside this one
 
-from measured_figures import figure_tables
+from measured_figures import figure_tables, question_table
 
 import startrack
 from startrack.applications.prediction import CELL_QUANTITIES, PATH_QUANTITIES
@@ -22,7 +22,8 @@ from startrack.applications.tracking import FRAME_QUANTITIES
 from startrack.core.errors import Reason
 from startrack.output import QUANTITIES, markdown_table
 
-PAGES = [Path(__file__).parent / name for name in ("../CONTRIBUTING.md", "formats.md", "track.md", "how-good.md")]
+NAMES = ("../CONTRIBUTING.md", "formats.md", "track.md", "how-good.md", "results.md")
+PAGES = [Path(__file__).parent / name for name in NAMES]
 PACKAGE = Path(startrack.__file__).parent
 
 
@@ -59,6 +60,7 @@ def page_with_tables(text: str) -> str:
     tables = {
         "packages": package_list(),
         "figures": figure_tables(),
+        "questions": question_table(),
         "quantities": markdown_table(QUANTITIES, "key"),
         "reasons": reason_table(),
         "track": markdown_table(FRAME_QUANTITIES, "column"),

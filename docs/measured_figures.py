@@ -1,4 +1,4 @@
-"""The figures of docs/how-good.md, taken from the stored results of the benchmarks (benchmarks/results/)."""
+"""The figures of docs/how-good.md and docs/results.md, taken from the stored results (benchmarks/results/)."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ class Figure:
 
     def line(self) -> str:
         """The line of the table."""
-        stored = result_of(self.section)
         link = f"[{self.section}]({PAGE}#{re.sub(r'[^a-z0-9 -]', '', self.section.lower()).replace(' ', '-')})"
-        return f"| {self.question} | {self._answer(stored)} | {link}, {stored['date']} |"
+        return f"| {self.question} | {self.answer_text()} | {link}, {result_of(self.section)['date']} |"
 
-    def _answer(self, stored: dict[str, Any]) -> str:
+    def answer_text(self) -> str:
+        """The answer with its numbers."""
+        stored = result_of(self.section)
         if not self.row:
             return str(next(one["text"] for one in stored["blocks"] if "text" in one)).rstrip(".")
         for block in stored["blocks"]:
@@ -99,6 +100,29 @@ GROUPS: dict[str, tuple[Figure, ...]] = {
 
 
 FRONT_PAGE = ("Depth", "Chain")  # sections whose figures README.md states
+
+
+QUESTIONS = (  # of docs/results.md, with a figure that answers each
+    ("How far off is a position from one picture?", "Position from one picture", 2),
+    ("And by Kua's method of 2008?", "Position from one picture", 3),
+    ("On ground that another program traced?", "Position from one picture", 6),
+    ("Under real starlight?", "Real pictures", 0),
+    ("By a real skyline?", "Real pictures", 1),
+    ("On a drive with odometry?", "Drives", 0),
+    ("Is the accuracy predicted rightly?", "Drives", 2),
+    ("Are stars named wrongly?", "Stars and lenses", 0),
+    ("How well is a lens known from one frame?", "Stars and lenses", 1),
+    ("How much CPU does a picture take, over sep's extraction?", "Speed and safety", 0),
+)
+
+
+def question_table() -> str:
+    """Questions, answers and the commands that measure them."""
+    rows = ["| question | answer | command |", "| --- | --- | --- |"]
+    for question, group, number in QUESTIONS:
+        figure = GROUPS[group][number]
+        rows.append(f"| {question} | {figure.answer_text()} | `{result_of(figure.section)['command']}` |")
+    return "\n".join(rows) + "\n"
 
 
 def cited_sections() -> set[str]:

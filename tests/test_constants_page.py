@@ -1,4 +1,4 @@
-"""Tables of docs/method.md against the code: the constants that decide an answer, and the errors of unstated facts."""
+"""docs/constants.md and the errors of unstated facts in docs/method.md, against the code."""
 
 from __future__ import annotations
 
@@ -14,16 +14,27 @@ from startrack.localization.clock import GROSS_PROBABILITY, GROSS_SIGMA_S
 from startrack.terrain.refracted import STAR_REFRACTION
 from startrack.terrain.shape import CYLINDER_FACTS, MAP_FACTS
 
-PAGE = (Path(__file__).parents[1] / "docs/method.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).parents[1] / "docs"
+METHOD = (DOCS / "method.md").read_text(encoding="utf-8")
 
 
-def rows_of(table: str) -> list[list[str]]:
+def rows_of(page: str, table: str) -> list[list[str]]:
     """Cells of the rows of the table after a comment."""
-    text = PAGE.split(f"<!-- {table} -->\n")[1].split("\n\n")[0]
+    text = page.split(f"<!-- {table} -->\n")[1].split("\n\n")[0]
     return [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()[2:]]
 
 
-CONSTANTS = rows_of("table of constants")
+def value_and_unit(cell: str) -> tuple[str, str]:
+    """Numbers with commas between, and the unit after them; empty where there is none."""
+    found = re.fullmatch(r"([-\d.e, ]*[\d.])(?: (\D.*))?", cell)
+    assert found, cell
+    return found[1], found[2] or ""
+
+
+CONSTANTS = [
+    (name, *value_and_unit(shown), meaning)
+    for name, shown, meaning in rows_of((DOCS / "constants.md").read_text(encoding="utf-8"), "table of constants")
+]
 
 
 @pytest.mark.parametrize(("name", "shown", "unit"), [row[:3] for row in CONSTANTS], ids=[row[0] for row in CONSTANTS])
@@ -59,11 +70,11 @@ def test_the_text_has_the_values_of_the_table() -> None:
         f"limited to {values['skyline_profiles.ROW_NATS']} nats",
         f"rounds ({values['importance_sampling.ROUNDS']} points)",
     ):
-        assert text in PAGE, text
+        assert text in METHOD, text
 
 
 def test_facts_have_the_default_and_gross_errors_of_the_code() -> None:
-    shown = {row[0].strip("`"): row[2:] for row in rows_of("table of facts")}
+    shown = {row[0].strip("`"): row[2:] for row in rows_of(METHOD, "table of facts")}
     clock = (TIME_SIGMA_S, GROSS_PROBABILITY, GROSS_SIGMA_S)
     known = {"time_sigma_s": clock} | {
         one.key: (one.sigma, one.gross_probability, one.gross_sigma)

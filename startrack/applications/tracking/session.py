@@ -27,7 +27,7 @@ from startrack.applications.tracking.odometry import SPAN_TOLERANCE_S, Odometry
 from startrack.applications.tracking.odometry_moves import odometry_moves, odometry_steps, times_s
 from startrack.applications.tracking.track import Track, estimate_track, track_of_newest
 from startrack.applications.tracking.track_errors import TrackErrors
-from startrack.applications.tracking.unknown_size import smooth_placed
+from startrack.applications.tracking.unknown_size import place_modes
 from startrack.catalog import load_catalog
 from startrack.chain import Located, Settings, input_hashes, job_sha256, load_camera_input, locate, terrain_input
 from startrack.core.errors import BadInput
@@ -156,16 +156,12 @@ class TrackSession:
         """The filter with frame k; where positions are not linear in `shared`, of all frames about what they show."""
         online = self._online
         if online is None or shared.bends:
-            online = OnlineTrack(len(shared), None if shared.bends else WINDOW)
+            online = OnlineTrack(len(shared), WINDOW)
         first = online.first
         frames = self.frames[first : k + 1]
         moves = odometry_moves(frames, odometry, self.odometry_errors, shows_scale=not shared.bends)
-        if shared.bends:
-            modes = [frame.modes for frame in frames]
-            placed = smooth_placed(modes, moves, shared)[0] if any(modes) else modes
-        else:
-            placed = [[shared.place(one) for one in frames[-1].modes]]
-        for of in placed:
+        added = frames if shared.bends else frames[-1:]
+        for of in place_modes([frame.modes for frame in added], moves, shared):
             online.add(of, moves, first)
         return online
 

@@ -1,6 +1,6 @@
 """Tracks of simulated drives and rests: errors and calibration of the filter, the smoother and the plain sum.
 
-    python benchmarks/drives.py [--drives 40] [--pixels] [--case NAME ...]
+    python benchmarks/drives.py [--drives 40] [--pixels] [--case NAME ...] [--seed N] [--section NAME]
 
 Drives on real Shackleton with odometry of 2 %, and rests. By default the evidence is simulated, without images: the
 catalogue's stars near the skyline, with the noise of photometry. With `--pixels` frames of 2048 px are rendered and
@@ -13,6 +13,8 @@ states such errors. "Plain sum" is the same smoother with every frame's own cova
 from __future__ import annotations
 
 import argparse
+import shlex
+import sys
 import time
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -22,8 +24,9 @@ from _drive_frames import Course, draw_course, frames_by_evidence, frames_by_pix
 from _map_draws import draw_ground
 from _results import table, write_section
 
-from startrack.applications.tracking.contradictions import smooth_robustly
+from startrack.applications.tracking.contradictions import conclude
 from startrack.applications.tracking.filtered_positions import filter_positions, positions_at_rest
+from startrack.applications.tracking.moves import Moves
 from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.types import Array
 from startrack.estimation.observations import FrameEstimate, Steps
@@ -36,6 +39,7 @@ SLIP_PART, SLIP_M = 0.1, 20.0
 SETTLED_FRAMES = 10  # after which the filter is scored
 SEED = 41
 CRATER = "shackleton-thesis"
+PACKAGES = "numpy", "scipy", "numba"
 
 
 @dataclass(frozen=True)
@@ -83,6 +87,7 @@ def main() -> None:
     parser.add_argument("--pixels", action="store_true", help="render and locate the frames")
     parser.add_argument("--case", action="append", choices=CASES, help="these cases only")
     parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--section", help="of the results; without it cases of one's own choice are not stored")
     args = parser.parse_args()
     lines = []
     for name in args.case or CASES:
@@ -101,10 +106,9 @@ def main() -> None:
             "plain sum, m", "NEES"]  # fmt: skip
     body = table(head, lines)
     print(body)
-    if not args.case:
-        source = "pixels" if args.pixels else "evidence"
-        command = f"python benchmarks/drives.py --drives {args.drives}" + (" --pixels" if args.pixels else "")
-        write_section(f"Tracks from {source}", command, ("numpy", "scipy", "numba"), body)
+    if args.section or not args.case:
+        section = args.section or f"Tracks from {'pixels' if args.pixels else 'evidence'}"
+        write_section(section, shlex.join(["python", "benchmarks/drives.py", *sys.argv[1:]]), PACKAGES, body)
 
 
 def score_track(case: Case, rng: np.random.Generator, pixels: bool, number: int) -> dict[str, float]:
@@ -124,9 +128,9 @@ def score_track(case: Case, rng: np.random.Generator, pixels: bool, number: int)
         found["smoothed"] = _score(position[-1:], covariance[-1:], course.position_m[:1])
     else:
         late = slice(SETTLED_FRAMES, None)
-        position, covariance, _, _ = filter_positions(modes, steps, len(course.shared))
-        found["filtered"] = _score(position[late], covariance[late], course.position_m[late])
-        robust = smooth_robustly(modes, steps).smoothed
+        filtered = filter_positions(modes, [Moves.of(steps)], len(course.shared))
+        found["filtered"] = _score(filtered.position_m[late], filtered.covariance_m2[late], course.position_m[late])
+        robust = conclude(modes, filtered.compared).smoothed
         found["smoothed"] = _score(robust.position_m, robust.covariance_m2, course.position_m)
     return {f"{key} {what}": value for key, score in found.items() for what, value in score.items()}
 

@@ -20,6 +20,7 @@ from _results import table, write_section
 from drives import Case, course_of, odometry
 
 from startrack.applications.tracking.filtered_positions import filter_positions
+from startrack.applications.tracking.moves import Moves
 from startrack.estimation.trajectory import smooth
 
 CASE = Case(40, 50.0, 900.0, degraded=True)
@@ -66,7 +67,7 @@ def compare(rng: np.random.Generator, python: str) -> dict[str, float]:
     start = time.process_time()
     ours = smooth(estimates, steps).position_m
     middle = time.process_time()
-    filtered, _, _, _ = filter_positions([(e,) for e in estimates], steps, len(course.shared))
+    filtered = filter_positions([(e,) for e in estimates], [Moves.of(steps)], len(course.shared)).position_m
     end = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         given, answer = Path(folder, "in.npz"), Path(folder, "out.npz")

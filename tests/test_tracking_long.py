@@ -9,10 +9,13 @@ from tracking_helpers import SHARED, attitudes, observed, odometry_of, shifted, 
 
 from startrack.applications.tracking import ObservedFrame, Odometry, TrackSession, estimate_track
 from startrack.applications.tracking import session as session_module
-from startrack.applications.tracking.filtered_positions import OnlineTrack
+from startrack.applications.tracking.contradictions import conclude
+from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions
 from startrack.applications.tracking.moves import Moves
+from startrack.applications.tracking.odometry_moves import odometry_moves
 from startrack.core.errors import BadInput
 from startrack.core.types import Array
+from startrack.estimation.observations import USUAL_ODOMETRY
 
 FRAMES, WINDOW = 44, 9
 LEG = slice(14, 27)  # moves that slip alike, more of them than the window has
@@ -61,13 +64,26 @@ def test_a_window_shorter_than_a_slipped_leg_changes_no_answer(monkeypatch):
     assert (np.linalg.norm(position[known, :2] - truth[known], axis=1) < 1.5 * radius[known]).all()
 
 
+def test_what_is_settled_is_smoothed_as_in_a_track_that_settles_nothing():
+    frames, odometry, _ = mixed_drive()
+    moves, modes = odometry_moves(frames, odometry, USUAL_ODOMETRY), [one.modes for one in frames]
+    whole, settled = (
+        conclude(modes, filter_positions(modes, moves, len(SHARED), window).compared) for window in (FRAMES, WINDOW)
+    )
+    assert settled.mode.tolist() == whole.mode.tolist()
+    assert whole.slipped[LEG].all() and settled.slipped[LEG].all()
+    sigma_m = np.sqrt(np.trace(whole.smoothed.covariance_m2, axis1=1, axis2=2))
+    away_m = np.linalg.norm(settled.smoothed.position_m - whole.smoothed.position_m, axis=1)
+    assert (away_m < 0.3 * sigma_m).all()
+
+
 def test_what_a_live_track_keeps_does_not_grow():
     drive = simulate_drive(np.random.default_rng(22), 5 * WINDOW)
     moves, online, sizes = Moves.of(drive.steps), OnlineTrack(1, WINDOW), []
     for k, estimate in enumerate(drive.estimates):
         first = online.first
         online.add([estimate], [moves.part(first, k + 1 - first)], first)
-        explained = online._explanations
+        explained = online.compared
         sizes.append((len(online._modes), len(explained._frames), explained._branches.history.shape[1], k - first))
     assert np.max(sizes[WINDOW:], axis=0).tolist() == [WINDOW, WINDOW, WINDOW, WINDOW + 1]
     assert np.linalg.norm(online.position_m - drive.position_m[-1]) < 4.0 * np.sqrt(np.trace(online.covariance_m2))

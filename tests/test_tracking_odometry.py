@@ -50,6 +50,20 @@ def test_increments_are_those_of_poses_interpolated_one_by_one(seed):
     np.testing.assert_allclose(odometry.increments_body_m(times), expected, atol=1e-8)
 
 
+def test_moves_of_a_few_frames_take_the_poses_about_them_alone():
+    """The cost of a frame does not grow with the drive; the poses beyond change nothing."""
+    rng = np.random.default_rng(8)
+    whole = random_odometry(rng, 400)
+    for first, last in ((0, 3), (150, 153), (396, 399)):
+        times = np.sort(np.append(rng.uniform(*whole.time_s[[first, last]], 4), whole.time_s[first + 1]))
+        about = whole._poses_about(times)
+        assert about.stop - about.start <= 4
+        part = Odometry(
+            time_s=whole.time_s[about], position_m=whole.position_m[about], quat_xyzw=whole.quat_xyzw[about]
+        )
+        np.testing.assert_array_equal(whole.increments_body_m(times), part.increments_body_m(times))
+
+
 def test_increments_do_not_depend_on_the_frame_of_the_odometry():
     rng = np.random.default_rng(7)
     odometry = random_odometry(rng)

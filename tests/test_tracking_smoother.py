@@ -1,16 +1,18 @@
 """The linear estimator of a track: against least squares with every unknown written out, and against the truth."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from tracking_helpers import STEP_SIGMA_M, Drive, mean_nees, shifted, simulate_drive, with_slips
 
-from startrack.applications.tracking.contradictions import smooth_robustly
+from startrack.applications.tracking.contradictions import RobustTrack, conclude
+from startrack.applications.tracking.explanations import explain
 from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions
 from startrack.applications.tracking.moves import Moves
 from startrack.estimation import trajectory
-from startrack.estimation.observations import Steps
+from startrack.estimation.observations import FrameEstimate, Steps
 from startrack.estimation.trajectory import TrackFilter, smooth
 
 
@@ -18,6 +20,11 @@ def with_shared_moves(drive: Drive) -> Drive:
     """The drive with errors of scale and heading that all its moves share."""
     move_m = drive.steps.move_m
     return replace(drive, steps=replace(drive.steps, by_shared_m=0.05 * np.stack([move_m, move_m[:, ::-1]], axis=-1)))
+
+
+def explained(modes: Sequence[Sequence[FrameEstimate]], steps: Steps) -> RobustTrack:
+    """The track by its likeliest explanation."""
+    return conclude(modes, explain(modes, [Moves.of(steps)]))
 
 
 def least_squares(drive: Drive, frames: int) -> tuple[np.ndarray, np.ndarray]:
@@ -151,10 +158,10 @@ def test_slipped_moves_are_found_and_cost_no_more_than_their_loss():
         drive = simulate_drive(np.random.default_rng([5, seed]), 30)
         which = np.array([2, 12, 22]) + np.random.default_rng([6, seed]).integers(0, 5, 3)
         modes = [(e,) for e in drive.estimates]
-        slipped = smooth_robustly(modes, with_slips(drive.steps, which, 20.0))
+        slipped = explained(modes, with_slips(drive.steps, which, 20.0))
         found += int(slipped.slipped[which].sum())
         assert slipped.slipped.sum() <= 4
-        assert not smooth_robustly(modes, drive.steps).slipped.any()
+        assert not explained(modes, drive.steps).slipped.any()
         without = np.where(np.isin(np.arange(29), which), np.inf, drive.steps.sigma_m)
         unslipped = smooth(
             drive.estimates, replace(drive.steps, sigma_m=without)
@@ -170,10 +177,10 @@ def test_a_frame_that_contradicts_is_left_out_by_both_estimates():
     estimates = list(drive.estimates)
     estimates[8] = shifted(estimates[8], np.array([120.0, -90.0]))
     modes = [(e,) for e in estimates]
-    found = smooth_robustly(modes, drive.steps)
+    found = explained(modes, drive.steps)
     assert found.mode.tolist() == [0] * 8 + [-1] + [0] * 11
     assert not found.slipped.any()
-    online, _, _, _ = filter_positions(modes, drive.steps, 1)
+    online = filter_positions(modes, [Moves.of(drive.steps)], 1).position_m
     assert np.linalg.norm(online - drive.position_m, axis=1).max() < 15.0
 
 
@@ -181,15 +188,15 @@ def test_a_wrong_first_frame_does_not_hold_the_filter():
     drive = simulate_drive(np.random.default_rng(8), 12)
     modes = [(e,) for e in drive.estimates]
     modes[0] = (shifted(drive.estimates[0], np.array([300.0, 400.0])),)
-    online, _, _, _ = filter_positions(modes, drive.steps, 1)
+    online = filter_positions(modes, [Moves.of(drive.steps)], 1).position_m
     assert np.linalg.norm(online[4:] - drive.position_m[4:], axis=1).max() < 15.0
-    assert smooth_robustly(modes, drive.steps).mode[0] == -1
+    assert explained(modes, drive.steps).mode[0] == -1
 
 
 def test_three_refused_frames_are_bridged_with_growing_errors():
     drive = simulate_drive(np.random.default_rng(9), 12)
     modes = [() if k in (5, 6, 7) else (e,) for k, e in enumerate(drive.estimates)]
-    found = smooth_robustly(modes, drive.steps)
+    found = explained(modes, drive.steps)
     assert found.mode.tolist() == [-1 if k in (5, 6, 7) else 0 for k in range(12)]
     online = OnlineTrack(1)
     traces = []
@@ -209,7 +216,7 @@ def test_the_sequence_chooses_the_mode_of_an_ambiguous_frame():
     wrong, right = shifted(drive.estimates[4], np.array([200.0, 0.0])), drive.estimates[4]
     modes[4] = (replace(wrong, weight=0.7), replace(right, weight=0.3))
     modes[6] = (replace(shifted(wrong, np.array([0.0, 500.0])), weight=0.6), replace(wrong, weight=0.4))  # neither
-    found = smooth_robustly(modes, drive.steps)
+    found = explained(modes, drive.steps)
     assert found.mode[4] == 1
     assert found.mode[6] == -1
 
@@ -218,7 +225,7 @@ def test_without_odometry_only_the_shared_errors_connect_the_frames():
     drive = simulate_drive(np.random.default_rng(11), 8)
     alone = smooth([drive.estimates[3]], Steps.unknown(1))
     modes = [(e,) for e in drive.estimates]
-    found = smooth_robustly(modes, Steps.unknown(8))
+    found = explained(modes, Steps.unknown(8))
     assert found.mode.tolist() == [0] * 8
     assert not found.slipped.any()
     assert np.trace(found.smoothed.covariance_m2[3]) < np.trace(alone.covariance_m2[0])
@@ -228,4 +235,4 @@ def test_without_odometry_only_the_shared_errors_connect_the_frames():
 
 def test_a_track_needs_one_frame_with_a_position():
     with pytest.raises(ValueError, match="no frame has a single position"):
-        smooth_robustly([(), ()], Steps.unknown(2))
+        explained([(), ()], Steps.unknown(2))

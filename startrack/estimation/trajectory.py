@@ -105,16 +105,16 @@ class TrackFilter:
         mean = np.vstack([*settled, before, self.mean[0, :2]])
         return mean, np.stack([*(own[0] for _, own in last.settled), *last.own[0], self.covariance[0, :2, :2]])
 
-    def take(self, which: Ints | Bools | slice) -> Self:
-        """The explanations of an index, without followers."""
+    def __getitem__(self, which: Ints | Bools | slice) -> Self:
+        """A copy of the explanations of an index, without followers."""
         mean, covariance = self.mean[which].copy(), self.covariance[which].copy()
         return replace(self, mean=mean, covariance=covariance, posts=self.posts.copy(), followers=None)
 
-    def join(self, others: Sequence[Self]) -> Self:
-        """These explanations and those of `others`, which have the same posts."""
-        parts = [self, *others]
+    @staticmethod
+    def join(parts: Sequence[TrackFilter]) -> TrackFilter:
+        """All explanations of several, which have the same posts."""
         mean, covariance = (np.concatenate([getattr(one, name) for one in parts]) for name in ("mean", "covariance"))
-        return replace(self, mean=mean, covariance=covariance)
+        return replace(parts[0], mean=mean, covariance=covariance)
 
     def predict(self, steps: Steps, number: int) -> None:
         """The camera made the move of this `number`, by all explanations; one that is not known leads anywhere."""
@@ -122,8 +122,7 @@ class TrackFilter:
         by_shared_m = steps.by_shared_m[one] if self.moves_count else np.zeros((1, 2, 0))
         self.move(*(np.repeat(of, count, axis=0) for of in (steps.move_m[one], steps.sigma_m[one], by_shared_m)))
         if len(steps.leg) and steps.leg[number] and np.isfinite(steps.sigma_m[number]):
-            known = np.isfinite(steps.sigma_m[:number])
-            is_new = bool(steps.leg[number] > steps.leg[:number][known].max(initial=0))
+            is_new = bool(steps.leg[number] > steps.leg[:number].max(initial=0))
             self.move_by_leg(np.repeat(steps.by_leg_m[one], count, axis=0), is_new=is_new)
 
     def move(self, move_m: Array, sigma_m: Array, by_m: Array) -> None:
@@ -153,20 +152,20 @@ class TrackFilter:
         end = 2 + self.shared_count + self.moves_count + self.leg_count
         leg = slice(end - self.leg_count, end)
         if is_new:
-            self.mean[:, leg], self.covariance[:, leg], self.covariance[:, :, leg] = 0.0, 0.0, 0.0
-            self.covariance[:, leg, leg] = np.eye(self.leg_count)
-            if self.followers is not None:
-                self.followers.cross[:, :, leg] = 0.0
+            self._forget(leg)
         self._shift(by_m, leg)
 
     def forget_moves(self) -> None:
         """The errors that all moves share are not known: those of another kind of odometry, in its sigmas."""
         first = 2 + self.shared_count
-        moves = slice(first, first + self.moves_count)
-        self.mean[:, moves], self.covariance[:, moves], self.covariance[:, :, moves] = 0.0, 0.0, 0.0
-        self.covariance[:, moves, moves] = np.eye(self.moves_count)
+        self._forget(slice(first, first + self.moves_count))
+
+    def _forget(self, part: slice) -> None:
+        """Of the errors in a `part` of the state, their prior is all that is known."""
+        self.mean[:, part], self.covariance[:, part], self.covariance[:, :, part] = 0.0, 0.0, 0.0
+        self.covariance[:, part, part] = np.eye(part.stop - part.start)
         if self.followers is not None:
-            self.followers.cross[:, :, moves] = 0.0
+            self.followers.cross[:, :, part] = 0.0
 
     def _shift(self, by_m: Array, part: slice) -> None:
         """Move by errors of a `part` of the state: `by_m` (b, 2, f) by one sigma of each."""

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.applications.tracking.explanations import Explanation, Explanations
-from startrack.applications.tracking.moves import Moves
 from startrack.core.types import Array, BadInput, Bools, Ints
 from startrack.estimation.observations import FrameEstimate, Steps
 from startrack.estimation.trajectory import Smoothed, mix_smoothed, smooth
@@ -36,19 +35,14 @@ class RobustTrack:
         return np.asarray(self.leg > 0)
 
 
-def smooth_robustly(
-    modes: Sequence[Sequence[FrameEstimate]],
-    moves: Steps | Sequence[Moves],
-    *,
-    may_slip: bool = True,
-    names: Sequence[str] = (),
+def conclude(
+    modes: Sequence[Sequence[FrameEstimate]], compared: Explanations, names: Sequence[str] = ()
 ) -> RobustTrack:
-    """The estimate from frames with one mode each, several (ambiguous) or none (refused), and the moves between them.
+    """The estimate from frames with one mode each, several (ambiguous) or none (refused).
 
     Args:
         modes: of n frames, in the order of time.
-        moves: between them; several for odometry with a fault as a whole, that as stated first.
-        may_slip: whether moves may slip; at rest they do not.
+        compared: their explanations, with the moves between all of them.
         names: of the frames, for messages; empty: their numbers from 1.
 
     Raises:
@@ -57,19 +51,15 @@ def smooth_robustly(
     """
     if not any(modes):
         raise ValueError("no frame has a single position")
-    kinds = [Moves.of(moves)] if isinstance(moves, Steps) else moves
-    compared = Explanations(next(of[0].parameters for of in modes if of) - 2, may_slip)
-    for of in modes:
-        compared.add(of, kinds)
     best, *others = compared.ranked()
     found = _smooth(modes, best, best.mode)
     doubt, rival = _doubt(modes, best, found, others)
     vouched = doubt <= AMBIGUOUS_MASS
     mode = np.where(vouched, best.mode, -1)
     if found is None or (mode < 0).all():
-        texts = [_group(one, names, has_odometry=len(kinds) > 1) for one in (best, rival or best)]
-        what = "contradict each other" if may_slip else "do not agree on one position"
-        why = "" if may_slip else ": has the camera moved? Then leave --at-rest out"
+        texts = [_group(one, names, has_odometry=compared.has_odometry) for one in (best, rival or best)]
+        what = "contradict each other" if compared.may_slip else "do not agree on one position"
+        why = "" if compared.may_slip else ": has the camera moved? Then leave --at-rest out"
         raise BadInput("inconsistent_evidence", f"{' and '.join(texts)} {what}, and neither is clearly right{why}")
     if (mode != best.mode).any():
         found = _smooth(modes, best, mode) or found
@@ -111,9 +101,8 @@ def _smooth(modes: Sequence[Sequence[FrameEstimate]], one: Explanation, mode: In
     chosen = [of[k] if k >= 0 else None for of, k in zip(modes, mode, strict=True)]
     if all(estimate is None for estimate in chosen):
         return None
-    others = [each.share for each in one.variants]
-    share = np.array([1.0 - sum(others), *others])
-    return mix_smoothed([smooth(chosen, each.steps) for each in (one, *one.variants)], share)
+    parts, share = one.parts
+    return mix_smoothed([smooth(chosen, each.steps) for each in parts], share)
 
 
 def _group(one: Explanation, names: Sequence[str], *, has_odometry: bool) -> str:

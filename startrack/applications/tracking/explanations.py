@@ -4,9 +4,8 @@ An explanation states of each image whether it is of this camera, and which of i
 whether the wheels slipped, in it alone or alike in the moves of a leg; and of the odometry, whether it is as stated or
 wrong as a whole. Each has a prior (the constants below) and a likelihood: that of the filter without posts, whose
 errors count as the image's own. An image that is not of the track is anywhere, or near its place with a gross error.
-The moves are turned by the attitude of the last image that an explanation takes as right. In a live track the images
-that WINDOW others have followed are settled, unless explanations that matter take them otherwise: time and memory then
-stay flat.
+The moves are turned by the attitude of the last image that an explanation takes as right. The images that WINDOW others
+have followed are settled, unless explanations that matter take them otherwise: the time of an image then stays flat.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ FOREIGN_SIGMA_M = 5000.0  # of a position anywhere in a search area, about its m
 MIXED_PROBABILITY, MIXED_PART = 1e-3, 0.1  # of a set with images from elsewhere, and how many of its images these are
 ODOMETRY_WRONG_PROBABILITY = 0.01  # as a whole
 LEAST_VARIANT = 0.01  # part of an explanation's probability, by other moves, that counts in its positions
-WINDOW = 200  # frames of a live track that are not settled
+WINDOW = 200  # frames that are not settled
 SETTLED_DOUBT = 1e-3  # probability of explanations that take a frame otherwise, from which on it is not settled
 KEPT_NATS, MOST_KEPT = 60.0, 60  # of explanations beside the best, and for each kind of odometry
 
@@ -39,7 +38,7 @@ KEPT_NATS, MOST_KEPT = 60.0, 60  # of explanations beside the best, and for each
 class Explanation:
     """One explanation of n frames, with the shares of all that differ in no frame and in no use of the odometry.
 
-    The frames are those that its moves have: all, or the last ones. Of settled ones among them nothing is said.
+    The frames are those that its moves have: all, or the last ones.
     """
 
     share: float  # of the probability
@@ -51,6 +50,12 @@ class Explanation:
     position_m: Array  # (2,) of the last frame
     covariance_m2: Array  # (2, 2)
     variants: tuple[Explanation, ...] = ()  # with other moves alone, beside it; their shares are those of this one
+
+    @property
+    def parts(self) -> tuple[tuple[Explanation, ...], Array]:
+        """It and its variants, with the share (m,) of each among them."""
+        others = [one.share for one in self.variants]
+        return (self, *self.variants), np.array([1.0 - sum(others), *others])
 
     @property
     def leg(self) -> Ints:
@@ -72,8 +77,8 @@ class Explanations:
 
     shared_count: int
     may_slip: bool = True
-    window: int | None = None  # frames that are not settled; None: all
-    settled: int = 0  # number of frames before these
+    window: int = WINDOW  # frames that are not settled
+    _settled: list[Ints] = field(default_factory=list)  # mode, kind and anchor (3,) of each frame before these
     _frames: list[Sequence[FrameEstimate]] = field(default_factory=list)  # that are not settled
     _with_modes: int = 0  # number of frames that have one
     _moves: Sequence[Moves] = ()
@@ -100,8 +105,13 @@ class Explanations:
             branches += [_decided(start, start.log_likelihood + np.log1p(-np.exp(doubt)), -1, here)]
             branches += [_decided(start, start.log_likelihood + doubt, -1, start.anchor)] if known.any() else []
         self._found = self._likeliest(Branches.join(branches))
-        while self.window is not None and len(self._frames) > self.window and self._settle(self._branches):
+        while len(self._frames) > self.window and self._settle(self._branches):
             pass
+
+    @property
+    def settled(self) -> int:
+        """Number of settled frames."""
+        return len(self._settled)
 
     def _settle(self, found: Branches) -> bool:
         """Keep the explanations that take the first frame as the likeliest one does; False where others matter."""
@@ -109,16 +119,25 @@ class Explanations:
         share, other = np.exp(total - np.logaddexp.reduce(total)), found.history[:, 0, 0] != found.history[0, 0, 0]
         if share[other].sum() > SETTLED_DOUBT:
             return False
-        second = self._second_group(found.take(np.arange(1)))
+        second = self._second_group(found[np.arange(1)])
         if second is not None:
             rival = second[0] + self._wrong_prior(second[1].wrong)[0]
             if rival - total[0] > np.log(SETTLED_DOUBT):
                 return False
-        kept = found.take(~other)
-        self.settled += 1
+        kept = found[~other]
+        self._settled.append(found.history[0, 0].copy())
         self._frames.pop(0)
         self._found = replace(kept, history=kept.history[:, 1:], log_wrong=kept.log_wrong[:, 1:])
         return True
+
+    def from_start(self, moves: Sequence[Moves]) -> Explanations:
+        """The same with the `moves` between all frames, also settled ones."""
+        return replace(self, _moves=moves, _first=0)
+
+    @property
+    def has_odometry(self) -> bool:
+        """Whether the moves are by odometry, which may have a fault."""
+        return len(self._moves) > 1
 
     @property
     def first(self) -> int:
@@ -140,7 +159,7 @@ class Explanations:
             key = bool(self._moves[found.odometry[b]].fault), found.history[b, :, 0].tobytes()
             groups.setdefault(key, []).append(b)
         weights = [np.logaddexp.reduce(total[group]) for group in groups.values()]
-        best = [found.take(np.array(group[:1])) for group in groups.values()]
+        best = [found[np.array(group[:1])] for group in groups.values()]
         seen: set[object] = set()
         for number, (is_faulty, *_) in enumerate(groups):  # the best with each use of the odometry
             second = None if is_faulty in seen else self._second_group(best[number])
@@ -157,7 +176,7 @@ class Explanations:
         if not likeliest.moves.fault:
             part = np.exp(total[group] - np.logaddexp.reduce(total[group]))
             kept = [(b, p) for b, p in zip(group[1:], part[1:].tolist(), strict=True) if p > LEAST_VARIANT]
-            more = tuple(self._explanation(found.take(np.array([b])), p) for b, p in kept)
+            more = tuple(self._explanation(found[np.array([b])], p) for b, p in kept)
             likeliest = replace(likeliest, variants=more)
         return [likeliest, *others]
 
@@ -168,8 +187,7 @@ class Explanations:
         return self._found
 
     def _explanation(self, one: Branches, share: float) -> Explanation:
-        before = np.tile([-1, STRAIGHT, 0], (self.settled - self._first, 1))
-        mode, kind, anchor = np.vstack([before, one.history[0]]).T
+        mode, kind, anchor = np.vstack([*self._settled[self._first :], one.history[0]]).T
         turned_by = np.maximum(anchor[1:] - self._first, 0)
         return Explanation(
             share, self._moves[one.odometry[0]], int(one.odometry[0]), mode, kind[1:], turned_by,
@@ -183,7 +201,7 @@ class Explanations:
         )  # fmt: skip
         nothing, none = np.zeros(count), np.zeros(count, dtype=np.int64)
         return Branches(
-            np.array([m.log_prior for m in self._moves]), nothing[:, None], none, state, np.arange(count), none,
+            state, np.array([m.log_prior for m in self._moves]), nothing[:, None], none, np.arange(count), none,
             np.zeros((count, 1, 3), dtype=np.int64),
         )  # fmt: skip
 
@@ -203,14 +221,11 @@ class Explanations:
         freedom = np.array([m.freedom_m[step] for m in self._moves])[one.odometry]
         move = np.einsum("bij,bj->bi", turn, delta)[:, :2]
         sigma = np.where(np.isfinite(move).all(axis=1), sigma, np.inf)
-        lost, state = np.isinf(sigma), one.state.take(slice(None))
+        lost, state = np.isinf(sigma), one.state[:]
         state.move(move, sigma, (turn @ freedom)[:, :2])
         entry = np.stack([np.zeros_like(one.anchor), np.zeros_like(one.anchor), one.anchor], axis=-1)
-        history, log_wrong = (
-            np.concatenate([one.history, entry[:, None]], axis=1),
-            np.pad(one.log_wrong, ((0, 0), (0, 1))),
-        )
-        moved = Branches(one.log_likelihood, log_wrong, one.wrong, state, one.odometry, one.anchor, history)
+        history = np.concatenate([one.history, entry[:, None]], axis=1)
+        moved = replace(one, state=state, log_wrong=np.pad(one.log_wrong, ((0, 0), (0, 1))), history=history)
         if not self.may_slip:
             return moved
         may_begin = ~lost & np.array([m.has_legs and not m.fault for m in self._moves])[one.odometry]
@@ -225,7 +240,7 @@ class Explanations:
             (BEGINS, may_begin, ended + np.log(LEG_PROBABILITY)),
             (CONTINUES, ~lost & in_leg, np.full(len(lost), np.log1p(-LEG_END_PROBABILITY))),
         ):
-            branches = moved.take(may)
+            branches = moved[may]
             branches.log_likelihood += log_prior[may]
             branches.history[:, -1, 1] = kind
             if kind == SLIPS:
@@ -273,7 +288,7 @@ class Explanations:
         order = order[total[order] > total.max() - KEPT_NATS]
         kind = found.odometry[order]
         place = np.cumsum(kind[:, None] == np.arange(len(self._moves)), axis=0)[np.arange(len(kind)), kind]
-        return found.take(order[place <= MOST_KEPT])
+        return found[order[place <= MOST_KEPT]]
 
     def _second_group(self, best: Branches) -> tuple[float, Branches] | None:
         """Log-likelihood of `best` where its wrong frames are a track of their own, and the explanation by that one.
@@ -285,16 +300,16 @@ class Explanations:
         wrong = np.count_nonzero(out & has_modes)
         if wrong < 2:
             return None
-        alone = Explanations(self.shared_count, self.may_slip)
+        alone = Explanations(self.shared_count, self.may_slip, window=len(out))
         start = replace(self._moves[best.odometry[0]].part(settled - self._first, len(out)), log_prior=0.0)
         start.turn[1:][~out] = np.nan
         for modes, is_out in zip(self._frames, out, strict=True):
             alone.add(modes if is_out else (), [start])
         other = alone._branches
-        other = other.take(other.wrong == 0)
+        other = other[other.wrong == 0]
         if not len(other.wrong):
             return None
-        other, as_wrong = other.take(np.argsort(-other.log_likelihood)[:1]), float(best.log_wrong[0].sum())
+        other, as_wrong = other[np.argsort(-other.log_likelihood)[:1]], float(best.log_wrong[0].sum())
         if other.log_likelihood[0] < as_wrong:
             return None
         other.history[..., 2] += np.where(other.history[..., 2] > 0, settled, 0)
@@ -302,9 +317,19 @@ class Explanations:
         return float(best.log_likelihood[0] - as_wrong + other.log_likelihood[0]), other
 
 
+def explain(modes: Sequence[Sequence[FrameEstimate]], moves: Sequence[Moves], *, may_slip: bool = True) -> Explanations:
+    """The explanations of frames with these `modes`, with the `moves` between all of them by each kind of odometry.
+
+    `may_slip`: whether moves may slip; at rest they do not.
+    """
+    found = Explanations(next((of[0].parameters for of in modes if of), 2) - 2, may_slip)
+    for of in modes:
+        found.add(of, moves)
+    return found
+
+
 def _decided(one: Branches, log_likelihood: Array, mode: int, anchor: Ints) -> Branches:
     """The same with a decision about the last frame."""
     history = one.history.copy()
     history[:, -1, 0] = mode
-    state = one.state.take(slice(None))
-    return Branches(log_likelihood, one.log_wrong, one.wrong, state, one.odometry, anchor, history)
+    return replace(one, state=one.state[:], log_likelihood=log_likelihood, anchor=anchor, history=history)

@@ -7,12 +7,12 @@ once.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.applications.tracking.contradictions import RobustTrack, disagrees, smooth_robustly
-from startrack.applications.tracking.explanations import Explanations
+from startrack.applications.tracking.contradictions import RobustTrack, conclude, disagrees
+from startrack.applications.tracking.explanations import WINDOW, Explanations, explain
 from startrack.applications.tracking.frame_estimate import (
     FRAME_REACH_SIGMAS,
     LEAST_FRAME_HALF_M,
@@ -38,14 +38,14 @@ Modes = Sequence[FrameEstimate]
 class OnlineTrack:
     """Positions at the time of each frame; `add` in the order of time. Without contradictions a Kalman filter."""
 
-    def __init__(self, shared_count: int, window: int | None = None) -> None:
+    def __init__(self, shared_count: int, window: int = WINDOW) -> None:
         """With `shared_count` errors that frames share; `window`: as of `Explanations`."""
         self.filter = TrackFilter.start(shared_count, FREEDOMS, LEG_FREEDOMS)
-        self._before, self._number = self.filter.take(slice(None)), 0  # of the settled frames; their kind of odometry
+        self._before, self._number = self.filter[:], 0  # of the settled frames; their kind of odometry
         self._first = 0  # frame of the first move
         self._has_used = False  # whether a frame before the last one is used
         self.is_vouched = True  # whether explanations of another position of the last frame are unlikely together
-        self._explanations = Explanations(shared_count, window=window)
+        self.compared = Explanations(shared_count, window=window)
         self._modes: list[Modes] = []  # of the frames that are not settled
         self._decided: list[tuple[object, ...]] = []  # of each of them that the filter has
 
@@ -67,8 +67,7 @@ class OnlineTrack:
     @property
     def _of_last(self) -> tuple[Array, Array]:
         """Where the filter differs from the explanation it follows, by posts, the variants differ alike."""
-        best, others = self._best, [one.share for one in self._best.variants]
-        parts, share = (best, *best.variants), np.array([1.0 - sum(others), *others])
+        best, (parts, share) = self._best, self._best.parts
         position, covariance = mixed_normal(
             [one.position_m for one in parts], [one.covariance_m2 for one in parts], share
         )
@@ -84,19 +83,19 @@ class OnlineTrack:
     @property
     def first(self) -> int:
         """Number of the first frame that `moves` must have when the next one is added."""
-        return self._explanations.first
+        return self.compared.first
 
     def add(self, modes: Modes, moves: Sequence[Moves], first: int = 0) -> None:
         """One more frame, with one mode, several (ambiguous) or none (refused).
 
         `moves` are as for `Explanations.add`, from the frame `first` on, at most that of the property.
         """
-        settled = self._explanations.settled
-        self._explanations.add(modes, moves, first)
+        settled = self.compared.settled
+        self.compared.add(modes, moves, first)
         self._modes.append(modes)
-        for number in range(settled, self._explanations.settled):
+        for number in range(settled, self.compared.settled):
             self._settle(number)
-        self._best, *others = self._explanations.ranked()
+        self._best, *others = self.compared.ranked()
         self._first = first
         self._follow_best()
         best = self._best
@@ -119,12 +118,12 @@ class OnlineTrack:
 
     def _follow_best(self) -> None:
         """Take into the filter what the likeliest explanation says of the frames that are not settled."""
-        best, steps, begin = self._best, self._best.steps, self._explanations.settled - self._first
+        best, steps, begin = self._best, self._best.steps, self.compared.settled - self._first
         turned_by = np.where(best.anchor > 0, best.anchor + self._first, 0).tolist()
         moved = [(), *zip(best.kind.tolist(), turned_by, [best.number] * len(best.kind), strict=True)]
         decided = [(mode, *move) for mode, move in zip(best.mode.tolist(), moved, strict=True)][begin:]
         if decided[: len(self._decided)] != self._decided:  # another explanation of these frames is likelier now
-            self.filter, self._decided = self._before.take(slice(None)), []
+            self.filter, self._decided = self._before[:], []
             if best.number != self._number:
                 self.filter.forget_moves()
         for k in range(len(self._decided), len(decided)):
@@ -135,23 +134,30 @@ class OnlineTrack:
         self._decided = decided
 
 
-def filter_positions(
-    modes: Sequence[Modes], moves: Steps | Sequence[Moves], shared_count: int
-) -> tuple[Array, Array, Ints, list[int]]:
-    """Positions (n, 2) and covariances (n, 2, 2), each by the frames up to its own, and the mode (n,) used then.
+@dataclass(frozen=True, eq=False)
+class Filtered:
+    """Positions of n frames, each by the frames up to its own."""
 
-    Also the frames whose position is by their image alone. `moves` are those of `smooth_robustly`. A position about
-    which explanations differ is not known.
-    """
-    track, position, covariance, alone, mode = OnlineTrack(shared_count), [], [], [], []
-    kinds = [Moves.of(moves)] if isinstance(moves, Steps) else moves
+    position_m: Array  # (n, 2)
+    covariance_m2: Array  # (n, 2, 2); of a position about which explanations differ, that of an unknown one
+    mode: Ints  # (n,) used then; -1: none
+    alone: list[int]  # the frames whose position is by their image alone
+    compared: Explanations  # of all frames
+
+
+def filter_positions(
+    modes: Sequence[Modes], moves: Sequence[Moves], shared_count: int, window: int = WINDOW
+) -> Filtered:
+    """The positions by frames of these `modes`; `moves` are those of `explain`, `window` that of `Explanations`."""
+    track, position, covariance, alone, mode = OnlineTrack(shared_count, window), [], [], [], []
     for k, of in enumerate(modes):
-        track.add(of, kinds)
+        first = track.first
+        track.add(of, [one.part(first, k + 1 - first) for one in moves], first)
         position.append(track.position_m)
         covariance.append(track.covariance_m2 if track.is_vouched else UNKNOWN_M**2 * np.eye(2))
         alone += [k] if track.is_first else []
         mode.append(track.mode)
-    return np.array(position), np.array(covariance), np.array(mode), alone
+    return Filtered(np.array(position), np.array(covariance), np.array(mode), alone, track.compared.from_start(moves))
 
 
 def positions_at_rest(
@@ -168,7 +174,7 @@ def positions_at_rest(
     terrain = terrain.with_steepness(next((frame.steepness_1 for frame in frames if frame.modes), 1.0))
     errors, modes = errors.on(terrain), [[errors.place(one) for one in frame.modes] for frame in frames]
     names = [frame.name for frame in frames]
-    agreeing = smooth_robustly(modes, still, may_slip=False, names=names)
+    agreeing = conclude(modes, explain(modes, [Moves.of(still)], may_slip=False), names)
     single = np.array([len(frame.modes) == 1 for frame in frames])
     agree, count = np.count_nonzero(single & (agreeing.mode >= 0)), np.count_nonzero(single)
     if count > 1 and 2 * agree <= count:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -84,20 +84,35 @@ class Odometry(Value):
             _refuse("the frames are not in the order of time")
         self.require_covers(at_s)
         at_s = np.clip(at_s, *self.time_s[[0, -1]])
-        position_m = np.stack([np.interp(at_s, self.time_s, axis) for axis in self.position_m.T], axis=-1)
-        return position_m, Slerp(self.time_s, Rotation.from_quat(self.quat_xyzw))(at_s)
+        about = self._poses_about(at_s)  # alone: a long drive has many others
+        own_s = self.time_s[about]
+        position_m = np.stack([np.interp(at_s, own_s, axis) for axis in self.position_m[about].T], axis=-1)
+        return position_m, Slerp(own_s, Rotation.from_quat(self.quat_xyzw[about]))(at_s)
+
+    def _poses_about(self, time_s: Array) -> slice:
+        """The poses, at least two, between which `time_s` (m,) within the odometry lie, in the order of time."""
+        if not len(time_s):
+            return slice(0, 2)
+        before = int(np.searchsorted(self.time_s, time_s[0], side="right")) - 1
+        after = int(np.searchsorted(self.time_s, time_s[-1]))
+        return slice(min(before, len(self) - 2), max(after, before + 1) + 1)
 
     def covers(self, time_s: Array, still_m: float = ODOMETRY_FLOOR_M) -> Bools:
         """Whether the odometry says where the body was at each of `time_s` (m,) [Unix s].
 
         It does not before its first pose, after its last one, and in a gap in which the body moved by `still_m` [m].
         """
-        step_s, moved_m = np.diff(self.time_s), np.linalg.norm(np.diff(self.position_m, axis=0), axis=1)
-        k = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, len(step_s) - 1)
-        is_gap = (step_s > GAP_INTERVALS * np.median(step_s)) & (moved_m > still_m)
+        k = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, len(self) - 2)
+        moved_m = np.linalg.norm(self.position_m[k + 1] - self.position_m[k], axis=1)
+        is_gap = (self.time_s[k + 1] - self.time_s[k] > self._longest_step_s) & (moved_m > still_m)
         after, before = time_s - self.time_s[k], self.time_s[k + 1] - time_s
         at_pose = (np.abs(after) <= SPAN_TOLERANCE_S) | (np.abs(before) <= SPAN_TOLERANCE_S)
-        return np.asarray(at_pose | ((after > 0) & (before > 0) & ~is_gap[k]))
+        return np.asarray(at_pose | ((after > 0) & (before > 0) & ~is_gap))
+
+    @cached_property
+    def _longest_step_s(self) -> float:
+        """Between poses of which none is missing."""
+        return GAP_INTERVALS * float(np.median(np.diff(self.time_s)))
 
     def require_covers(self, time_s: Array) -> None:
         """Raises BadInput (bad_odometry) for one of `time_s` (m,) [Unix s] before the first pose or after the last."""
@@ -111,14 +126,19 @@ class Odometry(Value):
 
     def require_possible(self, max_speed_m_s: float) -> None:
         """Raises BadInput (bad_odometry) for moves faster than `max_speed_m_s`."""
-        length_m, step_s = np.linalg.norm(np.diff(self.position_m, axis=0), axis=1), np.diff(self.time_s)
-        fast = length_m > max_speed_m_s * (step_s + SPAN_TOLERANCE_S)
-        if fast.any():
-            k = int(np.argmax(fast))
+        number, length_m, step_s = self._fastest_move
+        if length_m > max_speed_m_s * (step_s + SPAN_TOLERANCE_S):
             _refuse(
-                f"pose {k + 1}: {length_m[k]:.4g} m in {step_s[k]:.4g} s are faster than {max_speed_m_s:g} m/s, the "
+                f"pose {number}: {length_m:.4g} m in {step_s:.4g} s are faster than {max_speed_m_s:g} m/s, the "
                 "highest speed of the rover (--max-speed): are positions in metres?"
             )
+
+    @cached_property
+    def _fastest_move(self) -> tuple[int, float, float]:
+        """Number from 1 of the pose before the fastest move, its length [m] and its time [s]."""
+        length_m, step_s = np.linalg.norm(np.diff(self.position_m, axis=0), axis=1), np.diff(self.time_s)
+        k = int(np.argmax(length_m / (step_s + SPAN_TOLERANCE_S)))
+        return k + 1, float(length_m[k]), float(step_s[k])
 
 
 def read_odometry(

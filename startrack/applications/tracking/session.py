@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import os
 import time
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +27,7 @@ from startrack.applications.tracking.odometry import SPAN_TOLERANCE_S, Odometry
 from startrack.applications.tracking.odometry_moves import odometry_moves, odometry_steps, times_s
 from startrack.applications.tracking.track import Track, estimate_track, track_of_newest
 from startrack.applications.tracking.track_errors import TrackErrors
-from startrack.applications.tracking.unknown_size import smooth_placed
+from startrack.applications.tracking.unknown_size import place_modes
 from startrack.catalog import load_catalog
 from startrack.chain import Located, Settings, input_hashes, job_sha256, load_camera_input, locate, terrain_input
 from startrack.core.errors import BadInput
@@ -62,7 +64,7 @@ class TrackSession:
     shared: TrackErrors | None = None
     _references: tuple[Any, Any] | None = None  # camera and terrain as the first image has them
     _steepness_1: float | None = None  # of the terrain, from which the errors of all images are counted
-    _filtered: list[ObservedFrame] = field(default_factory=list)  # that the filter has
+    _filtered: int = 0  # number of frames that the filter has
     _online: OnlineTrack | None = None
 
     def add_exposure(self, exposure: Exposure, path: str | None = None) -> ObservedFrame:
@@ -73,9 +75,10 @@ class TrackSession:
         if exposure.time_utc is None:
             raise BadInput("no_time", "; ".join([NO_TIME, *exposure.warnings]))
         camera, terrain, shared = self._load_references(exposure)
-        same = next((frame for frame in self.frames if frame.time_utc == exposure.time_utc), None)
-        if same is not None:  # its evidence would count twice
-            raise BadInput("bad_image", f"{exposure.name} has the time of {same.name}: a track takes an image once")
+        place = bisect_left(self.frames, exposure.time_utc, key=attrgetter("time_utc"))
+        if place < len(self.frames) and self.frames[place].time_utc == exposure.time_utc:
+            same = self.frames[place].name  # its evidence would count twice
+            raise BadInput("bad_image", f"{exposure.name} has the time of {same}: a track takes an image once")
         key = "" if self.store is None or path is None else self._key(exposure, path, shared)
         frame = self.store.read(key) if self.store and key else None
         if frame is None:
@@ -89,9 +92,10 @@ class TrackSession:
         if together.gross != shared.gross:
             self.frames = [observe_again(one, together, ground) for one in self.frames]
             self.shared = together
+        if together.gross != shared.gross or place < self._filtered:
+            self._filtered, self._online = 0, None
         frame = frame if frame.facts == together.gross else observe_again(frame, together, ground)
-        self.frames.append(frame)
-        self.frames.sort(key=lambda one: (one.time_utc, one.name))
+        self.frames.insert(place, frame)
         return frame
 
     def _count_from(self, terrain: Terrain, steepness_1: float) -> Terrain:
@@ -129,7 +133,7 @@ class TrackSession:
     @property
     def waits(self) -> bool:
         """Whether frames were not filtered yet."""
-        return self._filtered != self.frames
+        return self._filtered < len(self.frames)
 
     def newest(self, odometry: Odometry | None, *, has_ended: bool = False) -> Iterator[Track]:
         """Each frame that was not filtered yet and that the `odometry` reaches, by the frames before it: a track each.
@@ -140,13 +144,11 @@ class TrackSession:
         terrain, shared = self.terrain, self.shared
         if terrain is None or shared is None:
             return
-        if self._filtered != self.frames[: len(self._filtered)]:
-            self._filtered, self._online = [], None
-        for k in range(len(self._filtered), len(self.frames)):
+        for k in range(self._filtered, len(self.frames)):
             if not (has_ended or _is_reached(self.frames[k], odometry)):
                 return
             online = self._online = self._filter_to(k, odometry, shared)
-            self._filtered.append(self.frames[k])
+            self._filtered += 1
             is_outside = odometry is not None and not odometry.covers(times_s(self.frames[k : k + 1]))[0]
             yield track_of_newest(self.frames[k], online, terrain, shared, is_outside=is_outside)
 
@@ -154,16 +156,12 @@ class TrackSession:
         """The filter with frame k; where positions are not linear in `shared`, of all frames about what they show."""
         online = self._online
         if online is None or shared.bends:
-            online = OnlineTrack(len(shared), None if shared.bends else WINDOW)
+            online = OnlineTrack(len(shared), WINDOW)
         first = online.first
         frames = self.frames[first : k + 1]
         moves = odometry_moves(frames, odometry, self.odometry_errors, shows_scale=not shared.bends)
-        if shared.bends:
-            modes = [frame.modes for frame in frames]
-            placed = smooth_placed(modes, moves, shared)[0] if any(modes) else modes
-        else:
-            placed = [[shared.place(one) for one in frames[-1].modes]]
-        for of in placed:
+        added = frames if shared.bends else frames[-1:]
+        for of in place_modes([frame.modes for frame in added], moves, shared):
             online.add(of, moves, first)
         return online
 

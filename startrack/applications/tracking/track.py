@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from itertools import pairwise
 
 import numpy as np
 
+from startrack.applications.tracking.contradictions import conclude
 from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions, positions_at_rest
 from startrack.applications.tracking.legs import SlippedLeg, images_outside, legs_about, slipped_legs
 from startrack.applications.tracking.observed_frame import ImageFix, ObservedFrame
 from startrack.applications.tracking.odometry import Odometry
 from startrack.applications.tracking.odometry_moves import odometry_moves, times_s
 from startrack.applications.tracking.track_errors import BIAS, CLOCK, TrackErrors
-from startrack.applications.tracking.unknown_size import SIZES, smooth_placed
+from startrack.applications.tracking.unknown_size import SIZES, place_modes
 from startrack.core.types import Array, BadInput, Bools, ClockError
 from startrack.estimation.observations import UNKNOWN_M, USUAL_ODOMETRY, OdometryErrors
 from startrack.estimation.trajectory import Smoothed, radius_holding
@@ -80,14 +81,14 @@ class Track:
     frames: tuple[TrackFrame, ...]
     filtered: Trajectory  # known at the time of each frame
     smoothed: Trajectory  # known at the end
-    bias_rad: float  # by which the true horizon is higher than the map's, all around
-    bias_sigma_rad: float
-    clock: ClockError | None
-    depth: SizeError | None  # None: the file's depth is taken as exact
-    width: SizeError | None  # None: the file's diameter is taken as exact
-    slipped: Bools  # (n - 1,) odometry steps judged wheel slip
-    at_rest: bool
     terrain: Terrain  # where its size is not known, the crater as estimated
+    bias_rad: float = 0.0  # by which the true horizon is higher than the map's, all around
+    bias_sigma_rad: float = 0.0
+    clock: ClockError | None = None
+    depth: SizeError | None = None  # None: the file's depth is taken as exact
+    width: SizeError | None = None  # None: the file's diameter is taken as exact
+    slipped: Bools = field(default_factory=lambda: np.zeros(0, dtype=bool))  # (n - 1,) steps judged wheel slip
+    at_rest: bool = False
     odometry_fault: str = ""  # of the odometry as a whole, which is left out then
     legs: tuple[SlippedLeg, ...] = ()  # the slipped steps, each leg of them as one
 
@@ -129,7 +130,7 @@ def estimate_track(
     times = [frame.time_utc for frame in frames]
     if any(a > b for a, b in pairwise(times)):
         raise BadInput("no_time", "the frames are not in the order of their times")
-    n, modes = len(frames), [frame.modes for frame in frames]
+    n = len(frames)
     is_outside = np.zeros(n, dtype=bool)
     if odometry is not None:
         is_outside = ~odometry.covers(times_s(frames), odometry_errors.floor_m)
@@ -143,11 +144,12 @@ def estimate_track(
     else:
         moves = odometry_moves(frames, odometry, odometry_errors, shows_scale=not shared.bends)
         names = [frame.name for frame in frames]
-        placed, robust = smooth_placed(modes, moves, shared, names)
+        placed = place_modes([frame.modes for frame in frames], moves, shared, names)
         filtered = filter_positions(placed, moves, len(shared))
-        position_m, covariance_m2, used_then, by_one = filtered
-        covariance_m2[(used_then >= 0) & (robust.mode < 0)] = UNKNOWN_M**2 * np.eye(2)  # taken back since
-        by_one += images_outside(frames, used_then, position_m, shared)
+        robust = conclude(placed, filtered.compared, names)
+        position_m, covariance_m2 = filtered.position_m, filtered.covariance_m2
+        covariance_m2[(filtered.mode >= 0) & (robust.mode < 0)] = UNKNOWN_M**2 * np.eye(2)  # taken back since
+        by_one = [*filtered.alone, *images_outside(frames, filtered.mode, position_m, shared)]
         alone = {k: frames[k].fixes for k in by_one if robust.mode[k] >= 0}
         by_image = images_outside(frames, robust.mode, robust.smoothed.position_m, shared)
     found, used = robust.smoothed, np.flatnonzero(robust.mode >= 0).tolist()
@@ -167,9 +169,8 @@ def estimate_track(
             _track_frame(*one)
             for one in zip(frames, robust.mode, robust.attitude_fits, is_outside.tolist(), strict=True)
         ),
-        _trajectory(position_m, covariance_m2, terrain, alone), smoothed, *(bias or (0.0, 0.0)),
-        clock and ClockError(*clock), depth, width, leg > 0, at_rest,
-        crater if shared.bends else terrain, robust.fault,
+        _trajectory(position_m, covariance_m2, terrain, alone), smoothed, crater if shared.bends else terrain,
+        *(bias or (0.0, 0.0)), clock and ClockError(*clock), depth, width, leg > 0, at_rest, robust.fault,
         slipped_legs(leg, robust.steps.move_m, smoothed.position_enu_m[:, :2]),
     )  # fmt: skip
 
@@ -186,20 +187,7 @@ def track_of_newest(
     alone = {0: frame.fixes} if online.is_first or by_image else {}
     covariance_m2 = online.covariance_m2 if online.is_vouched else UNKNOWN_M**2 * np.eye(2)
     found = _trajectory(position_m, covariance_m2[None], terrain, alone)
-    none = np.zeros(0, dtype=bool)
-    return Track(
-        (_track_frame(frame, online.mode, True, is_outside),),
-        found,
-        found,
-        0.0,
-        0.0,
-        None,
-        None,
-        None,
-        none,
-        False,
-        terrain,
-    )
+    return Track((_track_frame(frame, online.mode, True, is_outside),), found, found, terrain)
 
 
 def _track_frame(frame: ObservedFrame, mode: int, attitude_fits: bool, is_outside: bool) -> TrackFrame:

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from startrack.applications.tracking.contradictions import RobustTrack, smooth_robustly
+from startrack.applications.tracking.contradictions import RobustTrack, conclude
+from startrack.applications.tracking.explanations import explain
 from startrack.applications.tracking.moves import Moves
 from startrack.applications.tracking.track_errors import DEPTH, SIZE_ROUNDS, WIDTH, TrackErrors
 from startrack.core.types import BadInput
@@ -20,25 +21,25 @@ MOST_SIZE_SIGMAS = 4.0  # of the logarithms of a crater's depth and width: what 
 STILL_MOVES_M = 0.01  # expanded about a crater's size anew, until no position moves by more
 
 
-def smooth_placed(
+def place_modes(
     modes: Sequence[Sequence[FrameEstimate]],
     moves: Sequence[Moves],
     shared: TrackErrors,
     names: Sequence[str] = (),
-) -> tuple[list[list[FrameEstimate]], RobustTrack]:
-    """The modes with their positions in the crater of the errors `shared` that all show, and the track by them.
+) -> list[list[FrameEstimate]]:
+    """The modes of frames with their positions after the turn and the scaling of a round crater.
 
-    Where the size of a crater is not known, positions are products of it: they are expanded about the estimate anew,
-    by odometry as it is stated first. What may be wrong with it is compared where the expansion is right. `moves` and
-    `names` are those of `smooth_robustly`, which says what this raises.
+    Where its size is not known, positions are products of it: they are expanded about the estimate by the `moves`
+    between all frames anew, by odometry as it is stated first. What may be wrong with it is compared where the
+    expansion is right. `names` are those of `conclude`, which says what this raises then.
     """
     placed = [[shared.place(one) for one in of] for of in modes]
-    if not shared.bends:
-        return placed, smooth_robustly(placed, moves, names=names)
+    if not (shared.bends and any(modes)):
+        return placed
 
     def expand(placed: list[list[FrameEstimate]], kinds: Sequence[Moves]) -> tuple[Any, RobustTrack, float]:
         """The modes and the track by `kinds` of moves, and by how much [m] the last expansion moved it."""
-        robust = smooth_robustly(placed, kinds, names=names)
+        robust = conclude(placed, explain(placed, kinds), names)
         rounds, moved_m = 0, np.inf
         while moved_m > STILL_MOVES_M and rounds < SIZE_ROUNDS:
             before = robust.smoothed
@@ -46,7 +47,7 @@ def smooth_placed(
                 [shared.place(one, position_m, before.shared) for one in of]
                 for of, position_m in zip(modes, before.position_m, strict=True)
             ]
-            robust = smooth_robustly(placed, kinds, names=names)
+            robust = conclude(placed, explain(placed, kinds), names)
             rounds, moved_m = rounds + 1, float(np.abs(robust.smoothed.position_m - before.position_m).max())
         return placed, robust, moved_m
 
@@ -59,7 +60,7 @@ def smooth_placed(
             "inconsistent_evidence",
             "the odometry contradicts what the terrain file states of the crater's size: are its lengths in metres?",
         )
-    return placed, robust
+    return placed
 
 
 def _is_possible(found: Smoothed, shared: TrackErrors) -> bool:

@@ -44,9 +44,7 @@ def main() -> None:
         ["map", "method", "horizons", "RMS from Embree, degrees", "mean", "largest", "CPU microseconds a horizon"],
         lines,
     )
-    write_section(
-        "Horizons", f"python benchmarks/horizons.py --places {args.places}", ("numpy", "embreex"), body
-    )
+    write_section("Horizons", f"python benchmarks/horizons.py --places {args.places}", ("numpy", "embreex"), body)
 
 
 def crop_terrain(name: str, half_m: float) -> HeightMap:

@@ -6,30 +6,33 @@ import hashlib
 import importlib
 import inspect
 import os
+import pickle
 import pkgutil
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import startrack
-from startrack.kernels import build, library
+from startrack.kernels import build, library, records
 
 ROOT = Path(__file__).parent.parent
 HEADER = (build.FOLDER / "startrack_kernels.h").read_text()
 C_TYPES = {
     "float64": "double", "float32": "float", "int64": "int64_t", "int32": "int32_t", "uint8": "uint8_t",
-    "uint16": "uint16_t", "bool": "bool",
+    "uint16": "uint16_t", "bool": "bool", "int8": "int8_t", "uint64": "uint64_t",
+    "ground": "const struct ground *restrict", "table": "const struct table *restrict",
 }  # fmt: skip
 LEVEL_SCRIPT = "import test_kernels; print(test_kernels.bytes_of_all_kernels())"
 
 
 @pytest.fixture(scope="module")
 def declared():
-    """Declarations in Python of all kernels, by name."""
+    """Declarations in Python of all kernels and records, by name."""
     for one in pkgutil.walk_packages(startrack.__path__, "startrack."):
         source = importlib.util.find_spec(one.name).origin
         if "kernels.library import" in Path(source).read_text(encoding="utf-8"):
@@ -60,6 +63,47 @@ def test_declarations_in_python_are_those_of_the_header(declared):
         sizes = len(words) - len(arguments)
         assert words[:sizes] == found[name][1][:sizes], name
         assert words[sizes:] == [re.sub(r" ?\w+$", "", one) for one in found[name][1][sizes:]], name
+
+
+def test_records_in_python_are_the_structs_of_the_header(declared):
+    assert declared
+    found = {}
+    for name, body in re.findall(r"\nstruct (\w+) \{(.*?)\n\};", HEADER, re.DOTALL):
+        fields = re.sub(r"/\*.*?\*/", "", body, flags=re.DOTALL).split(";")[:-1]
+        kinds = [re.fullmatch(r"\s*((?:const )?\w+) (.*)", one, re.DOTALL).groups() for one in fields]
+        found[name] = [f"{kind} {one.strip()}" for kind, names in kinds for one in names.split(",")]
+    expected = {}
+    for name, (arguments, _) in records.RECORDS.items():
+        sizes = dict.fromkeys(dim for one in arguments for dim, _ in one.shape or () if not dim.isdigit())
+        arrays = [f"{'const ' * bool(one.shape)}{C_TYPES[one.dtype]} {'*' * bool(one.shape)}" for one in arguments]
+        names = [one.text.split(":")[0] for one in arguments]
+        expected[name] = [f"int64_t {size}" for size in sizes] + list(map("".join, zip(arrays, names, strict=True)))
+    assert found == expected
+
+
+def test_a_record_is_checked_when_it_is_made_and_made_anew_elsewhere():
+    from map_helpers import basin
+
+    from startrack.terrain.ground import surfaces
+
+    ground = basin().ground
+    expected, found = np.empty((2, 5))
+    points = np.random.default_rng(1).uniform(-900.0, 900.0, (5, 2))
+    surfaces(ground.record, points, expected)
+    surfaces(pickle.loads(pickle.dumps(ground.record)), points, found)
+    np.testing.assert_array_equal(found, expected)
+    with pytest.raises(TypeError, match="heights"):
+        assert replace(ground, heights=ground.heights.astype(np.float64)).record
+    with pytest.raises(TypeError, match="levels"):
+        assert replace(ground, levels=ground.levels[:0]).record
+    for wrong in (ground, None, records.Record("table", *table_values())):
+        with pytest.raises(TypeError, match="record ground is asked for"):
+            surfaces(wrong, points, found)
+
+
+def table_values():
+    """Numbers of a table without cells."""
+    return np.zeros((0, 3, 11), np.uint16), np.zeros(65536), np.zeros(3), np.zeros(3), 0, 0.0, 1.0, 1.0, 1.0
 
 
 def test_each_function_of_the_header_is_documented():
@@ -170,7 +214,8 @@ def bytes_of_all_kernels():
             for one, value in zip(arguments, values, strict=True):
                 if one.is_written:
                     key.update(value.tobytes())
-    for array in (*photometry_of(rng), *chain_of(rng), *identification_of(rng), *columns_of(rng)):
+    found = photometry_of(rng), chain_of(rng), identification_of(rng), columns_of(rng), horizons_of(rng)
+    for array in (one for each in found for one in each):
         key.update(array.tobytes())
     return key.hexdigest()
 
@@ -276,6 +321,34 @@ def columns_of(rng):
     change = np.array([0.2, 0.7, 0.95]), np.array([0.5, 0.3, 0.15]), 0.05, landing / landing.sum()
     kinds = np.array([0.7, 0.1, 0.2]), 0.02
     return total, *(pass_messages(likelihood, forward, *change, *kinds) for forward in (True, False))
+
+
+def horizons_of(rng):
+    """Horizons, bounds and crests of a small map in air, and of a crater."""
+    from map_helpers import basin
+
+    from startrack.terrain import Cylinder, horizon_table
+    from startrack.terrain.horizon_table import MIDDLES_RAD
+
+    ground = replace(basin(), terrestrial_refraction_1=0.2, search_radius_m=20.0)
+    points, azimuths = rng.uniform(-20.0, 20.0, (40, 2)), rng.uniform(0.0, 7.0, 40)
+    traced = ground.horizons(points, azimuths)
+    assert ground.table.square.across == 1
+    with_table = ground.horizons(points, azimuths)
+    narrow = ground.horizon_bounds_rad(points, np.float64(5.0), azimuths, 1e-3)
+    point = ground.horizon_bounds_rad(points[:, None], np.full((40, 1), 0.5), azimuths, 1e-3)
+    wide = [ground.horizon_bounds_rad(points[:, None], half, MIDDLES_RAD, 0.02) for half in (5.0, 200.0)]
+    crests = ground.expected_crests(points[0], azimuths)
+    near = ground.near(points[0], 10.0, azimuths).horizon_rad(points[0] + rng.uniform(-9.0, 9.0, (5, 1, 2)), azimuths)
+    most = ground.max_horizon_sigma_rad(points, 3.0, azimuths, 0.05)
+    memory, results = horizon_table.BoxMemory(16, 2, 40), np.empty((2, 40, 40))
+    for _ in range(2):
+        memory.fill(points, *results, lambda missing: rng.random((2, np.count_nonzero(missing), 40)))
+    circle = Cylinder(diameter_m=900.0, depth_m=90.0).horizon_rad(points[:, None], azimuths)
+    assert np.isfinite(traced[0]).all() and (narrow[0] <= narrow[1]).all()
+    flat = [one for pair in wide for one in pair]
+    values = ground.table.values, ground.ground_m(points), near, most, results, circle
+    return *traced, *with_table, *narrow, *point, *flat, *crests, *values
 
 
 def run_level(level, code, **more):
@@ -472,7 +545,7 @@ double sin(double), cos(double), atan2(double, double);
 
 
 def test_the_loader_is_small():
-    assert len(inspect.getsource(library).splitlines()) <= 120
+    assert len(inspect.getsource(library).splitlines()) <= 130
 
 
 def test_kernels_keep_no_state():

@@ -177,7 +177,7 @@ static bool begin_step(const struct view *v, const struct envelope *found, struc
     const double s = w->s, low = found->low, e = ray->east + s * ray->sin_a, n = ray->north + s * ray->cos_a;
     const double width = v->reach + (fabs(s) + v->reach) * v->tan_turn, tilted = fabs(v->side_rise);
     if (w->is_probe) {
-        w->known = (struct mark){-FAR_M, surface(g, e, n, w->known.z), w->known.at};
+        w->known.z = surface(g, e, n, w->known.z);
         *line = g->radius + w->known.z;
     } else {
         const double far = (fabs(s) + v->reach) / v->cos_turn, near = greater(0.0, s - v->reach);
@@ -354,7 +354,7 @@ static void take_ground(const struct view *v, struct walk *w, struct step *step,
     const struct ground *g = v->g;
     const double e = step->east, n = step->north;
     if (w->known.s != w->s)
-        w->known = (struct mark){w->s, surface_place(g, e, n, w->known.z, &w->known.at), w->known.at};
+        w->known.z = surface_place(g, e, n, w->known.z, &w->known.at);
     const struct mark known = w->known;
     int64_t level;
     const struct mark end = end_of_step(v, w, step, &level);
@@ -423,7 +423,7 @@ void bounds(const struct ground *g, struct box box, const struct beam *beam, boo
                      .known_block = -1, .steepest = -FAR_M, .known = {-FAR_M, v.ray.up, {-1, 0.0, 0.0}}};
     follow(&v, &w, v.middle.at > v.reach ? v.middle.at : 12.0 * v.reach + 1.0, &all);
     w.is_probe = false;
-    w.known.s = -FAR_M;
+    w.known.s = -FAR_M; /* unknown */
     follow(&v, &w, v.begin, &all);
     /* What the plane itself rises along a ray that is turned by up to `turn`. */
     const double tilted = fabs(v.side_rise), sin_turn = sqrt(1.0 - v.cos_turn * v.cos_turn);

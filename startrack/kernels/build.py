@@ -35,7 +35,8 @@ VARIABLE = "STARTRACK_PLATFORM"  # of the environment: a key of TARGETS, a syste
 # No fast arithmetic and no contraction: all compilers and both levels give the same bytes. The kernels read neither
 # `errno` nor the flags of floating-point exceptions.
 FLAGS = ("-std=c99", "-O3", "-fno-fast-math", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math")
-V3 = ("-mavx", "-mavx2", "-mbmi", "-mbmi2", "-mf16c", "-mfma", "-mlzcnt", "-mmovbe")  # of x86-64-v3, for old compilers
+# Of x86-64-v3, for old compilers; without FMA: gcc 12 fuses neighbouring a b + c and a b - c despite -ffp-contract=off.
+V3 = ("-mavx", "-mavx2", "-mbmi", "-mbmi2", "-mf16c", "-mlzcnt", "-mmovbe")
 SANITIZED = ("-O1", "-g", "-fno-omit-frame-pointer", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined")
 PROBE = "#include <math.h>\n#if defined(_WIN32)\n__declspec(dllexport)\n#endif\ndouble probe(double x) {return exp(x);}"
 CURE = (

@@ -26,7 +26,6 @@ SCALARS: dict[str, tuple[Any, Callable[..., Any]]] = {
 BUFFER: Any = (ctypes.c_char * 0).from_buffer  # a pointer to an array that is not read-only, in a fifth of the time
 FORM = re.compile(r"\w+: (out )?(\w+)(?:\[(.+)\])?")
 DECLARED: dict[str, tuple[list[Argument], str | None]] = {}  # by the name in the library: arguments and result
-RECORDS: dict[str, tuple[list[Argument], Callable[[Any], ctypes.Structure]]] = {}  # by the name of the struct
 
 
 class Argument(NamedTuple):
@@ -88,47 +87,14 @@ def kernel(name: str, *declarations: str, result: str | None = None) -> Callable
     """
     arguments = [Argument.of(text) for text in declarations]
     DECLARED[name] = arguments, result
-    names, types, check = _border(name, arguments)
+    names, types, check = border(name, arguments)
     function = getattr(LIBRARY, name)
     function.argtypes = [ctypes.c_int64] * len(names) + types
     function.restype = SCALARS[result][0] if result else None
     return lambda *values: function(*check(values))
 
 
-class Record:
-    """Arrays and numbers as a struct `name` of the library, which kernels take as `name: name`; see `declare_record`.
-
-    They are checked once. It keeps its arrays. Another process makes it anew.
-    """
-
-    def __init__(self, name: str, *values: Any) -> None:
-        self.name, self._values, self._struct = name, values, RECORDS[name][1](values)
-        self.address = ctypes.addressof(self._struct)
-
-    def __reduce__(self) -> tuple[type[Record], tuple[Any, ...]]:
-        return Record, (self.name, *self._values)
-
-
-def declare_record(name: str, *declarations: str) -> None:
-    """Declare a struct of the library. Its fields are the named sizes, in their order, then the `declarations`."""
-    arguments = [Argument.of(text) for text in declarations]
-    names, types, check = _border(name, arguments)
-    fields = [*((size, ctypes.c_int64) for size in names), *((f"field_{k}", one) for k, one in enumerate(types))]
-    struct = type(name, (ctypes.Structure,), {"_fields_": fields})
-
-    def make(values: tuple[Any, ...]) -> ctypes.Structure:
-        words = check(values)
-        return struct(*(ctypes.addressof(word) if isinstance(word, ctypes.Array) else word for word in words))
-
-    def address(value: Any) -> int:
-        if not isinstance(value, Record) or value.name != name:
-            raise TypeError(f"a record {name} is asked for, not {value!r:.80}")
-        return value.address
-
-    RECORDS[name], SCALARS[name] = (arguments, make), (ctypes.c_void_p, address)
-
-
-def _border(name: str, arguments: list[Argument]) -> tuple[list[str], list[Any], Callable[[Any], list[Any]]]:
+def border(name: str, arguments: list[Argument]) -> tuple[list[str], list[Any], Callable[[Any], list[Any]]]:
     """Names of the sizes, ctypes of the arguments, and a function that gives both for values, which it checks."""
     names = list(dict.fromkeys(dim for one in arguments for dim, _ in one.shape or () if not dim.isdigit()))
     types = [SCALARS[one.dtype][0] if one.shape is None else ctypes.c_void_p for one in arguments]

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from startrack.core.types import Array, Bools, Ints
 from startrack.frames import Site, enu_from_latlon, latlon_from_enu, sphere_radius_m
-from startrack.kernels.library import Record, declare_record, kernel
+from startrack.kernels.library import kernel
+from startrack.kernels.records import Record, declare_record
 from startrack.terrain.protocol import NO_POST
 from startrack.terrain.raster import Raster
 

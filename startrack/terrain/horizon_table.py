@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.types import SECTORS, Array, Bools, Ints
-from startrack.kernels.library import Record, declare_record, kernel
+from startrack.kernels.library import kernel
+from startrack.kernels.records import Record, declare_record
 from startrack.terrain.ground import merge_blocks
 from startrack.terrain.rays import rows_of_rays
 

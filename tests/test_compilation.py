@@ -17,7 +17,6 @@ import pytest
 from startrack.core import compilation, kernels
 from startrack.core.runner import Runner
 from startrack.core.types import Evidence, NotLocated
-from startrack.detection.residual_kernel import fill_row
 from startrack.localization import posterior
 from startrack.terrain import load_terrain
 
@@ -40,23 +39,6 @@ def kernel(x):
 
 kernel(1.0)
 kernel(1)
-"""
-
-PEAKS = """
-import errno
-import hashlib
-import numpy as np
-from startrack.detection.peak_kernel import find_maxima
-
-rng, single = np.random.default_rng(4), np.float32
-image = rng.normal(100.0, 10.0, (256, 256)).astype(single)
-background, noise = rng.uniform(90.0, 110.0, (4, 256)).astype(single), rng.uniform(9.0, 11.0, (4, 256)).astype(single)
-none, taps = np.zeros((0, 256), single), np.exp(-0.25 * np.arange(9) ** 2).astype(single)
-peaks = find_maxima(
-    image, background, noise, 64, none, single(1.0), single(0.0), taps, 2, single(1.0), single(2.0),
-    np.zeros((0, 256), bool), 8,
-)
-print(len(peaks), hashlib.sha256(peaks.tobytes()).hexdigest())
 """
 
 
@@ -115,49 +97,6 @@ def test_after_doctor_no_command_compiles(tmp_path):
         assert lines_of(*words) == [], words
 
 
-@pytest.mark.slow
-def test_a_kernel_gives_the_same_bytes_compiled_and_loaded(tmp_path):
-    """Its sums of reordered terms are those of its own library's code, in the process that compiles its parts too."""
-    script = tmp_path / "peaks.py"
-    script.write_text(PEAKS)
-    compiled, loaded = (run_script(script, tmp_path / "cache")[0] for _ in range(2))
-    assert int(compiled.split()[0]) > 100
-    assert compiled == loaded
-
-
-@pytest.mark.slow
-def test_the_line_about_compiling_counts_the_kernels_of_its_package(tmp_path):
-    script = tmp_path / "peaks.py"
-    script.write_text("from startrack.core.compilation import announce_compilation\nannounce_compilation()\n" + PEAKS)
-    out, log = run_script(script, tmp_path / "cache")
-    found = re.findall(r"compiling (\w+), once for this installation: (\d+) of (\d+) kernels are ready", log)
-    assert len(found) == len(log.splitlines()) == len({package for package, *_ in found})
-    ready, total = next((int(ready), int(total)) for package, ready, total in found if package == "detection")
-    sources = (compilation.PACKAGE / "detection").glob("*.py")
-    assert (ready, total) == (0, sum(source.read_text().count("@njit(cache=True") for source in sources))
-    assert run_script(script, tmp_path / "cache") == (out, "")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["nbi", "nbc"])
-@pytest.mark.parametrize("fault", ["cut short", "one bit"])
-def test_damaged_compiled_code_is_made_anew(tmp_path, kind, fault):
-    """With one line for all files and the same bytes; the run after it loads what it kept."""
-    script, cache = tmp_path / "peaks.py", tmp_path / "cache"
-    script.write_text(PEAKS)
-    before, _ = run_script(script, cache)
-    files = list(cache.rglob(f"*.{kind}"))
-    assert files
-    for file in files:
-        data = bytearray(file.read_bytes())
-        data[len(data) // 2] ^= fault == "one bit"
-        file.write_bytes(data[:30] if fault == "cut short" else data)
-    out, log = run_script(script, cache)
-    assert out == before
-    assert log.splitlines() == [f"a file of compiled code is damaged: compiled anew ({cache})"]
-    assert run_script(script, cache) == (before, "")
-
-
 def test_compiled_code_that_the_disk_does_not_take_is_used_all_the_same(monkeypatch, caplog):
     """A full disk, in the process that compiles."""
 
@@ -176,8 +115,8 @@ def add_two(x):
 
 
 def test_python_calls_no_inner_kernel():
-    with pytest.raises(TypeError, match="fill_row is called by kernels only"):
-        fill_row(1.0)
+    with pytest.raises(TypeError, match="add_two is called by kernels only"):
+        kernels.njit(inner=True)(add_two)(1.0)
 
 
 def compile_beside_another(folder: str) -> int:

@@ -201,7 +201,7 @@ RANDOM = (
 
 def bytes_of_all_kernels():
     """A hash of what kernels make of random arguments, and of scenes where they trust their arguments."""
-    for package in ("evidence", "identification"):
+    for package in ("evidence", "detection", "identification"):
         importlib.import_module(f"startrack.{package}")
     rng, key = np.random.default_rng(3), hashlib.sha256()
     for name in RANDOM:
@@ -214,7 +214,9 @@ def bytes_of_all_kernels():
             for one, value in zip(arguments, values, strict=True):
                 if one.is_written:
                     key.update(value.tobytes())
-    found = photometry_of(rng), chain_of(rng), identification_of(rng), columns_of(rng), horizons_of(rng)
+    found = (
+        photometry_of(rng), chain_of(rng), detection_of(rng), identification_of(rng), columns_of(rng), horizons_of(rng)
+    )  # fmt: skip
     for array in (one for each in found for one in each):
         key.update(array.tobytes())
     return key.hexdigest()
@@ -240,6 +242,28 @@ def photometry_of(rng):
                       visible=rng.random(300)),
     )  # fmt: skip
     return found.flux_e, found.variance_e2, found.own_shot, found.neighbour_variance_e2, found.usable
+
+
+def detection_of(rng):
+    """Stars of a crowded frame with a gain, bias, saturated and masked pixels, and its residuals."""
+    from startrack.core.types import Exposure
+    from startrack.detection import Detector, damage, frame, streaks
+
+    image = rng.poisson(100.0, (160, 203)).astype(np.float32)
+    shape = np.exp(-0.5 * np.square(np.arange(-4, 5)) / 1.3)
+    for row, column in rng.integers(0, (151, 194), (90, 2)):
+        image[row : row + 9, column : column + 9] += np.rint(rng.uniform(40.0, 900.0) * np.outer(shape, shape))
+    masked = np.zeros(image.shape, bool)
+    masked[40:70, 90:101] = True
+    filled, converted, saturated = damage.fill_masked(image, masked), np.empty_like(image), np.zeros_like(masked)
+    frame._convert_counts(image, image, 1.7, rng.random(image.shape).astype(np.float32), 900.0, converted, saturated)
+    sources = Detector()(Exposure(pixels_adu=filled, saturation_adu=900.0))
+    assert len(sources.xy_px) > 20
+    one = frame.Frame(filled, sources.background, sources.noise, None, frame.SourceNoise(1.0), found=converted)
+    residuals = np.empty_like(image)
+    streaks._fill_residuals(*one.light_and_noise, residuals)
+    found = sources.xy_px, sources.covariance_px2, sources.flux_e, sources.snr, sources.saturated
+    return (filled, converted, saturated, residuals, *found)
 
 
 def chain_of(rng):
@@ -541,6 +565,7 @@ MATH_H = """
 double exp(double), log(double), log10(double), sqrt(double), fabs(double), floor(double), ceil(double), rint(double);
 double fmod(double, double), erf(double), copysign(double, double);
 double sin(double), cos(double), atan2(double, double);
+float sqrtf(float), fabsf(float);
 """
 
 

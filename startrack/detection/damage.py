@@ -184,6 +184,6 @@ def fill_masked(image: Image, masked: Bools) -> Image:
 
 
 _fill_from_blocks = kernel(
-    "fill_from_blocks", "image: out float32[height, width]", "masked: bool[height, width]", "good: int64[rows, columns]",
-    "source: int64[2, rows, columns]", "side: int64", "values: out float32[room]",
+    "fill_from_blocks", "image: out float32[height, width]", "masked: bool[height, width]",
+    "good: int64[rows, columns]", "source: int64[2, rows, columns]", "side: int64", "values: out float32[room]",
 )  # fmt: skip

@@ -150,5 +150,5 @@ def paint_sources(fits: PointFits, sigma: float, shape: tuple[int, int]) -> Pixe
 _sum_neighbours = kernel(
     "sum_neighbours", "star: int64[m]", "offset_px: float64[m, 2]", "flux: float64[m]", "sigma_px: float64",
     "variance: float32[n, side, side]", "limit_sigma: float64", "last: float32[n, side, side]",
-    "profiles: out float64[7, side]", "signal: out float32[count, side, side]", "changed: out bool[count]",
+    "profiles: out float64[7, side + 1]", "signal: out float32[count, side, side]", "changed: out bool[count]",
 )  # fmt: skip

@@ -67,7 +67,7 @@ class Stamps:
 
 def profile_scratch(side: int) -> Array:
     """Room for profiles of a PSF in stamps of this side."""
-    return np.empty((7, side))
+    return np.empty((7, side + 1))
 
 
 def pixel_scratch(rows: int, side: int) -> Pixels:
@@ -94,7 +94,7 @@ def fit_points(
     _fit_stamps(
         *stamps.pixels, light, RESIDUAL_FRACTION, which, start_xy_px - centres, sigma_px, source_noise.per_unit,
         source_noise.model_error, rounds, MAX_STEP_PX, POSITION_PRIOR, FLUX_PRIOR, surround, profile_scratch(side),
-        pixel_scratch(6, side), offset, values, covariance,
+        pixel_scratch(7, side), offset, values, covariance,
     )  # fmt: skip
     columns = np.ascontiguousarray(values.T)
     columns.flags.writeable = covariance.flags.writeable = False  # locked values need no copy
@@ -190,13 +190,13 @@ _fit_stamps = kernel(
     "usable: bool[usable_rows, side, side]", "signal: float32[signals, side, side]", "signal_error: float64",
     "which: int64[m]", "start_px: float64[m, 2]", "sigma_px: float64", "per_unit: float64", "model_error: float64",
     "rounds: int64", "max_step_px: float64", "position_prior: float64", "flux_prior: float64", "surround: float64[m]",
-    "profiles: out float64[7, side]", "pixels: out float32[6, room]", "xy_px: out float64[m, 2]",
+    "profiles: out float64[7, side + 1]", "pixels: out float32[7, room]", "xy_px: out float64[m, 2]",
     "values: out float64[m, 8]", "covariance: out float64[m, 4, 4]",
 )  # fmt: skip
 _fill_squared_residuals = kernel(
     "fill_squared_residuals", "data: float32[n, side, side]", "variance: float32[n, side, side]",
     "offset_px: float64[n, 2]", "flux: float64[n]", "level: float64[n]", "covariance: float64[n, 4, 4]",
     "sigma_px: float64", "model_error: float64", "faint: float64", "most_leverage: float64",
-    "profiles: out float64[7, side]", "signal: out float64[n, side, side]", "squared: out float64[n, side, side]",
+    "profiles: out float64[7, side + 1]", "signal: out float64[n, side, side]", "squared: out float64[n, side, side]",
     "relative: out float64[n, side, side]", "lit: out bool[n, side, side]",
 )  # fmt: skip

@@ -126,6 +126,6 @@ def _width_by_fall(frame: Frame, pixels: Ints) -> float | None:
 
 _explain_by_widths = kernel(
     "explain_by_widths", "data: float32[n, side, side]", "weights: float32[n, side, side]", "offset_px: float64[n, 2]",
-    "widths_px: float64[m]", "profiles: out float64[7, side]", "explained: out float64[n, m]",
+    "widths_px: float64[m]", "profiles: out float64[7, side + 1]", "explained: out float64[n, m]",
     "variance: out float64[n]",
 )  # fmt: skip

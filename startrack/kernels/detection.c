@@ -7,6 +7,7 @@
 #include "startrack_kernels.h"
 
 #define PAIRS 4 /* of taps in one pass over a row */
+#define LANES 8 /* pixels of a block that are taken together */
 #define WORD 64 /* pixels of a row of which one bit each says whether they are high */
 
 
@@ -42,6 +43,12 @@ static int64_t reflect(int64_t at, int64_t length)
     return at < length ? at : period - at;
 }
 
+static inline void add_lanes(const float *restrict a, const float *restrict b, float *restrict to)
+{
+    for (int64_t j = 0; j < LANES; j++)
+        to[j] = a[j] + b[j];
+}
+
 void fill_blocks(int64_t height, int64_t width, int64_t px, int64_t rows, int64_t columns, const float *restrict image,
                  int64_t side, int64_t first, const float *restrict part_steps, float *restrict blocks)
 {
@@ -51,14 +58,14 @@ void fill_blocks(int64_t height, int64_t width, int64_t px, int64_t rows, int64_
             const float *line = image + reflect((first + i) * side + r / 2 * apart + r % 2, height) * width;
             const float *steps = part_steps + r * px;
             for (int64_t j = 0; j < columns; j++) {
-                float *restrict block = blocks + ((i * columns + j) * px + r) * px;
+                float *block = blocks + ((i * columns + j) * px + r) * px;
                 const int64_t left = j * side;
                 if (left + side > width || apart > 2)
                     for (int64_t c = 0; c < px; c++)
                         block[c] = line[reflect(left + c / 2 * apart + c % 2, width)] + steps[c];
                 else
-                    for (int64_t c = 0; c < px; c++)
-                        block[c] = line[left + c] + steps[c];
+                    for (int64_t c = 0; c < px; c += LANES)
+                        add_lanes(line + left + c, steps + c, block + c);
             }
         }
     }
@@ -243,7 +250,8 @@ static void filter_in_x(const struct search *s, const float *line, float *restri
         to[x] = s->taps[0] * middle[x];
     for (int64_t k = 1; k < s->reach; k += PAIRS) {
         const float *left = middle - k, *right = middle + k;
-        add_pairs(s->width, s->taps + k, left, left - 1, left - 2, left - 3, right, right + 1, right + 2, right + 3, to);
+        add_pairs(s->width, s->taps + k, left, left - 1, left - 2, left - 3, right, right + 1, right + 2, right + 3,
+                  to);
     }
 }
 
@@ -319,9 +327,9 @@ int64_t find_maxima(int64_t height, int64_t width, int64_t blocks, int64_t known
     const struct picture p = {width, blocks, side, known, image, background, noise, found, per_unit, found_error};
     const int64_t kept = 2 * reach + 1, lag = count - kept - 10;
     float *const across = rows + (lag + 1) * stride, *const filtered = across + kept * stride;
-    const struct search s = {width, reach, lag, kept, stride, coarse, beside, squares, columns, taps, level_factor, rows,
-                             across, filtered, filtered + 3 * stride, filtered + 6 * stride, filtered + 7 * stride,
-                             filtered + 8 * stride, means};
+    const struct search s = {width, reach, lag, kept, stride, coarse, beside, squares, columns, taps, level_factor,
+                             rows, across, filtered, filtered + 3 * stride, filtered + 6 * stride,
+                             filtered + 7 * stride, filtered + 8 * stride, means};
     const bool has_level = level_factor > 0.0f;
     int64_t filled = 0, peaks = 0;
     for (int64_t k = 0; k < count * stride; k++)

@@ -1,5 +1,5 @@
 /* Point sources in stamps: fits by Gauss-Newton, and how the pixels compare with the PSF, with edges and with lines.
-   Pixels are in single precision, twice as many at a time; positions, fluxes and their equations in double precision. */
+   Pixels are in single precision, twice as many at a time; places, fluxes and their equations in double precision. */
 
 #include <math.h>
 
@@ -28,11 +28,12 @@ struct psf {
     double sigma_px, *across, *down, *across_slope, *down_slope, *bell;
 };
 
-/* The PSF of this width, in scratch of 7 rows of `side`. */
+/* The PSF of this width, in scratch of 7 rows of `side` + 1. */
 static struct psf psf_of(int64_t side, double sigma_px, double *scratch)
 {
-    const struct psf found = {side, greater(sigma_px, NARROWEST_PX), scratch, scratch + side, scratch + 2 * side,
-                              scratch + 3 * side, scratch + 4 * side};
+    const int64_t row = side + 1;
+    const struct psf found = {side, greater(sigma_px, NARROWEST_PX), scratch, scratch + row, scratch + 2 * row,
+                              scratch + 3 * row, scratch + 4 * row};
     for (int64_t k = 0; k <= 5 * (side / 2); k++) {
         const double at = ((double)k + 0.5) / found.sigma_px;
         found.bell[k] = exp(-0.5 * at * at);
@@ -45,24 +46,24 @@ static struct psf psf_of(int64_t side, double sigma_px, double *scratch)
    A Gaussian about the source is one about a pixel (`bell`) times exponentials of x, which are powers of one. */
 static void fill_profile(const struct psf *psf, double offset, double *restrict profile, double *restrict slope)
 {
-    const double radius = (double)(psf->side / 2), sigma = psf->sigma_px;
+    const double radius = (double)(psf->side / 2), scale = 1.0 / psf->sigma_px, peak = scale / SQRT_2PI;
     const double place = smaller(greater(offset, -4.0 * radius), 4.0 * radius), whole = rint(place);
     const double part = place - whole, first = -radius - whole - 0.5; /* the first edge, from the nearest pixel */
-    const double ratio = exp(part / (sigma * sigma));
-    double power = exp((first - 0.5 * part) * part / (sigma * sigma)), last_area = 0.0, last_density = 0.0;
-    for (int64_t j = 0; j <= psf->side; j++) {
-        const double edge = (first + (double)j - part) / sigma, t = 1.0 / (1.0 + ERF_T * fabs(edge));
-        double density = psf->bell[(int64_t)fabs(first + (double)j)] * power;
-        double area = 0.5 - density * t * (ERF_A1 + t * (ERF_A2 + t * (ERF_A3 + t * (ERF_A4 + t * ERF_A5))));
-        area = edge >= 0.0 ? area : -area;
+    const double ratio = exp(part * scale * scale);
+    double power = exp((first - 0.5 * part) * part * scale * scale);
+    const int edges = (int)psf->side + 1, before = (int)(radius + whole); /* the edges left of that pixel */
+    for (int j = 0; j < edges; j++) {
+        slope[j] = psf->bell[j > before ? j - before - 1 : before - j] * power;
         power *= ratio;
-        density /= sigma * SQRT_2PI;
-        if (j > 0) {
-            profile[j - 1] = area - last_area;
-            slope[j - 1] = last_density - density;
-        }
-        last_area = area;
-        last_density = density;
+    }
+    for (int j = 0; j < edges; j++) {
+        const double edge = (first + (double)j - part) * scale, t = 1.0 / (1.0 + ERF_T * fabs(edge));
+        const double area = 0.5 - slope[j] * t * (ERF_A1 + t * (ERF_A2 + t * (ERF_A3 + t * (ERF_A4 + t * ERF_A5))));
+        profile[j] = edge >= 0.0 ? area : -area;
+    }
+    for (int j = 0; j + 1 < edges; j++) {
+        profile[j] = profile[j + 1] - profile[j];
+        slope[j] = (slope[j] - slope[j + 1]) * peak;
     }
 }
 
@@ -78,10 +79,10 @@ static inline float sum_of(const float lane[LANES])
 }
 
 /* Of a stamp (n pixels, a multiple of LANES): light, variance and 1 where usable; the source's profile and its slopes
-   in x and in y. */
+   in x and in y; room for a row. */
 struct stamp {
     int64_t side, n;
-    float *light, *variance, *use, *shape, *by_x, *by_y;
+    float *light, *variance, *use, *shape, *by_x, *by_y, *row;
 };
 
 /* A source: flux, level, and the noise of its own light: per unit of it, and the square of the PSF's error. */
@@ -117,16 +118,24 @@ static void read_stamp(const struct stamp *s, const float *data, const float *va
         s->use[p] = usable[p] ? 1.0f : 0.0f;
 }
 
+static inline void multiply(int64_t n, float factor, const float *restrict values, float *restrict to)
+{
+    for (int64_t c = 0; c < n; c++)
+        to[c] = factor * values[c];
+}
+
 static void fill_shapes(const struct stamp *s, const struct psf *psf)
 {
+    float *across = s->row, *slope = s->row + s->side;
+    for (int64_t c = 0; c < s->side; c++) {
+        across[c] = (float)psf->across[c];
+        slope[c] = (float)psf->across_slope[c];
+    }
     for (int64_t r = 0; r < s->side; r++) {
-        const float down = (float)psf->down[r], down_slope = (float)psf->down_slope[r];
-        for (int64_t c = 0; c < s->side; c++) {
-            const float across = (float)psf->across[c];
-            s->shape[r * s->side + c] = down * across;
-            s->by_x[r * s->side + c] = down * (float)psf->across_slope[c];
-            s->by_y[r * s->side + c] = down_slope * across;
-        }
+        const int64_t to = r * s->side;
+        multiply(s->side, (float)psf->down[r], across, s->shape + to);
+        multiply(s->side, (float)psf->down[r], slope, s->by_x + to);
+        multiply(s->side, (float)psf->down_slope[r], across, s->by_y + to);
     }
 }
 
@@ -221,20 +230,8 @@ static void judge(const struct stamp *s, const struct source *source, double sur
     const int64_t middle = s->side * s->side / 2;
     const float around = (float)surround;
     const struct source of = *source;
-    const float *light = s->light, *variance = s->variance, *shape = s->shape;
-    float *use = s->use;
-    for (int64_t k = 0; k < s->n; k += LANES) {
-        for (int64_t j = 0; j < LANES; j++) {
-            const float plain = use[k + j] / variance[k + j], f = shape[k + j], glow = of.shine * f;
-            const float miss = light[k + j] - of.flux * f - of.level, filtered = plain * f;
-            const float own = glow * (of.own_noise + of.error * glow);
-            lane[CHI2][j] += use[k + j] * miss * miss / (variance[k + j] + own);
-            lane[NUMBER][j] += use[k + j];
-            lane[ABOVE][j] += filtered * (light[k + j] - around);
-            lane[NORM][j] += filtered * f;
-            lane[OWN][j] += filtered * f / (1.0f + of.own_noise * glow * plain);
-        }
-    }
+    const float *light = s->light, *variance = s->variance, *use = s->use, *shape = s->shape;
+    float *others = s->by_x; /* the slopes are not needed any more */
     int64_t hot = middle - s->side - 1; /* the brightest pixel of the middle nine */
     for (int64_t r = -1; r <= 1; r++) {
         for (int64_t c = -1; c <= 1; c++) {
@@ -242,23 +239,27 @@ static void judge(const struct stamp *s, const struct source *source, double sur
             hot = light[k] > light[hot] ? k : hot;
         }
     }
-    use[hot] = 0.0f;
+    for (int64_t k = 0; k < s->n; k++)
+        others[k] = use[k] / variance[k];
+    others[hot] = 0.0f;
     for (int64_t k = 0; k < s->n; k += LANES) {
         for (int64_t j = 0; j < LANES; j++) {
-            const float plain = use[k + j] / variance[k + j];
-            lane[TOTAL][j] += plain;
-            lane[LIGHT][j] += plain * light[k + j];
+            const float plain = use[k + j] / variance[k + j], f = shape[k + j], glow = of.shine * f;
+            const float high = light[k + j] - of.level, miss = high - of.flux * f, filtered = plain * f;
+            const float own = glow * (of.own_noise + of.error * glow), rest = others[k + j] * high;
+            lane[CHI2][j] += use[k + j] * miss * miss / (variance[k + j] + own);
+            lane[NUMBER][j] += use[k + j];
+            lane[ABOVE][j] += filtered * (light[k + j] - around);
+            lane[NORM][j] += filtered * f;
+            lane[OWN][j] += filtered * f / (1.0f + of.own_noise * glow * plain);
+            lane[TOTAL][j] += others[k + j];
+            lane[LIGHT][j] += rest;
+            lane[PIXEL][j] += rest * high;
         }
     }
-    const float total = sum_of(lane[TOTAL]), mean = sum_of(lane[LIGHT]) / (total > LEAST ? total : LEAST);
-    for (int64_t k = 0; k < s->n; k += LANES) {
-        for (int64_t j = 0; j < LANES; j++) {
-            const float miss = light[k + j] - mean;
-            lane[PIXEL][j] += use[k + j] * (miss * miss) / variance[k + j];
-        }
-    }
+    const float total = sum_of(lane[TOTAL]), excess = sum_of(lane[LIGHT]);
     values[0] = (double)sum_of(lane[CHI2]);
-    values[1] = (double)sum_of(lane[PIXEL]);
+    values[1] = (double)(sum_of(lane[PIXEL]) - excess * (excess / (total > LEAST ? total : LEAST)));
     values[2] = (double)sum_of(lane[NUMBER]);
     values[3] = (double)sum_of(lane[ABOVE]);
     values[4] = (double)sum_of(lane[NORM]);
@@ -283,8 +284,8 @@ void fit_stamps(int64_t n, int64_t side, int64_t usable_rows, int64_t signals, i
     const double radius = (double)(side / 2);
     const struct psf psf = psf_of(side, sigma_px, profiles);
     const struct stamp s = {side, room, pixels, pixels + room, pixels + 2 * room, pixels + 3 * room, pixels + 4 * room,
-                            pixels + 5 * room};
-    for (int64_t p = 0; p < 6 * room; p++)
+                            pixels + 5 * room, pixels + 6 * room};
+    for (int64_t p = 0; p < 7 * room; p++)
         pixels[p] = p / room == 1 ? 1.0f : 0.0f;
     for (int64_t i = 0; i < m; i++) {
         const int64_t at = which[i] * size;

@@ -120,7 +120,7 @@ KERNEL void convert_counts(int64_t height, int64_t width, int64_t bias_rows, int
                            bool *restrict saturated);
 
 /* Fill `blocks` [rows, columns, px, px] with those of an image, from the row of blocks `first` on, plus `part_steps`
-   [px, px]. The border is reflected to fill the last blocks. Of blocks of more pixels (`side`) some, spread evenly, are
+   [px, px], px a multiple of 8. The border is reflected to fill the last blocks. Of blocks of more pixels (`side`) some, spread evenly, are
    taken: squares of two by two, for colour filters' sake. */
 KERNEL void fill_blocks(int64_t height, int64_t width, int64_t px, int64_t rows, int64_t columns,
                         const float *restrict image, int64_t side, int64_t first, const float *restrict part_steps,
@@ -501,7 +501,7 @@ KERNEL void measure_sources(int64_t height, int64_t width, int64_t background_ro
 
 /* point_sources.c: stamps [n, side, side] of an odd side, of light above the background and of its variance; places are
    pixels from the middle pixel, at most 4 radii of a stamp (NaN: the lowest); `usable` may have no rows: all pixels are.
-   Scratch: `profiles` [7, side], `pixels` of `room`: the pixels of a stamp, filled up to a multiple of 8. */
+   Scratch: `profiles` [7, side + 1], `pixels` [7, room], room: the pixels of a stamp, filled up to a multiple of 8. */
 
 /* Fit one source of a PSF `sigma_px` wide to each of the stamps `which` [m], in so many `rounds` from `start_px` on.
    `signal` [m, side, side], light of neighbours with the relative error `signal_error`, is subtracted; it may have no

@@ -1,47 +1,20 @@
-"""numba's cache: compiling is announced once, loading from the cache is not; a folder for read-only installations."""
+"""numba's cache: a folder for read-only installations, and damaged, stale and equal kernels."""
 
 from __future__ import annotations
 
 import errno
-import logging
 import os
 import re
 import subprocess
 import sys
-import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from startrack.core import compilation, kernels
-from startrack.core.runner import Runner
-from startrack.core.types import Evidence, NotLocated
 from startrack.detection.residual_kernel import fill_row
-from startrack.localization import posterior
-from startrack.terrain import load_terrain
 
 ROOT = Path(__file__).parent.parent
-FIRST_USE = """
-import sys
-
-from startrack.core.compilation import announce_compilation
-
-announce_compilation()
-announce_compilation()
-from numba import njit
-
-__name__ = "startrack.probe"  # a kernel of the package, as far as numba can tell
-sys.modules[__name__] = sys.modules["__main__"]
-
-@njit(cache=True)
-def kernel(x):
-    return x + 1.0
-
-kernel(1.0)
-kernel(1)
-"""
-
 PEAKS = """
 import errno
 import hashlib
@@ -69,53 +42,6 @@ def run_script(script: Path, cache: Path) -> tuple[str, str]:
 
 
 @pytest.mark.slow
-def test_compiling_is_announced_once_and_loading_is_not(tmp_path):
-    script = tmp_path / "first_use.py"
-    script.write_text(FIRST_USE)
-    out, log = run_script(script, tmp_path / "cache")
-    assert out == ""
-    assert log.splitlines() == ["compiling probe, once for this installation: for another kind of data"]
-    assert run_script(script, tmp_path / "cache") == ("", "")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("words", ["terrain show shackleton --no-plots --at 0 0", "render -t shackleton -o {out}"])
-def test_the_first_use_of_a_command_without_images_is_announced(tmp_path, words):
-    script = tmp_path / "command.py"
-    arguments = words.format(out=tmp_path / "a.png").split()
-    script.write_text(f"from startrack.cli.main import main\nassert main({arguments}) == 0\n")
-    _, log = run_script(script, tmp_path / "cache")
-    assert "compiling terrain, once for this installation: 0 of" in log
-
-
-@pytest.mark.slow
-def test_after_doctor_no_command_compiles(tmp_path):
-    """Of those that are used first: a narrow field without a camera file, a skyline, a track, and a height map."""
-    place = {"NUMBA_CACHE_DIR": str(tmp_path / "numba"), "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    (tmp_path / "numba").mkdir()
-    images = ROOT / "sample_images"
-    drive = tmp_path / "drive"
-    drive.mkdir()
-    for name in ("near-centre.png", "near-centre.json", "near-wall.png", "near-wall.json"):
-        (drive / name).write_bytes((images / name).read_bytes())
-    lowell = images / "lowell-2018-08-06.fits.bz2"
-
-    def lines_of(*words: object) -> list[str]:
-        command = [sys.executable, "-m", "startrack", *map(str, words)]
-        run = subprocess.run(command, env={**os.environ, **place}, capture_output=True, text=True, cwd=tmp_path)
-        return [line for line in run.stderr.splitlines() if line.startswith("compiling ")]
-
-    assert lines_of("doctor")
-    for words in (
-        ("identify", images / "near-centre.png", "--fov", "8..20", "-D", tmp_path / "out", "--no-plots"),
-        ("horizon", lowell, "-c", "lowell-ldt", "--site=34.7443,-111.4223,2361", "-o", tmp_path / "a.hrz"),
-        ("track", drive, "-D", tmp_path / "track"),
-        ("terrain", "show", "shackleton", "--no-plots"),
-    ):
-        assert lines_of(*words) == [], words
-
-
-@pytest.mark.slow
 def test_a_kernel_gives_the_same_bytes_compiled_and_loaded(tmp_path):
     """Its sums of reordered terms are those of its own library's code, in the process that compiles its parts too."""
     script = tmp_path / "peaks.py"
@@ -123,19 +49,6 @@ def test_a_kernel_gives_the_same_bytes_compiled_and_loaded(tmp_path):
     compiled, loaded = (run_script(script, tmp_path / "cache")[0] for _ in range(2))
     assert int(compiled.split()[0]) > 100
     assert compiled == loaded
-
-
-@pytest.mark.slow
-def test_the_line_about_compiling_counts_the_kernels_of_its_package(tmp_path):
-    script = tmp_path / "peaks.py"
-    script.write_text("from startrack.core.compilation import announce_compilation\nannounce_compilation()\n" + PEAKS)
-    out, log = run_script(script, tmp_path / "cache")
-    found = re.findall(r"compiling (\w+), once for this installation: (\d+) of (\d+) kernels are ready", log)
-    assert len(found) == len(log.splitlines()) == len({package for package, *_ in found})
-    ready, total = next((int(ready), int(total)) for package, ready, total in found if package == "detection")
-    sources = (compilation.PACKAGE / "detection").glob("*.py")
-    assert (ready, total) == (0, sum(source.read_text().count("@njit(cache=True") for source in sources))
-    assert run_script(script, tmp_path / "cache") == (out, "")
 
 
 @pytest.mark.slow
@@ -178,40 +91,6 @@ def add_two(x):
 def test_python_calls_no_inner_kernel():
     with pytest.raises(TypeError, match="fill_row is called by kernels only"):
         fill_row(1.0)
-
-
-def compile_beside_another(folder: str) -> int:
-    """Signal the compilation of a kernel, as numba does, once two processes have begun."""
-    from numba.core import event
-
-    compilation.announce_compilation()
-    (Path(folder) / str(os.getpid())).touch()
-    while len(list(Path(folder).iterdir())) < 2:
-        time.sleep(0.01)
-    dispatcher = SimpleNamespace(py_func=SimpleNamespace(__module__="startrack.probe"))
-    event.start_event("numba:compile", data={"dispatcher": dispatcher})
-    return os.getpid()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("announced", "level", "lines"), [(False, 0, 1), (True, 0, 0), (False, logging.ERROR, 0)])
-def test_two_processes_announce_once(tmp_path, capfd, monkeypatch, announced, level, lines):
-    """And not at all where their parent has, or where it is quiet."""
-    monkeypatch.setattr(compilation.ANNOUNCEMENT_TURN, "is_taken", announced)
-    monkeypatch.setattr(logging.getLogger("startrack"), "level", level)
-    with Runner(compile_beside_another, jobs=2) as runner:
-        processes = {process for _, process in runner.results([str(tmp_path)] * 4)}
-    assert len(processes) == 2
-    assert capfd.readouterr().err.count("compiling probe, once for this installation") == lines
-
-
-def test_a_localizer_called_without_the_pipeline_announces_too(monkeypatch):
-    calls: list[str] = []
-    monkeypatch.setattr(posterior, "announce_compilation", lambda: calls.append("announced"))
-    none = Evidence(azimuth_rad=[], elevation_rad=[], llr=[])
-    with pytest.raises(NotLocated):
-        posterior.ExactPosterior()(none, load_terrain("shackleton-thesis"))
-    assert calls == ["announced"]
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import pytest
 from scipy.special import ndtr
 
 from startrack.core import circle, table_text
-from startrack.core.kernels import NORMAL_CDF
+from startrack.core.statistics import NORMAL_CDF
 from startrack.evidence import sky_levels, sky_light, sky_pixels
 from startrack.exposure.png_rows import unfilter
 from startrack.frames import wahba

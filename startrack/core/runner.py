@@ -19,13 +19,10 @@ from multiprocessing.connection import wait as wait_for_sentinels
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
 
-from startrack.core.compilation import ANNOUNCEMENT_TURN
 from startrack.core.errors import BadInput
 from startrack.core.time_limit import check_time
 
 if TYPE_CHECKING:
-    from multiprocessing.synchronize import Semaphore
-
     from distributed import Client
 
 CONNECT_S = 10.0
@@ -220,7 +217,7 @@ class _Pool:
         self._others = set(active_children())
         # New processes: a fork would copy the thread of the progress bar.
         context = get_context("spawn")
-        given = (ANNOUNCEMENT_TURN.semaphore(context), logging.getLogger("startrack").level)
+        given = (logging.getLogger("startrack").level,)
         self._executor = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_process, initargs=given)
 
     def submit(self, work: Callable[[Task], Result], task: Task) -> Future[Result]:
@@ -259,9 +256,8 @@ def _block_signals() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _begin_process(turn: Semaphore, log_level: int) -> None:
-    """The first call in a new process: one of the pool announces compilation, and logs are as quiet as the parent's."""
-    ANNOUNCEMENT_TURN.shared = turn
+def _begin_process(log_level: int) -> None:
+    """The first call in a new process, whose logs are as quiet as the parent's."""
     logging.getLogger("startrack").setLevel(log_level)
     for number in SIGNALS:  # sent to the whole process group: the tasks in progress are finished
         signal.signal(number, signal.SIG_IGN)

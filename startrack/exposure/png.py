@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.compilation import announce_compilation
 from startrack.exposure.decoding import Decoded, bad_image, check_size, exif_warnings, grey_float32
 from startrack.exposure.facts import HEADER_KEYS
 
@@ -34,7 +33,6 @@ def decode(raw: bytes) -> Decoded:
     """
     import cv2
 
-    announce_compilation()
     from startrack.exposure.png_rows import DAMAGED, decode_rows, inflate_rows
 
     header: dict[str, str] = {}

@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import importlib.util
+import json
 import os
 import platform
 import shlex
@@ -64,9 +65,10 @@ class Compiler:
     def build(self, sources: Sequence[Path], level: str, library: Path) -> None:
         """Compile `sources` into a `library` for the processors of a `level`. Raises BuildFailed."""
         own = dict.fromkeys(("ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR"), _zig_cache().name) if self.is_zig else {}
+        flags = [*shlex.split(os.environ.get("CFLAGS", "")), *FLAGS, *self.flags(level)]
         command = [
-            *self.words, *shlex.split(os.environ.get("CFLAGS", "")), *FLAGS, *self.flags(level), "-o", str(library),
-            *map(str, sources), *shlex.split(os.environ.get("LDFLAGS", "")), "-lm",
+            *self.words, *flags, f"-DFLAGS={json.dumps(shlex.join(flags))}", "-o", str(library), *map(str, sources),
+            *shlex.split(os.environ.get("LDFLAGS", "")), "-lm",
         ]  # fmt: skip
         try:
             run = subprocess.run(command, capture_output=True, text=True, errors="replace", env={**os.environ, **own})

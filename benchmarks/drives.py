@@ -104,7 +104,7 @@ def main() -> None:
     if not args.case:
         source = "pixels" if args.pixels else "evidence"
         command = f"python benchmarks/drives.py --drives {args.drives}" + (" --pixels" if args.pixels else "")
-        write_section(f"Tracks from {source}", command, ("numpy", "scipy", "numba"), body)
+        write_section(f"Tracks from {source}", command, ("numpy", "scipy"), body)
 
 
 def score_track(case: Case, rng: np.random.Generator, pixels: bool, number: int) -> dict[str, float]:

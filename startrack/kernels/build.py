@@ -104,6 +104,12 @@ def library_name(level: str) -> str:
     return f"kernels-{source_key()}-{level}{suffix}"
 
 
+def how_to_build(level: str) -> str:
+    """What to type for the library of a `level`."""
+    words = f"{sys.executable} -m startrack.kernels.build{' sanitized' if level == 'sanitized' else ''}"
+    return f"type `{words}` in {FOLDER.parents[1]}, or install startrack anew"
+
+
 def find_compiler(with_zig: bool = True) -> Compiler:
     """The first compiler that works: $CC, cc, gcc, clang, and `with_zig` that of the package ziglang.
 

@@ -10,14 +10,13 @@ import ctypes
 import operator
 import os
 import re
-import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from startrack.kernels import LibraryMissing
-from startrack.kernels.build import COMPILED, levels, library_name
+from startrack.kernels.build import COMPILED, how_to_build, levels, library_name
 
 VARIABLE = "STARTRACK_KERNELS"
 SCALARS: dict[str, tuple[Any, Callable[..., Any]]] = {
@@ -53,9 +52,7 @@ def _open(level: str) -> ctypes.CDLL:
         return ctypes.CDLL(str(path))
     except OSError as cause:
         why = f"is not for this system ({cause})" if path.is_file() else "does not exist for these C sources"
-        words = f"{sys.executable} -m startrack.kernels.build{' sanitized' if level == 'sanitized' else ''}"
-        cure = f"type `{words}` in {COMPILED.parents[2]}, or install startrack anew"
-        raise LibraryMissing(f"{path} {why}: {cure}") from None
+        raise LibraryMissing(f"{path} {why}: {how_to_build(level)}") from None
 
 
 def _load() -> tuple[str, ctypes.CDLL]:

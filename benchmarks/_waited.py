@@ -160,7 +160,7 @@ def next_frames() -> None:
 
 
 def horizon_table() -> None:
-    """The table of horizons of a rough map of 1500 x 1500 posts, on all cores [s]; kernels are compiled before."""
+    """The table of horizons of a rough map of 1500 x 1500 posts, on all cores [s]."""
     from dataclasses import replace
 
     from _rough_map import rough_terrain

@@ -53,14 +53,14 @@ def main() -> None:
     if args.no_write:
         return
     command = f"python benchmarks/batch.py --frames {args.frames} --single {args.single}"
-    write_section("A night of images", command, ("numpy", "opencv-contrib-python-headless", "numba", "dask"), body)
+    write_section("A night of images", command, ("numpy", "opencv-contrib-python-headless", "dask"), body)
 
 
 def measure_runs(folder: Path, images: list[Path], single: int) -> tuple[list[list[str]], list[str]]:
     """All runs; rows of the table, and notes of the comparisons."""
     cores = len(os.sched_getaffinity(0))
     first = images[:single]
-    run(folder, first[:2], folder / "warm", 1)  # compiles the kernels
+    run(folder, first[:2], folder / "warm", 1)  # loads files and makes tables
     one = run(folder, first, folder / "one", 1)
     both = run(folder, first, folder / "both", cores)
     whole = run(folder, images, folder / "whole", cores)

@@ -63,7 +63,7 @@ def main() -> None:
     head = ["crater", "place, m", "slope, degrees", "horizon, degrees", "result", "error, m", "95 % circle, m",
             "99.9 %, m", "NEES", "s, position", "CPU s, all"]  # fmt: skip
     command = f"python benchmarks/craters.py --terrain {' '.join(args.terrain)} --floor {args.floor} --wall {args.wall}"
-    write_section("Dark craters", command, ("numpy", "scipy", "numba"), table(head, lines))
+    write_section("Dark craters", command, ("numpy", "scipy"), table(head, lines))
 
 
 def draw_positions(

@@ -5,7 +5,7 @@
 Frames of 2048 px, with the renderer's usual sky, are written one by one into a folder that `startrack track --follow`
 watches on one core; the next one follows after the answer. The time is that from the end of writing to the printed
 line; the 0.1 s for which a file must not change are in it. "CPU" is the time of the process between two lines, which
-does not depend on other processes. The first images load and compile: they do not count. Then the images come without
+does not depend on other processes. The first images load: they do not count. Then the images come without
 waiting, the command is killed (SIGKILL) at random times, and its files are compared with those of the undisturbed run.
 """
 
@@ -55,7 +55,7 @@ def main() -> None:
     print(body)
     if not args.place:
         write_section("Live tracks on one core", f"python benchmarks/live.py --images {args.images}",
-                      ("numpy", "scipy", "numba"), body)  # fmt: skip
+                      ("numpy", "scipy"), body)  # fmt: skip
 
 
 def render_drive(root: Path, terrain: str, images: int) -> None:

@@ -46,7 +46,7 @@ def main() -> None:
     errors = {
         name: np.mean([error_m(method(e, cylinder), p) for e, p in zip(lists[:n], truth[:n], strict=True)])
         for name, (method, n) in methods.items()
-    }  # kernels are compiled before the timing
+    }
     for _ in range(ROUNDS):
         for name, (method, n) in methods.items():
             start = time.thread_time()
@@ -60,7 +60,7 @@ def main() -> None:
     ]
     body = table(["method", "ms of CPU per fix", "ratio", "mean error, m"], rows)
     print(body)
-    write_section("Localizer", f"python benchmarks/localizer.py --places {args.places}", ("numpy", "numba"), body)
+    write_section("Localizer", f"python benchmarks/localizer.py --places {args.places}", ("numpy",), body)
 
 
 def thesis_lists(count: int) -> list[Evidence]:

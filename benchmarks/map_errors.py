@@ -55,7 +55,7 @@ def main() -> None:
     command = f"python benchmarks/map_errors.py --draws {args.draws} --positions {args.positions}"
     body = table(head, [summary(name, rows) for name, rows in found.items()])
     print(body)
-    write_section(f"Ground with errors of {args.sigma:g} m per post", command, ("numpy", "scipy", "numba"), body)
+    write_section(f"Ground with errors of {args.sigma:g} m per post", command, ("numpy", "scipy"), body)
 
 
 def simulate_rays(terrain: HeightMap, position: Array, rng: np.random.Generator) -> Evidence:

@@ -53,7 +53,7 @@ def main() -> None:
     waves = [f"wave {m}" for m in range(1, WAVE_COUNT + 1)]
     body = table(["map", "s.d., m", "length, km", "of the angle of height_sigma_m", *waves], rows)
     print(body)
-    write_section("Waves of the horizon's error", "python benchmarks/map_waves.py", ("numpy", "numba"), body)
+    write_section("Waves of the horizon's error", "python benchmarks/map_waves.py", ("numpy",), body)
 
 
 def observe_waves_deg(terrain: HeightMap) -> Array:

@@ -219,7 +219,7 @@ def main() -> None:
     print(body)
     if not (args.classes or args.terrain):
         write_section("Mixed tracks", f"python benchmarks/mixed_tracks.py --draws {args.draws}",
-                      ("numpy", "scipy", "numba"), body)  # fmt: skip
+                      ("numpy", "scipy"), body)  # fmt: skip
 
 
 if __name__ == "__main__":

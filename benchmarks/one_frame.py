@@ -2,7 +2,7 @@
 
     python benchmarks/one_frame.py [IMAGE] [--repeats 9] [--write]
 
-One thread. The frame is located once beforehand, so that files are cached and kernels compiled. Each repeat measures
+One thread. The frame is located once beforehand, so that files are cached. Each repeat measures
 `startrack.locate` and sep (background, extraction at 2 sigma, windowed centroids) one after the other.
 """
 
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[variable] = "1"
 
 import argparse

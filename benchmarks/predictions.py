@@ -50,7 +50,7 @@ def main() -> None:
     body = table(head, lines)
     print(body)
     command = f"python benchmarks/predictions.py --places {args.places} --frames {args.frames} --draws {args.draws}"
-    write_section("Predictions against images", command, ("numpy", "scipy", "numba"), body)
+    write_section("Predictions against images", command, ("numpy", "scipy"), body)
 
 
 def measure(name: str, places: int, frames: int, draws: int) -> list[str]:

@@ -64,9 +64,7 @@ def main() -> None:
     head += [text for count in EXPOSURES for text in (f"{count} exposures, m", "NEES")]
     body = table(head, lines)
     print(body)
-    write_section(
-        "Rests by stars", f"python benchmarks/rests.py --rests {args.rests}", ("numpy", "scipy", "numba"), body
-    )
+    write_section("Rests by stars", f"python benchmarks/rests.py --rests {args.rests}", ("numpy", "scipy"), body)
 
 
 def score_rest(case: Case, exact: HeightMap, stated: HeightMap, rng: np.random.Generator) -> list[list[float]]:

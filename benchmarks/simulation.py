@@ -45,7 +45,7 @@ def main() -> None:
     body = table(head, lines)
     print(body)
     command = f"python benchmarks/simulation.py --frames {args.frames} --draws {args.draws}"
-    write_section("Simulated evidence against pixels", command, ("numpy", "scipy", "numba"), body)
+    write_section("Simulated evidence against pixels", command, ("numpy", "scipy"), body)
 
 
 def compare(name: str, number: int, draws: int) -> tuple[Row, list[Row]] | None:

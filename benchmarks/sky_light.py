@@ -87,7 +87,7 @@ def main() -> None:
     print(body)
     if frames and hazards:
         command = f"python benchmarks/sky_light.py --frames {args.frames} --hazards {args.hazards}"
-        write_section("Sky light", command, ("numpy", "scipy", "numba"), body)
+        write_section("Sky light", command, ("numpy", "scipy"), body)
 
 
 def measure_case(job: tuple[int, int]) -> dict[str, dict[str, Any]]:

@@ -145,7 +145,7 @@ def main() -> None:
     body = table(head, lines)
     print(body)
     if not (args.classes or args.terrain):
-        write_section("Slips", f"python benchmarks/slips.py --drives {args.drives}", ("numpy", "scipy", "numba"), body)
+        write_section("Slips", f"python benchmarks/slips.py --drives {args.drives}", ("numpy", "scipy"), body)
 
 
 if __name__ == "__main__":

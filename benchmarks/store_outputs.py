@@ -68,7 +68,7 @@ class Commands:
         """Find the command and set up an environment with one thread and a cache of its own."""
         script = Path(sys.executable).with_name("startrack")
         self.program = [str(script)] if script.exists() else [sys.executable, "-m", "startrack.cli.main"]
-        one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+        one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
         self.environment = {**os.environ, **one_thread, "XDG_CACHE_HOME": cache}
         self.out, self.done = out, {}
         (out / "log").mkdir(parents=True)

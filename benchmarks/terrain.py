@@ -63,7 +63,7 @@ def main() -> None:
     print(body)
     write_section(
         f"Height maps: {args.terrain}", f"python benchmarks/terrain.py --terrain {args.terrain} --frames {args.frames}",
-        ("numpy", "scipy", "numba"), body,
+        ("numpy", "scipy"), body,
     )  # fmt: skip
 
 

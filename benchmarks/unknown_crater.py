@@ -69,7 +69,7 @@ def main() -> None:
     body = table(head, rows)
     print(body)
     command = f"python benchmarks/unknown_crater.py --drives {args.drives} --pixels {args.pixels}"
-    write_section("A crater of unknown depth and width", command, ("numpy", "scipy", "numba"), body)
+    write_section("A crater of unknown depth and width", command, ("numpy", "scipy"), body)
 
 
 def draw_drive(rng: np.random.Generator) -> Course:

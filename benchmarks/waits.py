@@ -81,7 +81,7 @@ def main() -> None:
     if args.only == [""]:
         columns = ["what", args.against, "this", "this / that", "peer", "this / peer", "wanted"]
         command = f"python benchmarks/waits.py --against {args.against} --runs {args.runs}"
-        write_section("Waits", command, ("numpy", "numba", *PEERS), table(columns, rows))
+        write_section("Waits", command, ("numpy", *PEERS), table(columns, rows))
 
 
 def cells(row: Row, before: Path, runs: int) -> list[str]:
@@ -118,13 +118,13 @@ def worktree(commit: str) -> Iterator[Path]:
             subprocess.run(["git", "-C", ROOT, "worktree", "remove", "--force", path], check=True)
 
 
-def process(code: Path, *words: str, **variables: str) -> Cost:
+def process(code: Path, *words: str) -> Cost:
     """Wall and CPU time of `startrack` with the arguments `words`, by the code in a folder."""
     inherited = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     with tempfile.TemporaryDirectory() as folder:
         command, before = [sys.executable, "-m", "startrack", *words, "-D", folder], cpu_s()
         start = time.perf_counter()
-        done = subprocess.run(command, cwd=folder, env=inherited | {"PYTHONPATH": str(code)} | variables, check=False)
+        done = subprocess.run(command, cwd=folder, env=inherited | {"PYTHONPATH": str(code)}, check=False)
         if done.returncode not in (0, REFUSED):
             done.check_returncode()
         return time.perf_counter() - start, cpu_s() - before
@@ -154,7 +154,7 @@ def cpu_s() -> float:
 
 @cache
 def warm_up(code: Path, image: Path, *flags: str) -> None:
-    """Have the code compile what it uses for an image, and compute the tables of its terrain."""
+    """Have the code compute the tables of the terrain of an image."""
     process(code, "locate", str(image), "-q", *flags)
 
 
@@ -162,13 +162,6 @@ def located(code: Path, *flags: str, image: Callable[[], Path] = lambda: SAMPLE)
     """The whole command, warm."""
     warm_up(code, image(), *flags)
     return process(code, "locate", str(image()), "-q", *flags)
-
-
-def first_use(code: Path, image: Callable[[], Path]) -> Cost:
-    """The whole command with nothing compiled; tables of the terrain are there."""
-    warm_up(code, image())
-    with tempfile.TemporaryDirectory() as folder:
-        return process(code, "locate", str(image()), "-q", NUMBA_CACHE_DIR=folder)
 
 
 @cache
@@ -271,8 +264,6 @@ ROWS = (
     Row("lost in space from a list; ruststartracker", "<= 1 peer", waited("listed_stars"), "ms",
         waited("ruststartracker_listed_stars"), 3),
     Row("identification of the next frame, after detection", "<= 5 ms", waited("next_frames"), "ms", runs=3),
-    Row("first use, cylinder: compilation", "<= 10 s", partial(first_use, image=lambda: SAMPLE), runs=1),
-    Row("first use, height map: compilation", "<= 20 s", partial(first_use, image=height_map_frame), runs=1),
     Row("packages of the core", "<= 760 MB", core_mb, "MB", runs=1),
 )  # fmt: skip
 

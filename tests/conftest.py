@@ -72,11 +72,6 @@ def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture(scope="session")
-def compiled_kernels(located: Located) -> None:
-    """The kernels of a fix on the cylinder are in numba's cache, so that other processes load them."""
-
-
-@pytest.fixture(scope="session")
 def located() -> Located:
     """A rendered and located exposure of a 1024 px fisheye, 6.5 km off the middle of the thesis's crater."""
     from startrack.camera import load_camera

@@ -16,8 +16,6 @@ from batch_helpers import frames
 
 from startrack.cli.main import main
 
-pytestmark = pytest.mark.usefixtures("compiled_kernels")  # else the first command announces on stderr that it compiles
-
 
 def start_batch(folder: Path, *flags: str, before: str = "") -> subprocess.Popen[str]:
     """The command in a shell, after the shell command `before`."""

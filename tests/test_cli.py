@@ -13,7 +13,9 @@ import cv2
 import numpy as np
 import pytest
 
+from startrack.cli import doctor
 from startrack.cli.main import main
+from startrack.kernels.library import LEVEL
 
 ROOT = Path(__file__).parent.parent
 SAMPLES = ROOT / "sample_images"
@@ -33,7 +35,6 @@ read_noise_e = 2.5
 """
 FACTS = {"time_utc": "2030-01-01T00:00:00Z", "exposure_s": 1.0, "camera": "small.toml", "terrain": "shackleton-thesis"}
 OK, ERROR, USAGE, REFUSED, BAD_INPUT = 0, 1, 2, 3, 4
-pytestmark = pytest.mark.usefixtures("compiled_kernels")  # else the first command announces on stderr that it compiles
 
 
 @pytest.fixture
@@ -489,7 +490,28 @@ def test_doctor_finds_all_well(folder, capsys):
     assert main(["doctor", "--json"]) == OK
     record = json.loads(capsys.readouterr().out)
     assert [check["name"] for check in record["checks"] if not check["ok"]] == []
-    assert {"catalogue", "cameras", "terrains", "kernels", "self-test"} <= {check["name"] for check in record["checks"]}
+    assert {"catalogue", "cameras", "terrains", "library", "self-test"} <= {check["name"] for check in record["checks"]}
+    library = next(check["message"] for check in record["checks"] if check["name"] == "library")
+    assert LEVEL in library and "-ffp-contract=off" in library
+
+
+def test_doctor_prepares_a_terrain(folder, capsys, monkeypatch):
+    monkeypatch.setattr(doctor, "_self_test", lambda: "left out")
+    assert main(["doctor", "-t", "shackleton-thesis"]) == OK
+    assert "horizons of shackleton-thesis are ready" in capsys.readouterr().out
+
+
+def test_without_the_library_a_command_ends_with_what_helps(folder):
+    """As of a checkout whose C sources have changed; the command that is named makes the library."""
+    code = "import startrack.kernels.build as b; b.source_key = lambda: 'of-other-sources'"
+    for words, expected in ((["locate", "a.png"], 1), (["--version"], OK), (["doctor", "-q"], 1)):
+        script = f"{code}; from startrack.cli.main import main; raise SystemExit(main({words}))"
+        run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=folder,
+                             env={**os.environ, "PYTHONPATH": str(ROOT)})  # fmt: skip
+        assert run.returncode == expected
+        if expected:
+            assert f"type `{sys.executable} -m startrack.kernels.build` in {ROOT}" in run.stderr + run.stdout
+            assert "internal error" not in run.stderr and "Traceback" not in run.stderr
 
 
 # --- round trips -----------------------------------------------------------------------------------------------------

@@ -39,7 +39,7 @@ KEYS = {
     "sky": "brightness_mag_arcsec2 unused",
     "clock": "offset_s sigma_s",
     "timing_ms": "read detect identify attitude evidence locate",
-    "provenance": "version image_sha256 camera terrain catalog localizer near time_utc time_sigma_s exposure_s "
+    "provenance": "version kernels image_sha256 camera terrain catalog localizer near time_utc time_sigma_s exposure_s "
     "mask_sha256 dark_sha256 flat_sha256",
 }
 

@@ -19,7 +19,7 @@ from startrack.kernels import build
 ROOT = Path(__file__).parent.parent
 BUILD = "from hatchling.build import build_wheel; import sys; print(build_wheel(sys.argv[1]))"
 BUILD_SOURCES = BUILD.replace("build_wheel", "build_sdist")
-COMPILED_BY = "from startrack.kernels.library import compiler; print(compiler())"
+COMPILED_BY = "from startrack.kernels.library import text_of; print(text_of('compiler_name'))"
 MODULES_OF_EXTRAS = (  # that the tests below do not load
     "matplotlib.pyplot", "playwright.sync_api", "axe_playwright_python.sync_playwright", "sphinx", "furo",
     "myst_parser", "sphinx_copybutton", "photutils.psf", "sep",

@@ -16,7 +16,6 @@ from startrack.chain.sky_state import stating_sky
 from startrack.chain.source_names import identified_names
 from startrack.chain.stages import Detected, Identified, Inputs, Oriented, Settings
 from startrack.core import FIELD_TOLERANCE_1
-from startrack.core.compilation import announce_compilation
 from startrack.core.types import (
     BadInput,
     Body,
@@ -85,7 +84,6 @@ def detect_sources(inputs: Inputs, camera: Camera | None, detector: Detector) ->
 
     `detector` finds them in the exposure of `inputs`; the levels of a `camera` convert counts to electrons.
     """
-    announce_compilation()
     stated = camera is not None and camera.sensor is not None
     if stated and inputs.exposure.saturation_adu is None and are_fractions(inputs.exposure.recorded_adu):
         raise BadInput(

@@ -20,10 +20,9 @@ from startrack.applications import batch
 from startrack.applications.batch import Image, ImageDone, Task
 from startrack.cli.console import discard_stdout, print_warnings, progress
 from startrack.cli.flags import check_cluster, check_localizer
-from startrack.cli.images import absolute_facts, compile_kernels, maps_left_out, prepare_reference, settings_of
+from startrack.cli.images import absolute_facts, maps_left_out, prepare_reference, settings_of
 from startrack.cli.report import write_page_of
 from startrack.core import errors
-from startrack.core.compilation import is_compiled
 from startrack.core.errors import INTERNAL_ERROR, BadInput
 from startrack.core.files import make_folder, printable
 from startrack.core.runner import Runner, RunStopped, count_cores
@@ -135,8 +134,6 @@ def _prepare(task: Task, args: argparse.Namespace) -> None:
     terrain = prepare_reference(reference, args)
     if terrain is not None and args.verbose:
         print_warnings(args, terrain.name, terrain.warnings(), of_all=True)
-    if terrain is not None and not is_compiled():
-        compile_kernels(terrain)
 
 
 class _Shown:

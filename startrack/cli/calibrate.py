@@ -19,7 +19,6 @@ from startrack.cli.camera_files import (
 from startrack.cli.console import named_steps, print_left_out, print_outcome, refusal
 from startrack.cli.flags import checked_flag
 from startrack.cli.images import approximate_camera, check_one_time, flag_site, read, read_each_once, site_of
-from startrack.core.compilation import announce_compilation
 from startrack.core.errors import BadInput, NoSolution
 from startrack.core.files import printable, resolve_named, split_camera
 from startrack.core.time_limit import limited_time
@@ -42,7 +41,6 @@ def run(args: argparse.Namespace) -> int:
     out = check_camera_output(args)
     with limited_time(args.time_limit):
         exposures = read_each_once(args)
-        announce_compilation()
         start = approximate_camera(args, exposures)
         with named_steps(
             args, f"calibrate with {len(exposures)} images", calibration.count_steps(len(exposures))

@@ -142,7 +142,7 @@ class Progress:
             self._bar.update(self._row, completed=completed, total=total, text=self.text)
 
     def line(self) -> str:
-        """What is done after how many seconds, and the time left at the mean speed; the first step may compile."""
+        """What is done after how many seconds, and the time left at the mean speed of the later steps."""
         now, (first_s, first), (last_s, last) = time.monotonic(), self._done[len(self._done) // 3], self._done[-1]
         to_do, left_s = (self.total or 0) - self.completed, 0.0
         if last > first:

@@ -6,11 +6,9 @@ import argparse
 import logging
 import math
 import os
-import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,11 +19,14 @@ from startrack.catalog import daylight_warnings
 from startrack.chain import NearAttitude, Settings, read_near_attitude
 from startrack.cli.console import progress
 from startrack.cli.flags import checked_flag
-from startrack.core.compilation import announce_compilation, is_compiled
 from startrack.core.errors import BadInput, one_line
 from startrack.core.files import is_path
+<<<<<<< HEAD
 from startrack.core.runner import count_cores
 from startrack.core.types import Evidence, Exposure, NotLocated, PositionPrior
+=======
+from startrack.core.types import Exposure, PositionPrior
+>>>>>>> ident
 from startrack.estimation.observations import OdometryErrors
 from startrack.frames import Site, angle_between_rad, parse_utc, rays_from_azel
 from startrack.identification import Identifier
@@ -43,6 +44,7 @@ LOADERS: dict[str, Callable[[str], object]] = {  # of the files among these fact
     "camera": load_camera, "terrain": load_terrain, "mask": images.read_mask, "dark": images.read_dark,
     "flat": images.read_flat,
 }  # fmt: skip
+<<<<<<< HEAD
 RAYS = 360  # of the fix that compiles the kernels: one a degree above the skyline and one below
 COMPILE = (  # without the search for garbage, a tenth of the time
     f"import gc, sys; gc.disable(); import {__name__} as images; images.compile_measurement(); "
@@ -50,6 +52,8 @@ COMPILE = (  # without the search for garbage, a tenth of the time
 )
 OFFSET_RAD = 0.01  # of these rays from the skyline
 DARK_PX = 64  # side of the picture that is measured for that
+=======
+>>>>>>> ident
 
 
 def read(path: str, args: argparse.Namespace) -> Exposure:
@@ -212,13 +216,13 @@ def prepare(terrain: Terrain, args: argparse.Namespace) -> None:
     """Compute a terrain's horizon table, unless it is known or there is none."""
     if terrain.is_prepared:
         return
-    announce_compilation()
     what, shown = f"horizons of {terrain.name}, once", not args.quiet
     about_s = terrain.costs_s().get("horizons") if shown and sys.stderr.isatty() else None
     with _terrain_log(args), progress(what, shown=shown, about_s=about_s) as bar:
         terrain.prepare(bar.update)
 
 
+<<<<<<< HEAD
 def compile_kernels(terrain: Terrain) -> None:
     """Compile the kernels of a fix on this terrain, by one fix from an ideal skyline seen from the origin."""
     from startrack.localization import ExactPosterior
@@ -267,6 +271,8 @@ def compile_beside(reference: str) -> subprocess.Popen[bytes] | None:
     return None
 
 
+=======
+>>>>>>> ident
 @contextmanager
 def _terrain_log(args: argparse.Namespace) -> Iterator[None]:
     """Print the terrain's log of the block on stderr: begin, wait, and with -v the path of the table."""

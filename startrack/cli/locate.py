@@ -20,7 +20,7 @@ from startrack.camera import Camera, load_camera
 from startrack.catalog import load_catalog
 from startrack.cli.console import Outcome, print_outcome, print_warnings, wait_lines, worst_code
 from startrack.cli.flags import check_localizer
-from startrack.cli.images import check_fov, compile_beside, flag_site, near_attitude_of, prepare, read, settings_of
+from startrack.cli.images import check_fov, flag_site, near_attitude_of, prepare, read, settings_of
 from startrack.cli.report import write_page_of_images
 from startrack.core.errors import INTERNAL_ERROR, BadInput, BadOutput
 from startrack.core.files import make_folder, printable
@@ -135,7 +135,6 @@ def _solve_image(args: argparse.Namespace, path: str, out: Path, solve: Solve, l
         if terrain is not None and exposure.terrain is not None and exposure.time_utc is not None:
             prepare(terrain, args)
             print_warnings(args, terrain.name, terrain.warnings(), of_all=True)
-            compile_beside(exposure.terrain)
         start = time.perf_counter()
         with wait_lines(args, f"{args.command} {printable(exposure.name)}"):
             result = chain.add_timing(solve(exposure, camera), read=1e3 * read_s)

@@ -27,6 +27,7 @@ from startrack.core import errors
 from startrack.core.errors import BadInput, BadOutput, NoSolution
 from startrack.core.files import FULL_DISK
 from startrack.core.memory import COMMAND_BYTES, START_BYTES, check_memory, refusing_shortage
+from startrack.kernels import LibraryMissing
 
 COMMANDS = {  # name to the module of startrack.cli that declares it
     "locate": "image_commands", "batch": "image_commands", "track": "image_commands", "identify": "image_commands",
@@ -114,6 +115,8 @@ def _run(args: argparse.Namespace) -> int:
         _report_failure(f"{cause.reason}: {cause}", code)
         print_advice(cause.reason, str(cause), args)
         return code
+    except LibraryMissing as cause:
+        return _report_failure(str(cause), errors.EXIT_INTERNAL_ERROR)
     except Exception as cause:
         is_output = isinstance(cause, BrokenPipeError) or getattr(cause, "errno", None) in FULL_DISK
         if getattr(args, "verbose", 0) or (is_output and getattr(cause, "filename", None) is None):

@@ -15,7 +15,6 @@ from startrack import rendering
 from startrack.camera import load_camera
 from startrack.cli.console import progress
 from startrack.cli.images import odometry_errors
-from startrack.core.compilation import announce_compilation
 from startrack.core.files import check_output, printable, write_atomically
 from startrack.core.types import TIME_SIGMA_S
 from startrack.exposure import with_facts, write_exposure, write_sidecar
@@ -51,7 +50,6 @@ def run(args: argparse.Namespace) -> int:
         written += [Path(args.dir) / name for name in ([TRUTH] if args.path is None else [TRUTH, ODOMETRY])]
     for path in written:  # all first: nothing is written half-way to an error
         check_output(path, overwrite=args.overwrite)
-    announce_compilation()
     poses = [series.pose(number) for number in range(len(images))] if args.every is not None else []
     with progress(f"render {len(images)} images", len(images), shown=len(images) > 2) as bar:
         for number, image in enumerate(images):

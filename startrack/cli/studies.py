@@ -19,8 +19,7 @@ from startrack.applications.reproduction import ARTEFACTS, Artefact
 from startrack.chain import input_hashes
 from startrack.cli.console import progress
 from startrack.cli.flags import check_cluster, check_extra, check_localizer
-from startrack.cli.images import absolute_reference, compile_kernels, odometry_errors, prepare
-from startrack.core.compilation import announce_compilation, is_compiled
+from startrack.cli.images import absolute_reference, odometry_errors, prepare
 from startrack.core.errors import EXIT_STOPPED, how_to_install, one_line
 from startrack.core.files import make_folder, printable
 from startrack.core.runner import RunStopped, count_cores
@@ -47,8 +46,6 @@ def predict(args: argparse.Namespace) -> int:
     if args.path is None and not can_write_maps():
         print(f"predict: no predict.tif, which needs rasterio: {how_to_install('dem')}", file=sys.stderr, flush=True)
     prepare(plan.terrain, args)
-    if args.cluster is None and not is_compiled():
-        compile_kernels(plan.terrain)
     start, depth, jobs = time.perf_counter(), None, args.jobs or count_cores()
     bar = partial(progress, shown=not args.quiet, jobs=jobs)
     try:
@@ -131,7 +128,6 @@ def reproduce(args: argparse.Namespace) -> int:
         check_extra(args, "matplotlib", "plots", "figures need", ", or omit them with --no-plots")
     check_cluster(args)
     out, size = make_folder(args.dir), reproduction.FULL if args.full else reproduction.QUICK
-    announce_compilation()
     if args.ours is not None:
         size = size.limit_our_positions(args.ours)
     with reproduction.fix_store(out, jobs=args.jobs or count_cores(), progress=progress, cluster=args.cluster) as store:

@@ -27,8 +27,8 @@ DRIVE_FLAGS = (
 )
 CACHE = """usage: startrack cache ACTION
 
-look             startrack cache show     tables of horizons and compiled code: folders, files, sizes
-remove           startrack cache clear    the next commands compute and compile again"""
+look             startrack cache show     tables of horizons: folder, files, size
+remove           startrack cache clear    the next commands compute them again"""
 COMMANDS = (
     Command(
         "render", function_at("render.run"), "make synthetic exposures and files with their truth",
@@ -162,30 +162,28 @@ COMMANDS = (
         "startrack reproduce table3.1 --quick",
     ),
     Command(
-        "doctor", function_at("doctor.run"), "versions, data files, compiled kernels, self-test",
-        "Check the installation: versions, extras, data files, and one rendered exposure located from its pixels, for "
-        "which the kernels are compiled (once for each installation). Exit code 0 if all is well, 1 otherwise.",
+        "doctor", function_at("doctor.run"), "versions, data files, C library, self-test",
+        "Check the installation: versions, extras, data files, the C library, and one rendered exposure located from "
+        "its pixels. Exit code 0 if all is well, 1 otherwise.",
         {
-            "input": (
-                flag("-t --terrain FILE", "compute this terrain's horizons and compile its kernels ahead of time"),
-            ),
+            "input": (flag("-t --terrain FILE", "compute this terrain's horizons ahead of time"),),
             "more": (flags.JSON, *flags.MORE),
         },
         "startrack doctor",
     ),
     Command(
-        "cache", None, "size and removal of tables of horizons and compiled code", None,
+        "cache", None, "size and removal of tables of horizons", None,
         start=CACHE,
         actions=(
             Command(
-                "show", function_at("cache.show"), "folders, files and sizes",
+                "show", function_at("cache.show"), "folder, files and size",
                 "Tables of horizons take at most 2 GB, or STARTRACK_CACHE_GB: above that those leave that were not "
                 "used for longest.",
                 {"more": (flags.JSON, *flags.MORE)}, "startrack cache show", memory_later=True,
             ),
             Command(
                 "clear", function_at("cache.clear"), "remove all of it",
-                "The next commands compute and compile again.",
+                "The next commands compute them again.",
                 {"more": (flags.JSON, *flags.MORE)}, "startrack cache clear", memory_later=True,
             ),
         ),

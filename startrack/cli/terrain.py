@@ -18,7 +18,6 @@ from startrack.cli.flag_types import amount
 from startrack.cli.images import prepare
 from startrack.cli.input_commands import STATED_ERRORS, state_flag
 from startrack.core import files
-from startrack.core.compilation import announce_compilation
 from startrack.core.errors import BadInput, length_text, one_line
 from startrack.frames import Site, latlon_from_enu
 from startrack.terrain import StateableError, Terrain, load_terrain, require_place
@@ -28,7 +27,6 @@ Values = dict[tuple[str, str], float | bool]  # by table and key
 
 def show(args: argparse.Namespace) -> int:
     """Print a terrain's properties, and draw it; 0."""
-    announce_compilation()
     terrain = load_terrain(args.terrain)
     position = None if args.at is None else (args.at[0], args.at[1])
     facts = _facts_of(terrain) | ({} if position is None else _view_facts(terrain, position))
@@ -59,7 +57,6 @@ def build(args: argparse.Namespace) -> int:
         if terrain.table_path is not None:
             if args.force:
                 terrain.discard_table()
-            announce_compilation()
             known = terrain.is_prepared
             facts |= {key: value for key, value in terrain.facts().items() if key == "maps_end"} | _cost_facts(terrain)
             start = time.perf_counter()
@@ -72,7 +69,6 @@ def build(args: argparse.Namespace) -> int:
 
 def import_map(args: argparse.Namespace) -> int:
     """Make a terrain file from elevation data; 0."""
-    announce_compilation()
     half = list(args.half or [])
     half += [30_000.0 if not half and k == 0 else 300_000.0 for k in range(len(half), len(args.maps))]
     if args.post is None and (args.crs or args.corner):

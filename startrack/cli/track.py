@@ -20,7 +20,6 @@ from startrack.catalog import load_catalog
 from startrack.chain import Settings
 from startrack.cli.console import progress, worst_code
 from startrack.cli.images import (
-    compile_kernels,
     flag_facts,
     maps_left_out,
     near_attitude_of,
@@ -133,8 +132,7 @@ class TrackRun:
         folder = self.args.frames[0]
         tree = image_tree(folder, self.args.dir)
         load_catalog()  # before the first image comes
-        if (terrain := prepare_reference(self.args.terrain, self.args)) is not None:
-            compile_kernels(terrain)
+        prepare_reference(self.args.terrain, self.args)
         former = signal.signal(signal.SIGTERM, signal.default_int_handler)
 
         def forget(path: str) -> str:

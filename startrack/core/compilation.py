@@ -1,4 +1,4 @@
-"""numba's cache of compiled kernels: where it lies, and whether this machine has compiled them already.
+"""numba's cache of compiled kernels: where it lies, and what of it is of other sources.
 
 The kernels are compiled at their first use after an installation and then loaded from the cache. It lies in a folder
 of the user's, as numba's NUMBA_CACHE_DIR is set, so that nothing stays of a package that is removed; of a checkout that
@@ -9,30 +9,20 @@ from __future__ import annotations
 
 import atexit
 import hashlib
-import logging
 import os
 import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from startrack import __version__
 from startrack.core.cache import cache_folder
 from startrack.core.files import PACKAGE, data_dir
-from startrack.core.time_limit import CLOCK
 
-if TYPE_CHECKING:
-    from multiprocessing.context import BaseContext
-    from multiprocessing.synchronize import Semaphore
-
-LOG = logging.getLogger(__name__)
 FOLDER = "numba"  # in the user's cache
 VARIABLE = "NUMBA_CACHE_DIR"
-CACHED = "@njit(cache=True"  # of a kernel that is kept on disk
 ABOVE_KERNELS = {  # no kernel of numba is in these packages, or uses them
     "api", "applications", "chain", "cli", "evidence", "exposure", "kernels", "localization", "output", "rendering",
     "simulation",
@@ -63,54 +53,6 @@ def choose_cache_folder() -> bool:
     return True
 
 
-class Turn:
-    """Whether this process announces compilations: of the processes that share a semaphore the first one does."""
-
-    def __init__(self) -> None:
-        self.is_taken = self.is_mine = False
-        self.shared: Semaphore | None = None  # of a pool, in its processes
-
-    def take(self) -> bool:
-        """True in the process that was the first of all to call this."""
-        if not self.is_taken:
-            self.is_taken = True
-            self.is_mine = self.shared is None or bool(self.shared.acquire(block=False))
-        return self.is_mine
-
-    def semaphore(self, context: BaseContext) -> Semaphore:
-        """For `shared` of the processes that a multiprocessing `context` starts; none announces where this one has."""
-        return context.Semaphore(int(not self.is_taken))
-
-
-ANNOUNCEMENT_TURN = Turn()
-
-
-@cache
-def announce_compilation() -> None:
-    """From now on, log one line when numba compiles the first kernel of a package of startrack in this process.
-
-    Compilation does not count towards a limit of time. Nothing is logged where all kernels come from the cache. Call
-    this before the first use of a kernel.
-    """
-    from numba.core import event
-
-    announced: set[str] = set()
-
-    class Announcement(event.Listener):  # type: ignore[misc]
-        def on_start(self, event: Any) -> None:
-            CLOCK.pause()
-            root, _, module = event.data["dispatcher"].py_func.__module__.partition(".")
-            package = module.partition(".")[0]
-            if root == PACKAGE.name and package not in announced and ANNOUNCEMENT_TURN.take():
-                announced.add(package)
-                LOG.warning("compiling %s, once for this installation: %s", package, _compiled_text(package))
-
-        def on_end(self, event: Any) -> None:
-            CLOCK.resume()
-
-    event.register("numba:compile", Announcement())
-
-
 def discard_stale_kernels() -> None:
     """Have numba forget the kernels that it compiled from other sources of startrack than these.
 
@@ -131,34 +73,6 @@ def discard_stale_kernels() -> None:
                 index.unlink(missing_ok=True)
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(key.hexdigest())
-
-
-def is_compiled() -> bool:
-    """Whether numba's cache holds kernels of a terrain for this Python.
-
-    For a decision that costs only time if it is wrong: kernels of changed sources count too.
-    """
-    return any(True for source in (PACKAGE / "terrain").glob("*.py") for _ in _indices_of(source))
-
-
-def compiled_files() -> dict[Path, list[Path]]:
-    """Files of compiled code by folder: in the user's cache those of all installations, elsewhere those of this one."""
-    own, named = cache_folder(FOLDER), os.environ.get(VARIABLE)
-    found = {own: [path for path in own.rglob("*") if path.is_file()]}
-    place = Path(named) if named else PACKAGE
-    if place != own:
-        folders = {_cache_of(source.parent) for source in PACKAGE.rglob("*.py")}
-        kernels = [path for folder in folders for path in folder.glob("*.nb[ic]")]
-        found[place] = sorted([*kernels, *([_key_file()] if _key_file().is_file() else [])])
-    return found
-
-
-def _compiled_text(package: str) -> str:
-    """How many of the kernels of a `package` of startrack are compiled."""
-    sources = [*(PACKAGE / package).rglob("*.py")]
-    total = sum(source.read_text(encoding="utf-8").count(CACHED) for source in sources)
-    ready = sum(1 for source in sources for _ in _indices_of(source))
-    return f"{ready} of {total} kernels are ready" if ready < total else "for another kind of data"
 
 
 def _indices_of(source: Path) -> Iterator[Path]:

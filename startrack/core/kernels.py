@@ -8,7 +8,6 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
-from math import erfc, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from startrack.core.compilation import choose_cache_folder, discard_stale_kernels
 from startrack.core.memory import check_memory
+from startrack.core.statistics import CDF_REACH, CDF_STEPS, NORMAL_CDF
 from startrack.core.stored import read_sealed, with_seal
 
 KEPT = {} if choose_cache_folder() else {"cache": False}  # options of each kernel
@@ -34,8 +34,6 @@ LOG = logging.getLogger(__name__)
 WARNED: set[str] = set()  # texts logged by this process
 REORDERED_SUMS = {"reassoc", "contract", "nsz"}  # as `fastmath`: lets the compiler sum several pixels at a time
 PYTHON_WRAPPER = "_ZN7cpython"  # begin of the name by which Python calls
-REACH, CDF_STEPS = 8.0, 4096  # of `normal_cdf`: standard deviations on either side, and steps; in common.h too
-NORMAL_CDF = np.array([0.5 * erfc(-x / sqrt(2.0)) for x in np.linspace(-REACH, REACH, CDF_STEPS + 1)])
 
 
 class KernelLibrary(JITCodeLibrary):  # type: ignore[misc]
@@ -194,7 +192,7 @@ def read_only(array: NDArray[Any]) -> NDArray[Any]:
 @njit(cache=True, inline="always")
 def normal_cdf(x):  # type: ignore[no-untyped-def]
     """The normal distribution function Phi(x) by linear interpolation of a table, to 5e-7."""
-    at = (min(max(x, -REACH), REACH) + REACH) * (CDF_STEPS / (2 * REACH))
+    at = (min(max(x, -CDF_REACH), CDF_REACH) + CDF_REACH) * (CDF_STEPS / (2 * CDF_REACH))
     i = min(int(at), CDF_STEPS - 1)
     return NORMAL_CDF[i] + (at - i) * (NORMAL_CDF[i + 1] - NORMAL_CDF[i])
 

@@ -11,6 +11,10 @@ import numpy as np
 from startrack.core.values import Array
 
 NORMAL_BY_MEDIAN = 1.4826  # standard deviation of a normal variable over the median of its absolute value
+# The normal distribution function as the kernels interpolate it: by so many steps, of so many sigmas to either side; in
+# common.h too.
+CDF_REACH, CDF_STEPS = 8.0, 4096
+NORMAL_CDF = np.array([0.5 * math.erfc(-x / math.sqrt(2.0)) for x in np.linspace(-CDF_REACH, CDF_REACH, CDF_STEPS + 1)])
 
 
 def median(values: Any, axis: int | None = None) -> Any:

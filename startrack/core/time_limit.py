@@ -1,7 +1,7 @@
 """A limit of the processor time of a block of work, for which its long loops ask.
 
-Processor time of the process, all threads, is counted; what is made once and kept (compiled kernels, tables of
-horizons) is not. No wall clock, thread or signal takes part: the same work ends at nearly the same place on a machine
+Processor time of the process, all threads, is counted; what is made once and kept (tables of horizons) is
+not. No wall clock, thread or signal takes part: the same work ends at nearly the same place on a machine
 that does other work too.
 """
 

@@ -139,7 +139,7 @@ class PhotometricScale:
 def brightness_agreement(v_mag: Array, measured_mag: Array, dimmed_mag: float = BRIGHTER_MAG) -> float:
     """Fraction of all pairs (star, detection) that agree in brightness, stars dimmed by at most `dimmed_mag`."""
     pairs = len(v_mag) * len(measured_mag)
-    return _count_alike(v_mag, np.sort(measured_mag), BRIGHTER_MAG, dimmed_mag) / pairs if pairs else 1.0
+    return _count_alike(np.ascontiguousarray(v_mag), np.sort(measured_mag), BRIGHTER_MAG, dimmed_mag) / pairs if pairs else 1.0
 
 
 @dataclass(frozen=True)
@@ -171,10 +171,10 @@ class CandidatePairs:
         k = len(self.star)
         slots = max(4, 1 << (2 * k - 1).bit_length())
         misfit, kept = np.empty(k), np.empty(k, np.int64)
+        pairs = self.detection, self.star, self.distance_px, self.v_mag, self.v_sigma_mag
         count = _compare_pairs(
-            self.detection, self.star, self.distance_px, self.v_mag, self.v_sigma_mag, self.scale.measured_mag,
-            self.scale.saturated, BRIGHTER_MAG, DIMMED_MAG, PX_PER_MAG, np.empty(k), np.empty(slots, np.int64), misfit,
-            kept,
+            *map(np.ascontiguousarray, pairs), self.scale.measured_mag, self.scale.saturated, BRIGHTER_MAG, DIMMED_MAG,
+            PX_PER_MAG, np.empty(k), np.empty(slots, np.int64), misfit, kept,
         )  # fmt: skip
         return misfit, kept[:count]
 

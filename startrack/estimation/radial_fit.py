@@ -54,7 +54,7 @@ def project_radial(
 ) -> tuple[Array, Bools]:
     """Pixels (n, 2) of rays (n, 3), and which lie in the frame and in the image circle."""
     px, inside = np.empty((len(rays_icrs), 2)), np.empty(len(rays_icrs), bool)
-    _project_radial(rays_icrs, R, lens, mirror, width, height, px, inside)
+    _project_radial(*map(np.ascontiguousarray, (rays_icrs, R)), lens, mirror, width, height, px, inside)
     return px, inside
 
 
@@ -69,8 +69,8 @@ def fit_radial(
     are known of them before. The sigmas of the centre are in focal lengths.
     """
     _fit_radial(
-        xy_px, rays_icrs, mirror, sigma_px, HALF_WEIGHT_CHI2, steps, free, expected, expected_sigma, LONGEST_STEP,
-        RIDGE, R, lens,
+        *map(np.ascontiguousarray, (xy_px, rays_icrs)), mirror, sigma_px, HALF_WEIGHT_CHI2, steps, free, expected,
+        expected_sigma, LONGEST_STEP, RIDGE, R, lens,
     )  # fmt: skip
 
 

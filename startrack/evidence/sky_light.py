@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from startrack.core.kernels import NORMAL_CDF
-from startrack.core.statistics import relative_weights, robust_sigma
+from startrack.core.statistics import NORMAL_CDF, relative_weights, robust_sigma
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Bools, Evidence, Ints, sector_of
 from startrack.evidence.photometry import SURE_SIGMAS
 from startrack.evidence.sky_levels import CLIP_SIGMAS, GROUND, SKY, SkyLevels, measure_levels

@@ -87,8 +87,8 @@ def rotate_by_inliers(
     m = len(which)
     agree, variance, refined = np.empty(m, bool), np.empty(m), np.empty((3, 3))
     change = _rotate_by_inliers(
-        which, detection, distance, variance_px2, rays_cam, rays_icrs, R, FIRST_GATE_PX, CHI2_2DOF_MEDIAN,
-        SMALLEST_EXTRA_PX2, STAR_OUTLIER_CHI2, np.empty((2, m)), agree, variance, refined,
+        which, detection, distance, variance_px2, *map(np.ascontiguousarray, (rays_cam, rays_icrs, R)), FIRST_GATE_PX,
+        CHI2_2DOF_MEDIAN, SMALLEST_EXTRA_PX2, STAR_OUTLIER_CHI2, np.empty((2, m)), agree, variance, refined,
     )  # fmt: skip
     return agree, variance, refined, change
 

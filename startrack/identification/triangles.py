@@ -177,7 +177,7 @@ class PatternIndex:
         reach = CUBE_DIAGONAL * tolerance * 2.0 / self.longest_chord
         near = self.grid.neighbours(to_cube(sides, self.longest_chord), reach)
         off, kept = np.empty(len(near.ray)), np.empty(len(near.ray), np.int64)
-        _largest_differences(sides, self.sides, near.ray, near.star, tolerance, off)
+        _largest_differences(np.ascontiguousarray(sides), self.sides, near.ray, near.star, tolerance, off)
         order, count = off.argsort(kind="stable"), np.empty(len(sides), np.int64)
         kept = kept[: _keep_closest(order, off, near.ray, most, count, kept)]
         return near.ray[kept], near.star[kept]

@@ -12,6 +12,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import importlib.util
+import json
 import os
 import platform
 import shlex
@@ -99,10 +100,15 @@ class Compiler:
 
     def build(self, sources: Sequence[Path], level: str, library: Path) -> None:
         """Compile `sources` into a `library` for the processors of a `level`. Raises BuildFailed."""
+<<<<<<< HEAD
         own = {name: os.environ.get(name) or _zig_cache().name for name in ZIG_CACHES} if self.is_zig else {}
+=======
+        own = dict.fromkeys(("ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR"), _zig_cache().name) if self.is_zig else {}
+        flags = [*shlex.split(os.environ.get("CFLAGS", "")), *FLAGS, *self.flags(level)]
+>>>>>>> ident
         command = [
-            *self.words, *shlex.split(os.environ.get("CFLAGS", "")), *FLAGS, *self.flags(level), "-o", str(library),
-            *map(str, sources), *shlex.split(os.environ.get("LDFLAGS", "")), "-lm",
+            *self.words, *flags, f"-DFLAGS={json.dumps(shlex.join(flags))}", "-o", str(library), *map(str, sources),
+            *shlex.split(os.environ.get("LDFLAGS", "")), "-lm",
         ]  # fmt: skip
         try:
             run = subprocess.run(command, capture_output=True, text=True, errors="replace", env={**os.environ, **own})
@@ -136,6 +142,12 @@ def this_target() -> Target:
     else:
         system = "linux-musl"
     return Target(sys.platform, machine, f"{name}-{system}")
+
+
+def how_to_build(level: str) -> str:
+    """What to type for the library of a `level`."""
+    words = f"{sys.executable} -m startrack.kernels.build{' sanitized' if level == 'sanitized' else ''}"
+    return f"type `{words}` in {FOLDER.parents[1]}, or install startrack anew"
 
 
 def find_compiler(with_zig: bool = True) -> Compiler:

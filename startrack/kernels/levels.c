@@ -35,3 +35,12 @@ const char *compiler_name(void)
     return "gcc " __VERSION__;
 #endif
 }
+
+#if !defined(FLAGS) /* build.py states them */
+#define FLAGS ""
+#endif
+
+const char *compiler_flags(void)
+{
+    return FLAGS;
+}

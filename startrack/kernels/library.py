@@ -10,13 +10,17 @@ import ctypes
 import operator
 import os
 import re
-import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
+<<<<<<< HEAD
 from startrack.kernels.build import COMPILED, this_target
+=======
+from startrack.kernels import LibraryMissing
+from startrack.kernels.build import COMPILED, how_to_build, levels, library_name
+>>>>>>> ident
 
 VARIABLE = "STARTRACK_KERNELS"
 SCALARS: dict[str, tuple[Any, Callable[..., Any]]] = {
@@ -46,36 +50,40 @@ class Argument(NamedTuple):
 
 
 def _open(level: str) -> ctypes.CDLL:
+<<<<<<< HEAD
     """The library of a level. Raises ImportError with the command that makes it."""
     path = COMPILED / this_target().library_name(level)
+=======
+    """The library of a level. Raises LibraryMissing with the command that makes it."""
+    path = COMPILED / library_name(level)
+>>>>>>> ident
     try:
         return ctypes.CDLL(str(path))
     except OSError as cause:
         why = f"is not for this system ({cause})" if path.is_file() else "does not exist for these C sources"
-        words = f"{sys.executable} -m startrack.kernels.build{' sanitized' if level == 'sanitized' else ''}"
-        raise ImportError(f"{path} {why}: type `{words}` in {COMPILED.parents[2]}, or install startrack anew") from None
+        raise LibraryMissing(f"{path} {why}: {how_to_build(level)}") from None
 
 
 def _load() -> tuple[str, ctypes.CDLL]:
     """The level that is loaded, and its library."""
     level = os.environ.get(VARIABLE) or None
     if level not in (None, "baseline", "v3", "sanitized"):
-        raise ImportError(f"{VARIABLE} is {level!r}; it may be baseline, v3 or sanitized")
+        raise LibraryMissing(f"{VARIABLE} is {level!r}; it may be baseline, v3 or sanitized")
     if level == "sanitized":
         return level, _open(level)
     baseline = _open("baseline")
     has_v3 = "v3" in this_target().levels and bool(baseline.has_x86_64_v3())
     if level == "v3" and not has_v3:
-        raise ImportError(f"{VARIABLE} is v3, which this processor is not")
+        raise LibraryMissing(f"{VARIABLE} is v3, which this processor is not")
     return ("v3", _open("v3")) if has_v3 and level != "baseline" else ("baseline", baseline)
 
 
 LEVEL, LIBRARY = _load()
 
 
-def compiler() -> str:
-    """Name and version of the compiler that made the library."""
-    return str(ctypes.cast(LIBRARY.compiler_name, ctypes.CFUNCTYPE(ctypes.c_char_p))().decode())
+def text_of(name: str) -> str:
+    """What the library says of itself: `compiler_name` with its version, or `compiler_flags`."""
+    return str(ctypes.cast(getattr(LIBRARY, name), ctypes.CFUNCTYPE(ctypes.c_char_p))().decode())
 
 
 def kernel(name: str, *declarations: str, result: str | None = None) -> Callable[..., Any]:

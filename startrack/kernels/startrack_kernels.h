@@ -58,6 +58,9 @@ KERNEL bool has_x86_64_v3(void);
 /* Name and version of the compiler, as it gives them. */
 KERNEL const char *compiler_name(void);
 
+/* The flags that it was given. */
+KERNEL const char *compiler_flags(void);
+
 /* attitudes.c */
 
 /* Fill `R` [3, 3] with the rotation that minimises sum weight |cam - R icrs|^2 over pairs of rays [n, 3]. */

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from startrack.core.compilation import announce_compilation
 from startrack.core.types import Array, Evidence, Explored, Fix, NotLocated, PositionPrior
 from startrack.localization.clock import explore_times, is_wide
 from startrack.localization.conclusion import conclude
@@ -42,7 +41,6 @@ class ExactPosterior:
 
         Raises NotLocated: insufficient_geometry, outside_search_area, inconsistent_evidence.
         """
-        announce_compilation()
         terrain = settle_steepness(evidence, require_terrain(terrain))
         informative = (np.abs(evidence.llr) > MIN_ROW_NATS) | (evidence.extended_nats > MIN_ROW_NATS)
         informative &= terrain.is_informative(evidence.azimuth_rad, evidence.elevation_rad)

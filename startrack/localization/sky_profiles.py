@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.core.kernels import NORMAL_CDF
+from startrack.core.statistics import NORMAL_CDF
 from startrack.core.types import Array, Evidence, Ints
 from startrack.kernels.library import kernel
 

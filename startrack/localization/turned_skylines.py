@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from startrack.core.compilation import announce_compilation
 from startrack.core.time_limit import check_time
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Fix, Ints, NotLocated
 from startrack.localization.neighbourhood import Neighbourhood
@@ -59,7 +58,6 @@ def locate_points(points: SkylinePoints, terrain: Terrain) -> tuple[Fix, SeenSky
     The errors of the attitude are integrated.
     Raises NotLocated: insufficient_geometry, outside_search_area, inconsistent_evidence.
     """
-    announce_compilation()
     middle = SeenSkyline.at(points, require_terrain(terrain), np.zeros(2), np.zeros(3))
     used = float(middle.used.mean() * 2 * np.pi)
     if used < NEEDED_RAD:

@@ -10,6 +10,7 @@ from startrack import __version__
 from startrack.chain import Detected, Identified, Inputs, Located, Measured, Oriented, Positioned
 from startrack.core.ecsv import Column
 from startrack.frames import format_utc
+from startrack.kernels.library import LEVEL
 from startrack.output.quantities_pose import ATTITUDE_QUANTITIES, MIDDLE_QUANTITIES, POSITION_QUANTITIES
 from startrack.output.quantity import Listed, Quantity, Show, list_schema, object_schema, show_everywhere
 from startrack.output.values import (
@@ -96,6 +97,9 @@ RUN_QUANTITIES: tuple[Quantity, ...] = (
       "as above", "positive", nullable=True, form="%.6g", columns={"clock_sigma_s": ()},
       shown=(Show("text", "clock", "; sigma {:.3f} s"), Show("notebook page", "clock", " ± {:.3f} s"))),
     Q("provenance.version", "", Inputs, lambda v: __version__, "of startrack", "text"),
+    Q("provenance.kernels", "", Inputs, lambda v: LEVEL,
+      "level of the processor that the C library was compiled for: `baseline`, `v3`, `sanitized`", "text",
+      optional=True),
     Q("provenance.image_sha256", "", Inputs, lambda v: v.exposure.sha256,
       "of the file; of an array: of its type, shape and values; null: it could not be read", "text", before=None,
       form="%s"),

@@ -10,6 +10,7 @@ from startrack import __version__
 from startrack.chain import STAGES, Detected, Identified, Inputs, Outcome, last_value
 from startrack.core.errors import Reason
 from startrack.core.types import Exposure
+from startrack.kernels.library import LEVEL
 from startrack.output.quantities import BY_PATH, QUANTITIES
 from startrack.output.quantity import Schema, record_from, schema_of_kind
 from startrack.output.values import At
@@ -51,7 +52,7 @@ def refused_dict(
     `kind` is fix, identification or detection; `image_sha256` that of the file, if it is known.
     """
     record = _record(kind, Path(image).name, reason, message, None)
-    known = {"version": __version__, "image_sha256": image_sha256}
+    known = {"version": __version__, "kernels": LEVEL, "image_sha256": image_sha256}
     record["provenance"] = {one.key: known.get(one.key) for one in QUANTITIES if one.section == "provenance"}
     return record
 

@@ -58,9 +58,9 @@ def decode(raw: bytes) -> Decoded:
         elif kind[:1].isupper() and kind != b"PLTE":
             raise bad_image(f"PNG needs a feature that startrack does not know ({kind!r})")
     # Gamma, colour profile and orientation are left out: they cannot change the pixels.
-    rows = _inflate_rows(b"".join(picture), width, height, depth * channels, ADAM7 if interlaced else WHOLE)
-    packed = zlib.compress(rows, 0)  # as they are: OpenCV need not inflate them again
-    bare = b"".join((raw[:IHDR_END], chunk(b"IDAT", packed), chunk(b"IEND", b"")))
+    data = b"".join(picture)
+    _check_rows(data, width, height, depth * channels, ADAM7 if interlaced else WHOLE)
+    bare = b"".join((raw[:IHDR_END], chunk(b"IDAT", data), chunk(b"IEND", b"")))
     stored = cv2.imdecode(np.frombuffer(bare, np.uint8), cv2.IMREAD_UNCHANGED)
     if stored is None or stored.shape[:2] != (height, width) or stored.dtype.itemsize * 8 != depth:
         raise bad_image(DAMAGED)
@@ -114,11 +114,11 @@ def _check_ihdr(body: memoryview) -> tuple[int, int, int, int, bool]:
     return width, height, depth, 3 if colour_type == 2 else 1, body[12] != 0
 
 
-def _inflate_rows(compressed: bytes, width: int, height: int, pixel_bits: int, passes: Passes) -> bytes:
-    """The filtered rows of all `passes`, each of whole bytes after the number of its filter; no more is inflated.
+def _check_rows(compressed: bytes, width: int, height: int, pixel_bits: int, passes: Passes) -> None:
+    """Raise BadInput bad_image for data that are damaged, too short or too long, or name an unknown filter.
 
-    Raises BadInput bad_image for data that are damaged, too short or too long, or name an unknown filter: libpng would
-    print a line about each.
+    They are the filtered rows of all `passes`, each of whole bytes after the number of its filter; no more is inflated.
+    OpenCV does not refuse data that are too long, and libpng prints a line about the other faults.
     """
     sides = [(-(-(height - y0) // dy), -(-(width - x0) // dx)) for x0, y0, dx, dy in passes]
     shapes = [(rows, 1 + columns * pixel_bits // 8) for rows, columns in sides if rows > 0 and columns > 0]
@@ -135,7 +135,6 @@ def _inflate_rows(compressed: bytes, width: int, height: int, pixel_bits: int, p
         if filters.max() >= FILTERS:
             raise bad_image(DAMAGED)
         at += rows * row_bytes
-    return data
 
 
 def _read_text(kind: bytes, body: bytes, header: dict[str, str]) -> None:

@@ -39,7 +39,7 @@ SLIP_PART, SLIP_M = 0.1, 20.0
 SETTLED_FRAMES = 10  # after which the filter is scored
 SEED = 41
 CRATER = "shackleton-thesis"
-PACKAGES = "numpy", "scipy", "numba"
+PACKAGES = "numpy", "scipy"
 
 
 @dataclass(frozen=True)

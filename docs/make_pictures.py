@@ -2,7 +2,7 @@
 
     python docs/make_pictures.py [NAME ...]
 
-Needs the extras `plots` and, for `report`, `browser` with Chromium. The figures of the thesis are made by
+Needs the extra `plots` and, for `report`, Chromium. The figures of the thesis are made by
 `startrack reproduce` instead.
 """
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -34,6 +35,7 @@ TRUE_M = (-6900.0, 4700.0)  # near-wall.truth.json
 MAX_BYTES = 300_000
 WIDE_LLR = 4.0  # rows of the panel of the whole floor: they decide the sum at distances of hundreds of metres
 NEAR_RAD = np.radians(3.0)  # other rows are the same at every position of the enlarged panel
+PAGE_PX = "1200,1850"  # width and height of the picture of the report page
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 DARK = {"figure.facecolor": "#0c0f16", "axes.facecolor": "#0c0f16", "savefig.facecolor": "#0c0f16",
         "text.color": "#e8eaf0", "axes.labelcolor": "#c8ccd8", "xtick.color": "#a0a6b4", "ytick.color": "#a0a6b4",
@@ -58,19 +60,15 @@ def make_skyline(solution: Any, folder: Path) -> None:
 
 
 def make_report(solution: Any, folder: Path) -> None:
-    """The HTML page of the sample, as a browser shows it."""
-    from playwright.sync_api import sync_playwright
-
+    """The upper part of the HTML page of the sample, as a browser shows it."""
     run("report", str(folder / "near-wall.fix.json"))
-    with sync_playwright() as driver:
-        path = next(filter(None, map(shutil.which, BROWSERS)), None)
-        browser = driver.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": 1200, "height": 900})
-        page.goto((folder / "near-wall.report.html").as_uri())
-        page.wait_for_timeout(1500)
-        page.screenshot(path=folder / "report.png", full_page=True)
-        browser.close()
-    save_webp(Image.open(folder / "report.png"), "report", width_px=1000)
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        raise SystemExit("Chromium is not installed")
+    page, picture = (folder / "near-wall.report.html").as_uri(), folder / "report.png"
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--virtual-time-budget=3000"]
+    subprocess.run([browser, *flags, f"--window-size={PAGE_PX}", f"--screenshot={picture}", page], check=True)
+    save_webp(Image.open(picture), "report", width_px=1200)
 
 
 def make_posterior(solution: Any, folder: Path) -> None:
@@ -131,16 +129,20 @@ def make_accuracy(solution: Any, folder: Path) -> None:
     rows = next(one["rows"] for one in stored["blocks"] if "head" in one and one["head"][0] == "position error, m")
     names = [row[0] for row in rows][::-1]
     mean, median, _, largest = np.array([[float(cell) for cell in row[1:]] for row in rows])[::-1].T
-    figure, axes = plt.subplots(figsize=(8, 2.6), layout="constrained")
-    axes.barh(names, mean, color="#3182ce", height=0.5, label="mean")
-    axes.plot(median, names, "o", color="#ffffff", mec="#1a365d", label="median")
-    axes.plot(largest, names, "|", color="#c05621", ms=18, mew=2.5, label="largest")
-    for name, value in zip(names, largest, strict=True):
-        axes.annotate(f"{value:.0f} m", (value, name), xytext=(8, 0), textcoords="offset points", va="center")
-    axes.set(xscale="log", xlim=(1, 6000), xlabel="position error, m (logarithmic)")
-    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, frameon=False)
-    axes.spines[["top", "right"]].set_visible(False)
-    save_figure(figure, "accuracy")
+    with plt.rc_context(DARK):
+        figure, axes = plt.subplots(figsize=(8, 2.6), layout="constrained")
+        axes.hlines(names, median, largest, color="#58606e", lw=3)
+        for values, colour, label in ((median, "#9fb0c8", "median"), (mean, "#f07a2b", "mean"),
+                                      (largest, "#63b3ed", "largest")):  # fmt: skip
+            axes.plot(values, names, "o", color=colour, ms=9, label=label)
+        for name, one, far in zip(names, mean, largest, strict=True):
+            for value, colour, side in ((one, "#f07a2b", "right"), (far, "#63b3ed", "left")):
+                text = f"{value:.1f} m" if value < 100 else f"{value:.0f} m"
+                axes.annotate(text, (value, name), (0, 9), textcoords="offset points", ha=side, color=colour)
+        axes.set(xscale="log", xlim=(1, 4000), ylim=(-0.5, len(names) - 0.3), xlabel="position error, m (logarithmic)")
+        axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, frameon=False)
+        axes.spines[["top", "right"]].set_visible(False)
+        save_figure(figure, "accuracy")
 
 
 def make_horizon(solution: Any, folder: Path) -> None:

@@ -6,13 +6,8 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-<<<<<<< HEAD
 from startrack.core import circle
-from startrack.core.kernels import NORMAL_CDF
-=======
-from startrack.core import circle, table_text
 from startrack.core.statistics import NORMAL_CDF
->>>>>>> ident
 from startrack.evidence import sky_levels, sky_light, sky_pixels
 from startrack.frames import wahba
 from startrack.identification import attitude_refinement, star_grid

@@ -21,12 +21,7 @@ from startrack.cli.console import progress
 from startrack.cli.flags import checked_flag
 from startrack.core.errors import BadInput, one_line
 from startrack.core.files import is_path
-<<<<<<< HEAD
-from startrack.core.runner import count_cores
-from startrack.core.types import Evidence, Exposure, NotLocated, PositionPrior
-=======
 from startrack.core.types import Exposure, PositionPrior
->>>>>>> ident
 from startrack.estimation.observations import OdometryErrors
 from startrack.frames import Site, angle_between_rad, parse_utc, rays_from_azel
 from startrack.identification import Identifier
@@ -44,16 +39,6 @@ LOADERS: dict[str, Callable[[str], object]] = {  # of the files among these fact
     "camera": load_camera, "terrain": load_terrain, "mask": images.read_mask, "dark": images.read_dark,
     "flat": images.read_flat,
 }  # fmt: skip
-<<<<<<< HEAD
-RAYS = 360  # of the fix that compiles the kernels: one a degree above the skyline and one below
-COMPILE = (  # without the search for garbage, a tenth of the time
-    f"import gc, sys; gc.disable(); import {__name__} as images; images.compile_measurement(); "
-    "images.compile_kernels(images.load_terrain(sys.argv[1]))"
-)
-OFFSET_RAD = 0.01  # of these rays from the skyline
-DARK_PX = 64  # side of the picture that is measured for that
-=======
->>>>>>> ident
 
 
 def read(path: str, args: argparse.Namespace) -> Exposure:
@@ -222,57 +207,6 @@ def prepare(terrain: Terrain, args: argparse.Namespace) -> None:
         terrain.prepare(bar.update)
 
 
-<<<<<<< HEAD
-def compile_kernels(terrain: Terrain) -> None:
-    """Compile the kernels of a fix on this terrain, by one fix from an ideal skyline seen from the origin."""
-    from startrack.localization import ExactPosterior
-
-    announce_compilation()
-    azimuth = np.linspace(0.0, 2 * np.pi, RAYS, endpoint=False)
-    skyline = terrain.horizon_rad(np.zeros((RAYS, 2)), azimuth)
-    evidence = Evidence(
-        azimuth_rad=np.tile(azimuth, 2),
-        elevation_rad=np.concatenate([skyline + OFFSET_RAD, skyline - OFFSET_RAD]),
-        llr=np.repeat([1.0, -1.0], RAYS),
-        edge_sigma_rad=np.full(2 * RAYS, 0.0 if terrain.hard_edges else OFFSET_RAD),
-    )
-    with suppress(NotLocated):  # the kernels are compiled in any case
-        ExactPosterior()(evidence, terrain)
-
-
-def compile_measurement() -> None:
-    """Compile the kernel of photometry, by a dark picture."""
-    from startrack.core.smooth_image import SmoothImage
-    from startrack.core.types import Detections
-    from startrack.evidence import Sources, measure
-
-    none, ones, dark = np.zeros(0), np.ones(1), np.zeros((DARK_PX, DARK_PX), np.float32)
-    picture = Detections(
-        xy_px=np.zeros((0, 2)), covariance_px2=np.zeros((0, 2, 2)), flux_e=none, snr=none, flux_sigma_e=none,
-        saturated=none > 0, psf_sigma_px=1.0, image_e=dark, dead=dark > 0,
-        background=SmoothImage.of(dark), noise=SmoothImage.of(dark + 1),
-    )  # fmt: skip
-    measure(picture, Sources(xy_px=np.full((1, 2), DARK_PX / 2), flux_e=ones, fraction_sigma=ones, visible=ones))
-
-
-@cache
-def compile_beside(reference: str) -> subprocess.Popen[bytes] | None:
-    """The process that compiles the kernels of a fix on the terrain at `reference`, beside this one; None if compiled.
-
-    It nearly halves the wait at the first use: numba compiles on one core. This process meanwhile compiles detection
-    and identification.
-    """
-    if is_compiled() or count_cores() == 1:
-        return None
-    nothing = subprocess.DEVNULL
-    command = [sys.executable, "-c", COMPILE, reference]
-    with suppress(OSError):  # without it the fix waits for its kernels: no memory, no right to run another process
-        return subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing)
-    return None
-
-
-=======
->>>>>>> ident
 @contextmanager
 def _terrain_log(args: argparse.Namespace) -> Iterator[None]:
     """Print the terrain's log of the block on stderr: begin, wait, and with -v the path of the table."""

@@ -100,12 +100,8 @@ class Compiler:
 
     def build(self, sources: Sequence[Path], level: str, library: Path) -> None:
         """Compile `sources` into a `library` for the processors of a `level`. Raises BuildFailed."""
-<<<<<<< HEAD
         own = {name: os.environ.get(name) or _zig_cache().name for name in ZIG_CACHES} if self.is_zig else {}
-=======
-        own = dict.fromkeys(("ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR"), _zig_cache().name) if self.is_zig else {}
         flags = [*shlex.split(os.environ.get("CFLAGS", "")), *FLAGS, *self.flags(level)]
->>>>>>> ident
         command = [
             *self.words, *flags, f"-DFLAGS={json.dumps(shlex.join(flags))}", "-o", str(library), *map(str, sources),
             *shlex.split(os.environ.get("LDFLAGS", "")), "-lm",

@@ -15,12 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-<<<<<<< HEAD
-from startrack.kernels.build import COMPILED, this_target
-=======
 from startrack.kernels import LibraryMissing
-from startrack.kernels.build import COMPILED, how_to_build, levels, library_name
->>>>>>> ident
+from startrack.kernels.build import COMPILED, how_to_build, this_target
 
 VARIABLE = "STARTRACK_KERNELS"
 SCALARS: dict[str, tuple[Any, Callable[..., Any]]] = {
@@ -50,13 +46,8 @@ class Argument(NamedTuple):
 
 
 def _open(level: str) -> ctypes.CDLL:
-<<<<<<< HEAD
-    """The library of a level. Raises ImportError with the command that makes it."""
-    path = COMPILED / this_target().library_name(level)
-=======
     """The library of a level. Raises LibraryMissing with the command that makes it."""
-    path = COMPILED / library_name(level)
->>>>>>> ident
+    path = COMPILED / this_target().library_name(level)
     try:
         return ctypes.CDLL(str(path))
     except OSError as cause:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from startrack.cli.main import main
-from startrack.core import cache, compilation
+from startrack.core import cache
 from startrack.core.files import hold_lock
 from startrack.core.types import BadInput
 
@@ -26,7 +26,6 @@ def unknown(uid):
 pwd.getpwuid = unknown
 os.environ.pop("HOME", None)
 os.environ.pop("XDG_CACHE_HOME", None)
-os.environ.pop("NUMBA_CACHE_DIR", None)
 """
 READ_ONLY = """
 def none():
@@ -48,7 +47,7 @@ def without_home(monkeypatch, tmp_path):
     def unknown(uid):
         raise KeyError(uid)
 
-    for name in ("HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR"):
+    for name in ("HOME", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr("pwd.getpwuid", unknown)
     monkeypatch.setattr(cache.tempfile, "gettempdir", lambda: str(tmp_path))
@@ -59,7 +58,7 @@ def without_home(monkeypatch, tmp_path):
 def test_without_a_home_the_cache_lies_in_a_temporary_folder_of_the_user_alone(without_home):
     assert cache.cache_folder("horizons") == without_home / "horizons"
     assert without_home.stat().st_mode & 0o777 == 0o700
-    assert cache.cache_folder("numba") == without_home / "numba"  # the same folder again
+    assert cache.cache_folder("draws") == without_home / "draws"  # the same folder again
 
 
 @needs_users
@@ -93,23 +92,10 @@ def test_a_user_without_a_home_builds_a_table(tmp_path):
 @needs_users
 @pytest.mark.slow
 def test_where_no_folder_takes_a_file_commands_run_or_end_in_words(tmp_path):
-    """Kernels are then compiled and not kept."""
     image = ROOT / "sample_images/near-centre.png"
     done = run_unknown(tmp_path, READ_ONLY, "detect", image, "-D", "out", "-q")
     assert (done.returncode, done.stderr) == (0, "")
     assert sorted(one.name for one in tmp_path.iterdir()) == ["out", "script.py"]
-
-
-def test_kernels_are_not_kept_where_no_folder_takes_a_file(monkeypatch):
-    def none(**_):
-        raise FileNotFoundError
-
-    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", os.devnull)
-    monkeypatch.setattr(compilation.os, "access", lambda path, mode: False)
-    monkeypatch.setattr(compilation.tempfile, "mkdtemp", none)
-    assert compilation.choose_cache_folder() is False
-    assert "NUMBA_CACHE_DIR" not in os.environ
 
 
 @pytest.fixture
@@ -161,14 +147,3 @@ def test_a_limit_that_is_no_size_is_refused(monkeypatch, text):
     monkeypatch.setenv("STARTRACK_CACHE_GB", text)
     with pytest.raises(BadInput, match=f"STARTRACK_CACHE_GB={text}: is no size in GB"):
         cache.limit_bytes()
-
-
-def test_compiled_code_of_an_installed_package_lies_in_the_users_cache(monkeypatch, tmp_path):
-    """So that nothing of it stays in site-packages when the package is removed; that of a checkout lies beside it."""
-    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert compilation.choose_cache_folder() is True
-    assert "NUMBA_CACHE_DIR" not in os.environ
-    monkeypatch.setattr(compilation, "data_dir", lambda kind: compilation.PACKAGE / "data" / kind)
-    assert compilation.choose_cache_folder() is True
-    assert os.environ.pop("NUMBA_CACHE_DIR") == str(tmp_path / "startrack" / "numba")

@@ -10,12 +10,12 @@ from contextlib import contextmanager, suppress
 from startrack.core.errors import BadInput, NoSolution, Reason
 from startrack.core.files import MAX_CAUSE_CHARS
 
-# Address space of a command and of each pixel of its picture (VmPeak of `detect` on two cores: 1.13 GB at 0.26 Mpx,
-# 2.74 GB at 67 Mpx). With less, OpenBLAS blocks (0.6 GB) or ends the process (0.8), and LLVM aborts it (0.9 to 1.13).
-COMMAND_BYTES = 1.12e9
-START_BYTES = 0.6e9  # of a command that loads libraries but no kernel (VmPeak of `schema` 0.58 GB, `terrain show` 0.60)
+# Address space of a command and of each pixel of its picture (VmPeak of `detect` on two cores: 0.90 GB at 0.26 Mpx).
+# With less, some libraries are not loaded, and OpenBLAS may block or end the process.
+COMMAND_BYTES = 0.9e9
+START_BYTES = 0.4e9  # of a command that loads no library for images (VmPeak of `schema`, and of `terrain show`)
 PIXEL_BYTES = 24
-LIBRARY_BYTES = 2**27  # a library that cannot be loaded, or a thread not started, lacks less (llvmlite has 0.12 GB)
+LIBRARY_BYTES = 2**27  # a library that cannot be loaded, or a thread not started, lacks less (OpenCV has 0.1 GB)
 OPENCV_NO_MEMORY = -4  # cv2.error.code, StsNoMem
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.kernels import NORMAL_CDF
+from startrack.core.statistics import NORMAL_CDF
 from startrack.core.types import MIDDLES_RAD, Array, Bools, Ints
 from startrack.kernels.library import kernel
 from startrack.terrain import shape

@@ -56,7 +56,7 @@ def _audit(event: str, args: tuple[Any, ...]) -> None:
     elif event in WRITING or (event == "open" and isinstance(args[0], str | bytes)):
         path = str(Path(args[0] if isinstance(args[0], str) else args[0].decode("utf-8", "replace")).absolute())
         writes = event in WRITING or bool(args[1] and set(str(args[1])) & set("wax+"))
-        is_code = "__pycache__" in path  # where numba stores compiled code
+        is_code = "__pycache__" in path  # where Python stores compiled code
         if not is_code and not (_below(path, *_written) if writes else _below(path, str(_allowed), *_READABLE)):
             _violations.append(f"{event} {path}")
 

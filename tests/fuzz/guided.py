@@ -8,10 +8,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
-from importlib import import_module
 from pathlib import Path
-
-import startrack
 
 from . import targets
 from .campaign import HANG_S, MEMORY_BYTES
@@ -41,21 +38,12 @@ def run_guided(kinds: list[str], runs: int, seed: int, failures: Path) -> int:
     return int(any(codes))
 
 
-def _import_compiled() -> None:
-    """Import the modules that numba compiles: they must not be instrumented, which their compiler cannot bear."""
-    package = Path(startrack.__file__).parent
-    for path in package.rglob("*.py"):
-        if "njit" in path.read_text(encoding="utf-8"):
-            import_module(".".join(path.relative_to(package.parent).with_suffix("").parts))
-
-
 def fuzz(kind: str, options: list[str]) -> None:
     """Give one kind of input to atheris; ends the process."""
     import atheris
 
     with tempfile.TemporaryDirectory(prefix="startrack-fuzz-") as name:
         folder = Path(name)
-        _import_compiled()
         with atheris.instrument_imports(include=["startrack", "tifffile", "astropy.io.fits", "tomllib", "PIL"]):
             targets.prepare(folder)
 

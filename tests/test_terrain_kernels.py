@@ -105,9 +105,8 @@ def test_a_trace_ends_at_a_void(ground):
     expected, ends = march(one, points, azimuths, 0.0)
     assert (edge < 1e9).sum() > 5
     reached = edge < 1e9
-    assert (ends[reached] - edge[reached] > -1.0).all() and (
-        ends[reached] - edge[reached] < 43.0
-    ).all()  # across a cell
+    before = ends[reached] - edge[reached]
+    assert (before > -1.0).all() and (before < 43.0).all()  # across a cell
     np.testing.assert_allclose(tan[~reached], expected[~reached], atol=5e-3)
 
 
@@ -123,7 +122,7 @@ def test_bounds_hold_the_horizons_beside_the_edge_of_a_map(ground, half_m):
     for _ in range(20):
         points = centres + rng.uniform(-half_m, half_m, (300, 2))
         found = np.arctan(trace(packed, points, azimuths + turn * rng.uniform(-1.0, 1.0, 300))[0])
-        assert (low - 1e-9 <= found).all() and (found <= high + 1e-9).all()
+        assert (low - 1e-6 <= found).all() and (found <= high + 1e-6).all()  # posts are rounded
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])

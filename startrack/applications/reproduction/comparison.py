@@ -165,7 +165,7 @@ def compare_places(
 
 @lru_cache(maxsize=2)
 def _warm_up(ground: str) -> None:
-    """Compile and load what the methods need on a `ground`, once a process, before the clock starts."""
+    """Load and prepare what the methods need on a `ground`, once a process, before the clock starts."""
     terrain_of(ground).prepare()
     scene = Scene(0, 0, 0, ground)
     for method in methods_on(ground).values():

@@ -62,6 +62,21 @@ def test_a_grey_picture_has_the_pixels_that_pillow_reads() -> None:
     np.testing.assert_array_equal(decode_png(raw).pixels_adu, np.asarray(Image.open(io.BytesIO(raw))))
 
 
+@pytest.mark.parametrize(
+    "header",
+    [(WIDTH, HEIGHT, 16, 0, 1, 0, 0), (WIDTH, HEIGHT, 16, 0, 0, 1, 0), (WIDTH, HEIGHT, 16, 0, 0, 0, 2),
+     (1_000_001, 1, 16, 0, 0, 0, 0)],
+)  # fmt: skip
+def test_a_header_that_libpng_does_not_read_is_refused(
+    header: tuple[int, ...], capfd: pytest.CaptureFixture[str]
+) -> None:
+    rows = bytes(header[1] * (1 + 2 * header[0]))
+    raw = SIGNATURE + chunk(b"IHDR", struct.pack(">IIBBBBB", *header)) + chunk(b"IDAT", zlib.compress(rows))
+    with pytest.raises(BadInput, match="method or width"):
+        decode_png(raw + chunk(b"IEND", b""))
+    assert capfd.readouterr().err == ""  # of libpng
+
+
 @pytest.mark.parametrize("fault", ["short", "long", "filter"])
 def test_rows_of_another_size_or_filter_are_refused(fault: str, capfd: pytest.CaptureFixture[str]) -> None:
     rows = filtered_rows(16, 1, 0)

@@ -203,7 +203,6 @@ PICTURES = {
 TUTORIALS = {  # name: page, and the file that its commands write
     "crater": ("own-terrain", "startrack-out/crater.horizon.png"),
     "valley": ("earth-valley", "startrack-out/night.annotated.png"),
-    "ridge": ("place-from-a-photograph", "startrack-out/ridge.skyline.png"),
     "lens": ("calibrate-your-camera", "my-camera.report.png"),
 }
 

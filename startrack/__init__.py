@@ -14,7 +14,7 @@ costs nothing.
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 _MODULES = {  # public name to the module that has it
     "detect": "api.solve", "identify": "api.solve", "locate": "api.solve", "locate_skyline": "api.solve",
     "track": "api.solve",

@@ -65,6 +65,7 @@ def test_a_window_shorter_than_a_slipped_leg_changes_no_answer(monkeypatch):
 
 
 def test_what_is_settled_is_smoothed_as_in_a_track_that_settles_nothing():
+    """But for the end of the leg: where one variant ends it a move later, settled moves are those of the likeliest."""
     frames, odometry, _ = mixed_drive()
     moves, modes = odometry_moves(frames, odometry, USUAL_ODOMETRY), [one.modes for one in frames]
     whole, settled = (
@@ -74,7 +75,7 @@ def test_what_is_settled_is_smoothed_as_in_a_track_that_settles_nothing():
     assert whole.slipped[LEG].all() and settled.slipped[LEG].all()
     sigma_m = np.sqrt(np.trace(whole.smoothed.covariance_m2, axis1=1, axis2=2))
     away_m = np.linalg.norm(settled.smoothed.position_m - whole.smoothed.position_m, axis=1)
-    assert (away_m < 0.3 * sigma_m).all()
+    assert (away_m < 0.5 * sigma_m).all() and np.mean(away_m / sigma_m) < 0.1
 
 
 def test_what_a_live_track_keeps_does_not_grow():

@@ -1,4 +1,4 @@
-"""PNG: strict check of all chunks and of the size of the picture's data; pixels by OpenCV.
+"""PNG: strict check of all chunks and of the size of the picture's data; interlaced pixels by OpenCV.
 
 Each chunk has a checksum: zlib.crc32 finds truncation and damage in about a millisecond.
 Format: W3C PNG specification (third edition, 2025).
@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from startrack.exposure.decoding import Decoded, bad_image, check_size, exif_warnings, grey_float32
 from startrack.exposure.facts import HEADER_KEYS
@@ -36,7 +37,7 @@ def decode(raw: bytes) -> Decoded:
 
     `BadInput` if truncated or damaged, with alpha or palette, animated, or of fewer bits.
     """
-    import cv2
+    from startrack.exposure.png_rows import undo_filters
 
     header: dict[str, str] = {}
     warnings: tuple[str, ...] = ()
@@ -60,13 +61,22 @@ def decode(raw: bytes) -> Decoded:
             raise bad_image(f"PNG needs a feature that startrack does not know ({kind!r})")
     # Gamma, colour profile and orientation are left out: they cannot change the pixels.
     data = b"".join(picture)
-    _check_rows(data, width, height, depth * channels, ADAM7 if interlaced else WHOLE)
-    bare = b"".join((raw[:IHDR_END], chunk(b"IDAT", data), chunk(b"IEND", b"")))
-    stored = cv2.imdecode(np.frombuffer(bare, np.uint8), cv2.IMREAD_UNCHANGED)
-    if stored is None or stored.shape[:2] != (height, width) or stored.dtype.itemsize * 8 != depth:
+    rows = _inflate_rows(data, width, height, depth * channels, ADAM7 if interlaced else WHOLE)
+    if interlaced:
+        stored = _decode_by_opencv(b"".join((raw[:IHDR_END], chunk(b"IDAT", data), chunk(b"IEND", b""))))
+    else:
+        stored = undo_filters(rows, height, channels, depth // 8)
+    if stored is None or stored.shape[:2] != (height, width):
         raise bad_image(DAMAGED)
-    pixels, colour = grey_float32(np.asarray(stored))
+    pixels, colour = (stored, ()) if stored.dtype == np.float32 else grey_float32(stored)
     return Decoded(pixels_adu=pixels, saturation_adu=2.0**depth - 1.0, header=header, warnings=warnings + colour)
+
+
+def _decode_by_opencv(png: bytes) -> NDArray[Any] | None:
+    """Pixels as they are stored; None where OpenCV decodes none."""
+    import cv2
+
+    return cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
 
 
 def add_text(png: bytes, texts: Mapping[str, str]) -> bytes:
@@ -117,11 +127,11 @@ def _check_ihdr(body: memoryview) -> tuple[int, int, int, int, bool]:
     return width, height, depth, 3 if colour_type == 2 else 1, body[12] == 1
 
 
-def _check_rows(compressed: bytes, width: int, height: int, pixel_bits: int, passes: Passes) -> None:
-    """Raise BadInput bad_image for data that are damaged, too short or too long, or name an unknown filter.
+def _inflate_rows(compressed: bytes, width: int, height: int, pixel_bits: int, passes: Passes) -> bytes:
+    """The filtered rows of all `passes`, each of whole bytes after the number of its filter.
 
-    They are the filtered rows of all `passes`, each of whole bytes after the number of its filter; no more is inflated.
-    OpenCV does not refuse data that are too long, and libpng prints a line about the other faults.
+    Raises BadInput bad_image for data that are damaged, too short or too long, or name an unknown filter; no more is
+    inflated. OpenCV does not refuse data that are too long, and libpng prints a line about the other faults.
     """
     sides = [(-(-(height - y0) // dy), -(-(width - x0) // dx)) for x0, y0, dx, dy in passes]
     shapes = [(rows, 1 + columns * pixel_bits // 8) for rows, columns in sides if rows > 0 and columns > 0]
@@ -138,6 +148,7 @@ def _check_rows(compressed: bytes, width: int, height: int, pixel_bits: int, pas
         if filters.max() >= FILTERS:
             raise bad_image(DAMAGED)
         at += rows * row_bytes
+    return data
 
 
 def _read_text(kind: bytes, body: bytes, header: dict[str, str]) -> None:

@@ -216,6 +216,23 @@ KERNEL void sum_cells(int64_t n, int64_t sectors, int64_t cells, const int64_t *
 KERNEL void clear_disks(int64_t height, int64_t width, int64_t n, bool *restrict mask, const int64_t *restrict xy_px,
                         const int64_t *restrict radius_px, double large_px, bool *restrict touching);
 
+/* exposure.c */
+
+/* Undo the filters of the rows [height, length + 1] of a PNG (W3C PNG, section 9), the kind of each in its first byte,
+   and write the samples; false where a filter is unknown, whose row counts as unfiltered. `pixel_bytes`: of a pixel, at
+   least 1. `scratch` [2, room] is zero; room = length + pixel_bytes, length = samples times their bytes. */
+KERNEL bool unfilter_grey_8(int64_t height, int64_t length, int64_t room, int64_t samples, const uint8_t *restrict rows,
+                            int64_t pixel_bytes, uint8_t *restrict scratch, float *restrict found);
+KERNEL bool unfilter_grey_16(int64_t height, int64_t length, int64_t room, int64_t samples,
+                             const uint8_t *restrict rows, int64_t pixel_bytes, uint8_t *restrict scratch,
+                             float *restrict found);
+KERNEL bool unfilter_colour_8(int64_t height, int64_t length, int64_t room, int64_t samples,
+                              const uint8_t *restrict rows, int64_t pixel_bytes, uint8_t *restrict scratch,
+                              uint8_t *restrict found);
+KERNEL bool unfilter_colour_16(int64_t height, int64_t length, int64_t room, int64_t samples,
+                               const uint8_t *restrict rows, int64_t pixel_bytes, uint8_t *restrict scratch,
+                               uint16_t *restrict found);
+
 /* localization.c */
 
 /* Fill `found` [sectors, n] with likelihoods at `shifts` of sectors whose skyline is the map's; `wrong`: probability that

@@ -210,6 +210,7 @@ static void fill_levels(const struct search *s, int64_t row, float *levels)
 {
     const int64_t last = s->columns - 1;
     const float share = s->factor / (float)((2 * s->beside + 1) * (2 * s->beside + 1));
+    const double per_pixel = 1.0 / (double)s->coarse;
     float *inner = s->padded + s->beside;
     for (int64_t j = 0; j < s->columns; j++)
         inner[j] = s->mean[j] = 0.0f;
@@ -228,7 +229,7 @@ static void fill_levels(const struct search *s, int64_t row, float *levels)
     for (int64_t j = 0; j < s->columns; j++) {
         const float own = s->mean[j], left = own - s->mean[most(j - 1, 0)], right = s->mean[least(j + 1, last)] - own;
         for (int64_t k = 0; k < s->coarse; k++) {
-            const float at = (float)(((double)k + 0.5) / (double)s->coarse - 0.5);
+            const float at = (float)(((double)k + 0.5) * per_pixel - 0.5);
             levels[j * s->coarse + k] = own + at * (at > 0.0f ? right : left);
         }
     }

@@ -106,16 +106,11 @@ static void read_stamp(const struct stamp *s, const float *data, const float *va
     const int64_t pixels = s->side * s->side;
     const float error = (float)(signal_error * signal_error);
     for (int64_t p = 0; p < pixels; p++) {
-        s->light[p] = data[p];
-        s->variance[p] = variance[p];
-        s->use[p] = 1.0f;
+        const float others = signal ? signal[p] : 0.0f;
+        s->light[p] = data[p] - others;
+        s->variance[p] = variance[p] + error * others * others;
+        s->use[p] = !usable || usable[p] ? 1.0f : 0.0f;
     }
-    for (int64_t p = 0; signal && p < pixels; p++) {
-        s->light[p] -= signal[p];
-        s->variance[p] += error * signal[p] * signal[p];
-    }
-    for (int64_t p = 0; usable && p < pixels; p++)
-        s->use[p] = usable[p] ? 1.0f : 0.0f;
 }
 
 static inline void multiply(int64_t n, float factor, const float *restrict values, float *restrict to)
@@ -225,20 +220,16 @@ static void solve(double A[TERMS][TERMS], double x[TERMS])
    the light above the surroundings, the profile, and the profile with the noise of the own photons. */
 static void judge(const struct stamp *s, const struct source *source, double surround, double *values)
 {
-    enum { CHI2, NUMBER, ABOVE, NORM, OWN, TOTAL, LIGHT, PIXEL, COUNT };
+    enum { CHI2, PIXEL, NUMBER, ABOVE, NORM, OWN, FOUND, TOTAL = FOUND, LIGHT, COUNT };
     float lane[COUNT][LANES] = {{0.0f}};
-    const int64_t middle = s->side * s->side / 2;
     const float around = (float)surround;
     const struct source of = *source;
     const float *light = s->light, *variance = s->variance, *use = s->use, *shape = s->shape;
     float *others = s->by_x; /* the slopes are not needed any more */
-    int64_t hot = middle - s->side - 1; /* the brightest pixel of the middle nine */
-    for (int64_t r = -1; r <= 1; r++) {
-        for (int64_t c = -1; c <= 1; c++) {
-            const int64_t k = middle + r * s->side + c;
+    int64_t middle = s->side * s->side / 2, hot = middle - s->side - 1; /* the brightest pixel of the middle nine */
+    for (int64_t r = middle - s->side; r <= middle + s->side; r += s->side)
+        for (int64_t k = r - 1; k <= r + 1; k++)
             hot = light[k] > light[hot] ? k : hot;
-        }
-    }
     for (int64_t k = 0; k < s->n; k++)
         others[k] = use[k] / variance[k];
     others[hot] = 0.0f;
@@ -258,12 +249,9 @@ static void judge(const struct stamp *s, const struct source *source, double sur
         }
     }
     const float total = sum_of(lane[TOTAL]), excess = sum_of(lane[LIGHT]);
-    values[0] = (double)sum_of(lane[CHI2]);
-    values[1] = (double)(sum_of(lane[PIXEL]) - excess * (excess / (total > LEAST ? total : LEAST)));
-    values[2] = (double)sum_of(lane[NUMBER]);
-    values[3] = (double)sum_of(lane[ABOVE]);
-    values[4] = (double)sum_of(lane[NORM]);
-    values[5] = (double)sum_of(lane[OWN]);
+    for (int c = 0; c < FOUND; c++)
+        values[c] = (double)sum_of(lane[c]);
+    values[PIXEL] -= (double)(excess * (excess / (total > LEAST ? total : LEAST)));
 }
 
 static double within(double value, double limit)
@@ -340,15 +328,13 @@ void sum_neighbours(int64_t m, int64_t n, int64_t side, int64_t count, const int
                     const float *restrict variance, double limit_sigma, const float *restrict last,
                     double *restrict profiles, float *restrict signal, bool *restrict changed)
 {
-    (void)n;
+    (void)n, (void)count;
     const int64_t size = side * side;
     const struct psf psf = psf_of(side, sigma_px, profiles);
     int64_t k = -1;
     for (int64_t i = 0; i < m; i++) {
         if (i == 0 || star[i] != star[i - 1])
             k++;
-        if (k >= count)
-            return;
         float *light = signal + k * size;
         for (int64_t p = 0; (i == 0 || star[i] != star[i - 1]) && p < size; p++)
             light[p] = 0.0f;
@@ -440,8 +426,6 @@ void compare_shapes(int64_t n, int64_t side, int64_t usable_rows, int64_t m, int
         misfit[i] = sqrt((double)((excess > 0.0f ? excess : 0.0f) / (squared > LEAST ? squared : LEAST)));
         edge[i] = (double)(sum_of(lane[TOTAL]) - most_explained(size, directions, stripes, weight, moment, stripe, ends,
                                                                 (float(*)[2])sums));
-        for (int64_t p = size; p < room; p++)
-            moment[p] = weight[p] = 0.0f;
     }
 }
 

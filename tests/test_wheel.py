@@ -135,7 +135,7 @@ class Environment:
             pytest.skip("no index of packages is reached")
 
     def finish(self, *words, **more):
-        clean = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "NUMBA_CACHE_DIR")}
+        clean = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
         clean |= {"XDG_CACHE_HOME": str(self.folder / "cache"), **more}
         return subprocess.run(list(map(str, words)), cwd=self.folder, capture_output=True, text=True, env=clean)
 

@@ -31,7 +31,7 @@ def cache_folder(kind: str) -> Path:
 
 
 def _temporary_folder() -> Path:
-    """A folder that only this user can write to, the same in each process: code is loaded from files in it."""
+    """A folder that only this user can write to, the same in each process: others could change positions there."""
     owner = os.getuid() if hasattr(os, "getuid") else 0  # as st_uid is on Windows
     try:
         folder = Path(tempfile.gettempdir()) / f"startrack-{owner}"

@@ -14,14 +14,12 @@ from startrack.core.files import FilePath, write_atomically
 SEAL_BYTES = hashlib.sha256().digest_size
 
 
-def with_seal(data: bytes) -> bytes:
-    """The `data` and behind them their SHA-256, for `read_sealed`. An archive or a pickle with it opens as without."""
-    return data + hashlib.sha256(data).digest()
-
-
 def write_sealed(path: FilePath, data: bytes) -> None:
-    """Write `data`, sealed, in the place of a file at `path`. Raises as `write_atomically`."""
-    write_atomically(path, with_seal(data), overwrite=True)
+    """Write `data` and behind them their SHA-256 in the place of a file at `path`. Raises as `write_atomically`.
+
+    An archive or a pickle with that hash opens as without.
+    """
+    write_atomically(path, data + hashlib.sha256(data).digest(), overwrite=True)
 
 
 def read_sealed(path: FilePath) -> bytearray | None:

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from startrack.core import chunk_store
 from startrack.core.chunk_store import ChunkStore
 from startrack.core.errors import BadOutput
 from startrack.core.stored import read_json_object, read_sealed, write_sealed
@@ -75,3 +76,10 @@ def test_sealed_data_are_read_as_they_were_written(tmp_path):
         write_sealed(tmp_path / "a", data)
         assert read_sealed(tmp_path / "a") == data
     assert read_sealed(tmp_path / "none") is None
+
+
+def test_a_changed_kernel_changes_the_keys_of_chunks(monkeypatch):
+    before = chunk_store.settings_digest(("core/*.py",), {"draws": 3})
+    assert chunk_store.settings_digest(("core/*.py",), {"draws": 3}) == before
+    monkeypatch.setattr(chunk_store, "source_key", lambda: "of other C sources")
+    assert chunk_store.settings_digest(("core/*.py",), {"draws": 3}) != before

@@ -176,7 +176,7 @@ def test_the_sign_of_the_step_is_a_matter_of_many_columns():
         values = np.radians(elevation_deg), np.radians(0.05), contrast, np.log1p(contrast), 9.0
         return Steps(which, *(np.full(n, value) for value in values))
 
-    bright = np.zeros((len(KINDS), AZIMUTH_COLUMNS, len(elevations_rad())))
+    bright = np.zeros((len(KINDS), AZIMUTH_COLUMNS, len(elevations_rad())), np.float32)
     dark = bright.copy()
     add_step_log_likelihood(bright, edge(5.0, 0.5, column), 1.0)
     add_step_log_likelihood(dark, edge(5.0, -0.5, column), 1.0)

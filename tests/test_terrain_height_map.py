@@ -281,7 +281,7 @@ def test_of_two_that_need_a_table_one_makes_it(shackleton, monkeypatch):
 @pytest.fixture
 def tracer(monkeypatch):
     """The middles of the cells that are traced; `stop_after` so many parts, Ctrl-C follows."""
-    traced, fill = SimpleNamespace(cells=[], stop_after=np.inf), cache.fill_cells
+    traced, fill = SimpleNamespace(cells=[], stop_after=np.inf), cache.fill_table
 
     def count(ground, centres, *more):
         if len(traced.cells) >= traced.stop_after:
@@ -289,7 +289,7 @@ def tracer(monkeypatch):
         fill(ground, centres, *more)
         traced.cells.append({tuple(centre) for centre in centres})
 
-    monkeypatch.setattr(cache, "fill_cells", count)
+    monkeypatch.setattr(cache, "fill_table", count)
     monkeypatch.setattr(cache, "PART_CELLS", 2)
     monkeypatch.setattr(cache, "count_cores", lambda: 1)
     return traced

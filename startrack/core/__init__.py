@@ -1,4 +1,4 @@
-"""What every package uses: values, errors with exit codes, files and locks, settings, compiled code, processes."""
+"""What every package uses: values, errors with exit codes, files and locks, settings, processes."""
 
 MAX_EXPOSURE_S = 1e6  # of an image
 MAX_COUNT = 1_000_000  # of frames, cells or draws: more is a wrong unit

@@ -17,6 +17,7 @@ from startrack import __version__
 from startrack.core.files import PACKAGE, remove_file
 from startrack.core.runner import TASK_LIMIT_S, Died, Runner, RunStopped
 from startrack.core.stored import read_sealed, write_sealed
+from startrack.kernels.build import source_key
 
 Chunk = dict[str, np.ndarray]  # the result of one task, by name
 
@@ -80,11 +81,11 @@ class ChunkStore(Runner[Task, Chunk]):
 
 
 def settings_digest(sources: tuple[str, ...], settings: Any) -> str:
-    """Hash of `settings` (JSON values), the version and the package's files that match `sources`: a chunk's key.
+    """Hash of `settings` (JSON values), version, kernels and the package's files that match `sources`: a chunk's key.
 
     Raises ValueError for a pattern that no file matches.
     """
-    whole = json.dumps([__version__, _source_digest(sources), settings], sort_keys=True, default=str)
+    whole = json.dumps([__version__, source_key(), _source_digest(sources), settings], sort_keys=True, default=str)
     return hashlib.sha256(whole.encode()).hexdigest()[:24]
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from startrack.core.types import Array, Bools, Ints
 from startrack.core.values import Rows, array
 from startrack.detection.frame import MODEL_ERROR, RESIDUAL_FRACTION, Pixels, SourceNoise
+from startrack.kernels import STAMP_LANES
 from startrack.kernels.library import kernel
 
 FIT_ROUNDS = 3  # iterations of a first fit
@@ -24,7 +25,6 @@ MIN_MODEL_ERROR = 0.005
 MAX_STEP_PX = 0.5
 POSITION_PRIOR = 0.1  # per px^2: positions within about 3 px of the start keep sources without light solvable
 FLUX_PRIOR = 1e-12
-STAMP_LANES = 8  # pixels that kernels sum together: stamps are filled up
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,6 +19,7 @@ from startrack.evidence.stamp_edge import (
     WIDTH_PART,
     edge_profiles,
 )
+from startrack.kernels import STAMP_LANES
 from startrack.kernels.library import kernel
 from startrack.psf import pixel_profile_table, stamp_radius
 
@@ -30,7 +31,6 @@ MODEL_VARIANCE = 0.05**2  # of a star's squared light, pixel by pixel: the real 
 # at most; with 1 in place of 0.3, circles in rendered frames are 2 % wider.
 SHAPE_VARIANCE = 0.3**2
 MAX_MASKED_PX = 6  # a stamp with more deviant pixels is not a star on a smooth background
-STAMP_LANES = 8  # pixels of which the kernel sums as many together: stamps are filled up
 PROFILE_SIGMAS = 6.0  # half width of a neighbour's profile: 1e-9 of its light lies beyond
 
 

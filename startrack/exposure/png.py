@@ -22,7 +22,7 @@ from startrack.exposure.facts import HEADER_KEYS
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 COLOUR_TYPES = {0: "grey", 2: "colour", 3: "palette", 4: "grey with alpha", 6: "colour with alpha"}
 MAX_FACT_BYTES = 4096  # of one fact; a compressed chunk is not inflated beyond it
-MAX_SIDE_PX = 1_000_000  # libpng's own limit
+LIBPNG_SIDE_PX = 1_000_000  # libpng's own limit
 MAX_CHUNKS = 200_000  # libpng's of 8 KiB for a colour picture of 200 Mpx and 16 bits: 146,000
 DAMAGED = "damaged PNG: its picture data cannot be decoded"
 FILTERS = 5  # none, the byte to the left, above, their mean, and Paeth's predictor
@@ -122,7 +122,7 @@ def _check_ihdr(body: memoryview) -> tuple[int, int, int, int, bool]:
         raise bad_image(f"PNG is {name}; startrack reads plain grey or colour")
     if depth not in (8, 16):
         raise bad_image(f"PNG has {depth} bits a pixel; startrack reads 8 or 16")
-    if max(width, height) > MAX_SIDE_PX or tuple(body[10:12]) != (0, 0) or body[12] > 1:
+    if max(width, height) > LIBPNG_SIDE_PX or tuple(body[10:12]) != (0, 0) or body[12] > 1:
         raise bad_image("PNG of a method or width that the format's library does not know: save it anew")
     return width, height, depth, 3 if colour_type == 2 else 1, body[12] == 1
 

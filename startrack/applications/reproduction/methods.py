@@ -106,7 +106,7 @@ def compute_chunk(task: Task) -> Chunk:
             except NotLocated:
                 return None  # `located` is False then
 
-        fix_or_none(0)  # compiles and loads before the clock starts
+        fix_or_none(0)  # loads before the clock starts
     start = time.thread_time()
     if task.method == KUA:
         own = _solve_kua(points, seen, cylinder)

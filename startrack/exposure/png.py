@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from startrack.exposure.decoding import Decoded, bad_image, check_size, exif_warnings, grey_float32
 from startrack.exposure.facts import HEADER_KEYS
+from startrack.kernels.library import kernel
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 COLOUR_TYPES = {0: "grey", 2: "colour", 3: "palette", 4: "grey with alpha", 6: "colour with alpha"}
@@ -37,8 +38,6 @@ def decode(raw: bytes) -> Decoded:
 
     `BadInput` if truncated or damaged, with alpha or palette, animated, or of fewer bits.
     """
-    from startrack.exposure.png_rows import undo_filters
-
     header: dict[str, str] = {}
     warnings: tuple[str, ...] = ()
     width = height = depth = channels = 0
@@ -65,7 +64,7 @@ def decode(raw: bytes) -> Decoded:
     if interlaced:
         stored = _decode_by_opencv(b"".join((raw[:IHDR_END], chunk(b"IDAT", data), chunk(b"IEND", b""))))
     else:
-        stored = undo_filters(rows, height, channels, depth // 8)
+        stored = _undo_filters(rows, height, channels, depth // 8)
     if stored is None or stored.shape[:2] != (height, width):
         raise bad_image(DAMAGED)
     pixels, colour = (stored, ()) if stored.dtype == np.float32 else grey_float32(stored)
@@ -151,6 +150,20 @@ def _inflate_rows(compressed: bytes, width: int, height: int, pixel_bits: int, p
     return data
 
 
+def _undo_filters(data: bytes, height: int, channels: int, sample_bytes: int) -> NDArray[Any]:
+    """Samples of `height` filtered rows: grey ones (H, W) as float32, which holds them exactly, else (H, W, channels).
+
+    Compiled, it takes half of the time in which OpenCV inflates the data again.
+    """
+    rows = np.frombuffer(data, np.uint8).reshape(height, -1)
+    row_bytes, pixel_bytes = rows.shape[1] - 1, channels * sample_bytes
+    dtype = np.float32 if channels == 1 else np.uint8 if sample_bytes == 1 else np.uint16
+    samples = np.empty((height, row_bytes // sample_bytes), dtype)
+    scratch = np.zeros((2, row_bytes + pixel_bytes), np.uint8)  # two rows, and zeros to their left
+    UNFILTER[samples.dtype.name, sample_bytes](rows, pixel_bytes, scratch, samples)
+    return samples if channels == 1 else samples.reshape(height, -1, channels)
+
+
 def _read_text(kind: bytes, body: bytes, header: dict[str, str]) -> None:
     """Add the value of one text chunk to `header` if its key is known; the first of equal keys counts."""
     keyword, _, rest = body.partition(b"\0")
@@ -186,3 +199,14 @@ def _read_exif(body: bytes) -> Any:
     exif = Image.Exif()
     exif.load(body)
     return exif
+
+
+UNFILTER = {  # by the type of the samples, and their bytes in the file
+    (dtype, sample_bytes): kernel(
+        f"unfilter_{colours}_{8 * sample_bytes}", "rows: uint8[height, length + 1]", "pixel_bytes: int64",
+        "scratch: out uint8[2, room]", f"samples: out {dtype}[height, samples]",
+    )
+    for colours, dtype, sample_bytes in (
+        ("grey", "float32", 1), ("grey", "float32", 2), ("colour", "uint8", 1), ("colour", "uint16", 2)
+    )
+}  # fmt: skip

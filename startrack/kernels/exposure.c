@@ -61,14 +61,12 @@ static void undo_mean_16(const uint8_t *restrict filtered, int64_t length, const
 /* Rows (height, 1 + length) to samples; `scratch` holds two rows of `room` bytes, which are zero. `LOAD` makes a sample
    of the bytes at x. */
 #define UNFILTER(NAME, SAMPLE, BYTES, LOAD)                                                                            \
-    bool NAME(int64_t height, int64_t length, int64_t room, int64_t samples, const uint8_t *restrict rows,             \
+    void NAME(int64_t height, int64_t length, int64_t room, int64_t samples, const uint8_t *restrict rows,             \
               int64_t pixel_bytes, uint8_t *restrict scratch, SAMPLE *restrict found)                                  \
     {                                                                                                                  \
         uint8_t *above = scratch, *row = scratch + room;                                                               \
-        bool known = true;                                                                                             \
         for (int64_t y = 0; y < height; y++) {                                                                         \
             const uint8_t *restrict filtered = rows + y * (length + 1);                                                \
-            known = known && filtered[0] <= 4;                                                                         \
             if (BYTES == 2 && filtered[0] == 3 && pixel_bytes == 2)                                                    \
                 undo_mean_16(filtered + 1, length, above, row);                                                        \
             else                                                                                                       \
@@ -80,7 +78,6 @@ static void undo_mean_16(const uint8_t *restrict filtered, int64_t length, const
             above = row;                                                                                               \
             row = swap;                                                                                                \
         }                                                                                                              \
-        return known;                                                                                                  \
     }
 
 UNFILTER(unfilter_grey_8, float, 1, from[x])

@@ -219,17 +219,17 @@ KERNEL void clear_disks(int64_t height, int64_t width, int64_t n, bool *restrict
 /* exposure.c */
 
 /* Undo the filters of the rows [height, length + 1] of a PNG (W3C PNG, section 9), the kind of each in its first byte,
-   and write the samples; false where a filter is unknown, whose row counts as unfiltered. `pixel_bytes`: of a pixel, at
-   least 1. `scratch` [2, room] is zero; room = length + pixel_bytes, length = samples times their bytes. */
-KERNEL bool unfilter_grey_8(int64_t height, int64_t length, int64_t room, int64_t samples, const uint8_t *restrict rows,
+   and write the samples; a row of another kind counts as unfiltered. `pixel_bytes`: of a pixel, at least 1. `scratch`
+   [2, room] is zero; room = length + pixel_bytes, length = samples times their bytes. */
+KERNEL void unfilter_grey_8(int64_t height, int64_t length, int64_t room, int64_t samples, const uint8_t *restrict rows,
                             int64_t pixel_bytes, uint8_t *restrict scratch, float *restrict found);
-KERNEL bool unfilter_grey_16(int64_t height, int64_t length, int64_t room, int64_t samples,
+KERNEL void unfilter_grey_16(int64_t height, int64_t length, int64_t room, int64_t samples,
                              const uint8_t *restrict rows, int64_t pixel_bytes, uint8_t *restrict scratch,
                              float *restrict found);
-KERNEL bool unfilter_colour_8(int64_t height, int64_t length, int64_t room, int64_t samples,
+KERNEL void unfilter_colour_8(int64_t height, int64_t length, int64_t room, int64_t samples,
                               const uint8_t *restrict rows, int64_t pixel_bytes, uint8_t *restrict scratch,
                               uint8_t *restrict found);
-KERNEL bool unfilter_colour_16(int64_t height, int64_t length, int64_t room, int64_t samples,
+KERNEL void unfilter_colour_16(int64_t height, int64_t length, int64_t room, int64_t samples,
                                const uint8_t *restrict rows, int64_t pixel_bytes, uint8_t *restrict scratch,
                                uint16_t *restrict found);
 

@@ -133,25 +133,22 @@ def test_images_from_elsewhere_do_not_take_over_what_is_settled(monkeypatch, len
     assert (np.linalg.norm(position[known, :2] - truth[known], axis=1) < 1.5 * radius[known]).all()
 
 
-@pytest.mark.parametrize(("second", "is_known"), [(3 * WINDOW, False), (3 * WINDOW + 5, True)])
-def test_images_that_contradict_what_is_settled_are_a_track_of_their_own(monkeypatch, second, is_known):
+@pytest.mark.parametrize(("first", "second", "is_known"), [(27, 27, False), (18, 23, True)])
+def test_images_that_contradict_what_is_settled_are_a_track_of_their_own(first, second, is_known):
     """As many images as before them, of which neither group is clearly right, and more; never both at once."""
-    first = 3 * WINDOW
     frames, odometry, truth = with_groups(first, second)
-    moves = odometry_moves(frames, odometry, USUAL_ODOMETRY)
-    for online in followed([one.modes for one in frames], moves):
-        used = [k + online._first for k in np.flatnonzero(online._best.mode >= 0).tolist()]
+    modes, moves = [one.modes for one in frames], odometry_moves(frames, odometry, USUAL_ODOMETRY)
+    for whole, live in zip(followed(modes, moves, len(modes)), followed(modes, moves), strict=True):
+        used = [k + live._first for k in np.flatnonzero(live._best.mode >= 0).tolist()]
         assert max(used) < first or min(used) >= first
-    assert online.compared.settled > WINDOW and online.is_vouched == is_known
-    whole = newest_positions(frames, odometry)
-    set_window(monkeypatch, WINDOW)
-    position, radius, status = newest_positions(frames, odometry)
-    assert status == whole[2] and np.isfinite(radius[-1]) == is_known
-    np.testing.assert_allclose(position, whole[0], atol=0.5)
+        assert (live.is_vouched, live.mode) == (whole.is_vouched, whole.mode)
+        np.testing.assert_allclose(live.position_m, whole.position_m, atol=0.5)
+        sigma_m = [np.sqrt(np.trace(one.covariance_m2)) for one in (live, whole)]
+        assert sigma_m[0] == pytest.approx(sigma_m[1], rel=0.2)
+    assert live.compared.settled > WINDOW and live.is_vouched == is_known
     if is_known:
-        assert (
-            np.linalg.norm(position[-1, :2] - truth[-1] - [1000.0, 300.0]) < radius[-1] == pytest.approx(whole[1][-1])
-        )
+        off = live.position_m - truth[-1] - [1000.0, 300.0]
+        assert off @ np.linalg.solve(live.covariance_m2, off) < 9.0
 
 
 def test_two_groups_of_which_neither_is_clearly_right_are_not_settled(monkeypatch):

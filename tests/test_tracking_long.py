@@ -1,5 +1,6 @@
 """Long drives: what many frames have followed is settled, and neither answers nor time and memory change."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,13 +10,14 @@ from tracking_helpers import SHARED, attitudes, observed, odometry_of, shifted, 
 
 from startrack.applications.tracking import ObservedFrame, Odometry, TrackSession, estimate_track
 from startrack.applications.tracking import session as session_module
-from startrack.applications.tracking.contradictions import conclude
+from startrack.applications.tracking.explanations import BEGINS, CONTINUES, explain
+from startrack.applications.tracking.explanations import WINDOW as SETTLED_AFTER
 from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions
 from startrack.applications.tracking.moves import Moves
 from startrack.applications.tracking.odometry_moves import odometry_moves
 from startrack.core.errors import BadInput
 from startrack.core.types import Array
-from startrack.estimation.observations import USUAL_ODOMETRY
+from startrack.estimation.observations import USUAL_ODOMETRY, FrameEstimate
 
 FRAMES, WINDOW = 44, 9
 LEG = slice(14, 27)  # moves that slip alike, more of them than the window has
@@ -64,28 +66,47 @@ def test_a_window_shorter_than_a_slipped_leg_changes_no_answer(monkeypatch):
     assert (np.linalg.norm(position[known, :2] - truth[known], axis=1) < 1.5 * radius[known]).all()
 
 
-def test_what_is_settled_is_smoothed_as_in_a_track_that_settles_nothing():
-    """But for the end of the leg: where one variant ends it a move later, settled moves are those of the likeliest."""
-    frames, odometry, _ = mixed_drive()
-    moves, modes = odometry_moves(frames, odometry, USUAL_ODOMETRY), [one.modes for one in frames]
-    whole, settled = (
-        conclude(modes, filter_positions(modes, moves, len(SHARED), window).compared) for window in (FRAMES, WINDOW)
-    )
-    assert settled.mode.tolist() == whole.mode.tolist()
-    assert whole.slipped[LEG].all() and settled.slipped[LEG].all()
-    sigma_m = np.sqrt(np.trace(whole.smoothed.covariance_m2, axis1=1, axis2=2))
-    away_m = np.linalg.norm(settled.smoothed.position_m - whole.smoothed.position_m, axis=1)
-    assert (away_m < 0.5 * sigma_m).all() and np.mean(away_m / sigma_m) < 0.1
+def followed(
+    modes: Sequence[Sequence[FrameEstimate]], moves: Sequence[Moves], window: int = WINDOW
+) -> Iterator[OnlineTrack]:
+    """The live track after each frame."""
+    online = OnlineTrack(1, window)
+    for k, of in enumerate(modes):
+        first = online.first
+        online.add(of, [one.part(first, k + 1 - first) for one in moves], first)
+        yield online
+
+
+def test_a_whole_track_settles_nothing():
+    drive = simulate_drive(np.random.default_rng(25), SETTLED_AFTER + 3)
+    modes, moves = [(one,) for one in drive.estimates], [Moves.of(drive.steps)]
+    (*_, live) = followed(modes, moves, SETTLED_AFTER)
+    assert live.compared.settled == 3
+    assert filter_positions(modes, moves, 1).compared.settled == explain(modes, moves).settled == 0
+
+
+@pytest.mark.parametrize("window", [1, 2, WINDOW])
+def test_what_is_settled_is_the_past_of_every_explanation_and_of_the_filter(window):
+    """A leg of which begin and end are disputed: without posts the filter is at the position that it follows."""
+    for seed in range(6):
+        drive = simulate_drive(np.random.default_rng([31, seed]), 24)
+        move_m = drive.steps.move_m.copy()
+        move_m[6:16, 0] *= 1.12
+        moves = [Moves.of(replace(drive.steps, move_m=move_m))]
+        for online in followed([(one.without_posts,) for one in drive.estimates], moves, window):
+            best, *others = online.compared.ranked()
+            np.testing.assert_allclose(online.filter.position_m, best.position_m, atol=1e-3)
+            for one in (best, *best.variants, *others):
+                assert (one.kind[:-1][one.kind[1:] == CONTINUES] >= BEGINS).all()
 
 
 def test_what_a_live_track_keeps_does_not_grow():
     drive = simulate_drive(np.random.default_rng(22), 5 * WINDOW)
-    moves, online, sizes = Moves.of(drive.steps), OnlineTrack(1, WINDOW), []
-    for k, estimate in enumerate(drive.estimates):
-        first = online.first
-        online.add([estimate], [moves.part(first, k + 1 - first)], first)
+    sizes, first = [], 0
+    for k, online in enumerate(followed([(one,) for one in drive.estimates], [Moves.of(drive.steps)])):
         explained = online.compared
         sizes.append((len(online._modes), len(explained._frames), explained._branches.history.shape[1], k - first))
+        first = online.first
     assert np.max(sizes[WINDOW:], axis=0).tolist() == [WINDOW, WINDOW, WINDOW, WINDOW + 1]
     assert np.linalg.norm(online.position_m - drive.position_m[-1]) < 4.0 * np.sqrt(np.trace(online.covariance_m2))
 
@@ -110,6 +131,24 @@ def test_images_from_elsewhere_do_not_take_over_what_is_settled(monkeypatch, len
     assert status == whole[2]
     known = np.isfinite(radius)
     assert (np.linalg.norm(position[known, :2] - truth[known], axis=1) < 1.5 * radius[known]).all()
+
+
+@pytest.mark.parametrize(("first", "second", "is_known"), [(27, 27, False), (18, 23, True)])
+def test_images_that_contradict_what_is_settled_are_a_track_of_their_own(first, second, is_known):
+    """As many images as before them, of which neither group is clearly right, and more; never both at once."""
+    frames, odometry, truth = with_groups(first, second)
+    modes, moves = [one.modes for one in frames], odometry_moves(frames, odometry, USUAL_ODOMETRY)
+    for whole, live in zip(followed(modes, moves, len(modes)), followed(modes, moves), strict=True):
+        used = [k + live._first for k in np.flatnonzero(live._best.mode >= 0).tolist()]
+        assert max(used) < first or min(used) >= first
+        assert (live.is_vouched, live.mode) == (whole.is_vouched, whole.mode)
+        np.testing.assert_allclose(live.position_m, whole.position_m, atol=0.5)
+        sigma_m = [np.sqrt(np.trace(one.covariance_m2)) for one in (live, whole)]
+        assert sigma_m[0] == pytest.approx(sigma_m[1], rel=0.2)
+    assert live.compared.settled > WINDOW and live.is_vouched == is_known
+    if is_known:
+        off = live.position_m - truth[-1] - [1000.0, 300.0]
+        assert off @ np.linalg.solve(live.covariance_m2, off) < 9.0
 
 
 def test_two_groups_of_which_neither_is_clearly_right_are_not_settled(monkeypatch):

@@ -24,7 +24,7 @@ class Branches:
     anchor: Ints  # (b,) number from 1 of the frame whose attitude turns the next move; 0: none
     history: Ints  # (b, w, 3) mode, kind and anchor of the move before it, of the last frames
 
-    def __getitem__(self, which: Ints | Bools) -> Branches:
+    def __getitem__(self, which: Ints | Bools | slice) -> Branches:
         """Those of an index."""
         return Branches(*(part[which] for part in self._parts))
 

@@ -4,8 +4,9 @@ An explanation states of each image whether it is of this camera, and which of i
 whether the wheels slipped, in it alone or alike in the moves of a leg; and of the odometry, whether it is as stated or
 wrong as a whole. Each has a prior (the constants below) and a likelihood: that of the filter without posts, whose
 errors count as the image's own. An image that is not of the track is anywhere, or near its place with a gross error.
-The moves are turned by the attitude of the last image that an explanation takes as right. The images that WINDOW others
-have followed are settled, unless explanations that matter take them otherwise: the time of an image then stays flat.
+The moves are turned by the attitude of the last image that an explanation takes as right. In a live track the images
+that WINDOW others with a position have followed are settled, unless explanations that matter take them otherwise, or
+wrong images agree with each other: the time of an image then stays flat. A whole track settles nothing.
 """
 
 from __future__ import annotations
@@ -24,12 +25,13 @@ from startrack.estimation.trajectory import TrackFilter, log_normal
 SLIP_PROBABILITY, SLIP_SIGMA_M = 0.05, 20.0  # of a move by wheel slip, and its size on each axis
 LEG_PROBABILITY, LEG_END_PROBABILITY = 0.05, 0.2  # that a leg begins with a move, and that a move of it is its last
 STRAIGHT, SLIPS, BEGINS, CONTINUES = range(4)  # what a move is: without slip, with, the first of a leg, another of it
+WRONG = np.array([-1, STRAIGHT, 0])  # mode, kind and anchor of a frame before all that are right
 WRONG_PROBABILITY, WRONG_SIGMA_M = 1e-3, 200.0  # of a frame, and the error of its position on each axis
 FOREIGN_SIGMA_M = 5000.0  # of a position anywhere in a search area, about its middle
 MIXED_PROBABILITY, MIXED_PART = 1e-3, 0.1  # of a set with images from elsewhere, and how many of its images these are
 ODOMETRY_WRONG_PROBABILITY = 0.01  # as a whole
 LEAST_VARIANT = 0.01  # part of an explanation's probability, by other moves, that counts in its positions
-WINDOW = 200  # frames that are not settled
+WINDOW = 200  # frames with a position, of a live track, that are not settled
 SETTLED_DOUBT = 1e-3  # probability of explanations that take a frame otherwise, from which on it is not settled
 KEPT_NATS, MOST_KEPT = 60.0, 60  # of explanations beside the best, and for each kind of odometry
 
@@ -50,6 +52,7 @@ class Explanation:
     position_m: Array  # (2,) of the last frame
     covariance_m2: Array  # (2, 2)
     variants: tuple[Explanation, ...] = ()  # with other moves alone, beside it; their shares are those of this one
+    keeps_settled: bool = True  # False: all settled frames are wrong
 
     @property
     def parts(self) -> tuple[tuple[Explanation, ...], Array]:
@@ -77,8 +80,8 @@ class Explanations:
 
     shared_count: int
     may_slip: bool = True
-    window: int = WINDOW  # frames that are not settled
-    _settled: list[Ints] = field(default_factory=list)  # mode, kind and anchor (3,) of each frame before these
+    window: int = WINDOW  # frames with a position that are not settled
+    _settled: list[Ints] = field(default_factory=list)  # of each frame before these, by each odometry (m, 3): `history`
     _frames: list[Sequence[FrameEstimate]] = field(default_factory=list)  # that are not settled
     _with_modes: int = 0  # number of frames that have one
     _moves: Sequence[Moves] = ()
@@ -105,7 +108,7 @@ class Explanations:
             branches += [_decided(start, start.log_likelihood + np.log1p(-np.exp(doubt)), -1, here)]
             branches += [_decided(start, start.log_likelihood + doubt, -1, start.anchor)] if known.any() else []
         self._found = self._likeliest(Branches.join(branches))
-        while len(self._frames) > self.window and self._settle(self._branches):
+        while sum(map(bool, self._frames)) > self.window and self._settle(self._branches):
             pass
 
     @property
@@ -114,25 +117,30 @@ class Explanations:
         return len(self._settled)
 
     def _settle(self, found: Branches) -> bool:
-        """Keep the explanations that take the first frame as the likeliest one does; False where others matter."""
-        total = self._log_posterior(found)
-        share, other = np.exp(total - np.logaddexp.reduce(total)), found.history[:, 0, 0] != found.history[0, 0, 0]
-        if share[other].sum() > SETTLED_DOUBT:
+        """Keep the explanations that take the first frame as the likeliest one does; False where others matter.
+
+        Of those by the same odometry, only the ones with the move to it of their likeliest are kept. While wrong frames
+        agree with each other nothing is settled: they may be those of the track when more follow.
+        """
+        total, taken = self._log_posterior(found), found.history[:, 0]
+        share, same = np.exp(total - np.logaddexp.reduce(total)), taken[:, 0] == taken[0, 0]
+        if share[~same].sum() > SETTLED_DOUBT or self._second_group(found[:1]) is not None:
             return False
-        second = self._second_group(found[np.arange(1)])
-        if second is not None:
-            rival = second[0] + self._wrong_prior(second[1].wrong)[0]
-            if rival - total[0] > np.log(SETTLED_DOUBT):
-                return False
-        kept = found[~other]
-        self._settled.append(found.history[0, 0].copy())
+        settled, kept = np.tile(taken[0], (len(self._moves), 1)), np.zeros_like(same)
+        for number in np.unique(found.odometry[same]):
+            alike = same & (found.odometry == number)
+            settled[number] = taken[np.argmax(alike)]
+            kept |= alike & (taken == settled[number]).all(axis=1)
+        self._settled.append(settled)
         self._frames.pop(0)
-        self._found = replace(kept, history=kept.history[:, 1:], log_wrong=kept.log_wrong[:, 1:])
+        found = found[kept]
+        self._found = replace(found, history=found.history[:, 1:], log_wrong=found.log_wrong[:, 1:])
         return True
 
-    def from_start(self, moves: Sequence[Moves]) -> Explanations:
-        """The same with the `moves` between all frames, also settled ones."""
-        return replace(self, _moves=moves, _first=0)
+    @property
+    def likeliest(self) -> Explanation:
+        """The single explanation by which frames are settled, with a share of 1."""
+        return self._explanation(self._branches[:1], 1.0)
 
     @property
     def has_odometry(self) -> bool:
@@ -171,7 +179,7 @@ class Explanations:
                 best.append(other)
         share = np.exp(np.array(weights) - np.logaddexp.reduce(weights))
         order = np.argsort(-share, kind="stable").tolist()
-        likeliest, *others = (self._explanation(best[g], float(share[g])) for g in order)
+        likeliest, *others = (self._explanation(best[g], float(share[g]), keeps_settled=g < len(groups)) for g in order)
         group = list(groups.values())[order[0]] if order[0] < len(groups) else []
         if not likeliest.moves.fault:
             part = np.exp(total[group] - np.logaddexp.reduce(total[group]))
@@ -186,12 +194,14 @@ class Explanations:
             raise ValueError("no frame was added")
         return self._found
 
-    def _explanation(self, one: Branches, share: float) -> Explanation:
-        mode, kind, anchor = np.vstack([*self._settled[self._first :], one.history[0]]).T
+    def _explanation(self, one: Branches, share: float, *, keeps_settled: bool = True) -> Explanation:
+        number = int(one.odometry[0])
+        before = [of[number] if keeps_settled else WRONG for of in self._settled[self._first :]]
+        mode, kind, anchor = np.vstack([*before, one.history[0]]).T
         turned_by = np.maximum(anchor[1:] - self._first, 0)
         return Explanation(
-            share, self._moves[one.odometry[0]], int(one.odometry[0]), mode, kind[1:], turned_by,
-            one.state.position_m, one.state.covariance_m2,
+            share, self._moves[number], number, mode, kind[1:], turned_by,
+            one.state.position_m, one.state.covariance_m2, keeps_settled=keeps_settled,
         )  # fmt: skip
 
     def _start(self) -> Branches:
@@ -322,7 +332,7 @@ def explain(modes: Sequence[Sequence[FrameEstimate]], moves: Sequence[Moves], *,
 
     `may_slip`: whether moves may slip; at rest they do not.
     """
-    found = Explanations(next((of[0].parameters for of in modes if of), 2) - 2, may_slip)
+    found = Explanations(next((of[0].parameters for of in modes if of), 2) - 2, may_slip, window=len(modes))
     for of in modes:
         found.add(of, moves)
     return found

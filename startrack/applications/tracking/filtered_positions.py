@@ -40,8 +40,9 @@ class OnlineTrack:
 
     def __init__(self, shared_count: int, window: int = WINDOW) -> None:
         """With `shared_count` errors that frames share; `window`: as of `Explanations`."""
-        self.filter = TrackFilter.start(shared_count, FREEDOMS, LEG_FREEDOMS)
-        self._before, self._number = self.filter[:], 0  # of the settled frames; their kind of odometry
+        self._start = TrackFilter.start(shared_count, FREEDOMS, LEG_FREEDOMS)
+        self.filter = self._start[:]
+        self._before, self._number = self._start[:], 0  # of the settled frames; their kind of odometry
         self._first = 0  # frame of the first move
         self._has_used = False  # whether a frame before the last one is used
         self.is_vouched = True  # whether explanations of another position of the last frame are unlikely together
@@ -90,48 +91,50 @@ class OnlineTrack:
 
         `moves` are as for `Explanations.add`, from the frame `first` on, at most that of the property.
         """
-        settled = self.compared.settled
+        settled, self._first = self.compared.settled, first
         self.compared.add(modes, moves, first)
         self._modes.append(modes)
-        for number in range(settled, self.compared.settled):
-            self._settle(number)
+        self._settle(settled)
         self._best, *others = self.compared.ranked()
-        self._first = first
-        self._follow_best()
+        self._follow_best(settled)
         best = self._best
         self._has_used |= bool(best.mode[:-1].max(initial=-1) >= 0)
         away = [disagrees(best.position_m, best.covariance_m2, o.position_m, o.covariance_m2) for o in others]
         doubt = sum(one.share for one, is_away in zip(others, away, strict=True) if is_away)
         self.is_vouched = doubt <= AMBIGUOUS_MASS
 
-    def _settle(self, number: int) -> None:
-        """The filter that begins anew has the frame of this number, as the last best explanation takes it."""
-        best, at = self._best, number - self._first
-        if best.number != self._number:  # its errors are in standard deviations of another kind of odometry
+    def _settle(self, first: int) -> None:
+        """The filter that begins anew has the settled frames from this number on, as they are settled."""
+        likeliest = self.compared.likeliest
+        steps, now = likeliest.steps, self.compared.settled
+        if now > first and likeliest.number != self._number:  # errors in standard deviations of another odometry
             self._before.forget_moves()
-            self._number = best.number
-        if number:
-            self._before.predict(best.steps, at - 1)
-        if best.mode[at] >= 0:
-            self._before.update(self._modes[0][best.mode[at]])
-        del self._modes[0], self._decided[0]
+            self._number = likeliest.number
+        for number in range(first, now):
+            _take(self._before, steps, number - self._first, self._modes[number - first], likeliest.mode)
 
-    def _follow_best(self) -> None:
-        """Take into the filter what the likeliest explanation says of the frames that are not settled."""
-        best, steps, begin = self._best, self._best.steps, self.compared.settled - self._first
+    def _follow_best(self, settled: int) -> None:
+        """Take into the filter what the likeliest explanation says of frames from number `settled` on."""
+        best, steps, begin = self._best, self._best.steps, settled - self._first
         turned_by = np.where(best.anchor > 0, best.anchor + self._first, 0).tolist()
         moved = [(), *zip(best.kind.tolist(), turned_by, [best.number] * len(best.kind), strict=True)]
-        decided = [(mode, *move) for mode, move in zip(best.mode.tolist(), moved, strict=True)][begin:]
-        if decided[: len(self._decided)] != self._decided:  # another explanation of these frames is likelier now
-            self.filter, self._decided = self._before[:], []
+        decided = [(best.keeps_settled, mode, *m) for mode, m in zip(best.mode.tolist(), moved, strict=True)][begin:]
+        done, more = len(self._decided), self.compared.settled - settled
+        if decided[:done] != self._decided:  # another explanation of these frames is likelier now
+            self.filter, done = (self._before if best.keeps_settled else self._start)[:], more
             if best.number != self._number:
                 self.filter.forget_moves()
-        for k in range(len(self._decided), len(decided)):
-            if begin + k:
-                self.filter.predict(steps, begin + k - 1)
-            if best.mode[begin + k] >= 0:
-                self.filter.update(self._modes[k][best.mode[begin + k]])
-        self._decided = decided
+        for k in range(done, len(decided)):
+            _take(self.filter, steps, begin + k, self._modes[k], best.mode)
+        self._decided, self._modes = decided[more:], self._modes[more:]
+
+
+def _take(track: TrackFilter, steps: Steps, at: int, modes: Modes, mode: Ints) -> None:
+    """Take the move to the frame at this index, and its mode that is right."""
+    if at:
+        track.predict(steps, at - 1)
+    if mode[at] >= 0:
+        track.update(modes[mode[at]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,19 +148,16 @@ class Filtered:
     compared: Explanations  # of all frames
 
 
-def filter_positions(
-    modes: Sequence[Modes], moves: Sequence[Moves], shared_count: int, window: int = WINDOW
-) -> Filtered:
-    """The positions by frames of these `modes`; `moves` are those of `explain`, `window` that of `Explanations`."""
-    track, position, covariance, alone, mode = OnlineTrack(shared_count, window), [], [], [], []
+def filter_positions(modes: Sequence[Modes], moves: Sequence[Moves], shared_count: int) -> Filtered:
+    """The positions by frames of these `modes`, of which none is settled; `moves` are those of `explain`."""
+    track, position, covariance, alone, mode = OnlineTrack(shared_count, len(modes)), [], [], [], []
     for k, of in enumerate(modes):
-        first = track.first
-        track.add(of, [one.part(first, k + 1 - first) for one in moves], first)
+        track.add(of, [one.part(0, k + 1) for one in moves])
         position.append(track.position_m)
         covariance.append(track.covariance_m2 if track.is_vouched else UNKNOWN_M**2 * np.eye(2))
         alone += [k] if track.is_first else []
         mode.append(track.mode)
-    return Filtered(np.array(position), np.array(covariance), np.array(mode), alone, track.compared.from_start(moves))
+    return Filtered(np.array(position), np.array(covariance), np.array(mode), alone, track.compared)
 
 
 def positions_at_rest(

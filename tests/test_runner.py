@@ -142,10 +142,14 @@ def test_a_killed_run_leaves_no_warnings_of_semaphores():
         from startrack.core.runner import Runner
         if __name__ == "__main__":
             with Runner(abs, jobs=2) as runner:
-                next(runner.results(range(8)))
+                results = runner.results(range(8))
+                next(results)
                 os.kill(os.getpid(), signal.SIGKILL)
     """
-    process = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=120)
+    process = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=120,
+        env={name: value for name, value in os.environ.items() if name != "PYTHONWARNINGS"},
+    )  # fmt: skip
     assert (process.returncode, process.stderr) == (-signal.SIGKILL, "")
 
 

@@ -9,13 +9,17 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing import active_children
 
 import pytest
 from batch_helpers import task_of
 
 from startrack.applications.batch import locate_images
-from startrack.core.runner import TASKS_PER_PROCESS, Died, Runner, RunStopped
+from startrack.core.runner import Died, Runner, RunStopped
 
 JOBS = 2
 
@@ -30,6 +34,22 @@ def work(name: str) -> tuple[str, int]:
     if "failing" in name:
         raise RunStopped("the disk is full")
     return name, os.getpid()
+
+
+@contextmanager
+def limit_of_s(limit_s: float) -> Iterator[None]:
+    """TimeoutError in the block after `limit_s` seconds: a test of what may hang fails instead."""
+
+    def end(*_: object) -> None:
+        raise TimeoutError(f"not finished in {limit_s} s")
+
+    before = signal.signal(signal.SIGALRM, end)
+    signal.setitimer(signal.ITIMER_REAL, limit_s)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def outcomes(runner: Runner[str, tuple[str, int]], names: list[str]) -> dict[str, tuple[str, int] | Died]:
@@ -69,7 +89,7 @@ def test_few_tasks_are_repeated_after_a_death(tmp_path):
     assert [name for name in names if isinstance(done[name], Died)] == ["03-deadly"]
     started = (tmp_path / "notes").read_text().splitlines()
     assert started.count("03-deadly") == 2
-    assert len(started) <= len(names) + TASKS_PER_PROCESS * JOBS
+    assert len(started) <= len(names) + JOBS
 
 
 @pytest.mark.slow
@@ -81,6 +101,56 @@ def test_a_stopped_process_does_not_block_the_end():
 def test_an_exception_of_the_work_reaches_the_caller():
     with Runner(work, jobs=JOBS) as runner, pytest.raises(RunStopped, match="the disk is full"):
         list(runner.results(["0", "1-failing", "2"]))
+
+
+def test_the_end_does_not_wait_for_a_blocked_process(monkeypatch):
+    monkeypatch.setattr("startrack.core.runner.CLOSE_S", 0.5)
+    with limit_of_s(60), Runner(work, jobs=JOBS) as runner, pytest.raises(RunStopped, match="the disk is full"):
+        list(runner.results(["0-stopping", "1-failing"]))
+    assert not active_children()
+
+
+def test_an_interrupted_end_leaves_no_process(monkeypatch):
+    """A Ctrl-C while it waits for a blocked process."""
+    monkeypatch.setattr("startrack.core.runner.CLOSE_S", 60.0)
+    ctrl_c = threading.Timer(1.0, os.kill, [os.getpid(), signal.SIGINT])
+    with limit_of_s(30), pytest.raises(KeyboardInterrupt), Runner(work, jobs=JOBS) as runner:
+        stop_beside_a_blocked_process(runner, ctrl_c.start)
+    deadline_s = time.monotonic() + 10.0
+    while active_children() and time.monotonic() < deadline_s:
+        time.sleep(0.05)
+    assert not active_children()
+
+
+def stop_beside_a_blocked_process(runner: Runner[str, tuple[str, int]], then: Callable[[], None]) -> None:
+    with pytest.raises(RunStopped):
+        list(runner.results(["0-stopping", "1-failing"]))
+    then()
+
+
+def test_after_a_stop_only_the_tasks_in_progress_are_finished():
+    with Runner(work, jobs=JOBS) as runner:
+        results = runner.results([str(number) for number in range(20)])
+        next(results)
+        runner.stop()
+        assert len(list(results)) == JOBS - 1
+
+
+def test_a_killed_run_leaves_no_warnings_of_semaphores():
+    code = """
+        import os, signal
+        from startrack.core.runner import Runner
+        if __name__ == "__main__":
+            with Runner(abs, jobs=2) as runner:
+                results = runner.results(range(8))
+                next(results)
+                os.kill(os.getpid(), signal.SIGKILL)
+    """
+    process = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=120,
+        env={name: value for name, value in os.environ.items() if name != "PYTHONWARNINGS"},
+    )  # fmt: skip
+    assert (process.returncode, process.stderr) == (-signal.SIGKILL, "")
 
 
 def test_processes_are_kept_between_calls():
@@ -148,3 +218,50 @@ def test_a_scheduler_that_goes_stops_the_run():
         with pytest.raises(RunStopped, match=r"the Dask scheduler has gone [^\n]*$"):
             list(results)
     assert not logging.getLogger("distributed.client").isEnabledFor(logging.ERROR)  # it would add tracebacks
+
+
+class Unreadable:
+    """A result that a worker sends and that its receiver cannot read."""
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return fail_to_read, ("no such result",)
+
+
+def fail_to_read(why: str) -> None:
+    raise OSError(why)
+
+
+def unreadable(_: str) -> Unreadable:
+    return Unreadable()
+
+
+def test_a_result_that_cannot_be_fetched_stops_the_run():
+    distributed = pytest.importorskip("distributed")
+    with (
+        distributed.LocalCluster(1, processes=True, threads_per_worker=1, dashboard_address=None) as cluster,
+        Runner(unreadable, cluster=cluster.scheduler_address) as runner,
+        limit_of_s(60),
+        pytest.raises(RunStopped),
+    ):
+        list(runner.results(["0", "1"]))
+
+
+RELEASE = threading.Event()
+
+
+def wait_for_release(_: str) -> bool:
+    return RELEASE.wait(60.0)
+
+
+def test_a_lost_connection_stops_a_run_without_any_result(monkeypatch):
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr("startrack.core.runner.CONNECT_S", 0.5)
+    with (
+        distributed.LocalCluster(1, processes=False, threads_per_worker=1, dashboard_address=None) as cluster,
+        Runner(wait_for_release, cluster=cluster.scheduler_address) as runner,
+        limit_of_s(30),
+    ):
+        distributed.default_client().status = "connecting"
+        with pytest.raises(RunStopped, match="the Dask scheduler has gone"):
+            list(runner.results(["0"]))
+        RELEASE.set()

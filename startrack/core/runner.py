@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import signal
 import threading
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
     CancelledError,
-    Executor,
     Future,
     ProcessPoolExecutor,
     ThreadPoolExecutor,
@@ -19,24 +19,28 @@ from concurrent.futures import (
 from concurrent.futures.process import BrokenProcessPool
 from contextvars import copy_context
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from multiprocessing import active_children, get_context, parent_process
 from multiprocessing.process import BaseProcess
-from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar, cast
 
 from startrack.core.errors import BadInput
 from startrack.core.time_limit import check_time
 
 if TYPE_CHECKING:
     from distributed import Client
+    from tornado.platform.asyncio import BaseAsyncIOLoop
 
 CONNECT_S = 10.0
+CLOSE_S = CONNECT_S / 2  # for the tasks in progress to end, when no more results are wanted
 TASK_LIMIT_S = 900.0  # without any result: far above the slowest image, reached only by a blocked process
-TASKS_PER_PROCESS = 2  # submitted at a time: one in progress and the next; twice as many far away, on a cluster
+TASKS_PER_THREAD = 4  # of a cluster, handed out at a time: it is far away. A process gets one, which can be finished
 DIED = "the process that worked on it died (out of memory?) or stood still, alone as it did beside others"
 DIED_ON_CLUSTER = "the Dask workers that worked on it died, one after the other (out of memory?)"
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+NO_TRACKER_WARNINGS = "ignore:resource_tracker"  # Python warns when it removes files of a killed process
 LOG_OF_CLIENT = "distributed.client"
 
 Task = TypeVar("Task")
@@ -112,7 +116,10 @@ class Runner(Generic[Task, Result]):
             self._client.close()
 
     def stop(self) -> None:
-        """Start no further task; `results` ends after those that were handed out. A signal handler may call this."""
+        """Start no further task; `results` ends after those in progress. A signal handler may call this.
+
+        On a cluster those that wait for a worker's thread are done too.
+        """
         self._stopping = True
 
     def results(self, tasks: Iterable[Task]) -> Generator[tuple[Task, Result | Died], None, None]:
@@ -124,51 +131,58 @@ class Runner(Generic[Task, Result]):
         coming = iter(tasks)
         if self._client is not None:
             threads = sum(self._client.nthreads().values())
-            yield from self._run(coming, self._client.get_executor(pure=False), 2 * TASKS_PER_PROCESS * max(threads, 1))
+            yield from self._run(coming, TASKS_PER_THREAD * max(threads, 1))
         elif self._in_process:
             yield from ((task, self.work(task)) for task in coming if not self._stopping)
         else:
-            while suspects := (
-                yield from self._run(coming, self._start_pool(self.jobs), TASKS_PER_PROCESS * self.jobs)
-            ):
+            while suspects := (yield from self._run(coming, self.jobs)):
                 alone = iter(suspects)
-                while culprits := (yield from self._run(alone, self._start_pool(1), 1)):
+                while culprits := (yield from self._run(alone, 1)):
                     yield from ((task, Died(DIED)) for task in culprits)
                 self._end_pool()
 
-    def _run(
-        self, coming: Iterator[Task], executor: Executor, most: int
-    ) -> Generator[tuple[Task, Result | Died], None, list[Task]]:
+    def _run(self, coming: Iterator[Task], most: int) -> Generator[tuple[Task, Result | Died], None, list[Task]]:
         """Yield results, with `most` tasks handed out at a time; return those of them when a process died or blocked.
 
         None are returned when all are done. The processes are killed after a death, and when the caller closes the
         generator: files are complete or absent, so that nothing is damaged.
         """
         waiting: dict[Future[Result], Task] = {}
-        limit_s = self.limit_s if self._client is None else None
+        client, submit = self._client, self._way_to_submit(most)
         try:
             while True:
                 for task in islice(coming, 0 if self._stopping else most - len(waiting)):
-                    waiting[_submit(executor, self.work, task)] = task
+                    waiting[submit(self.work, task)] = task
                 if not waiting:
                     return []
-                finished, _ = wait(waiting, limit_s, FIRST_COMPLETED)
-                has_failed = not finished or any(map(_is_lost, finished))
+                finished, _ = wait(waiting, self.limit_s if client is None else CONNECT_S, FIRST_COMPLETED)
+                if client is not None:
+                    _check_connection(client, finished)
+                has_failed = client is None and (not finished or any(map(_is_lost, finished)))
                 if has_failed:
                     self._end_pool(kill=True)  # after it each future is lost or has its result
                 for future in [one for one in waiting if one.done() and not _is_lost(one)]:
-                    yield waiting.pop(future), future.result() if self._client is None else _cluster_result(future)
+                    yield waiting.pop(future), future.result() if client is None else _cluster_result(future)
                 if has_failed:
                     return list(waiting.values())
         except (KeyboardInterrupt, GeneratorExit):
             self._end_pool(kill=True)
             raise
 
+    def _way_to_submit(self, most: int) -> Callable[[Callable[[Task], Result], Task], Future[Result]]:
+        """The function that hands a task to the cluster, or to the pool, which is started with `most` processes."""
+        if self._client is not None:
+            return partial(_submit_to_cluster, self._client)
+        return partial(_submit, self._start_pool(most))
+
     def _start_pool(self, jobs: int) -> ProcessPoolExecutor:
         """The pool, else a new one of `jobs` processes with one thread each."""
         if self._pool is None:
             for name in THREAD_LIMITS:  # inherited when the processes load NumPy: the other cores do other tasks
                 os.environ.setdefault(name, "1")
+            rules = os.environ.get("PYTHONWARNINGS", "")
+            if NO_TRACKER_WARNINGS not in rules:
+                os.environ["PYTHONWARNINGS"] = f"{rules},{NO_TRACKER_WARNINGS}".strip(",")
             self._others = active_children()
             # New processes: a fork would copy the thread of the progress bar.
             self._pool = ProcessPoolExecutor(
@@ -177,13 +191,23 @@ class Runner(Generic[Task, Result]):
         return self._pool
 
     def _end_pool(self, *, kill: bool = False) -> None:
-        """End the processes of a pool: at once with `kill`, otherwise after the tasks in progress."""
+        """End the processes of a pool: at once with `kill`, otherwise after the tasks in progress or CLOSE_S."""
         pool, self._pool = self._pool, None
-        if pool is not None:
-            for process in active_children() if kill else ():
-                if process not in self._others:
-                    process.kill()
+        if pool is None:
+            return
+        processes = [process for process in active_children() if process not in self._others]
+        limit = threading.Timer(0.0 if kill else CLOSE_S, _kill, [processes])
+        limit.start()
+        try:
             pool.shutdown(cancel_futures=not kill)
+        finally:  # also by a Ctrl-C meanwhile
+            limit.cancel()
+            _kill(processes)
+
+
+def _kill(processes: Iterable[BaseProcess]) -> None:
+    for process in processes:
+        process.kill()
 
 
 def _connect(cluster: str) -> Client:
@@ -197,7 +221,7 @@ def _connect(cluster: str) -> Client:
         raise BadInput("no_cluster", f"{cluster}: no Dask scheduler answers ({cause})") from cause
 
 
-def _submit(executor: Executor, work: Callable[[Task], Result], task: Task) -> Future[Result]:
+def _submit(pool: ProcessPoolExecutor, work: Callable[[Task], Result], task: Task) -> Future[Result]:
     """The future result; in a broken pool a future with BrokenProcessPool.
 
     SIGINT and SIGTERM are blocked meanwhile: a process that starts in here never gets them, this one gets them after.
@@ -205,7 +229,7 @@ def _submit(executor: Executor, work: Callable[[Task], Result], task: Task) -> F
     has_mask = hasattr(signal, "pthread_sigmask")  # not on Windows
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS) if has_mask else ()
     try:
-        return executor.submit(work, task)
+        return pool.submit(work, task)
     except BrokenProcessPool as cause:
         broken: Future[Result] = Future()
         broken.set_exception(cause)
@@ -213,6 +237,18 @@ def _submit(executor: Executor, work: Callable[[Task], Result], task: Task) -> F
     finally:
         if has_mask:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _submit_to_cluster(client: Client, work: Callable[[Task], Result], task: Task) -> Future[Result]:
+    """The future result, or the exception of the work, of its transfer or of a lost connection."""
+    from distributed import Future as FarFuture
+
+    async def fetched(far: FarFuture[Result]) -> Result:
+        return await far
+
+    # Not by the executor of the client: a future of it stays without an end when the transfer of its result fails.
+    far = client.submit(work, task, pure=False)
+    return asyncio.run_coroutine_threadsafe(fetched(far), cast("BaseAsyncIOLoop", client.loop).asyncio_loop)
 
 
 def _begin_process(log_level: int) -> None:
@@ -234,6 +270,12 @@ def _end_with_parent() -> None:
 def _is_lost(future: Future[Any]) -> bool:
     """Whether the finished future has no result because a process of its pool died."""
     return not future.cancelled() and isinstance(future.exception(), BrokenProcessPool)
+
+
+def _check_connection(client: Client, finished: Collection[Future[Any]]) -> None:
+    """Raises RunStopped if the scheduler has gone; not beside `finished` futures, which have results or the cause."""
+    if not finished and client.status != "running":
+        raise RunStopped(f"the Dask scheduler has gone (the client is {client.status})")
 
 
 def _cluster_result(future: Future[Any]) -> Any:

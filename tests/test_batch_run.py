@@ -113,7 +113,7 @@ def test_a_later_signal_drops_the_images_in_progress_and_writes_the_tables(tmp_p
 
     monkeypatch.setattr("builtins.print", interrupt)
     out = tmp_path / "out"
-    assert main(["batch", str(tmp_path / "images"), "-D", str(out), "-j", "1", "-v", "--no-plots"]) == 5
+    assert main(["batch", str(tmp_path / "images"), "-D", str(out), "-j", "2", "-v", "--no-plots"]) == 5
     assert len(Table.read(out / "results.ecsv", format="ascii.ecsv")) == len(list(out.glob("*.fix.json")))
     assert len(list(out.glob("*.fix.json"))) < 40
 

@@ -254,7 +254,8 @@ def bytes_of_all_kernels():
                 if one.is_written:
                     key.update(value.tobytes())
     found = (
-        photometry_of(rng), chain_of(rng), detection_of(rng), identification_of(rng), columns_of(rng), horizons_of(rng)
+        photometry_of(rng), chain_of(rng), detection_of(rng), small_frames_of(rng), identification_of(rng),
+        columns_of(rng), horizons_of(rng),
     )  # fmt: skip
     for array in (one for each in found for one in each):
         key.update(array.tobytes())
@@ -301,6 +302,24 @@ def detection_of(rng):
     streaks._fill_residuals(*one.light_and_noise, residuals)
     found = sources.xy_px, sources.covariance_px2, sources.flux_e, sources.snr, sources.saturated
     return (filled, converted, saturated, residuals, *found)
+
+
+def small_frames_of(rng):
+    """Numbers of sources in frames about as small as a stamp, each with a star beside a corner, or in the middle."""
+    from startrack.core.types import Exposure, TooFewStars
+    from startrack.detection import Detector
+
+    sides, found = (1, 3, 7, 8, 9, 12, 24), []
+    for height, width, at in [(h, w, at) for h in sides for w in sides for at in ((3, 3), (h // 2, w // 2))]:
+        row, column = np.mgrid[:height, :width]
+        distance = np.square(row - at[0]) + np.square(column - at[1])
+        image = rng.poisson(100.0 + 5000.0 * np.exp(-0.5 * distance / 1.3)).astype(np.float32)
+        try:
+            found.append(len(Detector()(Exposure(pixels_adu=image, saturation_adu=4000.0)).xy_px))
+        except TooFewStars:
+            found.append(0)
+    assert any(found)
+    return (np.array(found),)
 
 
 def chain_of(rng):

@@ -117,6 +117,14 @@ def test_a_black_frame_holds_no_stars(folder, capsys):
     assert reason(capsys, "locate", black_image()) == (REFUSED, "no_stars")
 
 
+@pytest.mark.parametrize("size", [(1, 1), (20, 7), (2, 40), (9, 9)])
+@pytest.mark.parametrize("words", [("detect",), ("identify", "--fov", "60")])
+def test_a_tiny_frame_holds_no_stars(folder, capsys, size, words):
+    pixels = np.random.default_rng(1).poisson(100.0, size[::-1]).astype(np.uint8)
+    assert cv2.imwrite("tiny.png", pixels)
+    assert reason(capsys, words[0], "tiny.png", *words[1:]) == (REFUSED, "no_stars")
+
+
 def test_a_saturated_frame_holds_no_stars(folder, capsys):
     image = write_image("day.png", np.full((SIZE, SIZE), 65535, np.uint16))
     assert reason(capsys, "locate", image) == (REFUSED, "no_stars")

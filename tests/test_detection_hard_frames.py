@@ -38,6 +38,17 @@ def test_noise_of_images_with_few_values(sigma_adu: float, level: float) -> None
     assert abs(background.whole().mean() - image.mean()) < 0.2 * image.std()
 
 
+@pytest.mark.parametrize("height", [1, 2, 7, 8, 9, 12, 40])
+@pytest.mark.parametrize("width", [1, 5, 7, 9, 20, 33])
+def test_frames_smaller_than_a_stamp_have_no_stars(height: int, width: int) -> None:
+    """Nor has a larger one with a star that near to a corner: it needs light from all around."""
+    rng, at = np.random.default_rng(height), np.array([3.0, 3.0])
+    row, column = np.mgrid[:height, :width]
+    mean = 100.0 + 5000.0 * np.exp(-0.5 * (np.square(column - at[0]) + np.square(row - at[1])) / 1.3)
+    with pytest.raises(TooFewStars):
+        Detector()(expose(mean, rng))
+
+
 @pytest.mark.parametrize("bits", [8, 12, 14, 16])
 def test_bit_depths(bits: int) -> None:
     """The same exposure, rounded ever more coarsely: with 8 bits a step is half as large again as the noise."""

@@ -61,6 +61,12 @@ def test_stamps_are_cut_from_light_and_variance():
             np.testing.assert_allclose(found, np.reshape(cut, (n, 11, 11)), rtol=1e-5, atol=1e-4)
 
 
+@pytest.mark.parametrize("centre", [(4, 30), (30, 4), (78, 30), (30, 56), (-1, 30)])
+def test_a_stamp_that_reaches_beyond_the_frame_is_refused(centre):
+    with pytest.raises(ValueError, match="beyond the frame"):
+        random_frame(np.random.default_rng(2)).cut_light(np.array([[40, 16], centre]), 5)
+
+
 @pytest.mark.parametrize("bias_shape", [(1, 1), (5, 7)])
 def test_counts_are_converted_and_saturated_ones_marked(bias_shape):
     rng = np.random.default_rng(3)

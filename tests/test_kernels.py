@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import importlib
 import inspect
@@ -13,6 +14,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -173,6 +175,43 @@ def test_an_array_has_as_many_elements_as_are_added_to_its_size():
         call(np.zeros((0, 2)), np.zeros((0, 5)), *np.zeros((2, 0, 5), np.float32), np.zeros((0, 2), np.int64))
 
 
+def test_a_size_has_the_least_value_that_its_declaration_states():
+    call = library.kernel(
+        "pass_curve", "likelihood: float64[sectors, n >= 1]", "heights: float64[n]", "cells: float64[n]",
+        "rough: float64", "jump: float64", "scratch: out float64[5, n]", "found: out float64[sectors]",
+    )  # fmt: skip
+    for n, is_enough in ((1, True), (0, False)):
+        values = np.ones((2, n)), np.zeros(n), np.ones(n), 1.0, 0.1, np.empty((5, n)), np.empty(2)
+        if is_enough:
+            call(*values)
+            continue
+        with pytest.raises(TypeError, match="n >= 1"):
+            call(*values)
+
+
+@pytest.mark.parametrize("radius", [2**63, -(2**64), np.uint64(2**63)])
+def test_a_number_beyond_64_bits_is_a_type_error(radius):
+    call = library.kernel(
+        "unfilter_grey_8", "rows: uint8[height, length + 1]", "pixel_bytes: int64", "scratch: out uint8[2, room]",
+        "found: out float32[height, samples]", result="bool",
+    )  # fmt: skip
+    room = np.zeros((0, 2), np.uint8), np.zeros((2, 2), np.uint8), np.zeros((0, 1), np.float32)
+    assert call(room[0], 2**63 - 1, *room[1:])
+    with pytest.raises(TypeError, match="pixel_bytes"):
+        call(room[0], radius, *room[1:])
+
+
+def test_what_the_processor_has_is_read_as_a_bool(monkeypatch):
+    """A C function sets the lowest byte of its result alone: the others hold anything."""
+
+    def has_x86_64_v3():
+        return 0x5500 & (0xFF if getattr(has_x86_64_v3, "restype", ctypes.c_int) is ctypes.c_bool else 0xFFFF)
+
+    monkeypatch.setattr(library, "_open", lambda level: SimpleNamespace(has_x86_64_v3=has_x86_64_v3))
+    monkeypatch.delenv(library.VARIABLE, raising=False)
+    assert library._load()[0] == "baseline"
+
+
 def random_arguments(arguments, rng):
     """Arrays and numbers as declared, whose indices are those of elements that exist."""
     sizes: dict[str, int] = {}
@@ -215,7 +254,8 @@ def bytes_of_all_kernels():
                 if one.is_written:
                     key.update(value.tobytes())
     found = (
-        photometry_of(rng), chain_of(rng), detection_of(rng), identification_of(rng), columns_of(rng), horizons_of(rng)
+        photometry_of(rng), chain_of(rng), detection_of(rng), small_frames_of(rng), identification_of(rng),
+        columns_of(rng), horizons_of(rng),
     )  # fmt: skip
     for array in (one for each in found for one in each):
         key.update(array.tobytes())
@@ -224,8 +264,6 @@ def bytes_of_all_kernels():
 
 def photometry_of(rng):
     """Fluxes and variances of stars beside an edge of the background."""
-    from types import SimpleNamespace
-
     from startrack.core.smooth_image import SmoothImage
     from startrack.evidence.photometry import Sources, measure
 
@@ -264,6 +302,24 @@ def detection_of(rng):
     streaks._fill_residuals(*one.light_and_noise, residuals)
     found = sources.xy_px, sources.covariance_px2, sources.flux_e, sources.snr, sources.saturated
     return (filled, converted, saturated, residuals, *found)
+
+
+def small_frames_of(rng):
+    """Numbers of sources in frames about as small as a stamp, each with a star beside a corner, or in the middle."""
+    from startrack.core.types import Exposure, TooFewStars
+    from startrack.detection import Detector
+
+    sides, found = (1, 3, 7, 8, 9, 12, 24), []
+    for height, width, at in [(h, w, at) for h in sides for w in sides for at in ((3, 3), (h // 2, w // 2))]:
+        row, column = np.mgrid[:height, :width]
+        distance = np.square(row - at[0]) + np.square(column - at[1])
+        image = rng.poisson(100.0 + 5000.0 * np.exp(-0.5 * distance / 1.3)).astype(np.float32)
+        try:
+            found.append(len(Detector()(Exposure(pixels_adu=image, saturation_adu=4000.0)).xy_px))
+        except TooFewStars:
+            found.append(0)
+    assert any(found)
+    return (np.array(found),)
 
 
 def chain_of(rng):
@@ -572,7 +628,7 @@ float sqrtf(float), fabsf(float);
 
 
 def test_the_loader_is_small():
-    assert len(inspect.getsource(library).splitlines()) <= 130
+    assert len(inspect.getsource(library).splitlines()) <= 135
 
 
 def test_kernels_keep_no_state():

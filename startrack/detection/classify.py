@@ -189,7 +189,7 @@ def _stripes(side: int) -> tuple[Ints, Ints]:
 
 
 _compare_shapes = kernel(
-    "compare_shapes", "data: float32[n, side, side]", "variance: float32[n, side, side]",
+    "compare_shapes", "data: float32[n, side >= 3, side]", "variance: float32[n, side, side]",
     "usable: bool[usable_rows, side, side]", "which: int64[m]", "offset_px: float64[m, 2]", "flux: float64[m]",
     "level: float64[m]", "width_px: float64[m]", "per_unit: float64", "model_error: float64",
     "stripe: int64[side, side, directions]", "ends: int64[directions]", "profiles: out float64[7, side + 1]",

@@ -140,8 +140,10 @@ def _neighbour_correlation(tiles: NDArray[np.float32]) -> float:
 def find_dead_parts(pixels_adu: NDArray[np.float32]) -> Bools | None:
     """The pixels (H, W) in rectangles of one value, below the highest one, of a frame that is noisy elsewhere.
 
-    None where there are none.
+    None where there are none, as in a frame with a side shorter than PROBE_PX.
     """
+    if min(pixels_adu.shape) < PROBE_PX:
+        return None
     corners = np.lib.stride_tricks.sliding_window_view(pixels_adu, (PROBE_PX, PROBE_PX))[::STRIDE_PX, ::STRIDE_PX]
     tiles = corners.reshape(-1, PROBE_PX**2)
     equal = np.ptp(tiles, axis=1) == 0

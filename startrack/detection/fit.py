@@ -186,7 +186,7 @@ def _squared_residuals(s: Stamps, fits: PointFits, sigma: float) -> tuple[Array,
 
 
 _fit_stamps = kernel(
-    "fit_stamps", "data: float32[n, side, side]", "variance: float32[n, side, side]",
+    "fit_stamps", "data: float32[n, side >= 3, side]", "variance: float32[n, side, side]",
     "usable: bool[usable_rows, side, side]", "signal: float32[signals, side, side]", "signal_error: float64",
     "which: int64[m]", "start_px: float64[m, 2]", "sigma_px: float64", "per_unit: float64", "model_error: float64",
     "rounds: int64", "max_step_px: float64", "position_prior: float64", "flux_prior: float64", "surround: float64[m]",

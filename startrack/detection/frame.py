@@ -59,8 +59,11 @@ class Frame:
     def cut_light(self, centres: Ints, radius: int) -> tuple[Image, Image]:
         """Stamps (n, s, s) without their background, and their variance without the sources' own signal.
 
-        s is 2 `radius` + 1. The stamps around the pixels `centres` (n, 2), x and y, must lie in the image.
+        s is 2 `radius` + 1. Raises ValueError unless the stamps around the pixels `centres` (n, 2), x and y, lie in
+        the image.
         """
+        if not lie_inside(centres, self.shape, radius).all():
+            raise ValueError(f"a stamp of radius {radius} reaches beyond the frame of {self.shape} pixels")
         light, variance = np.empty((2, len(centres), 2 * radius + 1, 2 * radius + 1), dtype=np.float32)
         _cut_light(*self.light_and_noise[:4], centres, light, variance)
         return light, variance
@@ -100,6 +103,12 @@ def cut_stamps(image: NDArray[Any], centres: Ints, radius: int) -> NDArray[Any]:
         image, (height - side + 1, width - side + 1, side, side), image.strides * 2, writeable=False
     )
     return np.ascontiguousarray(positions[centres[:, 1] - radius, centres[:, 0] - radius])
+
+
+def lie_inside(pixels: Ints, shape: tuple[int, int], margin: int) -> Bools:
+    """Whether pixels (n, 2), x and y, lie `margin` inside a frame of this shape (H, W)."""
+    last = np.array([shape[1], shape[0]]) - 1 - margin
+    return np.asarray(((pixels >= margin) & (pixels <= last)).all(axis=1))
 
 
 def radius_for(sigma_px: float) -> int:
@@ -142,7 +151,7 @@ def _sums(image: Image, side: int) -> Image:
 
 # Of an image with its background and noise, and of known stars' light with its noise.
 LIGHT_AND_NOISE = (
-    "image: float32[height, width]", "background: float32[blocks, width]", "noise: float32[blocks, width]",
+    "image: float32[height, width]", "background: float32[blocks >= 1, width]", "noise: float32[blocks, width]",
     "side: int64", "found: float32[known, width]", "per_unit: float32", "found_error: float32",
 )  # fmt: skip
 _cut_light = kernel(

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.smooth_image import Image
-from startrack.core.types import Array, Bools, Ints
+from startrack.core.types import Array, Ints
 from startrack.detection.background import BLOCK_PX, CLIPPED_SIGMA
-from startrack.detection.frame import LIGHT_AND_NOISE, Frame, radius_for
+from startrack.detection.frame import LIGHT_AND_NOISE, Frame, lie_inside, radius_for
 from startrack.kernels.library import kernel
 from startrack.psf import filter_kernel
 
@@ -69,13 +69,11 @@ def find_peaks(frame: Frame, sigma: float, lowest: float, most: int, known: Arra
 
 
 def nearest_pixels(xy_px: Array | Ints, shape: tuple[int, int], margin: int) -> Ints:
-    """The pixels (n, 2) nearest to positions (n, 2) that lie `margin` inside a frame of this shape (H, W)."""
+    """The pixels (n, 2) nearest to positions (n, 2) that lie `margin` inside a frame of this shape (H, W).
+
+    The frame has such pixels, or there are no positions.
+    """
     return np.clip(np.rint(xy_px).astype(np.int64), margin, np.array([shape[1], shape[0]]) - 1 - margin)
-
-
-def lie_inside(pixels: Ints, shape: tuple[int, int], margin: int) -> Bools:
-    """Whether pixels (n, 2) lie `margin` inside a frame of this shape (H, W)."""
-    return np.asarray((nearest_pixels(pixels, shape, margin) == pixels).all(axis=1))
 
 
 def bright_pixels(frame: Frame, lowest: float, most: int) -> Ints:
@@ -119,7 +117,8 @@ def _peaks_above(
     taps[: radius + 1] = kernel[radius:]
     lag = max(reach, COARSE_PX * (beside + 2) if level_factor else 0)
     squares, columns = -(-height // COARSE_PX), -(-width // COARSE_PX)
-    stride = -(-max(width + 2 * reach, columns + 2 * beside) // WORD_PX) * WORD_PX
+    longest = max(width + 2 * reach, columns * COARSE_PX, columns + 2 * beside)
+    stride = -(-longest // WORD_PX) * WORD_PX
     scratch = np.empty((lag + 2 * reach + 11, stride), np.float32), np.empty((squares, columns), np.float32)
     dead = np.zeros((0, width), np.bool_) if frame.dead is None else frame.dead
     room = count = height * width // PIXELS_PER_PEAK
@@ -169,6 +168,6 @@ def _without_gaps(at: Ints) -> Ints:
 _find_maxima = kernel(
     "find_maxima", *LIGHT_AND_NOISE, "taps: float32[reach + 1]", "coarse: int64", "beside: int64", "clipped: float32",
     "level_factor: float32", "lowest: float32", "dead: bool[dead_rows, width]", "margin: int64",
-    "rows: out float32[count, stride]", "means: out float32[squares, columns]", "pixels: out int64[room, 2]",
+    "rows: out float32[count, stride]", "means: out float32[squares >= 1, columns >= 1]", "pixels: out int64[room, 2]",
     "values: out float32[room, 4]", result="int64",
 )  # fmt: skip

@@ -8,8 +8,8 @@ import numpy as np
 
 from startrack.core.types import Array, Bools, Ints
 from startrack.detection.fit import FIT_ROUNDS_AGAIN, PointFits, Stamps, fit_points, profile_scratch
-from startrack.detection.frame import Frame, Pixels, radius_for
-from startrack.detection.peaks import bright_pixels, find_peaks, lie_inside
+from startrack.detection.frame import Frame, Pixels, lie_inside, radius_for
+from startrack.detection.peaks import bright_pixels, find_peaks
 from startrack.kernels.library import kernel
 
 WIDTH_SNR = 12.0  # of the sources from which the width is measured

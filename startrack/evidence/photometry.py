@@ -126,11 +126,11 @@ _profiles_of = kernel(
     "down: out float32[n, wide]", "centre: out int64[n, 2]",
 )  # fmt: skip
 _measure_sources = kernel(
-    "measure_sources", "image: float32[height, width]", "background: float32[background_rows, width]",
-    "noise: float32[noise_rows, width]", "dead: bool[height, width]", "background_side: int64", "noise_side: int64",
-    "xy_px: float64[n, 2]", "flux_e: float64[n]", "fraction_sigma: float64[n]", "visible: float64[n]",
-    "first: int64[cells + 1]", "columns: int64", "reach_px: float64", "side_px: float64", "radius: int64",
-    "outlier: float32", "model: float32", "shape_variance: float32", "most_masked: int64",
+    "measure_sources", "image: float32[height, width]", "background: float32[background_rows >= 1, width]",
+    "noise: float32[noise_rows >= 1, width]", "dead: bool[height, width]", "background_side: int64",
+    "noise_side: int64", "xy_px: float64[n, 2]", "flux_e: float64[n]", "fraction_sigma: float64[n]",
+    "visible: float64[n]", "first: int64[cells + 1]", "columns: int64", "reach_px: float64", "side_px: float64",
+    "radius: int64", "outlier: float32", "model: float32", "shape_variance: float32", "most_masked: int64",
     "profiles: float64[steps + 1, wide]", "edges: float32[2, phases + 1, table_places]", "sigma_px: float64",
     "step_px: float64", "flat_excess: float64", "width_part: float64", "contrast_sigmas: float64", "places: int64",
     "across: out float32[n, wide]", "down: out float32[n, wide]", "centre: out int64[n, 2]", "near: out int64[n]",

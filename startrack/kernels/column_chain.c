@@ -41,11 +41,6 @@ void add_steps(int64_t k, int64_t n, int64_t columns, double temper, double lowe
     }
 }
 
-static inline double sum_of(const double lane[LANES])
-{
-    return ((lane[0] + lane[4]) + (lane[2] + lane[6])) + ((lane[1] + lane[5]) + (lane[3] + lane[7]));
-}
-
 /* Replace a message [n] by `after` [n] at other elevations: sums over exponentials of their distance, from below and
    from above, that fall by `ratio` a sample. The sums from both ends take their steps beside each other.
    Scratch: `below` [n], `above` [n + 1]. */
@@ -108,8 +103,8 @@ static double weigh(int64_t n, const double *restrict message, const float *rest
         sum[0] += after[i];
         weighted[0] += after[i] * landing[i];
     }
-    *landed = sum_of(weighted);
-    return sum_of(sum);
+    *landed = SUM_OF(weighted);
+    return SUM_OF(sum);
 }
 
 static void multiply(int64_t n, const double *restrict factors, double *restrict values)

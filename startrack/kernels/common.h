@@ -7,6 +7,10 @@
 
 #define TURN 6.283185307179586 /* radians */
 
+/* The sum of eight accumulators, of float or double, in an order that all compilers keep. */
+#define SUM_OF(lane) \
+    ((((lane)[0] + (lane)[4]) + ((lane)[2] + (lane)[6])) + (((lane)[1] + (lane)[5]) + ((lane)[3] + (lane)[7])))
+
 static inline int64_t least(int64_t a, int64_t b)
 {
     return a < b ? a : b;

@@ -25,6 +25,7 @@ SCALARS: dict[str, tuple[Any, Callable[..., Any]]] = {
 }  # fmt: skip
 BUFFER: Any = (ctypes.c_char * 0).from_buffer  # a pointer to an array that is not read-only, in a fifth of the time
 FORM = re.compile(r"\w+: (out )?(\w+)(?:\[(.+)\])?")
+DIMENSION = re.compile(r"(\w+)(?: ?>= ?(\d+))?(?: ?\+ ?(\d+))?")
 DECLARED: dict[str, tuple[list[Argument], str | None]] = {}  # by the name in the library: arguments and result
 
 
@@ -35,14 +36,15 @@ class Argument(NamedTuple):
     is_written: bool
     dtype: str
     shape: tuple[tuple[str, int], ...] | None  # None: a number
+    least: dict[str, int]  # of the sizes that it names
 
     @classmethod
     def of(cls, text: str) -> Argument:
-        """From `name: dtype`, `name: dtype[n, m + 1, 3]`, or `name: out dtype[n]` of an array that is written to."""
+        """From `name: dtype`, `name: dtype[n, m + 1, k >= 2, 3]`, or `name: out dtype[n]` of one that is written to."""
         out, dtype, shape = FORM.fullmatch(text).groups()  # type: ignore[union-attr]
-        parts = [part.split("+") for part in shape.split(",")] if shape else []
-        dims = tuple((part[0].strip(), int(part[1]) if len(part) > 1 else 0) for part in parts)
-        return cls(text, bool(out), dtype, dims if shape else None)
+        parts = DIMENSION.findall(shape or "")
+        dims = tuple((dim, int(more or 0)) for dim, _, more in parts)
+        return cls(text, bool(out), dtype, dims if shape else None, {dim: int(low) for dim, low, _ in parts if low})
 
 
 def _open(level: str) -> ctypes.CDLL:
@@ -63,7 +65,8 @@ def _load() -> tuple[str, ctypes.CDLL]:
     if level == "sanitized":
         return level, _open(level)
     baseline = _open("baseline")
-    has_v3 = "v3" in this_target().levels and bool(baseline.has_x86_64_v3())
+    baseline.has_x86_64_v3.restype = ctypes.c_bool
+    has_v3 = "v3" in this_target().levels and baseline.has_x86_64_v3()
     if level == "v3" and not has_v3:
         raise LibraryMissing(f"{VARIABLE} is v3, which this processor is not")
     return ("v3", _open("v3")) if has_v3 and level != "baseline" else ("baseline", baseline)
@@ -99,6 +102,7 @@ def border(name: str, arguments: list[Argument]) -> tuple[list[str], list[Any], 
     types = [SCALARS[one.dtype][0] if one.shape is None else ctypes.c_void_p for one in arguments]
     known = [int(dim) for one in arguments for dim, _ in one.shape or () if dim.isdigit()]
     slots = [*names, *map(str, known)]  # of sizes: those of names are not known yet (-1)
+    least = [max([one.least.get(slot, 0) for one in arguments], default=0) for slot in slots]
     kinds: list[Any] = [np.dtype(one.dtype) if one.shape else SCALARS[one.dtype][1] for one in arguments]
     shapes = [one.shape and [(slots.index(dim), more) for dim, more in one.shape] for one in arguments]
     plan: list[Any] = [(*one[:2], kind, shape) for one, kind, shape in zip(arguments, kinds, shapes, strict=True)]
@@ -110,6 +114,8 @@ def border(name: str, arguments: list[Argument]) -> tuple[list[str], list[Any], 
         for value, (text, is_written, kind, shape) in zip(values, plan, strict=True):
             if shape is None:
                 words.append(kind(value))
+                if kind is operator.index and words[-1].bit_length() > 63:  # ctypes would take the lowest bits
+                    raise TypeError(f"{name}: `{text}` is asked for, not {value}")
                 continue
             is_kind = isinstance(value, np.ndarray) and (value.dtype is kind or value.dtype == kind)  # `is`: fast
             if not is_kind or value.ndim != len(shape):
@@ -121,7 +127,7 @@ def border(name: str, arguments: list[Argument]) -> tuple[list[str], list[Any], 
             for (slot, more), size in zip(shape, value.shape, strict=True):
                 if sizes[slot] < 0:
                     sizes[slot] = size - more
-                if size != sizes[slot] + more or sizes[slot] < 0:
+                if size != sizes[slot] + more or sizes[slot] < least[slot]:
                     raise TypeError(f"{name}: `{text}` is asked for, not {value.shape}; sizes: {sizes}")
             words.append(BUFFER(value) if flags.writeable else value.__array_interface__["data"][0])
         return [*sizes[: len(names)], *words]

@@ -28,11 +28,6 @@ struct profiles {
     const int64_t *centre;
 };
 
-static inline float sum_of(const float lane[LANES])
-{
-    return ((lane[0] + lane[4]) + (lane[2] + lane[6])) + ((lane[1] + lane[5]) + (lane[3] + lane[7]));
-}
-
 /* Write into `near` the sources within reach of source i that may be visible; how many there are. */
 static int64_t find_neighbours(int64_t *restrict near, int64_t i, const double *restrict xy_px,
                                const double *restrict visible, const int64_t *restrict first, int64_t rows,
@@ -157,8 +152,8 @@ static struct sums sum_stamp(const struct stamp *s)
             lane[8][j] += vd * b;
         }
     }
-    const struct sums found = {sum_of(lane[0]), sum_of(lane[1]), sum_of(lane[2]), sum_of(lane[3]), sum_of(lane[4]),
-                               sum_of(lane[5]), sum_of(lane[6]), sum_of(lane[7]), sum_of(lane[8])};
+    const struct sums found = {SUM_OF(lane[0]), SUM_OF(lane[1]), SUM_OF(lane[2]), SUM_OF(lane[3]), SUM_OF(lane[4]),
+                               SUM_OF(lane[5]), SUM_OF(lane[6]), SUM_OF(lane[7]), SUM_OF(lane[8])};
     return found;
 }
 
@@ -239,8 +234,8 @@ static void find_variances(const struct stamp *s, float shape_variance, double *
             own[j] += w * w * profile[p + j];
         }
     }
-    *total_found = (double)(by_shape * by_shape / shape_variance + sum_of(total));
-    *own_found = (double)sum_of(own);
+    *total_found = (double)(by_shape * by_shape / shape_variance + SUM_OF(total));
+    *own_found = (double)SUM_OF(own);
 }
 
 /* An edge in the stamp: its sharpness, and the table of its light at places that are `step_px` apart. */
@@ -474,7 +469,7 @@ void measure_sources(int64_t height, int64_t width, int64_t background_rows, int
             for (int64_t j = 0; j < LANES; j++)
                 lane[j] += s.weight[p + j] > 0.0f ? s.profile[p + j] : 0.0f;
         double *restrict to = measured + 4 * i;
-        usable[i] = fit.masked <= most_masked && sum_of(lane) > 0.5f;
+        usable[i] = fit.masked <= most_masked && SUM_OF(lane) > 0.5f;
         to[0] = 0.0;
         to[1] = 1.0;
         to[2] = to[3] = 0.0;

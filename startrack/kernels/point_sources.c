@@ -73,11 +73,6 @@ static void place_source(const struct psf *psf, double x, double y)
     fill_profile(psf, y, psf->down, psf->down_slope);
 }
 
-static inline float sum_of(const float lane[LANES])
-{
-    return ((lane[0] + lane[4]) + (lane[2] + lane[6])) + ((lane[1] + lane[5]) + (lane[3] + lane[7]));
-}
-
 /* Of a stamp (n pixels, a multiple of LANES): light, variance and 1 where usable; the source's profile and its slopes
    in x and in y; room for a row. */
 struct stamp {
@@ -165,7 +160,7 @@ static void sum_normal(const struct stamp *s, const struct source *source, doubl
         }
     }
     for (int c = 0; c < COUNT; c++)
-        t[c] = sum_of(lane[c]);
+        t[c] = SUM_OF(lane[c]);
     A[0][0] = flux * flux * (double)t[XX];
     A[1][1] = flux * flux * (double)t[YY];
     A[1][0] = flux * flux * (double)t[XY];
@@ -248,9 +243,9 @@ static void judge(const struct stamp *s, const struct source *source, double sur
             lane[PIXEL][j] += rest * high;
         }
     }
-    const float total = sum_of(lane[TOTAL]), excess = sum_of(lane[LIGHT]);
+    const float total = SUM_OF(lane[TOTAL]), excess = SUM_OF(lane[LIGHT]);
     for (int c = 0; c < FOUND; c++)
-        values[c] = (double)sum_of(lane[c]);
+        values[c] = (double)SUM_OF(lane[c]);
     values[PIXEL] -= (double)(excess * (excess / (total > LEAST ? total : LEAST)));
 }
 
@@ -422,9 +417,9 @@ void compare_shapes(int64_t n, int64_t side, int64_t usable_rows, int64_t m, int
                 lane[TOTAL][j] += moment[p + j] * light[p + j];
             }
         }
-        const float excess = sum_of(lane[EXCESS]), squared = sum_of(lane[SQUARED]);
+        const float excess = SUM_OF(lane[EXCESS]), squared = SUM_OF(lane[SQUARED]);
         misfit[i] = sqrt((double)((excess > 0.0f ? excess : 0.0f) / (squared > LEAST ? squared : LEAST)));
-        edge[i] = (double)(sum_of(lane[TOTAL]) - most_explained(size, directions, stripes, weight, moment, stripe, ends,
+        edge[i] = (double)(SUM_OF(lane[TOTAL]) - most_explained(size, directions, stripes, weight, moment, stripe, ends,
                                                                 (float(*)[2])sums));
     }
 }

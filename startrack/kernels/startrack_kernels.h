@@ -1,7 +1,8 @@
 /* The inner loops of startrack: functions over plain arrays.
 
    Rules for all of them:
-   - The sizes come first. Arrays are contiguous in C order; their shapes stand in brackets in the comments.
+   - The sizes come first. Arrays are contiguous in C order; their shapes stand in brackets in the comments. Sizes may
+     be 0 unless a comment says more; callers check the least ones (`>=` in the declarations in Python).
    - An array that is written to overlaps no other one (`restrict`). Arrays that are only read may be the same.
    - They allocate nothing, keep nothing between calls, and read and write nothing but their arguments.
    - Indices in arrays are those of elements that exist: the callers see to that, the functions do not test it.
@@ -136,14 +137,14 @@ KERNEL void fill_from_blocks(int64_t height, int64_t width, int64_t rows, int64_
                              const int64_t *restrict source, int64_t side, float *restrict values);
 
 /* Fill `residuals` [height, width] with the light of an image above its `background`, in units of its `noise`. Of both
-   there are rows in the middles of blocks of `side` rows. `found`: light of known stars, subtracted, whose noise is
-   `per_unit` of it and the part `found_error`; it may have no rows. */
+   there are rows in the middles of blocks of `side` rows, one at least. `found`: light of known stars, subtracted,
+   whose noise is `per_unit` of it and the part `found_error`; `known` is height, or 0: there are none. */
 KERNEL void fill_residuals(int64_t height, int64_t width, int64_t blocks, int64_t known, const float *restrict image,
                            const float *restrict background, const float *restrict noise, int64_t side,
                            const float *restrict found, float per_unit, float found_error, float *restrict residuals);
 
 /* Fill stamps [n, stamp, stamp] around the pixels `centres` [n, 2], x and y, with the light of an image above its
-   background and with the variance of its noise. The stamps lie in the image. */
+   background and with the variance of its noise; see `fill_residuals`. `stamp` is odd. The stamps lie in the image. */
 KERNEL void cut_light(int64_t height, int64_t width, int64_t blocks, int64_t n, int64_t stamp,
                       const float *restrict image, const float *restrict background, const float *restrict noise,
                       int64_t side, const int64_t *restrict centres, float *restrict light, float *restrict variance);
@@ -155,11 +156,12 @@ KERNEL void cut_light(int64_t height, int64_t width, int64_t blocks, int64_t n, 
    Residuals (see `fill_residuals`), zero beyond the border, are filtered in x and in y by a symmetric kernel, of which
    `taps` [reach + 1] has the middle and one side; reach is a multiple of 4. The local level, times `level_factor`, is
    subtracted: the mean, without values beyond `clipped`, over a square of `coarse` pixels and so many `beside` on each
-   side of it, interpolated between their middles. `dead` pixels are no maxima; it may have no rows.
+   side of it, interpolated between their middles. `dead` pixels are no maxima; `dead_rows` is height, or 0: there are
+   none.
 
    A filtered row follows `lag` rows after that of the image: reach, or with a level coarse (beside + 2), if that is
-   more. Scratch: `rows` [lag + 2 reach + 11, stride], stride: a multiple of 64, at least width + 2 reach and columns +
-   2 beside; `means` [squares, columns], those that cover the image. */
+   more. Scratch: `rows` [lag + 2 reach + 11, stride], stride: a multiple of 64, at least width + 2 reach, coarse *
+   columns and columns + 2 beside; `means` [squares, columns], those that cover the image, which has a pixel at least. */
 KERNEL int64_t find_maxima(int64_t height, int64_t width, int64_t blocks, int64_t known, int64_t reach,
                            int64_t dead_rows, int64_t count, int64_t stride, int64_t squares, int64_t columns,
                            int64_t room, const float *restrict image, const float *restrict background,
@@ -296,7 +298,8 @@ KERNEL void smooth_states(int64_t sectors, int64_t states, const double *restric
                           double *restrict scratch, double *restrict f, double *restrict post);
 
 /* Fill `found` [sectors] with log-likelihoods of each sector by those before it, of a curve at one of the heights [n] of
-   widths `cells`, whose steps have the mean size `rough`, or lead anywhere with probability `jump`. Scratch: [5, n]. */
+   widths `cells`, whose steps have the mean size `rough`, or lead anywhere with probability `jump`; n is at least 1.
+   Scratch: [5, n]. */
 KERNEL void pass_curve(int64_t sectors, int64_t n, const double *restrict likelihood, const double *restrict heights,
                        const double *restrict cells, double rough, double jump, double *restrict scratch,
                        double *restrict found);
@@ -318,8 +321,8 @@ KERNEL int64_t fill_cells(int64_t stars, int64_t sectors, int64_t room, const do
                           int64_t *restrict first, double *restrict x, double *restrict left);
 
 /* Make cells of those given [m], divided in widths of `cell` (radians) where the sky's light shows the skyline, with the
-   `values` [sectors, knots] of that light at heights from `low` on, `step` apart; step 0: none. The number of cells, or
-   -1 where they are more than `room`. */
+   `values` [sectors, knots] of that light at heights from `low` on, `step` apart; step 0: none. There are 4 knots at
+   least. The number of cells, or -1 where they are more than `room`. */
 KERNEL int64_t add_sky(int64_t sectors, int64_t m, int64_t knots, int64_t room, const int64_t *restrict old_first,
                        const double *restrict old_x, const double *restrict old_left, const double *restrict old_right,
                        const double *restrict old_bend, const double *restrict low, const double *restrict step,
@@ -407,9 +410,9 @@ KERNEL void crests(int64_t n, const struct ground *restrict ground, double camer
 KERNEL void surfaces(int64_t n, const struct ground *restrict ground, const double *restrict points,
                      double *restrict up);
 
-/* Fill `found` [n, m] with the horizon (radians) at `points` [n, 2] and columns [rows, m], of each point or of all
-   (rows 1): bilinear between nodes [azimuths, across, across], the east first, about (east, north) from -half to half,
-   less `per_height` [azimuths] times the ground's height above `middle`. */
+/* Fill `found` [n, m] with the horizon (radians) at `points` [n, 2] and columns [rows, m], of each point (rows n) or of
+   all (rows 1): bilinear between nodes [azimuths, across, across], the east first, about (east, north) from -half to
+   half, less `per_height` [azimuths] times the ground's height above `middle`. */
 KERNEL void interpolate_horizons(int64_t azimuths, int64_t across, int64_t n, int64_t rows, int64_t m,
                                  const struct ground *restrict ground, const double *restrict nodes,
                                  const double *restrict per_height, double middle, double east, double north,
@@ -438,8 +441,8 @@ KERNEL void box_bounds(int64_t n, const struct ground *restrict ground, const st
                        const double *restrict azimuths, const double *restrict turn, double *restrict low,
                        double *restrict high);
 
-/* Fill `low` and `high` [n, m] (radians) with bounds over boxes, and azimuths [rows, m] within `turn` of each box or of
-   all (rows 1), from the table. `lows` and `highs` [blocks, blocks, bins]: of its level that fits. Boxes smaller than a
+/* Fill `low` and `high` [n, m] (radians) with bounds over boxes, and azimuths [rows, m] within `turn` of each box (rows
+   n) or of all (rows 1), from the table. `lows` and `highs` [blocks, blocks, bins]: of its level that fits. Boxes smaller than a
    cell take the lines and points of the cells they touch, larger ones the bounds of the level's blocks. */
 KERNEL void sector_bounds(int64_t blocks, int64_t bins, int64_t rows, int64_t m, int64_t n,
                           const struct ground *restrict ground, const struct table *restrict table,
@@ -468,7 +471,7 @@ KERNEL void keep_bounds(int64_t slots, int64_t numbers, int64_t azimuths, int64_
                         const double *restrict high);
 
 /* Fill `found` [n, m] with the largest of the values [across, across, bins], or 0, of the cells from the first to the
-   last [n, 2, 2] of each box, in bins [rows, m, turns] of each box or of all (rows 1). */
+   last [n, 2, 2] of each box, in bins [rows, m, turns] of each box (rows n) or of all (rows 1). */
 KERNEL void largest_of_cells(int64_t across, int64_t bins, int64_t n, int64_t rows, int64_t m, int64_t turns,
                              const float *restrict values, const int64_t *restrict cells,
                              const int64_t *restrict bin, double *restrict found);
@@ -498,7 +501,8 @@ KERNEL int64_t count_alike(int64_t n, int64_t m, const double *restrict v_mag, c
    `usable` [n] for stars at `xy_px` [n, 2], whose stamps of 2 radius + 1 pixels lie inside the image [height, width].
    The stars are ordered by square cells of `side_px`, of `columns` a row; `first` [cells + 1] is each cell's first.
    Neighbours within `reach_px` (at most `side_px`) count by their expected flux, its relative error and their
-   probability to be visible [n]. `background` and `noise` are rows in the middles of blocks of so many rows.
+   probability to be visible [n]. `background` and `noise` are rows, one at least, in the middles of blocks of so many
+   rows.
    `outlier`: squared sigma from which a pixel is masked, at most `most_masked`; `model`: variance of a star's squared
    light; `shape_variance`: of the part by which the background's shape is wrong. `edges` [2, phases + 1, table_places]:
    light of an edge and its slope, at places `step_px` (of the PSF's width `sigma_px`) apart; `flat_excess`,
@@ -519,15 +523,16 @@ KERNEL void measure_sources(int64_t height, int64_t width, int64_t background_ro
                             int64_t *restrict near, float *restrict stamp, double *restrict sums,
                             double *restrict measured, bool *restrict usable);
 
-/* point_sources.c: stamps [n, side, side] of an odd side, of light above the background and of its variance; places are
-   pixels from the middle pixel, at most 4 radii of a stamp (NaN: the lowest); `usable` may have no rows: all pixels are.
+/* point_sources.c: stamps [n, side, side] of an odd side, 3 at least, of light above the background and of its
+   variance; places are pixels from the middle pixel, at most 4 radii of a stamp (NaN: the lowest); `usable_rows` is n, or 0: all
+   pixels are usable.
    Scratch: `profiles` [7, side + 1], `pixels` [7, room], room: the pixels of a stamp, filled up to a multiple of 8. */
 
 /* Fit one source of a PSF `sigma_px` wide to each of the stamps `which` [m], in so many `rounds` from `start_px` on.
-   `signal` [m, side, side], light of neighbours with the relative error `signal_error`, is subtracted; it may have no
-   rows. `per_unit` and `model_error`: noise of the source's own light; `surround` [m]: level of its surroundings. A step
-   is at most `max_step_px`; priors (1 / variance) of a step in place and in flux, and of the level, keep sources without
-   light solvable. Outputs: places `xy_px` [m, 2]; `covariance` of x, y, flux and level; `values` [m, 8]: flux, level,
+   `signal` [signals, side, side], light of neighbours with the relative error `signal_error`, is subtracted; `signals`
+   is m, or 0: there is none. `per_unit` and `model_error`: noise of the source's own light; `surround` [m]: level of its
+   surroundings. A step is at most `max_step_px`; priors (1 / variance) of a step in place and in flux, and of the level,
+   keep sources without light solvable. Outputs: places `xy_px` [m, 2]; `covariance` of x, y, flux and level; `values` [m, 8]: flux, level,
    chi^2, chi^2 of a single pixel, usable pixels, and the sums of the matched filter times the light above the
    surroundings, times the profile, and times the profile with the noise of the own photons. */
 KERNEL void fit_stamps(int64_t n, int64_t side, int64_t usable_rows, int64_t signals, int64_t m, int64_t room,

@@ -41,6 +41,6 @@ def _pass(likelihood: Array, heights: Array, cells: Array, rough: float) -> Arra
 
 
 _pass_curve = kernel(
-    "pass_curve", "likelihood: float64[sectors, n]", "heights: float64[n]", "cells: float64[n]", "rough: float64",
+    "pass_curve", "likelihood: float64[sectors, n >= 1]", "heights: float64[n]", "cells: float64[n]", "rough: float64",
     "jump: float64", "scratch: out float64[5, n]", "found: out float64[sectors]",
 )  # fmt: skip

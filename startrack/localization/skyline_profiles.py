@@ -133,7 +133,7 @@ _cells_of_stars = kernel(
 )  # fmt: skip
 _cells_of_sky = kernel(
     "add_sky", *declare(CELLS), "low: float64[sectors]", "step: float64[sectors]", "cell: float64[sectors]",
-    "values: float64[sectors, knots]", *_MADE, result="int64",
+    "values: float64[sectors, knots >= 4]", *_MADE, result="int64",
 )  # fmt: skip
 _cells_of_error = kernel(
     "average_over_error", *declare(f"{CELLS} integral free guide"), "sigma: float64[sectors]", "low: float64[sectors]",

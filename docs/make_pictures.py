@@ -79,8 +79,8 @@ def make_posterior(solution: Any, folder: Path) -> None:
     horizon = terrain.horizon_rad(middle_m[None], rows.azimuth_rad)
     near = np.abs(rows.elevation_rad - horizon.ravel()) < NEAR_RAD
     panels = [
-        ("Whole crater floor", np.zeros(2), 10_000.0, 1e-3, rows.take(np.abs(rows.llr) > WIDE_LLR)),
-        ("Enlarged", middle_m, 2 * by_stars.radius95_m, 1.0, rows.take(near)),
+        ("By the stars: whole crater floor", np.zeros(2), 10_000.0, 1e-3, rows.take(np.abs(rows.llr) > WIDE_LLR)),
+        ("By the stars: enlarged", middle_m, 2 * by_stars.radius95_m, 1.0, rows.take(near)),
     ]
     with plt.rc_context(DARK):
         figure, all_axes = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained")
@@ -97,7 +97,7 @@ def make_posterior(solution: Any, folder: Path) -> None:
             drawn = axes.imshow(
                 shown.reshape(141, 141), origin="lower", extent=extent * scale, cmap="inferno", vmin=lowest,
             )  # fmt: skip
-            units, density = ("km", "log posterior") if scale < 1 else ("m", "posterior, relative")
+            units, density = ("km", "logarithm of the posterior") if scale < 1 else ("m", "posterior, relative")
             axes.set(title=title, xlabel=f"east, {units}", ylabel=f"north, {units}")
             axes.ticklabel_format(useOffset=False)
             axes.locator_params(nbins=4)

@@ -70,7 +70,8 @@ GROUPS: dict[str, tuple[Figure, ...]] = {
         Figure("Real starlight over invented craters", "Real starlight", (), ""),
         Figure("Real skyline by day (Finse, snow), attitude known to 0.02 degrees", "Real ground",
                ("2019-05-24, snow", "0.02, 0.02"),
-               "{along the line of sight, m} m along, {across, m} m across the line of sight; its 95 % circle: {95 %, m} m"),
+               "{along the line of sight, m} m along, {across, m} m across the line of sight; "
+               "its 95 % circle: {95 %, m} m"),
         Figure("The same, heading open and tilt to 3 degrees", "Real ground", ("2019-05-24, snow", "180, 3"),
                "{along the line of sight, m} m along, {across, m} m across; its 95 % circle: {95 %, m} m"),
         Figure("Horizon of an all-sky camera, pictures against each other", "Skylines of a camera held out",
@@ -100,8 +101,8 @@ GROUPS: dict[str, tuple[Figure, ...]] = {
                "{time against sep} of the time of sep"),
     ),
     "Speed and safety": (
-        Figure("CPU of one warm frame, file to position, in times of sep's extraction alone", "One frame", ("total over sep",),
-               "{median}"),
+        Figure("CPU of one warm frame, file to position, in times of sep's extraction alone", "One frame",
+               ("total over sep",), "{median}"),
         Figure("Mutated PNG files", "Mutated files", ("png",),
                "{tried} tried: {internal errors} internal errors, {hangs} hangs"),
     ),

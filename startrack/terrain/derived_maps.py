@@ -189,5 +189,5 @@ class HorizonInterpolator(ForwardingTerrain):
 _interpolate = kernel(
     "interpolate_horizons", "ground: ground", "nodes: float64[azimuths, across, across]",
     "per_height: float64[azimuths]", "middle: float64", "east: float64", "north: float64", "half: float64",
-    "points: float64[n, 2]", "column: int64[rows >= 1, m]", "found: out float64[n, m]",
+    "points: float64[n, 2]", "column: int64[rows, m]", "found: out float64[n, m]",
 )  # fmt: skip

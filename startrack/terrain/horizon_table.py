@@ -246,7 +246,7 @@ box_bounds = kernel(
 )  # fmt: skip
 sector_bounds = kernel(
     "sector_bounds", "ground: ground", "table: table", "lows: uint16[blocks, blocks, bins]",
-    "highs: uint16[blocks, blocks, bins]", "camera_height: float64", "azimuths: float64[rows >= 1, m]",
+    "highs: uint16[blocks, blocks, bins]", "camera_height: float64", "azimuths: float64[rows, m]",
     "turn: float64[rows, m]", "centres: float64[n, 2]", "half: float64[n]", "low: out float64[n, m]",
     "high: out float64[n, m]",
 )  # fmt: skip
@@ -264,5 +264,5 @@ _keep_bounds = kernel(
 )  # fmt: skip
 _largest_of_cells = kernel(
     "largest_of_cells", "values: float32[across, across, bins]", "cells: int64[n, 2, 2]",
-    "bin: int64[rows >= 1, m, turns]", "found: out float64[n, m]",
+    "bin: int64[rows, m, turns]", "found: out float64[n, m]",
 )  # fmt: skip

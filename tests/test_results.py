@@ -92,7 +92,7 @@ def test_the_front_page_states_measured_figures(monkeypatch):
     monkeypatch.setattr(sys, "path", [str(ROOT / "docs"), *sys.path])
     figures = importlib.import_module("measured_figures")
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    stated = re.search(r"to ([\d.]+) m by its stars, and to ([\d.]+) m with the light of the sky", text)
+    stated = re.search(r"is ([\d.]+) m by the stars, and ([\d.]+) m with the light of the sky", text)
     kua = re.search(r"gives (\d+) m on such pictures", text)
     blocks = [block for name in figures.FRONT_PAGE for block in figures.result_of(name)["blocks"]]
     cells = {tuple(row[:2]): row for block in blocks for row in block.get("rows", [])}

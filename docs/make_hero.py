@@ -41,13 +41,7 @@ WIDE, HIGH = 13.5, 9.0  # inches
 
 def main() -> None:
     """Draw and store the picture."""
-    solution = startrack.locate(SAMPLE)
-    with tempfile.TemporaryDirectory() as folder:
-        solution.write(folder)
-        layers = layers_of((Path(folder) / "near-wall.annotated.png").read_bytes())
-        stars = Table.read(Path(folder) / "near-wall.stars.ecsv")
-    if layers is None:
-        raise SystemExit("the annotated picture has no layers")
+    solution, layers, stars = locate_sample()
     figure = plt.figure(figsize=(WIDE, HIGH), facecolor=DARK)
     draw_sky(figure.add_axes((0.0, 0.0, HIGH / WIDE, 1.0)), layers, stars)
     draw_map(figure.add_axes((0.69, 0.42, 0.29, 0.435)), solution)
@@ -59,6 +53,18 @@ def main() -> None:
     stored = BytesIO()
     figure.savefig(stored, dpi=120, facecolor=DARK)
     save_webp(Image.open(stored), "hero", width_px=1400)
+
+
+def locate_sample() -> tuple[startrack.Solution, Layers, Table]:
+    """The solution of the sample, the layers of its annotated picture, and its table of stars."""
+    solution = startrack.locate(SAMPLE)
+    with tempfile.TemporaryDirectory() as folder:
+        solution.write(folder)
+        layers = layers_of((Path(folder) / "near-wall.annotated.png").read_bytes())
+        stars = Table.read(Path(folder) / "near-wall.stars.ecsv")
+    if layers is None:
+        raise SystemExit("the annotated picture has no layers")
+    return solution, layers, stars
 
 
 def draw_sky(axes: Axes, layers: Layers, stars: Table) -> None:

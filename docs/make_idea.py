@@ -7,9 +7,7 @@ Needs the extra `plots`.
 
 from __future__ import annotations
 
-import tempfile
 from io import BytesIO
-from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -17,13 +15,24 @@ import numpy as np
 from astropy.table import Table
 from PIL import Image
 
-import startrack
 from startrack.core.types import Array
-from startrack.output.picture.annotate import Layers, layers_of
+from startrack.output.picture.annotate import Layers
 
 matplotlib.use("Agg")
-from make_hero import DARK, EDGE, FAINTEST_RING, HIDDEN, NAMED_SEEN, PLACE, SEEN, WALL, draw_wall, write_name
-from make_pictures import SAMPLE, save_webp
+from make_hero import (
+    DARK,
+    EDGE,
+    FAINTEST_RING,
+    HIDDEN,
+    NAMED_SEEN,
+    PLACE,
+    SEEN,
+    WALL,
+    draw_wall,
+    locate_sample,
+    write_name,
+)  # fmt: skip
+from make_pictures import save_webp
 from matplotlib import patheffects
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
@@ -39,13 +48,7 @@ ROVER_KM, RIM_KM, DEEP_KM = -8.3, 10.0, 2.0  # of the sample, seen from the sout
 
 def main() -> None:
     """Draw and store the pictures."""
-    solution = startrack.locate(SAMPLE)
-    with tempfile.TemporaryDirectory() as folder:
-        solution.write(folder)
-        layers = layers_of((Path(folder) / "near-wall.annotated.png").read_bytes())
-        stars = Table.read(Path(folder) / "near-wall.stars.ecsv")
-    if layers is None:
-        raise SystemExit("the annotated picture has no layers")
+    solution, layers, stars = locate_sample()
     store("idea-1-crater", draw_crater, layers)
     store("idea-2-stars", draw_stars, layers, stars)
     store("idea-3-attitude", draw_sphere, solution)

@@ -622,7 +622,7 @@ MATH_H = """
 #define signbit(x) __builtin_signbit(x)
 double exp(double), log(double), log10(double), sqrt(double), fabs(double), floor(double), ceil(double), rint(double);
 double fmod(double, double), erf(double), copysign(double, double);
-double sin(double), cos(double), tan(double), atan2(double, double);
+double sin(double), cos(double), tan(double), atan(double), atan2(double, double);
 float sqrtf(float), fabsf(float);
 """
 

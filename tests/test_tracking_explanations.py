@@ -23,8 +23,8 @@ from startrack.applications.tracking.explanations import (
     STRAIGHT,
     Explanations,
 )
+from startrack.applications.tracking.files import tum_text
 from startrack.applications.tracking.moves import LEG_SIGMA_1, Moves
-from startrack.applications.tracking.write import tum_text
 from startrack.core.errors import BadInput
 from startrack.core.types import Array
 from startrack.estimation.observations import FrameEstimate, OdometryErrors, Steps

@@ -70,7 +70,7 @@ def test_a_leg_that_slips_is_found_and_named(factor, turned_deg):
         record = track_record(track)
         Draft202012Validator(TRACK).validate(record)
         assert record["counts"]["slips"] == sum(one["moves"] for one in record["legs"]) >= 3
-        assert track.leg_texts[0] in track_page(track, b"", title="drive")
+        assert track.leg_texts[0] in track_page(track, title="drive")
     assert max(worst) < 1.2 and np.count_nonzero(np.array(worst) > 1.0) <= 1
     first, last, found, turned = np.median(named, axis=0)
     assert (first, last) == pytest.approx((3, 7), abs=0.6)

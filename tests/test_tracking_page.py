@@ -12,13 +12,11 @@ import pytest
 from html_helpers import DESKTOP, PHONE, Window
 from synthetic_track import NASTY, odometry_alone, synthetic_track
 
-from startrack.applications.tracking.write import track_page
+from startrack.applications.tracking.files import track_page
 from startrack.estimation.trajectory import radius_holding
-from startrack.output import png_bytes
 
 pytestmark = pytest.mark.slow
 
-PICTURE = png_bytes(np.full((40, 60, 3), 90, dtype=np.uint8))
 TITLE = 'A drive & </script><i>"more"</i>'
 
 
@@ -29,7 +27,7 @@ def data_of(text: str) -> dict[str, Any]:
 def test_the_page_holds_the_frames_and_needs_nothing_else():
     track = synthetic_track(unknown=1)
     odometry_m = odometry_alone(track)
-    text = track_page(track, PICTURE, title=TITLE, odometry_m=odometry_m)
+    text = track_page(track, title=TITLE, odometry_m=odometry_m)
     data = data_of(text)
     frames = data["frames"]
     assert {len(values) for values in frames.values()} == {8}
@@ -39,14 +37,13 @@ def test_the_page_holds_the_frames_and_needs_nothing_else():
     expected = radius_holding(track.filtered.covariance_m2[1:], 0.95)
     np.testing.assert_allclose(frames["filtered_radius95_m"][1:], expected, atol=1e-4)
     np.testing.assert_allclose(data["odometry"], odometry_m[1:], atol=1e-3)
-    assert data["picture"].startswith("data:image/png;base64,")
     assert TITLE not in text and not re.search(r"https?://", text)
 
     assert [one for one in re.findall(r'(?:src|href)="([^"]*)"', text) if "data:" not in one] == ["#main"]
 
 
 def test_a_page_without_a_position_can_be_made():
-    data = data_of(track_page(synthetic_track(unknown=8), PICTURE, title="nothing"))
+    data = data_of(track_page(synthetic_track(unknown=8), title="nothing"))
     assert set(data["frames"]["radius95_m"]) == {None}
     assert data["odometry"] is None
 
@@ -57,7 +54,7 @@ def window(chromium, tmp_path) -> Iterator[Any]:
 
     def make(track, size=DESKTOP, scheme="light", odometry_m=None) -> Window:
         page = tmp_path / f"{len(opened)}.html"
-        page.write_text(track_page(track, PICTURE, title=TITLE, odometry_m=odometry_m), encoding="utf-8")
+        page.write_text(track_page(track, title=TITLE, odometry_m=odometry_m), encoding="utf-8")
         opened.append(Window(chromium, page, size, scheme))
         return opened[-1]
 

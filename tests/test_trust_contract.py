@@ -29,7 +29,7 @@ from localization_helpers import Delegating
 
 import startrack
 from startrack.api.solution import Solution
-from startrack.applications.tracking.write import track_record
+from startrack.applications.tracking.files import track_record
 from startrack.chain import Refused, Settings, locate_rays, pipeline
 from startrack.core.types import Array, Evidence, Fix, NoSolution
 from startrack.localization import ExactPosterior

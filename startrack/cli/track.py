@@ -290,9 +290,8 @@ class TrackRun:
         if pictures and not args.no_plots:
             if odometry is not None and not track.odometry_fault:
                 moves_m = self.session.odometry_positions_m(track, self._odometry())
-            picture = png_bytes(tracking.draw_track(track, moves_m))
             title = f"Track of {Path(args.frames[0]).resolve().name}"
-            page = tracking.track_page(track, picture, title=title, odometry_m=moves_m)
-            made = {"track.png": picture, "track.html": page.encode()}
+            page = tracking.track_page(track, title=title, odometry_m=moves_m)
+            made = {"track.png": png_bytes(tracking.draw_track(track, moves_m)), "track.html": page.encode()}
         tracking.write_track(track, Path(args.dir), odometry=odometry, pictures=made)
         self.has_written = True

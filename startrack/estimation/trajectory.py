@@ -2,8 +2,8 @@
 
 A Kalman filter has the last position, the errors that frames and moves share, and the errors of all posts and waves of
 the map that a recent observation has depended on, in standard deviations. Posts that were not seen for the longest time
-are left out, so that memory stays flat; where they are seen again, they count as new. Positions of earlier frames may be
-part of the state, where each observation moves them by their covariance with the others. That is a fixed-point
+are left out, so that memory stays flat; where they are seen again, they count as new. Positions of earlier frames may
+be part of the state, where each observation moves them by their covariance with the others. That is a fixed-point
 smoother, whose last result is the estimate by all frames. Source: Anderson and Moore 1979, Optimal Filtering, 7.2.
 """
 

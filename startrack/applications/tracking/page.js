@@ -233,7 +233,6 @@ host.append(
   make("h1", { tabindex: "-1" }, page.title), make("p", { class: "lead" }, leadText()),
   section("Map", make("p", { class: "dim" }, "Ellipses hold 95 % and have their true size: zoom in to see small ones. A click on a position chooses its frame."), make("div", { class: "beside" }, map.node, make("div", {}, chosen, radii.node))),
   slider(), section("Frames", table()),
-  make("details", { class: "card" }, make("summary", {}, "Picture"), make("img", { class: "whole", src: page.picture, alt: "Map of the track with the stated errors by frame" })),
 );
 host.hidden = false;
 choose(current);

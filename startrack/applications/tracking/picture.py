@@ -1,113 +1,129 @@
-"""The picture of a track: a map with its positions and ellipses, the search area, and the stated errors by frame."""
+"""The picture of a track: a map with its positions and 95 % ellipses, odometry alone, and frames not used."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.applications.tracking.track import Track
-from startrack.applications.tracking.track_map import ODOMETRY, REFUSED, draw_track_map
+from startrack.applications.tracking.track import Track, Trajectory
 from startrack.core.errors import length_text
 from startrack.core.types import Array
-from startrack.output import MARGIN_PX, SIDE_PX, TEXT_PX, TITLE_PX, Axes, Box, Canvas, Colour, Ink, Map, draw_overview
+from startrack.estimation.trajectory import SIGMAS_95
+from startrack.output import MARGIN_PX, SIDE_PX, TEXT_PX, TITLE_PX, Box, Canvas, Ink, Legend, Map, ellipse_m, nice_step
 
-PANEL_PX, GRAPH_PX = 22.5 * TEXT_PX, 15 * TEXT_PX  # beside and below the map
 MAP_BOX: Box = (MARGIN_PX, MARGIN_PX, MARGIN_PX + SIDE_PX, MARGIN_PX + SIDE_PX)
-PANEL: Box = (MAP_BOX[2] + 2 * TEXT_PX, MARGIN_PX, MAP_BOX[2] + 2 * TEXT_PX + PANEL_PX, MARGIN_PX + PANEL_PX)
-TRACK_WIDTH_PX, TRACK_HEIGHT_PX = round(PANEL[2] + 2 * TEXT_PX), round(MAP_BOX[3] + 2.5 * MARGIN_PX + GRAPH_PX)
-LOGARITHMIC = 8.0  # a scale whose ends have a larger ratio
-
-Series = list[tuple[str, Colour, Array]]  # names, colours, and lengths (n,) [m], nan or infinite where not known
+PANEL_PX = 22.5 * TEXT_PX  # beside the map
+TRACK_SIZE_PX = round(MAP_BOX[2] + 4 * TEXT_PX + PANEL_PX), round(MAP_BOX[3] + MARGIN_PX)
+ODOMETRY, UNUSED = Ink.YELLOW, Ink.PURPLE
+SEEN_PX = 14.0  # half of the longer axis that the median ellipse has at least
+SMALLEST_HALF_M = 0.05
+WIDEST = 25.0  # ellipse that the map has room for, in half axes of the last one
 
 
 def draw_track(track: Track, odometry_m: Array | None = None) -> NDArray[np.uint8]:
-    """The picture (H, W, 3), red, green, blue.
-
-    A map of the smoothed track with the filtered positions and 95 % ellipses, enlarged where they would be too small;
-    of a camera at rest, the position after each exposure. Beside it the search area, below it the stated 95 % radii.
+    """The picture (H, W, 3), red, green, blue: the map, and beside it the track in words and a legend.
 
     Args:
         track: with n frames.
         odometry_m: positions (n, 2) in enu by odometry alone, from the first smoothed position; None: not known.
     """
-    canvas = Canvas(TRACK_WIDTH_PX, TRACK_HEIGHT_PX)
+    canvas = Canvas(*TRACK_SIZE_PX)
     title = f"{'camera at rest' if track.at_rest else 'track'} on {track.terrain.name}"
     canvas.text((MAP_BOX[0], 0.7 * MARGIN_PX), title, Ink.PLAIN, size=TITLE_PX)
     drawn, legend = draw_track_map(canvas, MAP_BOX, track, odometry_m)
     drawn.draw_distances()
-    _draw_extent(draw_overview(canvas, PANEL, track.terrain), drawn)
-    y = PANEL[3] + 2 * TEXT_PX
+    left, y = MAP_BOX[2] + 2 * TEXT_PX, MAP_BOX[1] + TEXT_PX
     for line in _facts(track):
-        y = canvas.paragraph(PANEL[0], y, line, PANEL_PX, Ink.PLAIN)
-    canvas.legend(PANEL[0], y + TEXT_PX, PANEL_PX, legend)
-    filtered, smoothed = track.filtered.radius95_m, track.smoothed.radius95_m
-    unused = np.array([frame.status != "used" for frame in track.frames], dtype=bool)
-    left, right, bottom = MAP_BOX[0], PANEL[2], TRACK_HEIGHT_PX - MARGIN_PX
-    middle = right if odometry_m is None else 0.5 * (left + right - MARGIN_PX)
-    radii: Series = [("filtered", Ink.BLUE, filtered), ("smoothed", Ink.POSITION, smoothed)]
-    draw_graph(canvas, (left, bottom - GRAPH_PX, middle, bottom), "stated 95 % radius [m]", radii, unused, True)
-    if odometry_m is not None:
-        away_m = np.linalg.norm(odometry_m - track.smoothed.position_enu_m[:, :2], axis=1)
-        box = (middle + MARGIN_PX, bottom - GRAPH_PX, right, bottom)
-        draw_graph(canvas, box, "odometry alone, from the smoothed track [m]", [("", ODOMETRY, away_m)], unused)
+        y = canvas.paragraph(left, y, line, PANEL_PX, Ink.PLAIN)
+    canvas.legend(left, y + TEXT_PX, PANEL_PX, legend)
     return canvas.rendered_pixels()
-
-
-def _draw_extent(overview: Map, drawn: Map) -> None:
-    """Where a map lies in the search area: its edge, and a ring where that is too small to see."""
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * drawn.half_m + drawn.centre_m
-    places = overview.canvas_px(corners)
-    overview.window.line(places, Ink.POSITION, 2, closed=True)
-    if np.ptp(places[:, 0]) < TEXT_PX:
-        overview.window.mark(places.mean(axis=0), "ring", 0.7 * TEXT_PX, Ink.POSITION)
 
 
 def _facts(track: Track) -> list[str]:
     """What the track rests on, and its last position."""
     statuses = [frame.status for frame in track.frames]
-    counts = ", ".join(
-        f"{statuses.count(status)} {words}"
-        for status, words in (("used", "used"), ("left_out", "left out"), ("refused", "refused"))
-        if status == "used" or status in statuses
-    )
-    lines = [f"{len(statuses)} frames: {counts}"]
-    if statuses:
-        start, end = (f"{track.frames[k].time_utc:%Y-%m-%d %H:%M:%S}" for k in (0, -1))
-        lines.append(f"{start} to {end} UTC")
-    radius_m = track.smoothed.radius95_m
-    known = np.flatnonzero(np.isfinite(radius_m))
+    parts = [f"{statuses.count(one)} {one.replace('_', ' ')}" for one in dict.fromkeys(["used", *sorted(statuses)])]
+    start, end = (f"{track.frames[k].time_utc:%Y-%m-%d %H:%M:%S}" for k in (0, -1))
+    lines = [f"{len(statuses)} frames: {', '.join(parts)}", f"{start} to {end} UTC"]
+    known = np.flatnonzero(np.isfinite(track.smoothed.radius95_m))
     if len(known):
-        east_m, north_m, _ = track.smoothed.position_enu_m[known[-1]]
+        (east_m, north_m, _), radius_m = track.smoothed.position_enu_m[known[-1]], track.smoothed.radius95_m[known]
         lines += [
             f"last position: E {east_m:.1f} m  N {north_m:.1f} m",
-            f"95 % within {length_text(radius_m[known[-1]])} of it",
+            f"95 % within {length_text(radius_m[-1])} of it",
         ]
-    if len(known) > 1 and not track.at_rest:
-        lines.append(f"95 % radius of all, smoothed: median {length_text(float(np.median(radius_m[known])))}")
-    lines += track.crater_texts
-    slips = f"slips of the odometry: {np.count_nonzero(track.slipped)} moves in {len(track.legs)} legs"
-    return lines + ([slips] if track.slipped.any() else [])
+        lines += [f"95 % radius of all, smoothed: median {length_text(float(np.median(radius_m)))}"]
+    return [*lines, *track.crater_texts, *track.leg_texts]
 
 
-def draw_graph(
-    canvas: Canvas, box: Box, caption: str, series: Series, unused: NDArray[np.bool_], logarithmic: bool = False
-) -> None:
-    """Lengths [m] of the `series` above the number of the frame in the `box` of the `canvas`, below a `caption`.
+def track_extent(track: Track, odometry_m: Array | None = None) -> tuple[tuple[float, float], float]:
+    """Centre (east, north) and half side [m] of a map of the `track`; the search area where no position is known."""
+    shown = track.filtered if track.at_rest else track.smoothed
+    around = known_points(np.concatenate([shown.position_enu_m[:, :2], *([] if odometry_m is None else [odometry_m])]))
+    if not len(around):
+        return (0.0, 0.0), track.terrain.search_radius_m
+    low, high = around.min(axis=0), around.max(axis=0)
+    axis = half_axes_95_m(shown.covariance_m2)
+    axis = axis[np.isfinite(axis)]
+    widest = min(float(axis.max(initial=SMALLEST_HALF_M)), WIDEST * float(axis[-1]) if len(axis) else np.inf)
+    east, north = (float(x) for x in 0.5 * (low + high))
+    span = float((high - low).max())
+    return (east, north), max(0.57 * span, 0.5 * span + 1.3 * widest)
 
-    There is a cross below each frame that is `unused` (n,). `logarithmic`: where the lengths differ much.
-    """
-    values = np.concatenate([values for _, _, values in series])
-    known, count = values[np.isfinite(values) & (values >= 0)], len(unused)
-    low, high = float(known.min(initial=np.inf)), float(known.max(initial=0.0)) or 1.0
-    logarithmic = logarithmic and 0 < LOGARITHMIC * low < high
-    y = (0.8 * low, 1.25 * high) if logarithmic else (0.0, 1.15 * high)
-    axes = Axes(canvas, box, (0.5, count + 0.5), y, "y" if logarithmic else "")
-    names = [(name, colour) for name, colour, _ in series]
-    names += [("x: frame not used", REFUSED)] if unused.any() else []
-    step = max(1, round(float(np.diff(axes.ticks("x")).min(initial=count))))
-    axes.draw_scales(caption, "frame", names, np.array(sorted({1, *range(step, count + 1, step)})))
-    frame = np.arange(1.0, count + 1)
-    for _, colour, values in series:
-        axes.draw_curve(frame, values, colour, TEXT_PX / (5 if count < 150 else 10))
-    for x in frame[unused]:
-        canvas.mark(axes.canvas_px(x, y[0]) - (0, TEXT_PX / 2), "cross", TEXT_PX / 4, REFUSED)
+
+def half_axes_95_m(covariance_m2: Array) -> Array:
+    """Longer half axes (n,) [m] of the 95 % ellipses of covariances (n, 2, 2); infinite where these are."""
+    known = np.isfinite(covariance_m2).all(axis=(1, 2))
+    axis = np.full(len(covariance_m2), np.inf)
+    axis[known] = SIGMAS_95 * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance_m2[known])[:, 1], 0.0))
+    return axis
+
+
+def known_points(points_m: Array) -> Array:
+    """The points (n, 2) that are known."""
+    return points_m[np.isfinite(points_m).all(axis=1)]
+
+
+def draw_track_map(canvas: Canvas, box: Box, track: Track, odometry_m: Array | None) -> tuple[Map, Legend]:
+    """Draw the map into the box; returns it and its legend."""
+    drawn = Map.of_extent(canvas, box, *track_extent(track, odometry_m))
+    drawn.draw_ground(track.terrain)
+    words, window = drawn.draw_heights(track.terrain), drawn.window
+    shown, colour = (track.filtered, Ink.BLUE) if track.at_rest else (track.smoothed, Ink.POSITION)
+    times = _draw_ellipses(drawn, shown, colour)
+    legend: Legend = [("ring", colour, "95 % ellipses" + (f", enlarged {times:g} times" if times > 1 else ""))]
+    if odometry_m is not None:
+        window.line(drawn.canvas_px(known_points(odometry_m)), ODOMETRY, 2)
+        legend += [("line", ODOMETRY, "odometry alone")]
+    smoothed, filtered = (drawn.canvas_px(one.position_enu_m[:, :2]) for one in (track.smoothed, track.filtered))
+    window.line(known_points(smoothed), Ink.POSITION, 3)
+    for place in known_points(filtered):
+        window.mark(place, "disc", TEXT_PX / (5 if len(filtered) < 200 else 8), Ink.BLUE)
+    legend += [("line", Ink.POSITION, "smoothed: by all frames"), ("disc", Ink.BLUE, "filtered: by those up to each")]
+    status, slipped = np.array([frame.status for frame in track.frames], dtype=np.str_), np.flatnonzero(track.slipped)
+    for kind, ink, what, at in (
+        ("cross", UNUSED, "refused frame", smoothed[status == "refused"]),
+        ("plus", UNUSED, "frame left out", smoothed[status == "left_out"]),
+        ("ring", ODOMETRY, "slip of the odometry", 0.5 * (smoothed[slipped] + smoothed[slipped + 1])),
+        ("plus", Ink.POSITION, "last position", smoothed[-1:]),
+    ):  # fmt: skip
+        for place in known_points(at):
+            window.mark(place, kind, 0.45 * TEXT_PX, ink, 2 if kind == "ring" else 3)
+        legend += [(kind, ink, what)] if len(at) else []
+    drawn.draw_frame(words)
+    return drawn, legend
+
+
+def _draw_ellipses(drawn: Map, shown: Trajectory, colour: Ink) -> float:
+    """Ellipses of positions, each clear of the last one's centre; returns how much they are enlarged."""
+    axis_m, last = half_axes_95_m(shown.covariance_m2), None
+    known = np.flatnonzero(np.isfinite(axis_m))
+    median_px = max(float(np.median(axis_m[known])) / drawn.metres_per_px, 1e-6) if len(known) else SEEN_PX
+    times = 1.0 if median_px >= SEEN_PX else nice_step(2.5 * SEEN_PX / median_px)
+    for k in known:
+        centre_m = shown.position_enu_m[k, :2]
+        if last is None or k == known[-1] or np.linalg.norm(centre_m - last) > 0.8 * times * axis_m[k]:
+            last = centre_m
+            outline = ellipse_m(tuple(centre_m.tolist()), (times * SIGMAS_95) ** 2 * shown.covariance_m2[k])
+            drawn.window.curve(drawn.canvas_px(outline[:-1]), colour, 1.6, closed=True)
+    return times

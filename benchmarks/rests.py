@@ -20,8 +20,8 @@ from _results import table, write_section
 from drives import RADIUS_M, SLOPE_RAD, mean_error_and_nees
 
 from startrack.applications.tracking import ObservedFrame, TrackErrors
-from startrack.applications.tracking.filtered_positions import positions_at_rest
 from startrack.applications.tracking.frame_estimate import estimate_frame
+from startrack.applications.tracking.positions import positions_at_rest
 from startrack.catalog import load_catalog
 from startrack.terrain import HeightMap, load_terrain
 

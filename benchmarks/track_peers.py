@@ -19,8 +19,8 @@ from _drive_frames import frames_by_evidence
 from _results import table, write_section
 from drives import Case, course_of, odometry
 
-from startrack.applications.tracking.filtered_positions import filter_positions
 from startrack.applications.tracking.moves import Moves
+from startrack.applications.tracking.positions import filter_positions
 from startrack.estimation.trajectory import smooth
 
 CASE = Case(40, 50.0, 900.0, degraded=True)

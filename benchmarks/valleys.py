@@ -29,7 +29,7 @@ from _sky_view import Hazard, Rng, View, expose, smooth_noise, turn
 
 from startrack.applications.reproduction.valley import BELOW_RAD, DARK_RAD, draw_floor, draw_time, jacksboro
 from startrack.applications.tracking import TrackErrors, observe_frame
-from startrack.applications.tracking.filtered_positions import positions_at_rest
+from startrack.applications.tracking.positions import positions_at_rest
 from startrack.camera import Camera, load_camera
 from startrack.catalog import NIGHT_RAD, load_catalog
 from startrack.chain import Located, locate

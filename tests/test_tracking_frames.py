@@ -8,7 +8,6 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 
-from startrack.applications.tracking.filtered_positions import positions_at_rest
 from startrack.applications.tracking.frame_estimate import (
     FIRST_WAVE,
     MIN_NOISE_SHARE,
@@ -23,6 +22,7 @@ from startrack.applications.tracking.observed_frame import (
     observe_again,
     observe_frame,
 )
+from startrack.applications.tracking.positions import positions_at_rest
 from startrack.applications.tracking.track_errors import BIAS, CLOCK, DEPTH, EDGE, TrackErrors
 from startrack.core.types import BadInput, Clock, Evidence, ImageErrors, ShownError
 from startrack.estimation.observations import Steps

@@ -12,9 +12,8 @@ from startrack.applications.tracking import ObservedFrame, Odometry, TrackSessio
 from startrack.applications.tracking import session as session_module
 from startrack.applications.tracking.explanations import BEGINS, CONTINUES, explain
 from startrack.applications.tracking.explanations import WINDOW as SETTLED_AFTER
-from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions
-from startrack.applications.tracking.moves import Moves
-from startrack.applications.tracking.odometry_moves import odometry_moves
+from startrack.applications.tracking.moves import Moves, odometry_moves
+from startrack.applications.tracking.positions import OnlineTrack, filter_positions
 from startrack.core.errors import BadInput
 from startrack.core.types import Array
 from startrack.estimation.observations import USUAL_ODOMETRY, FrameEstimate
@@ -66,6 +65,14 @@ def test_a_window_shorter_than_a_slipped_leg_changes_no_answer(monkeypatch):
     assert (np.linalg.norm(position[known, :2] - truth[known], axis=1) < 1.5 * radius[known]).all()
 
 
+def part_of(moves: Moves, first: int, frames: int) -> Moves:
+    """The moves between so many frames from number `first` on."""
+    turn, which = np.concatenate([moves.turn[:1], moves.turn[first + 1 :][:frames]]), slice(first, first + frames - 1)
+    return replace(
+        moves, turn=turn, delta_m=moves.delta_m[which], sigma_m=moves.sigma_m[which], freedom_m=moves.freedom_m[which]
+    )  # fmt: skip
+
+
 def followed(
     modes: Sequence[Sequence[FrameEstimate]], moves: Sequence[Moves], window: int = WINDOW
 ) -> Iterator[OnlineTrack]:
@@ -73,7 +80,7 @@ def followed(
     online = OnlineTrack(1, window)
     for k, of in enumerate(modes):
         first = online.first
-        online.add(of, [one.part(first, k + 1 - first) for one in moves], first)
+        online.add(of, [part_of(one, first, k + 1 - first) for one in moves], first)
         yield online
 
 
@@ -108,7 +115,7 @@ def test_what_a_live_track_keeps_does_not_grow():
         sizes.append((len(online._modes), len(explained._frames), explained._branches.history.shape[1], k - first))
         first = online.first
     assert np.max(sizes[WINDOW:], axis=0).tolist() == [WINDOW, WINDOW, WINDOW, WINDOW + 1]
-    assert np.linalg.norm(online.position_m - drive.position_m[-1]) < 4.0 * np.sqrt(np.trace(online.covariance_m2))
+    assert np.linalg.norm(online.position[0] - drive.position_m[-1]) < 4.0 * np.sqrt(np.trace(online.position[1]))
 
 
 def with_groups(*lengths: int, together: bool = True) -> tuple[list[ObservedFrame], Odometry, Array]:
@@ -142,13 +149,21 @@ def test_images_that_contradict_what_is_settled_are_a_track_of_their_own(first, 
         used = [k + live._first for k in np.flatnonzero(live._best.mode >= 0).tolist()]
         assert max(used) < first or min(used) >= first
         assert (live.is_vouched, live.mode) == (whole.is_vouched, whole.mode)
-        np.testing.assert_allclose(live.position_m, whole.position_m, atol=0.5)
-        sigma_m = [np.sqrt(np.trace(one.covariance_m2)) for one in (live, whole)]
+        np.testing.assert_allclose(live.position[0], whole.position[0], atol=0.5)
+        sigma_m = [np.sqrt(np.trace(one.position[1])) for one in (live, whole)]
         assert sigma_m[0] == pytest.approx(sigma_m[1], rel=0.2)
     assert live.compared.settled > WINDOW and live.is_vouched == is_known
     if is_known:
-        off = live.position_m - truth[-1] - [1000.0, 300.0]
-        assert off @ np.linalg.solve(live.covariance_m2, off) < 9.0
+        off = live.position[0] - truth[-1] - [1000.0, 300.0]
+        assert off @ np.linalg.solve(live.position[1], off) < 9.0
+
+
+def test_a_pair_of_images_from_elsewhere_that_agree_is_settled():
+    frames, odometry, truth = with_groups(WINDOW, 2, 2 * WINDOW)
+    (*_, live) = followed([one.modes for one in frames], odometry_moves(frames, odometry, USUAL_ODOMETRY))
+    assert live.compared.settled == len(frames) - WINDOW
+    off = live.position[0] - truth[-1]
+    assert live.is_vouched and off @ np.linalg.solve(live.position[1], off) < 9.0
 
 
 def test_two_groups_of_which_neither_is_clearly_right_are_not_settled(monkeypatch):

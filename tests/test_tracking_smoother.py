@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from tracking_helpers import STEP_SIGMA_M, Drive, mean_nees, shifted, simulate_drive, with_slips
 
-from startrack.applications.tracking.contradictions import RobustTrack, conclude
 from startrack.applications.tracking.explanations import explain
-from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions
 from startrack.applications.tracking.moves import Moves
+from startrack.applications.tracking.positions import OnlineTrack, RobustTrack, conclude, filter_positions
 from startrack.estimation import trajectory
 from startrack.estimation.observations import FrameEstimate, Steps
 from startrack.estimation.trajectory import TrackFilter, smooth
@@ -159,9 +158,9 @@ def test_slipped_moves_are_found_and_cost_no_more_than_their_loss():
         which = np.array([2, 12, 22]) + np.random.default_rng([6, seed]).integers(0, 5, 3)
         modes = [(e,) for e in drive.estimates]
         slipped = explained(modes, with_slips(drive.steps, which, 20.0))
-        found += int(slipped.slipped[which].sum())
-        assert slipped.slipped.sum() <= 4
-        assert not explained(modes, drive.steps).slipped.any()
+        found += int((slipped.best.leg > 0)[which].sum())
+        assert (slipped.best.leg > 0).sum() <= 4
+        assert not explained(modes, drive.steps).best.leg.any()
         without = np.where(np.isin(np.arange(29), which), np.inf, drive.steps.sigma_m)
         unslipped = smooth(
             drive.estimates, replace(drive.steps, sigma_m=without)
@@ -179,7 +178,7 @@ def test_a_frame_that_contradicts_is_left_out_by_both_estimates():
     modes = [(e,) for e in estimates]
     found = explained(modes, drive.steps)
     assert found.mode.tolist() == [0] * 8 + [-1] + [0] * 11
-    assert not found.slipped.any()
+    assert not found.best.leg.any()
     online = filter_positions(modes, [Moves.of(drive.steps)], 1).position_m
     assert np.linalg.norm(online - drive.position_m, axis=1).max() < 15.0
 
@@ -227,7 +226,7 @@ def test_without_odometry_only_the_shared_errors_connect_the_frames():
     modes = [(e,) for e in drive.estimates]
     found = explained(modes, Steps.unknown(8))
     assert found.mode.tolist() == [0] * 8
-    assert not found.slipped.any()
+    assert not found.best.leg.any()
     assert np.trace(found.smoothed.covariance_m2[3]) < np.trace(alone.covariance_m2[0])
     assert found.smoothed.shared_covariance[0, 0] < alone.shared_covariance[0, 0]
     assert np.linalg.norm(found.smoothed.position_m - drive.position_m, axis=1).max() < 25.0

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from startrack.applications.tracking.explanations import WINDOW
-from startrack.applications.tracking.filtered_positions import OnlineTrack
+from startrack.applications.tracking.moves import odometry_moves, odometry_steps, times_s
 from startrack.applications.tracking.observed_frame import (
     FrameStore,
     ObservedFrame,
@@ -24,10 +24,9 @@ from startrack.applications.tracking.observed_frame import (
     observe_frame,
 )
 from startrack.applications.tracking.odometry import SPAN_TOLERANCE_S, Odometry
-from startrack.applications.tracking.odometry_moves import odometry_moves, odometry_steps, times_s
+from startrack.applications.tracking.positions import OnlineTrack, place_modes
 from startrack.applications.tracking.track import Track, estimate_track, track_of_newest
 from startrack.applications.tracking.track_errors import TrackErrors
-from startrack.applications.tracking.unknown_size import place_modes
 from startrack.catalog import load_catalog
 from startrack.chain import Located, Settings, input_hashes, job_sha256, load_camera_input, locate, terrain_input
 from startrack.core.errors import BadInput

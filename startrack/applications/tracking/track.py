@@ -9,15 +9,19 @@ from itertools import pairwise
 
 import numpy as np
 
-from startrack.applications.tracking.contradictions import conclude
-from startrack.applications.tracking.filtered_positions import OnlineTrack, filter_positions, positions_at_rest
-from startrack.applications.tracking.legs import SlippedLeg, images_outside, legs_about, slipped_legs
+from startrack.applications.tracking.moves import odometry_moves, times_s
 from startrack.applications.tracking.observed_frame import ImageFix, ObservedFrame
 from startrack.applications.tracking.odometry import Odometry
-from startrack.applications.tracking.odometry_moves import odometry_moves, times_s
+from startrack.applications.tracking.positions import (
+    SIZES,
+    OnlineTrack,
+    conclude,
+    filter_positions,
+    place_modes,
+    positions_at_rest,
+)
 from startrack.applications.tracking.track_errors import BIAS, CLOCK, TrackErrors
-from startrack.applications.tracking.unknown_size import SIZES, place_modes
-from startrack.core.types import Array, BadInput, Bools, ClockError
+from startrack.core.types import Array, BadInput, Bools, ClockError, Ints
 from startrack.estimation.observations import UNKNOWN_M, USUAL_ODOMETRY, OdometryErrors
 from startrack.estimation.trajectory import Smoothed, radius_holding
 from startrack.frames import quat_xyzw_from_R
@@ -72,6 +76,25 @@ class SizeError:
 
     def __str__(self) -> str:
         return f"{self.size_m:.1f} ± {self.sigma_m:.1f} m"
+
+
+@dataclass(frozen=True)
+class SlippedLeg:
+    """Moves in a row in which the odometry slipped alike."""
+
+    first: int  # number of the image before the leg
+    last: int  # of the one after it
+    length_m: float  # by the odometry
+    factor_1: float  # by which the odometry is longer than the track; nan: not known
+    heading_rad: float  # by which the odometry turns to the right of the track; nan: not known
+
+    def text(self, names: Sequence[str]) -> str:
+        """The leg in words, with the `names` of the images."""
+        where = f"{self.length_m:.1f} m of odometry slipped from {names[self.first]} to {names[self.last]}"
+        if not np.isfinite(self.factor_1):
+            return where
+        turned = f"{abs(np.degrees(self.heading_rad)):.1f} degrees to the {'right' if self.heading_rad > 0 else 'left'}"
+        return f"{where}: {self.factor_1:.2f} times the track, {turned}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +183,7 @@ def estimate_track(
     smoothed = _trajectory(
         np.broadcast_to(found.position_m, (n, 2)), np.broadcast_to(known_m2, (n, 2, 2)), terrain, own
     )  # fmt: skip
-    leg = legs_about(robust.leg, by_image, np.isfinite(robust.steps.sigma_m))
+    leg = legs_about(robust.best.leg, by_image, np.isfinite(robust.best.steps.sigma_m))
     bias, clock = (_shared_error(found, shared, name) for name in (BIAS, CLOCK))
     crater = terrain.with_shape(_shape_values(found, shared, terrain)) if shared.size_sigma_1 else terrain
     depth, width = (_size_error(found, shared, name, crater.facts().get(key, np.nan)) for name, key in SIZES.items())
@@ -170,8 +193,8 @@ def estimate_track(
             for one in zip(frames, robust.mode, robust.attitude_fits, is_outside.tolist(), strict=True)
         ),
         _trajectory(position_m, covariance_m2, terrain, alone), smoothed, crater if shared.bends else terrain,
-        *(bias or (0.0, 0.0)), clock and ClockError(*clock), depth, width, leg > 0, at_rest, robust.fault,
-        slipped_legs(leg, robust.steps.move_m, smoothed.position_enu_m[:, :2]),
+        *(bias or (0.0, 0.0)), clock and ClockError(*clock), depth, width, leg > 0, at_rest, robust.best.moves.fault,
+        slipped_legs(leg, robust.best.steps.move_m, smoothed.position_enu_m[:, :2]),
     )  # fmt: skip
 
 
@@ -182,11 +205,10 @@ def track_of_newest(
 
     `shared` are the errors of the track; `is_outside`: the odometry does not cover the frame.
     """
-    position_m = online.position_m[None]
+    position_m = online.position[0][None]
     by_image = images_outside([frame], np.array([online.mode]), position_m, shared)
     alone = {0: frame.fixes} if online.is_first or by_image else {}
-    covariance_m2 = online.covariance_m2 if online.is_vouched else UNKNOWN_M**2 * np.eye(2)
-    found = _trajectory(position_m, covariance_m2[None], terrain, alone)
+    found = _trajectory(position_m, online.known_m2[None], terrain, alone)
     return Track((_track_frame(frame, online.mode, True, is_outside),), found, found, terrain)
 
 
@@ -240,3 +262,43 @@ def _shared_error(found: Smoothed, shared: TrackErrors, name: str) -> tuple[floa
     at = shared.names.index(name)
     error, slope = (shared.values(found.shared) - shared.mean)[at], shared.slopes(found.shared)[at]
     return float(error), float(slope * np.sqrt(found.shared_covariance[at, at]))
+
+
+def images_outside(frames: Sequence[ObservedFrame], mode: Ints, position_m: Array, shared: TrackErrors) -> list[int]:
+    """Images in use whose position (n, 2) on the track lies outside the 99.9 % circle of their own fix.
+
+    An image has no own circle where it is refused or ambiguous, or where its fix was made without the gross errors
+    of the `shared` ones. In a crater of unknown size it is that of the stated size.
+    """
+    if shared.bends:
+        return []
+    return [
+        k for k, (frame, used, at) in enumerate(zip(frames, mode, position_m, strict=True))
+        if used >= 0 and len(frame.fixes) == 1 and frame.facts == shared.gross
+        and np.linalg.norm(at - frame.fixes[0].position_enu_m[:2]) > frame.fixes[0].radius999_m
+    ]  # fmt: skip
+
+
+def legs_about(leg: Ints, images: Sequence[int], known: Bools) -> Ints:
+    """The numbers `leg` (n - 1,) of the `known` moves, with those to and from `images` as further legs."""
+    leg = np.where(known, leg, 0)
+    touched = np.isin(np.arange(len(leg)), [[k - 1, k] for k in images]) & known & (leg == 0)
+    begins = touched & ~np.append(False, touched[:-1])[: len(leg)]
+    return np.asarray(np.where(touched, leg.max(initial=0) + np.cumsum(begins), leg))
+
+
+def slipped_legs(leg: Ints, move_m: Array, position_m: Array) -> tuple[SlippedLeg, ...]:
+    """The legs with these numbers (n - 1,), of moves (n - 1, 2) by odometry between positions (n, 2).
+
+    Factor and heading are those of the similarity that turns the track's moves into the odometry's, by least squares.
+    """
+    found = []
+    for number in np.unique(leg[leg > 0]):
+        at = np.flatnonzero(leg == number)
+        by_odometry = move_m[at] @ [1.0, 1.0j]
+        by_track = np.diff(position_m, axis=0)[at] @ [1.0, 1.0j]
+        length2 = np.sum(np.abs(by_track) ** 2)
+        turn = np.sum(by_track.conj() * by_odometry) / length2 if length2 > 0.0 else np.nan
+        length_m = float(np.abs(by_odometry).sum())
+        found.append(SlippedLeg(int(at[0]), int(at[-1]) + 1, length_m, float(np.abs(turn)), float(-np.angle(turn))))
+    return tuple(sorted(found, key=lambda one: one.first))

@@ -122,7 +122,8 @@ def score_track(case: Case, rng: np.random.Generator, pixels: bool, number: int)
     plain = smooth([one and alone(one) for one in single], steps)
     found["plain"] = _score(plain.position_m, plain.covariance_m2, course.position_m)
     if case.spacing_m == 0.0:
-        _, position, covariance = positions_at_rest(frames, course.stated, course.shared)
+        by_first = positions_at_rest(frames, course.stated, course.shared)[1]
+        position, covariance = by_first.position_m, by_first.covariance_m2
         found["filtered"] = _score(position[3:4], covariance[3:4], course.position_m[:1])
         found["smoothed"] = _score(position[-1:], covariance[-1:], course.position_m[:1])
     else:

@@ -84,7 +84,8 @@ def score_rest(case: Case, exact: HeightMap, stated: HeightMap, rng: np.random.G
         at = position + FIRST_ERROR_M * rng.normal(size=2)
         estimate = estimate_frame(rows, stated, shared, at, FIRST_SIGMA_M**2 * np.eye(2))
         frames.append(ObservedFrame(f"frame-{number:03d}", when, None, (estimate,), rows))
-    _, position, covariance = positions_at_rest(frames, stated, shared)
+    by_first = positions_at_rest(frames, stated, shared)[1]
+    position, covariance = by_first.position_m, by_first.covariance_m2
     used = [count - 1 for count in EXPOSURES]
     return [mean_error_and_nees(position[k : k + 1], covariance[k : k + 1], course.position_m[:1]) for k in used]
 

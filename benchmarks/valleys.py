@@ -171,7 +171,8 @@ def locate_frame(job: tuple[str, int]) -> tuple[str, float, float, float]:
         return "ok", *_score(one.fix.position_enu_m[:2] - place_m, one.fix.covariance_m2, one.fix.radius999_m)
     shared = TrackErrors.of(stated, None, True)
     observed = [observe_frame(one, shared) for one in outcomes]
-    _, position, covariance = positions_at_rest(observed, stated, shared)
+    by_first = positions_at_rest(observed, stated, shared)[1]
+    position, covariance = by_first.position_m, by_first.covariance_m2
     return "ok", *_score(
         position[-1] - place_m, covariance[-1], RADIUS999_SIGMAS * np.sqrt(np.linalg.eigvalsh(covariance[-1])[1])
     )

@@ -243,7 +243,8 @@ def test_exposures_at_rest_are_one_posterior():
         rng = np.random.default_rng([6, seed])
         place = rng.uniform(-3000, 3000, 2)
         frames = [frame_at(terrain, shared, place, rng, k) for k in range(4)]
-        found, position, covariance = positions_at_rest(frames, terrain, shared)
+        found, by_first = positions_at_rest(frames, terrain, shared)
+        position, covariance = by_first.position_m, by_first.covariance_m2
         assert found.mode.tolist() == [0, 0, 0, 0]
         pooled = ExactPosterior()(Evidence.concatenate(*(frame.evidence for frame in frames)), terrain)
         away = position[-1] - pooled.position_enu_m[:2]

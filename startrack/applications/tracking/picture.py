@@ -9,7 +9,20 @@ from startrack.applications.tracking.track import Track, Trajectory
 from startrack.core.errors import length_text
 from startrack.core.types import Array
 from startrack.estimation.trajectory import SIGMAS_95
-from startrack.output import MARGIN_PX, SIDE_PX, TEXT_PX, TITLE_PX, Box, Canvas, Ink, Legend, Map, ellipse_m, nice_step
+from startrack.output import (
+    MARGIN_PX,
+    SIDE_PX,
+    TEXT_PX,
+    TITLE_PX,
+    Box,
+    Canvas,
+    Colour,
+    Ink,
+    Legend,
+    Map,
+    ellipse_m,
+    nice_step,
+)
 
 MAP_BOX: Box = (MARGIN_PX, MARGIN_PX, MARGIN_PX + SIDE_PX, MARGIN_PX + SIDE_PX)
 PANEL_PX = 22.5 * TEXT_PX  # beside the map
@@ -114,7 +127,7 @@ def draw_track_map(canvas: Canvas, box: Box, track: Track, odometry_m: Array | N
     return drawn, legend
 
 
-def _draw_ellipses(drawn: Map, shown: Trajectory, colour: Ink) -> float:
+def _draw_ellipses(drawn: Map, shown: Trajectory, colour: Colour) -> float:
     """Ellipses of positions, each clear of the last one's centre; returns how much they are enlarged."""
     axis_m, last = half_axes_95_m(shown.covariance_m2), None
     known = np.flatnonzero(np.isfinite(axis_m))

@@ -145,7 +145,7 @@ class Filtered:
     position_m: Array  # (n, 2)
     covariance_m2: Array  # (n, 2, 2); of a position about which explanations differ, that of an unknown one
     mode: Ints  # (n,) used then; -1: none
-    alone: list[int]  # the frames whose position is by their image alone
+    alone: Ints  # (n,) the frame by whose image alone it is; -1: by several
     compared: Explanations  # of all frames
 
 
@@ -154,9 +154,8 @@ def filter_positions(modes: Sequence[Modes], moves: Sequence[Moves], shared_coun
     track, found = OnlineTrack(shared_count, len(modes)), []
     for of in modes:
         track.add(of, moves)
-        found.append((track.position[0], track.known_m2, track.mode, track.is_first))
-    position, covariance, mode, is_alone = (np.array(part) for part in zip(*found, strict=True))
-    return Filtered(position, covariance, mode, np.flatnonzero(is_alone).tolist(), track.compared)
+        found.append((track.position[0], track.known_m2, track.mode, len(found) if track.is_first else -1))
+    return Filtered(*(np.array(part) for part in zip(*found, strict=True)), compared=track.compared)
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,8 +292,8 @@ def place_modes(
 
 def positions_at_rest(
     frames: Sequence[ObservedFrame], terrain: Terrain, errors: TrackErrors
-) -> tuple[RobustTrack, Array, Array]:
-    """The one position by all exposures, and positions (n, 2) and covariances (n, 2, 2) by each with those before it.
+) -> tuple[RobustTrack, Filtered]:
+    """The one position by all exposures, and those by each exposure with those before it.
 
     Single fixes that contradict the others are left out. Errors that exposures share are carried once, those of each
     image apart. Raises ValueError where no exposure has a position, and BadInput (inconsistent_evidence) where half of
@@ -304,8 +303,8 @@ def positions_at_rest(
     still = Steps(np.zeros((n - 1, 2)), np.full(n - 1, STILL_M))
     terrain = terrain.with_steepness(next((frame.steepness_1 for frame in frames if frame.modes), 1.0))
     errors, modes = errors.on(terrain), [[errors.place(one) for one in frame.modes] for frame in frames]
-    names = [frame.name for frame in frames]
-    agreeing = conclude(modes, explain(modes, [Moves.of(still)], may_slip=False), names)
+    compared = explain(modes, [Moves.of(still)], may_slip=False)
+    agreeing = conclude(modes, compared, [frame.name for frame in frames])
     single = np.array([len(frame.modes) == 1 for frame in frames])
     agree, count = np.count_nonzero(single & (agreeing.mode >= 0)), np.count_nonzero(single)
     if count > 1 and 2 * agree <= count:
@@ -337,4 +336,5 @@ def positions_at_rest(
         if k != first:
             points = sample_together(models, reference, spread)
             found = take(k, observe_together(models, points))
-    return replace(agreeing, smoothed=found), position, covariance
+    alone = np.where(np.cumsum(agreeing.mode >= 0) == 1, first, -1)
+    return replace(agreeing, smoothed=found), Filtered(position, covariance, agreeing.mode, alone, compared)

@@ -149,7 +149,7 @@ class TrackSession:
             online = self._online = self._filter_to(k, odometry, shared)
             self._filtered += 1
             is_outside = odometry is not None and not odometry.covers(times_s(self.frames[k : k + 1]))[0]
-            yield track_of_newest(self.frames[k], online, terrain, shared, is_outside=is_outside)
+            yield track_of_newest(self.frames[k], online, terrain, is_outside=is_outside)
 
     def _filter_to(self, k: int, odometry: Odometry | None, shared: TrackErrors) -> OnlineTrack:
         """The filter with frame k; where positions are not linear in `shared`, of all frames about what they show."""

@@ -20,10 +20,10 @@ from startrack.applications.tracking.positions import (
     place_modes,
     positions_at_rest,
 )
-from startrack.applications.tracking.track_errors import BIAS, CLOCK, TrackErrors
+from startrack.applications.tracking.track_errors import BIAS, CLOCK, ErrorFound, TrackErrors
 from startrack.core.types import Array, BadInput, Bools, ClockError, Ints
 from startrack.estimation.observations import UNKNOWN_M, USUAL_ODOMETRY, OdometryErrors
-from startrack.estimation.trajectory import Smoothed, radius_holding
+from startrack.estimation.trajectory import radius_holding
 from startrack.frames import quat_xyzw_from_R
 from startrack.localization import camera_at
 from startrack.terrain import Terrain
@@ -68,6 +68,12 @@ class SizeError:
     size_m: float
     error_1: float  # relative to the stated one
     sigma_1: float
+
+    @classmethod
+    def of(cls, found: ErrorFound, size_m: float) -> SizeError:
+        """Of a shared error in a crater of that size; it is counted from another one than the stated size."""
+        stated = 1.0 + found.mean
+        return cls(size_m, found.error / stated, found.sigma / stated)
 
     @property
     def sigma_m(self) -> float:
@@ -153,62 +159,57 @@ def estimate_track(
     times = [frame.time_utc for frame in frames]
     if any(a > b for a, b in pairwise(times)):
         raise BadInput("no_time", "the frames are not in the order of their times")
-    n = len(frames)
-    is_outside = np.zeros(n, dtype=bool)
+    is_outside = np.zeros(len(frames), dtype=bool)
     if odometry is not None:
         is_outside = ~odometry.covers(times_s(frames), odometry_errors.floor_m)
         if is_outside.all():
             odometry.require_covers(times_s(frames))
-    by_image: list[int] = []  # whose smoothed positions are those of their images
     if at_rest:
-        robust, position_m, covariance_m2 = positions_at_rest(frames, terrain, shared)
-        first, second = [*np.flatnonzero(robust.mode >= 0).tolist(), n][:2]
-        alone = dict.fromkeys(range(first, second), frames[first].fixes)
+        robust, filtered = positions_at_rest(frames, terrain, shared)
     else:
         moves = odometry_moves(frames, odometry, odometry_errors, shows_scale=not shared.bends)
         names = [frame.name for frame in frames]
         placed = place_modes([frame.modes for frame in frames], moves, shared, names)
         filtered = filter_positions(placed, moves, len(shared))
         robust = conclude(placed, filtered.compared, names)
-        position_m, covariance_m2 = filtered.position_m, filtered.covariance_m2
-        covariance_m2[(filtered.mode >= 0) & (robust.mode < 0)] = UNKNOWN_M**2 * np.eye(2)  # taken back since
-        by_one = [*filtered.alone, *images_outside(frames, filtered.mode, position_m, shared)]
-        alone = {k: frames[k].fixes for k in by_one if robust.mode[k] >= 0}
-        by_image = images_outside(frames, robust.mode, robust.smoothed.position_m, shared)
-    found, used = robust.smoothed, np.flatnonzero(robust.mode >= 0).tolist()
-    known_m2 = np.where(robust.vouched[:, None, None], found.covariance_m2, UNKNOWN_M**2 * np.eye(2))
-    own = {k: frames[k].fixes for k in by_image}
-    if len(used) == 1:
-        own = dict.fromkeys(range(n) if at_rest else used, frames[used[0]].fixes)
-    smoothed = _trajectory(
-        np.broadcast_to(found.position_m, (n, 2)), np.broadcast_to(known_m2, (n, 2, 2)), terrain, own
+    found, best = robust.smoothed, robust.best
+    alone = np.where(robust.mode[filtered.alone] >= 0, filtered.alone, -1)  # -1 is the last one, or no frame
+    by_first = _trajectory(
+        filtered.position_m, _known_m2(filtered.covariance_m2, (filtered.mode < 0) | (robust.mode >= 0)), terrain,
+        {k: frames[of].fixes for k, of in enumerate(alone.tolist()) if of >= 0},
     )  # fmt: skip
-    leg = legs_about(robust.best.leg, by_image, np.isfinite(robust.best.steps.sigma_m))
-    bias, clock = (_shared_error(found, shared, name) for name in (BIAS, CLOCK))
-    crater = terrain.with_shape(_shape_values(found, shared, terrain)) if shared.size_sigma_1 else terrain
-    depth, width = (_size_error(found, shared, name, crater.facts().get(key, np.nan)) for name, key in SIZES.items())
+    used = np.flatnonzero(robust.mode >= 0).tolist()
+    own = dict.fromkeys(range(len(frames)) if at_rest else used, frames[used[0]].fixes) if len(used) == 1 else {}
+    smoothed = _trajectory(found.position_m, _known_m2(found.covariance_m2, robust.vouched), terrain, own)
+    errors = dict(zip(shared.names, shared.errors_found(found.shared, found.shared_covariance), strict=True))
+    crater = terrain
+    if shared.size_sigma_1:
+        shape = [errors[one.name].mean + errors[one.name].error if one.name in errors else one.mean
+                 for one in terrain.shape_errors]  # fmt: skip
+        crater = terrain.with_shape(np.array(shape))
+    depth, width = (
+        SizeError.of(errors[name], crater.facts().get(key, np.nan)) if name in errors else None
+        for name, key in SIZES.items()
+    )
+    leg = np.where(np.isfinite(best.steps.sigma_m), np.maximum(best.leg, 0), 0)
     return Track(
-        tuple(
-            _track_frame(*one)
-            for one in zip(frames, robust.mode, robust.attitude_fits, is_outside.tolist(), strict=True)
-        ),
-        _trajectory(position_m, covariance_m2, terrain, alone), smoothed, crater if shared.bends else terrain,
-        *(bias or (0.0, 0.0)), clock and ClockError(*clock), depth, width, leg > 0, at_rest, robust.best.moves.fault,
-        slipped_legs(leg, robust.best.steps.move_m, smoothed.position_enu_m[:, :2]),
+        tuple(map(_track_frame, frames, robust.mode, robust.attitude_fits, is_outside.tolist())),
+        by_first, smoothed, crater if shared.bends else terrain,
+        *(errors[BIAS][:2] if BIAS in errors else (0.0, 0.0)),
+        ClockError(*errors[CLOCK][:2]) if CLOCK in errors else None, depth, width, leg > 0, at_rest, best.moves.fault,
+        slipped_legs(leg, best.steps.move_m, smoothed.position_enu_m[:, :2]),
     )  # fmt: skip
 
 
 def track_of_newest(
-    frame: ObservedFrame, online: OnlineTrack, terrain: Terrain, shared: TrackErrors, *, is_outside: bool = False
-) -> Track:
+    frame: ObservedFrame, online: OnlineTrack, terrain: Terrain, *, is_outside: bool = False
+) -> Track:  # fmt: skip
     """The last `frame` that `online` has, as a track of its own: by all frames up to it.
 
-    `shared` are the errors of the track; `is_outside`: the odometry does not cover the frame.
+    `is_outside`: the odometry does not cover the frame.
     """
-    position_m = online.position[0][None]
-    by_image = images_outside([frame], np.array([online.mode]), position_m, shared)
-    alone = {0: frame.fixes} if online.is_first or by_image else {}
-    found = _trajectory(position_m, online.known_m2[None], terrain, alone)
+    own = {0: frame.fixes} if online.is_first else {}
+    found = _trajectory(online.position[0][None], online.known_m2[None], terrain, own)
     return Track((_track_frame(frame, online.mode, True, is_outside),), found, found, terrain)
 
 
@@ -225,66 +226,24 @@ def _track_frame(frame: ObservedFrame, mode: int, attitude_fits: bool, is_outsid
     return TrackFrame(frame.name, frame.time_utc, *found, quat, frame.search, is_outside)
 
 
+def _known_m2(covariance_m2: Array, known: Bools) -> Array:
+    """The covariances (n, 2, 2), of positions that are not `known` (n,) those of unknown ones."""
+    return np.where(known[:, None, None], covariance_m2, UNKNOWN_M**2 * np.eye(2))
+
+
 def _trajectory(
     position_m: Array, covariance_m2: Array, terrain: Terrain, alone: Mapping[int, Sequence[ImageFix]]
 ) -> Trajectory:
-    """Positions (n, 2) and covariances (n, 2, 2) as a trajectory."""
+    """Positions (n, 2) or (1, 2) and covariances (n, 2, 2) as a trajectory; `alone` are those of one image."""
     known = np.sqrt(np.trace(covariance_m2, axis1=1, axis2=2)) < UNKNOWN_SIGMA_M
-    position = np.full((len(position_m), 3), np.nan)
+    position = np.full((len(known), 3), np.nan)
     for k in np.flatnonzero(known):
-        position[k] = camera_at(position_m[k], terrain)
+        position[k] = camera_at(np.broadcast_to(position_m, (len(known), 2))[k], terrain)
     found = Trajectory.of_normal(position, np.where(known[:, None, None], covariance_m2, np.inf))
     for at, fixes in ((at, fixes) for at, fixes in alone.items() if len(fixes) == 1):
         found.position_enu_m[at], found.covariance_m2[at] = fixes[0].position_enu_m, fixes[0].covariance_m2
         found.radius95_m[at], found.radius999_m[at] = fixes[0].radius95_m, fixes[0].radius999_m
     return found
-
-
-def _shape_values(found: Smoothed, shared: TrackErrors, terrain: Terrain) -> Array:
-    """(n,) of all errors of the terrain's shape, as estimated."""
-    known = dict(zip(shared.names, shared.values(found.shared).tolist(), strict=True))
-    return np.array([known.get(one.name, one.mean) for one in terrain.shape_errors])
-
-
-def _size_error(found: Smoothed, shared: TrackErrors, name: str, size_m: float) -> SizeError | None:
-    """Of the shared error of this name, in a crater of that size; None where it is not shared."""
-    error = _shared_error(found, shared, name)
-    if error is None:
-        return None
-    stated = 1.0 + float(shared.mean[shared.names.index(name)])  # relative to the size that errors are counted from
-    return SizeError(size_m, error[0] / stated, error[1] / stated)
-
-
-def _shared_error(found: Smoothed, shared: TrackErrors, name: str) -> tuple[float, float] | None:
-    """The shared error of this name and its standard deviation; None where it is not shared."""
-    if name not in shared.names:
-        return None
-    at = shared.names.index(name)
-    error, slope = (shared.values(found.shared) - shared.mean)[at], shared.slopes(found.shared)[at]
-    return float(error), float(slope * np.sqrt(found.shared_covariance[at, at]))
-
-
-def images_outside(frames: Sequence[ObservedFrame], mode: Ints, position_m: Array, shared: TrackErrors) -> list[int]:
-    """Images in use whose position (n, 2) on the track lies outside the 99.9 % circle of their own fix.
-
-    An image has no own circle where it is refused or ambiguous, or where its fix was made without the gross errors
-    of the `shared` ones. In a crater of unknown size it is that of the stated size.
-    """
-    if shared.bends:
-        return []
-    return [
-        k for k, (frame, used, at) in enumerate(zip(frames, mode, position_m, strict=True))
-        if used >= 0 and len(frame.fixes) == 1 and frame.facts == shared.gross
-        and np.linalg.norm(at - frame.fixes[0].position_enu_m[:2]) > frame.fixes[0].radius999_m
-    ]  # fmt: skip
-
-
-def legs_about(leg: Ints, images: Sequence[int], known: Bools) -> Ints:
-    """The numbers `leg` (n - 1,) of the `known` moves, with those to and from `images` as further legs."""
-    leg = np.where(known, leg, 0)
-    touched = np.isin(np.arange(len(leg)), [[k - 1, k] for k in images]) & known & (leg == 0)
-    begins = touched & ~np.append(False, touched[:-1])[: len(leg)]
-    return np.asarray(np.where(touched, leg.max(initial=0) + np.cumsum(begins), leg))
 
 
 def slipped_legs(leg: Ints, move_m: Array, position_m: Array) -> tuple[SlippedLeg, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -19,6 +19,14 @@ from startrack.terrain import Terrain
 LINEAR_SIZE_1 = 0.005  # sigma of a crater's size: of positions 15 m off it leaves 0.1 m
 SIZE_ROUNDS = 10  # of the expansion about a crater's size
 BIAS, CLOCK, DEPTH, WIDTH, EDGE = "bias_rad", "clock_s", "depth_1", "diameter_1", "edge_px"
+
+
+class ErrorFound(NamedTuple):
+    """A shared error as estimated, in the unit of its name."""
+
+    error: float  # beyond its mean before
+    sigma: float
+    mean: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +105,12 @@ class TrackErrors:
     def slopes(self, shared: Array) -> Array:
         """(k,) of the `values` by the parameters, at `shared` (k,)."""
         return np.asarray(self.sigma * np.exp(self._log_sigma * shared))
+
+    def errors_found(self, shared: Array, covariance: Array) -> list[ErrorFound]:
+        """The errors (k,) at parameters `shared` (k,) of this `covariance` (k, k)."""
+        sigma = self.slopes(shared) * np.sqrt(np.diag(covariance))
+        found = np.stack([self.values(shared) - self.mean, sigma, self.mean], axis=-1)
+        return [ErrorFound(*one) for one in found.tolist()]
 
     def to_model(self, parameters: Array, evidence: Evidence) -> Array:
         """Parameters (n, 2 + m) of a `SkylineModel` of `evidence`, from `parameters` (n, 2 + k) of the track."""

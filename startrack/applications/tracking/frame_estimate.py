@@ -169,12 +169,12 @@ def balanced_moments(found: WeightedPoints) -> Gaussian:
     What the evidence says nothing about keeps the covariance of its prior, which weighted points have to some percent.
     """
     mean, covariance = moments(found.points, found.share)
-    root = np.linalg.cholesky(covariance)
-    size2 = np.square(np.linalg.solve(root, (found.points - mean).T)).sum(axis=0)
+    off, known_1 = found.points - mean, np.linalg.inv(covariance)
+    size2 = np.einsum("ni,ij,nj->n", off, known_1, off)
     known = WeightedPoints(found.points, -0.5 * size2 - found.log_drawn, found.log_drawn)
     shown_mean, shown = moments(found.points, known.share)
     corrected = 2.0 * covariance - shown
-    if np.linalg.eigvalsh(np.linalg.solve(root, np.linalg.solve(root, corrected).T))[0] < LEAST_CORRECTED:
+    if np.linalg.eigvals(known_1 @ corrected).real.min() < LEAST_CORRECTED:
         return mean, covariance
     return 2.0 * mean - shown_mean, corrected
 

@@ -91,10 +91,9 @@ class Odometry(Value):
 
     def _poses_about(self, time_s: Array) -> slice:
         """The poses, at least two, between which `time_s` (m,) within the odometry lie, in the order of time."""
-        if not len(time_s):
-            return slice(0, 2)
-        before = int(np.searchsorted(self.time_s, time_s[0], side="right")) - 1
-        after = int(np.searchsorted(self.time_s, time_s[-1]))
+        first, last = time_s[[0, -1]] if len(time_s) else self.time_s[[0, 0]]
+        before = int(np.searchsorted(self.time_s, first, side="right")) - 1
+        after = int(np.searchsorted(self.time_s, last))
         return slice(min(before, len(self) - 2), max(after, before + 1) + 1)
 
     def covers(self, time_s: Array, still_m: float = ODOMETRY_FLOOR_M) -> Bools:
@@ -104,15 +103,16 @@ class Odometry(Value):
         """
         k = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, len(self) - 2)
         moved_m = np.linalg.norm(self.position_m[k + 1] - self.position_m[k], axis=1)
-        is_gap = (self.time_s[k + 1] - self.time_s[k] > self._longest_step_s) & (moved_m > still_m)
+        is_gap = (self.time_s[k + 1] - self.time_s[k] > self._extremes[0]) & (moved_m > still_m)
         after, before = time_s - self.time_s[k], self.time_s[k + 1] - time_s
         at_pose = (np.abs(after) <= SPAN_TOLERANCE_S) | (np.abs(before) <= SPAN_TOLERANCE_S)
         return np.asarray(at_pose | ((after > 0) & (before > 0) & ~is_gap))
 
     @cached_property
-    def _longest_step_s(self) -> float:
-        """Between poses of which none is missing."""
-        return GAP_INTERVALS * float(np.median(np.diff(self.time_s)))
+    def _extremes(self) -> tuple[float, int]:
+        """The longest step [s] between poses of which none is missing, and the pose before the fastest move."""
+        length_m, step_s = np.linalg.norm(np.diff(self.position_m, axis=0), axis=1), np.diff(self.time_s)
+        return GAP_INTERVALS * float(np.median(step_s)), int(np.argmax(length_m / (step_s + SPAN_TOLERANCE_S)))
 
     def require_covers(self, time_s: Array) -> None:
         """Raises BadInput (bad_odometry) for one of `time_s` (m,) [Unix s] before the first pose or after the last."""
@@ -126,19 +126,13 @@ class Odometry(Value):
 
     def require_possible(self, max_speed_m_s: float) -> None:
         """Raises BadInput (bad_odometry) for moves faster than `max_speed_m_s`."""
-        number, length_m, step_s = self._fastest_move
-        if length_m > max_speed_m_s * (step_s + SPAN_TOLERANCE_S):
+        k = self._extremes[1]
+        length_m, step_s = np.linalg.norm(self.position_m[k + 1] - self.position_m[k]), np.diff(self.time_s[k : k + 2])
+        if length_m > max_speed_m_s * (step_s[0] + SPAN_TOLERANCE_S):
             _refuse(
-                f"pose {number}: {length_m:.4g} m in {step_s:.4g} s are faster than {max_speed_m_s:g} m/s, the "
+                f"pose {k + 1}: {length_m:.4g} m in {step_s[0]:.4g} s are faster than {max_speed_m_s:g} m/s, the "
                 "highest speed of the rover (--max-speed): are positions in metres?"
             )
-
-    @cached_property
-    def _fastest_move(self) -> tuple[int, float, float]:
-        """Number from 1 of the pose before the fastest move, its length [m] and its time [s]."""
-        length_m, step_s = np.linalg.norm(np.diff(self.position_m, axis=0), axis=1), np.diff(self.time_s)
-        k = int(np.argmax(length_m / (step_s + SPAN_TOLERANCE_S)))
-        return k + 1, float(length_m[k]), float(step_s[k])
 
 
 def read_odometry(
@@ -167,8 +161,8 @@ class OdometryFile:
 
     def __init__(self, path: str, topic: str | None, is_followed: bool, floor_m: float = ODOMETRY_FLOOR_M) -> None:
         """Of a `path`, and of a bag the `topic`; `is_followed`: its last line may be incomplete."""
-        self.path, self.topic, self._is_growing, self.floor_m = path, topic, is_followed, floor_m
-        self._has_ended = False
+        self.path, self._is_growing = path, is_followed
+        self._read_as = partial(read_odometry, path, topic, floor_m=floor_m)
         self._read: tuple[object, Odometry] | None = None  # with the stamp of the file
 
     @property
@@ -178,20 +172,14 @@ class OdometryFile:
 
     def read(self) -> Odometry:
         """The odometry as it is now. Raises BadInput as `read_odometry`."""
-        stamp = self._stamp()
-        if self._read is None or self._read[0] != stamp:
-            read = partial(read_odometry, self.path, self.topic, floor_m=self.floor_m)
-            try:
-                self._read = stamp, read(growing=self._is_growing)
-            except BadInput:
-                if not self._has_ended:
-                    raise
-                self._read = stamp, read(growing=True)  # without the last line
+        if self._read is None or self.has_changed:
+            self._read = self._stamp(), self._read_as(growing=self._is_growing)
         return self._read[1]
 
     def end(self) -> None:
         """The file grows no more: its last line counts too, if it can be read."""
-        self._has_ended, self._is_growing, self._read = True, False, None
+        with suppress(BadInput):
+            self._read = self._stamp(), self._read_as(growing=False)
 
     def _stamp(self) -> object:
         with suppress(OSError):
@@ -242,49 +230,42 @@ def _odometry_of_bag(path: FilePath, topic: str | None, floor_m: float) -> Odome
 
 def _odometry_of_rows(path: FilePath, rows: ArrayLike, name_row: Callable[[int], str], floor_m: float) -> Odometry:
     values = np.asarray(rows, dtype=np.float64).reshape(-1, len(TUM_COLUMNS.split()))
-    again = _repeats(values, floor_m)
-    fault = _first_fault(values, again)
+    warnings: tuple[str, ...] = ()
+    # The rows before those that have the same time, and the same pose within `floor_m` and ODOMETRY_SIGMA rad.
+    with np.errstate(over="ignore", invalid="ignore"):
+        moved_m = np.linalg.norm(np.diff(values[:, 1:4], axis=0), axis=1)
+        ahead, q = values[:-1, 4:], values[1:, 4:]
+        half_rad = np.minimum(np.linalg.norm(q - ahead, axis=1), np.linalg.norm(q + ahead, axis=1))
+        again = (np.diff(values[:, 0]) == 0) & (moved_m <= floor_m) & (2.0 * half_rad <= ODOMETRY_SIGMA)
+    kept = np.flatnonzero(~np.append(again, False)[: len(values)])
+    fault = _first_fault(values[kept])
     if fault is not None:
-        _refuse(f"{printable(path)}: {name_row(fault[0])}: {fault[1]}")
+        _refuse(f"{printable(path)}: {name_row(int(kept[fault[0]]))}: {fault[1]}")
+    if again.any():
+        first, apart_mm = name_row(int(again.argmax()) + 1), 1e3 * moved_m[again].max()
+        many = f"{again.sum()} second poses at one time, the first in {first}, up to {apart_mm:.1f} mm apart"
+        warnings = (f"{printable(path)}: {many}: the last one counts",)
+    values = values[kept]
     try:
-        warnings: tuple[str, ...] = ()
-        if again.any():
-            apart_m = np.linalg.norm(np.diff(values[:, 1:4], axis=0)[again[1:]], axis=1).max()
-            first, values = name_row(int(np.argmax(again))), values[~np.append(again[1:], False)]
-            warnings = (
-                f"{printable(path)}: {np.count_nonzero(again)} second poses at one time, the first in {first}, up to "
-                f"{1e3 * apart_m:.1f} mm apart: the last one counts",
-            )
         return Odometry(time_s=values[:, 0], position_m=values[:, 1:4], quat_xyzw=values[:, 4:], warnings=warnings)
     except ValueError as cause:
         raise BadInput("bad_odometry", f"{printable(path)}: {cause}") from cause
 
 
-def _repeats(rows: Array, floor_m: float) -> Bools:
-    """Which of `rows` (n, 8) have the time of the one before, and its pose within `floor_m` and ODOMETRY_SIGMA rad."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        moved_m = np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1)
-        before, after = rows[:-1, 4:], rows[1:, 4:]
-        turned = np.minimum(*(np.linalg.norm(after - sign * before, axis=1) for sign in (1.0, -1.0)))  # half the angle
-        same = (np.diff(rows[:, 0]) == 0) & (moved_m <= floor_m) & (2.0 * turned <= ODOMETRY_SIGMA)
-    return np.append(np.zeros(min(len(rows), 1), dtype=bool), same)
-
-
-def _first_fault(rows: Array, again: Bools | None = None) -> tuple[int, str] | None:
-    """Index and fault of the first pose that cannot be used among `rows` (n, 8) of TUM's columns; None: all can.
-
-    Rows `again` (n,) repeat the one before.
-    """
-    time_s, again = rows[:, 0], np.zeros(len(rows), dtype=bool) if again is None else again
+def _first_fault(rows: Array) -> tuple[int, str] | None:
+    """Index and fault of the first pose that cannot be used among `rows` (n, 8) of TUM's columns; None: all can."""
+    time_s = rows[:, 0]
     with np.errstate(over="ignore", invalid="ignore"):
         length, step_s = np.linalg.norm(rows[:, 4:], axis=1), np.diff(time_s, prepend=-np.inf)
-        largest_m = np.abs(rows[:, 1:4]).max(axis=1)
+        apart_m = np.append(0.0, np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1))
         faults = {
             "a number is NaN or infinite": ~np.isfinite(rows).all(axis=1),
             "the time {now:.6g} is not in Unix seconds": ~((time_s >= 0) & (time_s <= LAST_TIME_S)),
             "the quaternion has the length {length:.3g}, not 1": ~(np.abs(length - 1) <= QUATERNION_LENGTH_1),
-            f"a coordinate is larger than {LARGEST_COORDINATE_M:.0e} m": ~(largest_m <= LARGEST_COORDINATE_M),
-            "a second pose at the time {now:.6f}, {apart:.4g} m away": (step_s == 0) & ~again,
+            f"a coordinate is larger than {LARGEST_COORDINATE_M:.0e} m": (
+                ~(np.abs(rows[:, 1:4]).max(axis=1) <= LARGEST_COORDINATE_M)
+            ),
+            "a second pose at the time {now:.6f}, {apart:.4g} m away": step_s == 0,
             "times are not in order: {now:.6f} follows {before:.6f}": step_s < 0,
         }
     faulty = np.array(list(faults.values()))
@@ -292,9 +273,7 @@ def _first_fault(rows: Array, again: Bools | None = None) -> tuple[int, str] | N
         return None
     k = int(np.argmax(faulty.any(axis=0)))
     text = list(faults)[int(np.argmax(faulty[:, k]))]
-    with np.errstate(over="ignore", invalid="ignore"):
-        apart = np.linalg.norm(rows[k, 1:4] - rows[k - 1, 1:4])
-    return k, text.format(now=time_s[k], before=time_s[k - 1], length=length[k], apart=apart)
+    return k, text.format(now=time_s[k], before=time_s[k - 1], length=length[k], apart=apart_m[k])
 
 
 def _utc_text(time_s: float) -> str:

@@ -151,11 +151,14 @@ class Filtered:
 
 def filter_positions(modes: Sequence[Modes], moves: Sequence[Moves], shared_count: int) -> Filtered:
     """The positions by frames of these `modes`, of which none is settled; `moves` are those of `explain`."""
-    track, found = OnlineTrack(shared_count, len(modes)), []
-    for of in modes:
+    n, track = len(modes), OnlineTrack(shared_count, len(modes))
+    mode, alone = np.full((2, n), -1)
+    found = Filtered(np.zeros((n, 2)), np.zeros((n, 2, 2)), mode, alone, track.compared)
+    for k, of in enumerate(modes):
         track.add(of, moves)
-        found.append((track.position[0], track.known_m2, track.mode, len(found) if track.is_first else -1))
-    return Filtered(*(np.array(part) for part in zip(*found, strict=True)), compared=track.compared)
+        found.position_m[k], found.covariance_m2[k], mode[k] = track.position[0], track.known_m2, track.mode
+        alone[k] = k if track.is_first else -1
+    return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,8 +27,8 @@ def data_of(text: str) -> dict[str, Any]:
 
 def test_the_page_holds_the_frames_and_needs_nothing_else():
     track = synthetic_track(unknown=1)
-    odometry_m = odometry_alone(track)
-    text = track_page(track, title=TITLE, odometry_m=odometry_m)
+    track = replace(track, odometry_m=odometry_alone(track))
+    text = track_page(track, TITLE)
     data = data_of(text)
     frames = data["frames"]
     assert {len(values) for values in frames.values()} == {8}
@@ -36,7 +37,7 @@ def test_the_page_holds_the_frames_and_needs_nothing_else():
     np.testing.assert_allclose(frames["east_m"][1:], track.smoothed.position_enu_m[1:, 0], atol=1e-4)
     expected = radius_holding(track.filtered.covariance_m2[1:], 0.95)
     np.testing.assert_allclose(frames["filtered_radius95_m"][1:], expected, atol=1e-4)
-    np.testing.assert_allclose(data["odometry"], odometry_m[1:], atol=1e-3)
+    np.testing.assert_allclose(data["odometry"], track.odometry_m[1:], atol=1e-3)
     assert TITLE not in text and not re.search(r"https?://", text)
 
     assert [one for one in re.findall(r'(?:src|href)="([^"]*)"', text) if "data:" not in one] == ["#main"]
@@ -52,9 +53,9 @@ def test_a_page_without_a_position_can_be_made():
 def window(chromium, tmp_path) -> Iterator[Any]:
     opened = []
 
-    def make(track, size=DESKTOP, scheme="light", odometry_m=None) -> Window:
+    def make(track, size=DESKTOP, scheme="light") -> Window:
         page = tmp_path / f"{len(opened)}.html"
-        page.write_text(track_page(track, title=TITLE, odometry_m=odometry_m), encoding="utf-8")
+        page.write_text(track_page(track, TITLE), encoding="utf-8")
         opened.append(Window(chromium, page, size, scheme))
         return opened[-1]
 
@@ -65,7 +66,7 @@ def window(chromium, tmp_path) -> Iterator[Any]:
 
 def test_the_slider_chooses_the_frame_by_keys_buttons_and_rows(window):
     track = synthetic_track()
-    w = window(track, odometry_m=odometry_alone(track))
+    w = window(replace(track, odometry_m=odometry_alone(track)))
     slider, frame = w.page.get_by_role("slider"), w.page.locator("#frame")
     assert w.page.locator("h1").inner_text() == TITLE
     assert "frame-8.png" in frame.inner_text()

@@ -27,26 +27,26 @@ def pixels_like(pixels, colour) -> int:
     return int(np.count_nonzero(np.abs(pixels.astype(int) - colour).sum(axis=-1) < 12))
 
 
-def drawn(track, odometry_m=None):
+def drawn(track):
     """The map's pixels, its view and its legend."""
     canvas = Canvas(601, 601)
-    view, legend = draw_track_map(canvas, BOX, track, odometry_m)
+    view, legend = draw_track_map(canvas, BOX, track)
     return canvas.pixels, view, legend
 
 
 def test_the_map_shows_every_part_of_a_track_and_its_legend_names_them():
     track = synthetic_track()
-    odometry_m = odometry_alone(track)
-    pixels, view, legend = drawn(track, odometry_m)
+    track = replace(track, odometry_m=odometry_alone(track))
+    pixels, view, legend = drawn(track)
     for colour in (Ink.POSITION, Ink.BLUE, ODOMETRY, UNUSED):
         assert pixels_like(pixels, colour) > 20
     words = " | ".join(text for _, _, text in legend)
     for word in ("smoothed", "filtered", "odometry alone", "refused frame", "frame left out", "slip", "enlarged"):
         assert word in words
-    everything = np.concatenate([track.smoothed.position_enu_m[:, :2], odometry_m])
+    everything = np.concatenate([track.smoothed.position_enu_m[:, :2], track.odometry_m])
     places = view.canvas_px(everything)
     assert (places > 10).all() and (places < 590).all()
-    plain, _, legend = drawn(replace(track, slipped=np.zeros(7, dtype=bool)))
+    plain, _, legend = drawn(replace(synthetic_track(), slipped=np.zeros(7, dtype=bool)))
     assert pixels_like(plain, ODOMETRY) == 0
     assert not any(word in text for _, _, text in legend for word in ("slip", "odometry"))
 
@@ -98,5 +98,5 @@ def test_the_relief_of_the_map_is_that_of_its_own_place():
 
 def _texts_of(track):
     canvas = Canvas(601, 601)
-    draw_track_map(canvas, BOX, track, None)
+    draw_track_map(canvas, BOX, track)
     return canvas._texts

@@ -9,9 +9,9 @@ import pytest
 from tracking_helpers import HEIGHT_SIGMA_M, SHARED, attitudes, observed, odometry_of, shifted, simulate_drive
 
 from startrack.applications.tracking import ObservedFrame, Track, estimate_track
-from startrack.applications.tracking.moves import odometry_steps
+from startrack.applications.tracking.moves import odometry_moves
 from startrack.core.errors import BadInput
-from startrack.estimation.observations import OdometryErrors
+from startrack.estimation.observations import OdometryErrors, Steps
 from startrack.terrain import HeightMap, load_terrain
 
 FRAMES = 12
@@ -22,6 +22,13 @@ def ground() -> HeightMap:
     terrain = load_terrain("shackleton")
     assert isinstance(terrain, HeightMap)
     return replace(terrain, search_radius_m=3000.0, height_sigma_m=HEIGHT_SIGMA_M)
+
+
+def steps_of(frames, odometry) -> Steps:
+    """Moves by odometry as stated, turned by the last attitude of the frames before each."""
+    has = np.array([frame.R_body_enu is not None for frame in frames[:-1]])
+    anchor = np.maximum.accumulate(np.where(has, np.arange(1, len(has) + 1), 0))
+    return odometry_moves(frames, odometry, OdometryErrors(0.02, 0.05))[0].steps(anchor)
 
 
 def refused(frame: ObservedFrame) -> ObservedFrame:
@@ -35,7 +42,7 @@ def test_moves_are_turned_by_the_stars_attitude_also_over_refused_frames():
     frames = observed(drive.estimates, R)
     for k in (4, 5, 6):
         frames[k] = refused(frames[k])
-    steps = odometry_steps(frames, odometry_of(drive.position_m, R), OdometryErrors(0.02, 0.05))
+    steps = steps_of(frames, odometry_of(drive.position_m, R))
     moves = np.diff(drive.position_m, axis=0)
     np.testing.assert_allclose(steps.move_m, moves, atol=1e-6)
     np.testing.assert_allclose(steps.sigma_m, np.hypot(0.02 * np.linalg.norm(moves, axis=1), 0.05), rtol=1e-6)
@@ -46,7 +53,7 @@ def test_moves_before_the_first_attitude_are_not_known():
     drive, R = simulate_drive(rng, FRAMES), attitudes(rng, FRAMES)
     frames = observed(drive.estimates, R)
     frames[0] = refused(frames[0])
-    steps = odometry_steps(frames, odometry_of(drive.position_m, R), OdometryErrors(0.02, 0.05))
+    steps = steps_of(frames, odometry_of(drive.position_m, R))
     assert np.isinf(steps.sigma_m[0])
     assert np.isfinite(steps.sigma_m[1:]).all()
 
@@ -72,6 +79,8 @@ def test_a_track_names_what_it_used_and_bridges_the_rest(ground):
     assert track.bias_rad == pytest.approx(1e-3 * drive.shared[0], abs=4 * track.bias_sigma_rad)
     assert not track.slipped.any()
     assert track.clock is None
+    start_m = track.smoothed.position_enu_m[0, :2] - drive.position_m[0]
+    np.testing.assert_allclose(track.odometry_m - start_m, drive.position_m, atol=1e-6)
 
 
 def test_without_odometry_a_refused_frame_has_no_position(ground):

@@ -283,15 +283,13 @@ class TrackRun:
         return odometry
 
     def _write(self, track: Track, pictures: bool = True) -> None:
-        args, odometry, made, moves_m = self.args, None, {}, None
+        args, odometry, made = self.args, None, {}
         if args.odometry is not None:
             odometry = {"file": Path(args.odometry).name, "sigma": args.odometry_sigma, "floor_m": args.odometry_floor,
                         "time_sigma_s": args.odometry_time_sigma, "fault": track.odometry_fault or None}  # fmt: skip
         if pictures and not args.no_plots:
-            if odometry is not None and not track.odometry_fault:
-                moves_m = self.session.odometry_positions_m(track, self._odometry())
             title = f"Track of {Path(args.frames[0]).resolve().name}"
-            page = tracking.track_page(track, title=title, odometry_m=moves_m)
-            made = {"track.png": png_bytes(tracking.draw_track(track, moves_m)), "track.html": page.encode()}
+            page = tracking.track_page(track, title)
+            made = {"track.png": png_bytes(tracking.draw_track(track)), "track.html": page.encode()}
         tracking.write_track(track, Path(args.dir), odometry=odometry, pictures=made)
         self.has_written = True

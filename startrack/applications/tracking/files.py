@@ -255,15 +255,9 @@ def track_geojson(track: Track, records: Sequence[dict[str, Any]]) -> str:
     return output.geojson_text([*([line] if len(places) > 1 else []), *points], "" if site is None else site.body)
 
 
-def track_page(track: Track, *, title: str, odometry_m: Array | None = None) -> str:
-    """The page as text: HTML with its style, scripts and data.
-
-    Args:
-        track: with n frames.
-        title: of the page, plain text.
-        odometry_m: positions (n, 2) in enu by odometry alone; None: not known.
-    """
-    (east_m, north_m), half_m = track_extent(track, odometry_m)
+def track_page(track: Track, title: str) -> str:
+    """The page as text, with a plain `title`: HTML with its style, scripts and data."""
+    (east_m, north_m), half_m = track_extent(track)
     records = frame_records(track)
     head = {
         "columns": [],
@@ -278,7 +272,7 @@ def track_page(track: Track, *, title: str, odometry_m: Array | None = None) -> 
             for q in FRAME_QUANTITIES
             if not q.key.endswith(OFF_PAGE)
         },
-        "odometry": None if odometry_m is None else np.round(known_points(odometry_m), 3).tolist(),
+        "odometry": np.round(known_points(track.odometry_m), 3).tolist() or None,
         "crater": track.crater_texts,
         "terrain": track.terrain.name,
         "terrains": {track.terrain.name: output.ground_map(track.terrain, (east_m, north_m), RELIEF_MARGIN * half_m)},

@@ -135,13 +135,3 @@ def odometry_moves(
 def times_s(frames: Sequence[ObservedFrame]) -> Array:
     """Times (n,) [Unix s] of the frames."""
     return np.array([frame.time_utc.astimezone(UTC).timestamp() for frame in frames])
-
-
-def odometry_steps(frames: Sequence[ObservedFrame], odometry: Odometry | None, errors: OdometryErrors) -> Steps:
-    """Moves between frames in enu by `odometry` as stated, turned by the last attitude of the `frames` before each.
-
-    Moves before the first attitude are not known. Raises as `odometry_moves`.
-    """
-    has = np.array([frame.R_body_enu is not None for frame in frames[:-1]], dtype=bool)
-    anchor = np.maximum.accumulate(np.where(has, np.arange(1, len(has) + 1), 0)) if len(has) else np.zeros(0, int)
-    return odometry_moves(frames, odometry, errors)[0].steps(anchor)

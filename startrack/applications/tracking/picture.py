@@ -33,17 +33,12 @@ SMALLEST_HALF_M = 0.05
 WIDEST = 25.0  # ellipse that the map has room for, in half axes of the last one
 
 
-def draw_track(track: Track, odometry_m: Array | None = None) -> NDArray[np.uint8]:
-    """The picture (H, W, 3), red, green, blue: the map, and beside it the track in words and a legend.
-
-    Args:
-        track: with n frames.
-        odometry_m: positions (n, 2) in enu by odometry alone, from the first smoothed position; None: not known.
-    """
+def draw_track(track: Track) -> NDArray[np.uint8]:
+    """The picture (H, W, 3), red, green, blue: the map, and beside it the track in words and a legend."""
     canvas = Canvas(*TRACK_SIZE_PX)
     title = f"{'camera at rest' if track.at_rest else 'track'} on {track.terrain.name}"
     canvas.text((MAP_BOX[0], 0.7 * MARGIN_PX), title, Ink.PLAIN, size=TITLE_PX)
-    drawn, legend = draw_track_map(canvas, MAP_BOX, track, odometry_m)
+    drawn, legend = draw_track_map(canvas, MAP_BOX, track)
     drawn.draw_distances()
     left, y = MAP_BOX[2] + 2 * TEXT_PX, MAP_BOX[1] + TEXT_PX
     for line in _facts(track):
@@ -69,10 +64,10 @@ def _facts(track: Track) -> list[str]:
     return [*lines, *track.crater_texts, *track.leg_texts]
 
 
-def track_extent(track: Track, odometry_m: Array | None = None) -> tuple[tuple[float, float], float]:
+def track_extent(track: Track) -> tuple[tuple[float, float], float]:
     """Centre (east, north) and half side [m] of a map of the `track`; the search area where no position is known."""
     shown = track.filtered if track.at_rest else track.smoothed
-    around = known_points(np.concatenate([shown.position_enu_m[:, :2], *([] if odometry_m is None else [odometry_m])]))
+    around = known_points(np.concatenate([shown.position_enu_m[:, :2], track.odometry_m]))
     if not len(around):
         return (0.0, 0.0), track.terrain.search_radius_m
     low, high = around.min(axis=0), around.max(axis=0)
@@ -97,16 +92,16 @@ def known_points(points_m: Array) -> Array:
     return points_m[np.isfinite(points_m).all(axis=1)]
 
 
-def draw_track_map(canvas: Canvas, box: Box, track: Track, odometry_m: Array | None) -> tuple[Map, Legend]:
+def draw_track_map(canvas: Canvas, box: Box, track: Track) -> tuple[Map, Legend]:
     """Draw the map into the box; returns it and its legend."""
-    drawn = Map.of_extent(canvas, box, *track_extent(track, odometry_m))
+    drawn = Map.of_extent(canvas, box, *track_extent(track))
     drawn.draw_ground(track.terrain)
     words, window = drawn.draw_heights(track.terrain), drawn.window
     shown, colour = (track.filtered, Ink.BLUE) if track.at_rest else (track.smoothed, Ink.POSITION)
     times = _draw_ellipses(drawn, shown, colour)
     legend: Legend = [("ring", colour, "95 % ellipses" + (f", enlarged {times:g} times" if times > 1 else ""))]
-    if odometry_m is not None:
-        window.line(drawn.canvas_px(known_points(odometry_m)), ODOMETRY, 2)
+    if len(track.odometry_m):
+        window.line(drawn.canvas_px(known_points(track.odometry_m)), ODOMETRY, 2)
         legend += [("line", ODOMETRY, "odometry alone")]
     smoothed, filtered = (drawn.canvas_px(one.position_enu_m[:, :2]) for one in (track.smoothed, track.filtered))
     window.line(known_points(smoothed), Ink.POSITION, 3)

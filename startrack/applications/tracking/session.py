@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from startrack.applications.tracking.explanations import WINDOW
-from startrack.applications.tracking.moves import odometry_moves, odometry_steps, times_s
+from startrack.applications.tracking.moves import odometry_moves, times_s
 from startrack.applications.tracking.observed_frame import (
     FrameStore,
     ObservedFrame,
@@ -35,7 +35,7 @@ from startrack.exposure import NO_TIME, sidecar_of
 
 if TYPE_CHECKING:
     from startrack.camera import Camera
-    from startrack.core.types import Array, Exposure
+    from startrack.core.types import Exposure
     from startrack.terrain import Terrain
 
 # Since the last change of a file or its sidecar: it is complete, and one that cannot be read is refused.
@@ -118,16 +118,6 @@ class TrackSession:
         return estimate_track(
             frames, self.terrain, self.shared, odometry=odometry, odometry_errors=self.odometry_errors, at_rest=at_rest,
         )  # fmt: skip
-
-    def odometry_positions_m(self, track: Track, odometry: Odometry | None) -> Array:
-        """Positions (n, 2) [m] of the frames of a `track` by `odometry` alone, from the first smoothed position.
-
-        Not a number where no move is known.
-        """
-        steps = odometry_steps(self.frames[: len(track.frames)], odometry, self.odometry_errors)
-        move_m = np.where(np.isfinite(steps.sigma_m)[:, None], steps.move_m, np.nan)
-        first_m = track.smoothed.position_enu_m[:1, :2]
-        return np.concatenate([first_m, first_m + np.cumsum(move_m, axis=0)])
 
     @property
     def waits(self) -> bool:

@@ -22,7 +22,7 @@ from startrack.applications.tracking.positions import (
 )
 from startrack.applications.tracking.track_errors import BIAS, CLOCK, ErrorFound, TrackErrors
 from startrack.core.types import Array, BadInput, Bools, ClockError, Ints
-from startrack.estimation.observations import UNKNOWN_M, USUAL_ODOMETRY, OdometryErrors
+from startrack.estimation.observations import UNKNOWN_M, USUAL_ODOMETRY, OdometryErrors, Steps
 from startrack.estimation.trajectory import radius_holding
 from startrack.frames import quat_xyzw_from_R
 from startrack.localization import camera_at
@@ -120,6 +120,7 @@ class Track:
     at_rest: bool = False
     odometry_fault: str = ""  # of the odometry as a whole, which is left out then
     legs: tuple[SlippedLeg, ...] = ()  # the slipped steps, each leg of them as one
+    odometry_m: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (n, 2) by odometry alone; (0, 2): not known
 
     @property
     def leg_texts(self) -> list[str]:
@@ -191,13 +192,15 @@ def estimate_track(
         SizeError.of(errors[name], crater.facts().get(key, np.nan)) if name in errors else None
         for name, key in SIZES.items()
     )
-    leg = np.where(np.isfinite(best.steps.sigma_m), np.maximum(best.leg, 0), 0)
+    steps = best.steps
+    leg = np.where(np.isfinite(steps.sigma_m), np.maximum(best.leg, 0), 0)
     return Track(
         tuple(map(_track_frame, frames, robust.mode, robust.attitude_fits, is_outside.tolist())),
         by_first, smoothed, crater if shared.bends else terrain,
         *(errors[BIAS][:2] if BIAS in errors else (0.0, 0.0)),
         ClockError(*errors[CLOCK][:2]) if CLOCK in errors else None, depth, width, leg > 0, at_rest, best.moves.fault,
-        slipped_legs(leg, best.steps.move_m, smoothed.position_enu_m[:, :2]),
+        slipped_legs(leg, steps.move_m, smoothed.position_enu_m[:, :2]),
+        np.zeros((0, 2)) if odometry is None or at_rest or best.moves.fault else _odometry_alone_m(steps, smoothed),
     )  # fmt: skip
 
 
@@ -244,6 +247,12 @@ def _trajectory(
         found.position_enu_m[at], found.covariance_m2[at] = fixes[0].position_enu_m, fixes[0].covariance_m2
         found.radius95_m[at], found.radius999_m[at] = fixes[0].radius95_m, fixes[0].radius999_m
     return found
+
+
+def _odometry_alone_m(steps: Steps, smoothed: Trajectory) -> Array:
+    """Positions (n, 2) by the moves alone from the first smoothed one; nan behind a move that is not known."""
+    move_m = np.where(np.isfinite(steps.sigma_m)[:, None], steps.move_m, np.nan)
+    return np.cumsum(np.concatenate([smoothed.position_enu_m[:1, :2], move_m]), axis=0)
 
 
 def slipped_legs(leg: Ints, move_m: Array, position_m: Array) -> tuple[SlippedLeg, ...]:

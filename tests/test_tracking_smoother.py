@@ -32,8 +32,9 @@ def least_squares(drive: Drive, frames: int) -> tuple[np.ndarray, np.ndarray]:
     Also their covariance.
     """
     k, posts, steps = len(drive.shared), len(drive.height_error_m), drive.steps
-    legs = [number for number in np.unique(steps.leg) if number]
-    by_moves = [steps.by_shared_m, *(steps.by_leg_m * (steps.leg == number)[:, None, None] for number in legs)]
+    leg = np.cumsum(steps.begins)
+    legs = [steps.by_leg_m * (leg == number)[:, None, None] for number in range(1, steps.begins.sum() + 1)]
+    by_moves = [steps.by_shared_m, *legs]
     by_move = np.concatenate(by_moves, axis=-1)
     moves = by_move.shape[-1]
     size = 2 * frames + k + posts + moves
@@ -83,8 +84,10 @@ def test_the_smoother_is_least_squares_with_all_unknowns(shared_count, by_moves)
 def test_the_filter_is_least_squares_with_the_frames_so_far(by_moves, leg):
     drive = simulate_drive(np.random.default_rng(2), 9)
     drive = with_shared_moves(drive) if by_moves else drive
-    by_leg_m = 0.2 * np.stack([drive.steps.move_m, drive.steps.move_m[:, ::-1]], axis=-1)
-    drive = replace(drive, steps=replace(drive.steps, leg=np.array(leg), by_leg_m=by_leg_m)) if by_moves else drive
+    number = np.array(leg)
+    by_leg_m = 0.2 * np.stack([drive.steps.move_m, drive.steps.move_m[:, ::-1]], axis=-1) * (number > 0)[:, None, None]
+    begins = (number > 0) & (np.diff(number, prepend=0) != 0)
+    drive = replace(drive, steps=replace(drive.steps, begins=begins, by_leg_m=by_leg_m)) if by_moves else drive
     state = TrackFilter.start(1, drive.steps.by_shared_m.shape[-1], drive.steps.by_leg_m.shape[-1])
     for k, estimate in enumerate(drive.estimates):
         if k:

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from startrack.core import MAX_SPEED_M_S, ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
-from startrack.core.types import Array, Ints
+from startrack.core.types import Array, Bools, Ints
 
 UNKNOWN_M = 1e5  # standard deviation of a position about which nothing is known; larger ones cost digits of the others
 UNSEEN_NOISE = 1e-6  # of means that do not respond to anything: any will do, and about that of others leaves all digits
@@ -88,8 +88,8 @@ class Steps:
     move_m: Array  # (n - 1, 2)
     sigma_m: Array  # (n - 1,) on each axis; infinite where the move is not known
     by_shared_m: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))  # (n - 1, 2, f) by one sigma of each
-    leg: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # (n - 1,) number, rising; 0: none
-    by_leg_m: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))  # (n - 1, 2, l) by one sigma of its errors
+    by_leg_m: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))  # (n - 1, 2, l) of its leg; 0 where none is
+    begins: Bools = field(default_factory=lambda: np.zeros(0, dtype=bool))  # (n - 1,) whether a leg begins with it
 
     @classmethod
     def unknown(cls, frames: int) -> Steps:

@@ -96,9 +96,8 @@ class TrackFilter:
         count, one = len(self.mean), slice(number, number + 1)
         by_shared_m = steps.by_shared_m[one] if self.moves_count else np.zeros((1, 2, 0))
         self.move(*(np.repeat(of, count, axis=0) for of in (steps.move_m[one], steps.sigma_m[one], by_shared_m)))
-        if len(steps.leg) and steps.leg[number] and np.isfinite(steps.sigma_m[number]):
-            is_new = bool(steps.leg[number] > steps.leg[:number].max(initial=0))
-            self.move_by_leg(np.repeat(steps.by_leg_m[one], count, axis=0), is_new=is_new)
+        if len(steps.begins):
+            self.move_by_leg(np.repeat(steps.by_leg_m[one], count, axis=0), is_new=bool(steps.begins[number]))
 
     def move(self, move_m: Array, sigma_m: Array, by_m: Array) -> None:
         """Make moves (b, 2) with errors of `sigma_m` (b,) on each axis; infinite: not known, they lead anywhere.

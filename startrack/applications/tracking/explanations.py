@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from startrack.applications.tracking.moves import FREEDOMS, LEG_FREEDOMS, Moves
+from startrack.applications.tracking.moves import FREEDOMS, LEG_FREEDOMS, Moves, turned
 from startrack.core.types import Array, Bools, Ints
 from startrack.estimation.observations import FrameEstimate, Steps
 from startrack.estimation.trajectory import TrackFilter, log_normal
@@ -33,6 +33,7 @@ LEAST_VARIANT = 0.01  # part of an explanation's probability, by other moves, th
 WINDOW = 200  # frames with a position, of a live track, that are not settled
 SETTLED_DOUBT = 1e-3  # probability of explanations that take a frame otherwise, from which on it is not settled
 KEPT_NATS, MOST_KEPT = 60.0, 60  # of explanations beside the best, and for each kind of odometry
+OF_MOVE = "delta_m", "sigma_m", "freedom_m"
 MODE, KIND, ANCHOR = 0, slice(1, 3), slice(3, 5)  # of a frame in the history: kinds and anchors of both drives
 
 
@@ -62,16 +63,16 @@ class Explanation:
 
     @property
     def leg(self) -> Ints:
-        """(n - 1,) number from 1 of the leg, or of the single move, that slipped; 0: none; -1: begun before them."""
-        number = np.cumsum((self.kind == SLIPS) | (self.kind == BEGINS))
-        return np.where(self.kind > STRAIGHT, np.where(number > 0, number, -1), 0)
+        """(n - 1,) number from 1 of the leg, or of the single move, that slipped; 0: none, or begun before them."""
+        return np.where(self.kind > STRAIGHT, np.cumsum((self.kind == SLIPS) | (self.kind == BEGINS)), 0)
 
     @property
     def steps(self) -> Steps:
         """The moves with their errors: those that slipped with a larger one, those of a leg with what they share."""
         steps = self.moves.steps(self.anchor)
         sigma_m = np.where(self.kind == SLIPS, np.hypot(steps.sigma_m, SLIP_SIGMA_M), steps.sigma_m)
-        return replace(steps, sigma_m=sigma_m, leg=np.where(self.kind >= BEGINS, self.leg, 0))
+        by_leg_m = np.where((self.kind >= BEGINS)[:, None, None], steps.by_leg_m, 0.0)
+        return replace(steps, sigma_m=sigma_m, by_leg_m=by_leg_m, begins=self.kind == BEGINS)
 
 
 @dataclass(eq=False)
@@ -267,18 +268,15 @@ class Explanations:
 
         A leg may begin, and go on, in odometry without a fault as a whole.
         """
-
-        def of_move(name: str) -> Array:
-            return np.array([getattr(m, name)[step] for m in self._moves])[one.odometry]
-
-        moved, turns, sigmas = one[np.arange(len(one.drive))], [], []
+        moved, parts = one[np.arange(len(one.drive))], []
+        own = [np.array([getattr(m, name)[step] for m in self._moves])[one.odometry] for name in OF_MOVE]
         for side, state in enumerate((moved.track, moved.other)):
             anchor = np.maximum(one.anchor[:, side] - self._first, 0)
-            turns.append(np.array([self._moves[m].turn[k] for m, k in zip(one.odometry, anchor, strict=True)]))
-            move = np.einsum("bij,bj->bi", turns[side], of_move("delta_m"))[:, :2]
-            sigmas.append(np.where(np.isfinite(move).all(axis=1), of_move("sigma_m"), np.inf))
-            state.move(move, sigmas[side], (turns[side] @ of_move("freedom_m"))[:, :2])
-        lost, entry = np.isinf(sigmas[0]), np.zeros((len(one.drive), 1, 5), dtype=np.int64)
+            turn = np.array([self._moves[m].turn[k] for m, k in zip(one.odometry, anchor, strict=True)])
+            parts.append(turned(turn, *own))
+            state.move(*parts[side][:3])
+        lost, by_leg = np.isinf(parts[0][1]), parts[0][3]
+        entry = np.zeros((len(one.drive), 1, 5), dtype=np.int64)
         entry[:, 0, ANCHOR] = one.anchor
         moved.history = np.concatenate([one.history, entry], axis=1)
         if not self.may_slip:
@@ -287,8 +285,7 @@ class Explanations:
         in_leg = one.history[:, -1, KIND][:, 0] >= BEGINS
         ended = np.where(in_leg, np.log(LEG_END_PROBABILITY), 0.0)  # a move that is not known ends a leg too
         slips = np.where(may_begin, SLIP_PROBABILITY + LEG_PROBABILITY, SLIP_PROBABILITY)
-        by_leg = (turns[0] @ of_move("leg_m"))[:, :2]
-        parts = []
+        branched = []
         for kind, may, log_prior in (
             (STRAIGHT, np.ones_like(lost), np.where(lost, 0.0, ended + np.log1p(-slips))),
             (SLIPS, ~lost, ended + np.log(SLIP_PROBABILITY)),
@@ -302,8 +299,8 @@ class Explanations:
                 branches.track.add_noise(SLIP_SIGMA_M)
             elif kind != STRAIGHT:
                 branches.track.move_by_leg(by_leg[may], is_new=kind == BEGINS)
-            parts.append(branches)
-        return Branches.join(parts)
+            branched.append(branches)
+        return Branches.join(branched)
 
     def _used(self, one: Branches, side: int, number: int, mode: FrameEstimate, here: Ints) -> Branches:
         """The frame is of the drive of this `side`: of the track, or of the other one."""

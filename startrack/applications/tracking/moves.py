@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC
-from functools import cached_property
 
 import numpy as np
 
@@ -46,19 +45,23 @@ class Moves:
 
     def steps(self, anchor: Ints) -> Steps:
         """The first moves in enu, turned as by the entries `anchor` (m,) of `turn`; none is known with a fault."""
-        count, turn = len(anchor), self.turn[anchor]
-        move = np.einsum("nij,nj->ni", turn, self.delta_m[:count])[:, :2]
-        known = np.isfinite(move).all(axis=1) & np.isfinite(self.sigma_m[:count]) & (not self.fault)
-        shared, of_leg = (
-            np.where(known[:, None, None], (turn @ by_m[:count])[:, :2], 0.0) for by_m in (self.freedom_m, self.leg_m)
-        )
-        sigma_m = np.where(known, self.sigma_m[:count], np.inf)
-        return Steps(np.where(known[:, None], move, 0.0), sigma_m, shared, np.zeros(count, dtype=np.int64), of_leg)
+        own = (of[: len(anchor)] for of in (self.delta_m, self.sigma_m, self.freedom_m))
+        move, sigma_m, *by_errors = turned(self.turn[anchor], *own)
+        unknown = np.isinf(sigma_m) | bool(self.fault)
+        for part in (move, *by_errors):
+            part[unknown] = 0.0
+        return Steps(move, np.where(unknown, np.inf, sigma_m), *by_errors)
 
-    @cached_property
-    def leg_m(self) -> Array:
-        """(n - 1, 3, LEG_FREEDOMS) of `delta_m`, by errors of a standard normal prior that the moves of a leg share."""
-        return LEG_SIGMA_1 * moves_by_scale_and_heading(self.delta_m)
+
+def turned(turn: Array, delta_m: Array, sigma_m: Array, freedom_m: Array) -> tuple[Array, Array, Array, Array]:
+    """Moves (n, 2) in enu by `delta_m` (n, 3) and rotations `turn` (n, 3, 3), and their standard deviations (n,).
+
+    Also their changes (n, 2, FREEDOMS) and (n, 2, LEG_FREEDOMS) by errors that all moves, and those of a leg, share.
+    """
+    move = np.einsum("nij,nj->ni", turn, delta_m)[:, :2]
+    by_leg = LEG_SIGMA_1 * moves_by_scale_and_heading(delta_m)
+    known = np.isfinite(move).all(axis=1)
+    return move, np.where(known, sigma_m, np.inf), (turn @ freedom_m)[:, :2], (turn @ by_leg)[:, :2]
 
 
 def odometry_moves(

@@ -193,7 +193,7 @@ def estimate_track(
         for name, key in SIZES.items()
     )
     steps = best.steps
-    leg = np.where(np.isfinite(steps.sigma_m), np.maximum(best.leg, 0), 0)
+    leg = np.where(np.isfinite(steps.sigma_m), best.leg, 0)
     return Track(
         tuple(map(_track_frame, frames, robust.mode, robust.attitude_fits, is_outside.tolist())),
         by_first, smoothed, crater if shared.bends else terrain,

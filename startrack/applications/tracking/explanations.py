@@ -183,6 +183,7 @@ class Explanations:
         self._settled.append(settled)
         self._frames.pop(0)
         found = found[kept]
+        found.anchor[found.anchor[:, 1] <= self.settled, 1] = 0  # the next move of the other drive leads anywhere
         self._found = replace(found, history=found.history[:, 1:])
         return True
 

@@ -46,11 +46,11 @@ class Moves:
     def steps(self, anchor: Ints) -> Steps:
         """The first moves in enu, turned as by the entries `anchor` (m,) of `turn`; none is known with a fault."""
         own = (of[: len(anchor)] for of in (self.delta_m, self.sigma_m, self.freedom_m))
-        move, sigma_m, *by_errors = turned(self.turn[anchor], *own)
+        move, sigma_m, shared, of_leg = turned(self.turn[anchor], *own)
         unknown = np.isinf(sigma_m) | bool(self.fault)
-        for part in (move, *by_errors):
+        for part in (move, shared, of_leg):
             part[unknown] = 0.0
-        return Steps(move, np.where(unknown, np.inf, sigma_m), *by_errors)
+        return Steps(move, np.where(unknown, np.inf, sigma_m), shared, of_leg)
 
 
 def turned(turn: Array, delta_m: Array, sigma_m: Array, freedom_m: Array) -> tuple[Array, Array, Array, Array]:

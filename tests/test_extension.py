@@ -46,13 +46,11 @@ class Sine(Lens):
 ''',
     "startrack.terrain.wall": '''
 from dataclasses import dataclass
-from pathlib import Path
-
 import numpy as np
 
 from startrack.core.declaration import Table, Text
 from startrack.frames import Site
-from startrack.terrain.protocol import Terrain
+from startrack.terrain.protocol import Terrain, TerrainFile
 
 TABLE = Table(keys={"file": Text(max_chars=100, required=True, description="height [m]")})
 
@@ -64,7 +62,7 @@ class Wall(Terrain):
     name: str
     site: Site
     height_m: float
-    files: tuple[Path, ...]
+    file: TerrainFile
     camera_height_m: float = 1.5
     search_radius_m: float = 300.0
 
@@ -87,7 +85,7 @@ class Wall(Terrain):
 
 def make_wall(keys, name, site, folder):
     file = folder / keys["wall"]["file"]
-    return Wall(name=name, site=site, height_m=float(file.read_text()), files=(file,))
+    return Wall(name=name, site=site, height_m=float(file.read_text()), file=TerrainFile(paths=(file,)))
 ''',
     "startrack.exposure.counts": '''
 import numpy as np

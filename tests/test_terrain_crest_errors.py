@@ -94,7 +94,7 @@ def crater() -> HeightMap:
     )
     site = Site("moon", plane.latitude_rad, plane.longitude_rad)
     return HeightMap(
-        site=site, maps=(average_posts(ground, 4),), files=(), search_radius_m=5000.0, height_sigma_m=4.0,
+        site=site, maps=(average_posts(ground, 4),), search_radius_m=5000.0, height_sigma_m=4.0,
     )  # fmt: skip
 
 

@@ -68,7 +68,7 @@ class SkylineEstimate:
         variance_m2, axes = np.linalg.eigh(covariance_m2)
         axes = (axes * np.sqrt(np.maximum(variance_m2, 0.0))).T
         there = terrain.horizon_rad((position_m + np.vstack([np.zeros(2), axes, -axes]))[:, None], MIDDLES_RAD)
-        by_map = np.asarray(terrain.horizon_sigma_rad(np.asarray(position_m)[None], MIDDLES_RAD)).ravel()
+        by_map = np.asarray(terrain.errors.sigma_rad(np.asarray(position_m)[None], MIDDLES_RAD)).ravel()
         moved = (
             np.abs(there[1:] - there[0]).reshape(2, 2, -1).min(axis=0)
         )  # beyond a wall nearby the horizon is no measure

@@ -11,13 +11,14 @@ from startrack.terrain.ground_brightness import GroundBrightness
 from startrack.terrain.io import KEYS as TERRAIN_KEYS
 from startrack.terrain.io import MAKERS, files_of_terrain, load_terrain, site_of_terrain, terrain_from_dict
 from startrack.terrain.projection import EQUIRECTANGULAR, STEREOGRAPHIC, Projection
-from startrack.terrain.protocol import NO_POST, ExpectedCrests, ForwardingTerrain, Terrain
+from startrack.terrain.protocol import ForwardingTerrain, Rim, Terrain, TerrainFile
 from startrack.terrain.raster import Raster
-from startrack.terrain.shape import DIAMETER, WAVES, ShapeError
+from startrack.terrain.shape import DIAMETER, NO_POST, WAVES, ExpectedCrests, GroundErrors, ShapeError
 
 if TYPE_CHECKING:
     from startrack.terrain.array_map import Grid, map_of_array
     from startrack.terrain.earth_projection import EarthProjection
+    from startrack.terrain.ground import cell_posts
     from startrack.terrain.height_map import HeightMap
     from startrack.terrain.import_map import import_maps
     from startrack.terrain.map_reading import read_map
@@ -27,17 +28,18 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DIAMETER", "EQUIRECTANGULAR", "MAKERS", "NO_POST", "STEREOGRAPHIC", "TERRAIN_KEYS", "WAVES", "Cylinder",
-    "EarthProjection", "ExpectedCrests", "ForwardingTerrain", "Grid", "GroundBrightness", "HeightMap", "Projection",
-    "Raster", "ShapeError", "StateableError", "Terrain", "can_write_maps", "files_of_terrain", "import_maps",
-    "is_geotiff", "load_terrain", "map_of_array", "read_map", "require_bounds", "require_horizons", "require_place",
-    "require_site", "require_terrain", "site_of_terrain", "state_errors", "stateable_errors", "terrain_from_dict",
-    "write_bands", "write_map",
+    "EarthProjection", "ExpectedCrests", "ForwardingTerrain", "Grid", "GroundBrightness", "GroundErrors", "HeightMap",
+    "Projection", "Raster", "Rim", "ShapeError", "StateableError", "Terrain", "TerrainFile", "can_write_maps",
+    "cell_posts", "files_of_terrain", "import_maps", "is_geotiff", "load_terrain", "map_of_array", "read_map",
+    "require_bounds", "require_horizons", "require_place", "require_site", "require_terrain", "site_of_terrain",
+    "state_errors", "stateable_errors", "terrain_from_dict", "write_bands", "write_map",
 ]  # fmt: skip
 _LAZY_MODULES = {  # of names that few programs use: imported at the first use
     "EarthProjection": "earth_projection", "Grid": "array_map", "HeightMap": "height_map",
-    "StateableError": "state_file", "can_write_maps": "map_writing", "import_maps": "import_map",
-    "is_geotiff": "plain_tiff", "map_of_array": "array_map", "read_map": "map_reading", "state_errors": "state_file",
-    "stateable_errors": "state_file", "write_bands": "map_writing", "write_map": "map_writing",
+    "StateableError": "state_file", "can_write_maps": "map_writing", "cell_posts": "ground",
+    "import_maps": "import_map", "is_geotiff": "plain_tiff", "map_of_array": "array_map", "read_map": "map_reading",
+    "state_errors": "state_file", "stateable_errors": "state_file", "write_bands": "map_writing",
+    "write_map": "map_writing",
 }  # fmt: skip
 
 

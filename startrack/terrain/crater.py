@@ -9,7 +9,7 @@ import numpy as np
 
 from startrack.core.types import Array, Bools
 from startrack.frames import Site
-from startrack.terrain.protocol import Terrain
+from startrack.terrain.protocol import Rim, Terrain
 
 HALVINGS = 60  # of the range of distances: to the last digit of a length
 
@@ -71,9 +71,9 @@ class Crater(Terrain):
         return self.diameter_m / 2
 
     @property
-    def rim_radius_m(self) -> float:  # type: ignore[override]
-        """The round wall's, to be drawn on maps."""
-        return self.radius_m
+    def rim(self) -> Rim:  # type: ignore[override]
+        """The top of the wall."""
+        return Rim(self.radius_m, self.wall_m)
 
     @property
     def radii_m(self) -> tuple[float, float]:

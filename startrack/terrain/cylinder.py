@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from startrack.core.declaration import Flag
-from startrack.core.obstacles import Obstacles
 from startrack.core.types import Array, BadInput
 from startrack.kernels.library import kernel
 from startrack.terrain.crater import Crater, DeformedCrater, distance_bounds, distance_to_circle, slopes_of_round_crater
-from startrack.terrain.ground_brightness import GroundBrightness
-from startrack.terrain.protocol import Terrain
+from startrack.terrain.protocol import Terrain, TerrainFile
 from startrack.terrain.refracted import refraction_errors, refraction_slopes_rad, with_refraction_error
 from startrack.terrain.shape import (
     AMOUNT,
@@ -26,6 +23,7 @@ from startrack.terrain.shape import (
     EXACT,
     LENGTH,
     RIM_TILT,
+    GroundErrors,
     ShapeError,
     errors_by_name,
     select_slopes,
@@ -61,9 +59,7 @@ class Cylinder(Crater):
     rim_tilt_sigma_rad: float | None = EXACT  # of each of two axes
     camera_height_sigma_m: float = EXACT
     stated_depth_m: float | None = None  # of the file, which the errors are about; None: `depth_m`
-    obstacles: Obstacles | None = None
-    ground_brightness: GroundBrightness | None = None
-    files: tuple[Path, ...] = ()
+    file: TerrainFile = Terrain.file
     axisymmetric = True
     horizon_cost = 0.02
 
@@ -81,7 +77,7 @@ class Cylinder(Crater):
             raise BadInput(
                 "bad_terrain", f"camera_height_m is {self.camera_height_m:g}: the camera must be below the rim"
             )
-        for key, size in (("depth_sigma_m", self._stated_m), ("diameter_sigma_m", self.diameter_m)):
+        for key, size in (("depth_sigma_m", self.about_depth_m), ("diameter_sigma_m", self.diameter_m)):
             if (getattr(self, key) or 0.0) >= MAX_SHAPE_SIGMA * size:
                 raise BadInput("bad_terrain", f"{key} must be below {MAX_SHAPE_SIGMA * size:g} m, half of it")
 
@@ -103,30 +99,13 @@ class Cylinder(Crater):
         return np.arctan2(self.wall_m, farthest), np.arctan2(self.wall_m, nearest)
 
     @property
-    def shape_errors(self) -> tuple[ShapeError, ...]:  # type: ignore[override]
-        """Errors of depth and width (relative), ellipse, tilt of the rim, height of the camera, and refraction."""
-        depth = None if self.depth_sigma_m is None else self.depth_sigma_m / self.depth_m
-        diameter = None if self.diameter_sigma_m is None else self.diameter_sigma_m / self.diameter_m
-        deeper = self._stated_m / self.depth_m - 1.0
-        return (
-            *(replace(one, mean=deeper) for one in DEPTH.shape_errors(depth)),
-            *DIAMETER.shape_errors(diameter), *ELLIPSE.shape_errors(self.ellipse_sigma_1),
-            *RIM_TILT.shape_errors(self.rim_tilt_sigma_rad), *CAMERA_ERROR.shape_errors(self.camera_height_sigma_m),
-            *refraction_errors(self.air),
-        )  # fmt: skip
-
-    def shape_slopes_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
-        """In closed form; see `Terrain`. Zero from inside the wall."""
-        shape = np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))
-        errors = self.shape_errors
-        slopes = slopes_of_round_crater(self, points_m, azimuths_rad) if errors else {}
-        if self.air is not None:
-            slopes |= refraction_slopes_rad(self.air, self.horizon_rad(points_m, azimuths_rad))
-        return select_slopes(errors, slopes, shape)
+    def errors(self) -> CylinderErrors:  # type: ignore[override]
+        """Errors of its sizes, of the rim's shape, and of the camera's height."""
+        return CylinderErrors(self)
 
     def with_shape(self, values: Array) -> Terrain:
         """The crater with these errors; see `Terrain`."""
-        errors = errors_by_name(self.shape_errors, values)
+        errors = errors_by_name(self.errors.shape, values)
         refraction_1 = errors.pop("refraction_1", 0.0)
         crater = DeformedCrater(
             name=self.name, site=self.site, search_radius_m=self.search_radius_m,
@@ -136,42 +115,63 @@ class Cylinder(Crater):
         )  # fmt: skip
         return with_refraction_error(crater, refraction_1)
 
-    @property
-    def unknown_steepness_1(self) -> float:  # type: ignore[override]
-        """See `Terrain`: of depth over diameter."""
-        sigma = {one.name: one.sigma for one in self.shape_errors}
-        found = float(np.hypot(sigma.get("depth_1", 0.0), sigma.get("diameter_1", 0.0)))
-        return found if found > LINEAR_SHAPE_1 and self.stated_depth_m is None else 0.0
-
-    @property
-    def steepness_1(self) -> float:  # type: ignore[override]
-        """See `Terrain`."""
-        return self.wall_m / (self._stated_m - self.camera_height_m)
-
     def with_steepness(self, steepness_1: float) -> Cylinder:
         """See `Terrain`: of another depth."""
-        if steepness_1 == self.steepness_1:
+        if steepness_1 == self.errors.steepness_1:
             return self
-        depth_m = self.camera_height_m + steepness_1 * (self._stated_m - self.camera_height_m)
-        return replace(self, depth_m=depth_m, stated_depth_m=self._stated_m)
+        depth_m = self.camera_height_m + steepness_1 * (self.about_depth_m - self.camera_height_m)
+        return replace(self, depth_m=depth_m, stated_depth_m=self.about_depth_m)
 
     @property
-    def _stated_m(self) -> float:
+    def about_depth_m(self) -> float:
+        """Depth [m] that the errors are about: that of the file."""
         return self.depth_m if self.stated_depth_m is None else self.stated_depth_m
 
     def facts(self) -> dict[str, Any]:
         """Diameter and depth, as JSON values."""
         return {"kind": "cylinder", "diameter_m": self.diameter_m, "depth_m": self.depth_m}
 
-    def visible_disks(self, azimuths_rad: Array, elevations_rad: Array) -> tuple[Array, float]:
-        """A ray is visible from p exactly where |p + rho u| < R, rho = wall / tan e, u its horizontal direction.
 
-        Rays at or below the horizontal are visible nowhere: their disks lie infinitely far away.
-        """
-        tan = np.tan(elevations_rad)
-        rho = np.divide(self.wall_m, tan, out=np.full_like(tan, 1e12), where=tan > 0)
-        u = np.stack([np.sin(azimuths_rad), np.cos(azimuths_rad)], axis=-1)
-        return -np.minimum(rho, 1e12)[:, None] * u, self.radius_m
+@dataclass(frozen=True)
+class CylinderErrors(GroundErrors):
+    """Errors of the shape of a round `crater`."""
+
+    crater: Cylinder
+
+    @property
+    def shape(self) -> tuple[ShapeError, ...]:  # type: ignore[override]
+        """Errors of depth and width (relative), ellipse, tilt of the rim, height of the camera, and refraction."""
+        crater = self.crater
+        depth = None if crater.depth_sigma_m is None else crater.depth_sigma_m / crater.depth_m
+        diameter = None if crater.diameter_sigma_m is None else crater.diameter_sigma_m / crater.diameter_m
+        deeper = crater.about_depth_m / crater.depth_m - 1.0
+        return (
+            *(replace(one, mean=deeper) for one in DEPTH.errors_of_shape(depth)),
+            *DIAMETER.errors_of_shape(diameter), *ELLIPSE.errors_of_shape(crater.ellipse_sigma_1),
+            *RIM_TILT.errors_of_shape(crater.rim_tilt_sigma_rad),
+            *CAMERA_ERROR.errors_of_shape(crater.camera_height_sigma_m), *refraction_errors(crater.air),
+        )  # fmt: skip
+
+    def slopes_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """In closed form; zero from inside the wall."""
+        shape = np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))
+        errors, crater = self.shape, self.crater
+        slopes = slopes_of_round_crater(crater, points_m, azimuths_rad) if errors else {}
+        if crater.air is not None:
+            slopes |= refraction_slopes_rad(crater.air, crater.horizon_rad(points_m, azimuths_rad))
+        return select_slopes(errors, slopes, shape)
+
+    @property
+    def unknown_steepness_1(self) -> float:  # type: ignore[override]
+        """Of depth over diameter."""
+        sigma = {one.name: one.sigma for one in self.shape}
+        found = float(np.hypot(sigma.get("depth_1", 0.0), sigma.get("diameter_1", 0.0)))
+        return found if found > LINEAR_SHAPE_1 and self.crater.stated_depth_m is None else 0.0
+
+    @property
+    def steepness_1(self) -> float:  # type: ignore[override]
+        """That of its depth."""
+        return self.crater.wall_m / (self.crater.about_depth_m - self.crater.camera_height_m)
 
 
 _horizons_of_circle = kernel(

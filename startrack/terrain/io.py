@@ -15,13 +15,13 @@ from startrack.core.declaration import Choice, Either, Flag, List, Number, Table
 from startrack.core.errors import Reason
 from startrack.core.files import parse_toml, printable, read_text, resolve_named
 from startrack.core.memory import check_memory
-from startrack.core.obstacles import Obstacles, read_obstacles
+from startrack.core.obstacles import read_obstacles
 from startrack.core.types import BadInput
 from startrack.frames import AIR_TABLE, Site
 from startrack.terrain import shape
 from startrack.terrain.cylinder import CYLINDER_KEYS, Cylinder
 from startrack.terrain.ground_brightness import GROUND_TABLE, GroundBrightness
-from startrack.terrain.protocol import Terrain
+from startrack.terrain.protocol import Terrain, TerrainFile
 
 FILE = Text(max_chars=4000, is_path=True)
 HEIGHT = Number(low=-shape.MAX_LENGTH_M, high=shape.MAX_LENGTH_M)
@@ -122,7 +122,7 @@ def load_terrain(name_or_path: str | Path) -> Terrain:
 def files_of_terrain(path: str | Path) -> tuple[Path, ...]:
     """The files that the terrain of the file at `path` is read from, beside it; where it cannot be loaded, its maps."""
     try:
-        return load_terrain(path).files
+        return load_terrain(path).file.paths
     except BadInput:  # refused when it is used; a map that is missing may come
         with suppress(BadInput):
             return _files_of_maps(read_keys(read_text(path, "bad_terrain")), Path(path).parent)
@@ -204,21 +204,17 @@ def terrain_from_dict(values: dict[str, Any], default_name: str = "terrain", fol
     return makers[0](keys, keys.get("name", default_name), site, folder or Path())
 
 
-def _obstacles(keys: dict[str, Any], folder: Path) -> tuple[Obstacles | None, tuple[Path, ...]]:
-    """The obstacles that a terrain file names, and their file."""
-    if "obstacles" not in keys:
-        return None, ()
-    return read_obstacles(folder / keys["obstacles"], "bad_terrain"), (folder / keys["obstacles"],)
-
-
-def _ground_brightness(keys: dict[str, Any]) -> GroundBrightness | None:
-    """What a terrain file states of the light of its ground. Raises BadInput bad_terrain."""
-    stated = keys.get("ground", {}).get("brightness")
-    return None if stated is None else GroundBrightness.of(stated)
+def _file_facts(keys: dict[str, Any], folder: Path) -> TerrainFile:
+    """What the `keys` of a terrain file in a `folder` state beside the ground. Raises BadInput bad_terrain."""
+    paths, obstacles, brightness = _files_of_maps(keys, folder), None, keys.get("ground", {}).get("brightness")
+    if "obstacles" in keys:
+        file = folder / keys["obstacles"]
+        paths, obstacles = (*paths, file), read_obstacles(file, "bad_terrain")
+    light = None if brightness is None else GroundBrightness.of(brightness)
+    return TerrainFile(paths=paths, obstacles=obstacles, ground_brightness=light)
 
 
 def _make_cylinder(keys: dict[str, Any], name: str, site: Site, folder: Path) -> Cylinder:
-    obstacles, files = _obstacles(keys, folder)
     cylinder, rover = keys["cylinder"], keys["rover"]
     sigmas: dict[str, Any] = {fact.key: cylinder.get(fact.key) for fact in shape.CYLINDER_FACTS}
     if cylinder.get("exact", False):
@@ -235,9 +231,7 @@ def _make_cylinder(keys: dict[str, Any], name: str, site: Site, folder: Path) ->
         search_radius_m=keys["search"].get("radius_m", cylinder["diameter_m"] / 2),
         camera_height_sigma_m=rover.get("camera_height_sigma_m", 0.0),
         rim_tilt_sigma_rad=_radians(sigmas.pop("rim_tilt_sigma_deg")),
-        obstacles=obstacles,
-        ground_brightness=_ground_brightness(keys),
-        files=files,
+        file=_file_facts(keys, folder),
         **sigmas,
     )
 
@@ -260,7 +254,7 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
     check_memory()  # its kernels come later: OpenBLAS ends the process before them
     dem, rover, search = keys["dem"], keys["rover"], keys["search"]
     near, files = (site.latitude_rad, site.longitude_rad), _map_files(keys, folder)
-    obstacles, more_files = _obstacles(keys, folder)
+    stated = _file_facts(keys, folder)
     scaling = {key: dem[key] for key in ("scale", "offset_m", "unusual_heights") if key in dem}
     maps = tuple(read_map(file, near=near, body=site.body, **scaling) for file in files)
     require_origin(maps, *near)
@@ -285,9 +279,7 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
         site=site,
         camera_height_m=rover["camera_height_m"],
         maps=maps,
-        files=(*_files_of_maps(keys, folder), *more_files),
-        obstacles=obstacles,
-        ground_brightness=_ground_brightness(keys),
+        file=stated,
         search_radius_m=search.get("radius_m", Terrain.search_radius_m),
         height_sigma_m=dem.get("height_sigma_m", 0.0),
         unstated_errors=() if "height_sigma_m" in dem else ("height_sigma_m",),

@@ -21,7 +21,8 @@ from startrack.terrain.crest_errors import (
     measure_crest_errors,
     spread_positions,
 )
-from startrack.terrain.height_map import COMMON_PER_POST, HeightMap
+from startrack.terrain.height_map import HeightMap
+from startrack.terrain.map_errors import COMMON_PER_POST
 from startrack.terrain.raster import Raster
 
 FINER = 2.0  # a finer map has at least so many posts to one of the map

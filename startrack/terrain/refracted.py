@@ -17,7 +17,7 @@ STAR_REFRACTION = Fact(
 
 def refraction_errors(air: Air | None) -> list[ShapeError]:
     """The error of the refraction in an `air`; none without."""
-    return [] if air is None else STAR_REFRACTION.shape_errors(air.refraction_sigma_1)
+    return [] if air is None else STAR_REFRACTION.errors_of_shape(air.refraction_sigma_1)
 
 
 def refraction_slopes_rad(air: Air | None, horizon_rad: Array) -> dict[str, Array]:
@@ -31,14 +31,9 @@ def with_refraction_error(ground: Terrain, error_1: float) -> Terrain:
 
 
 class MisrefractedGround(ForwardingTerrain):
-    """The terrain `whole` in directions of stars that are refracted by its `air` alone, where more does.
+    """The terrain `whole`, without errors of its shape, in directions of stars that its `air` alone refracts."""
 
-    It has no errors of its shape.
-    """
-
-    shape_errors, common_sigma_rad = (), 0.0
-    near, shape_slopes_rad, with_shape = Terrain.near, Terrain.shape_slopes_rad, Terrain.with_shape
-    visible_disks = Terrain.visible_disks
+    near, with_shape = Terrain.near, Terrain.with_shape
 
     def __init__(self, whole: Terrain, air: Air, error_1: float) -> None:
         super().__init__(whole)

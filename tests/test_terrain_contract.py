@@ -15,7 +15,7 @@ from startrack.core.types import Array, BadInput, Evidence
 from startrack.frames import Site
 from startrack.localization import ExactPosterior
 from startrack.terrain import Cylinder, ForwardingTerrain, GroundErrors, Terrain, load_terrain
-from startrack.terrain.crater import DeformedCrater
+from startrack.terrain.cylinder import DeformedCrater
 from startrack.terrain.shape import EXACT_WAVES
 
 SITE = Site("moon", np.radians(-89.66), np.radians(129.78))

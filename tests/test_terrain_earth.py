@@ -19,8 +19,8 @@ from startrack.core.types import BadInput
 from startrack.frames import Site, enu_from_latlon
 from startrack.terrain import HeightMap, Raster, Terrain, import_maps, load_terrain, read_map, write_map
 from startrack.terrain.derived_maps import DeformedMap
-from startrack.terrain.ellipsoid_fit import heights_above_sphere
 from startrack.terrain.height_map import OFF_MAP
+from startrack.terrain.maps.ellipsoid import heights_above_sphere
 
 pytest.importorskip("pyproj")
 pytest.importorskip("rasterio")
@@ -28,7 +28,7 @@ pytest.importorskip("matplotlib")
 import pyproj
 from earth_helpers import PLACE_DEG, SITE, in_projection, jacksboro, march
 
-from startrack.terrain.earth_projection import EarthProjection, project_earth
+from startrack.terrain.maps.projections import EarthProjection, project_earth
 
 DATA = Path(__file__).parent / "data"
 FINE_M = np.geomspace(1.0, 24_000.0, 5_000)
@@ -280,7 +280,7 @@ def test_import_writes_a_terrain_of_the_earth(tmp_path, capsys):
 
 def test_a_stated_geoid_tilts_the_ground():
     """The geoid rises by 20 arcsec to the east: the horizon there stands that much higher, in the west lower."""
-    from startrack.terrain.ellipsoid_fit import above_ellipsoid
+    from startrack.terrain.maps.ellipsoid import above_ellipsoid
 
     plain = on_earth(jacksboro())
     tilted = on_earth(above_ellipsoid(jacksboro(), SITE, -30.0, [20.0, 0.0]))

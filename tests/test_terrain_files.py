@@ -35,8 +35,8 @@ from startrack.terrain import (
     terrain_from_dict,
     write_map,
 )
-from startrack.terrain.import_map import MEASURED_PER_ESTIMATE
-from startrack.terrain.projection import ORTHOGRAPHIC, projection_of
+from startrack.terrain.imports.import_map import MEASURED_PER_ESTIMATE
+from startrack.terrain.maps.projections import ORTHOGRAPHIC, projection_of
 
 ROOT = Path(__file__).parent.parent
 pytestmark = pytest.mark.usefixtures("own_cache")

@@ -30,7 +30,7 @@ from startrack.terrain import table_cache as cache
 from startrack.terrain.derived_maps import DeformedMap, HorizonInterpolator
 from startrack.terrain.ground import ground_up_m
 from startrack.terrain.map_ends import facts_of_ends
-from startrack.terrain.projection import ORTHOGRAPHIC
+from startrack.terrain.maps.projections import ORTHOGRAPHIC
 from startrack.terrain.shape import EXACT_WAVES
 
 DATA = Path(__file__).parent / "data"

@@ -27,15 +27,16 @@ from startrack.terrain import (
     read_map,
     write_map,
 )
-from startrack.terrain.height_units import SURVEY_FOOT_M, metres_of
-from startrack.terrain.map_heights import (
+from startrack.terrain.maps.heights import (
     FOOT_M,
     GROUNDS,
+    SURVEY_FOOT_M,
     Mark,
     find_marks,
     highest_step_m,
+    metres_of,
 )
-from startrack.terrain.map_reading import place_on
+from startrack.terrain.maps.reading import place_on
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 SPHERES = {"moon": "+proj=longlat +R=1737400 +no_defs", "earth": "EPSG:4326"}

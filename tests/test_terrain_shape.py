@@ -26,7 +26,7 @@ from startrack.terrain import (
     load_terrain,
     terrain_from_dict,
 )
-from startrack.terrain.crater import DeformedCrater
+from startrack.terrain.cylinder import DeformedCrater
 from startrack.terrain.shape import WAVES
 
 CRATER = {

@@ -1,4 +1,4 @@
-"""The thesis's crater: a vertical wall of constant height around a flat circular floor, in closed form."""
+"""Craters with a vertical wall about a flat floor, in closed form: the thesis's round one, and a deformed one."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from startrack.core.declaration import Flag
-from startrack.core.types import Array, BadInput
+from startrack.core.types import Array, BadInput, Bools
+from startrack.frames import Site
 from startrack.kernels.library import kernel
-from startrack.terrain.crater import Crater, DeformedCrater, distance_bounds, distance_to_circle, slopes_of_round_crater
-from startrack.terrain.protocol import Terrain, TerrainFile
-from startrack.terrain.refracted import refraction_errors, refraction_slopes_rad, with_refraction_error
+from startrack.terrain.protocol import Rim, Terrain, TerrainFile, with_refraction_error
 from startrack.terrain.shape import (
     AMOUNT,
     CAMERA_ERROR,
@@ -26,9 +25,12 @@ from startrack.terrain.shape import (
     GroundErrors,
     ShapeError,
     errors_by_name,
+    refraction_errors,
+    refraction_slopes_rad,
     select_slopes,
 )
 
+HALVINGS = 60  # of the range of distances: to the last digit of a length
 MAX_SHAPE_SIGMA = 0.5  # of depth and diameter; beyond, a normal distribution holds sizes below 0
 LINEAR_SHAPE_1 = 0.05  # of depth over diameter: beyond, the shape that the rows show is searched, as it is not linear
 _SIZES = {"diameter_m": replace(LENGTH, required=True), "depth_m": replace(LENGTH, required=True)}
@@ -41,6 +43,193 @@ _SIGMAS = {
     **{fact.key: fact.limits for fact in (DEPTH, DIAMETER, ELLIPSE, CAMERA_ERROR)},
     "rim_tilt_sigma_rad": replace(RIM_TILT.limits, high=float(np.radians(RIM_TILT.limits.high))),
 }
+
+
+def distance_to_circle(points_m: Array, azimuths_rad: Array, radius_m: Array | float) -> Array:
+    """Distance (...) from points (..., 2) along azimuths to the far side of the origin's circle; 0: none ahead."""
+    points_m = np.asarray(points_m, dtype=np.float64)
+    x, y = points_m[..., 0], points_m[..., 1]
+    return chord(x * np.sin(azimuths_rad) + y * np.cos(azimuths_rad), np.hypot(x, y), radius_m)
+
+
+def chord(along_m: Array, off_centre_m: Array, radius_m: Array | float) -> Array:
+    """Distance to the circle ahead of a point `off_centre_m` from its middle, `along_m` of that in the direction."""
+    inner = np.square(np.maximum(radius_m, 0.0)) - np.square(off_centre_m)
+    root = np.sqrt(np.maximum(np.square(along_m) + inner, 0.0))
+    # Outside the circle (inner < 0) the rim no longer surrounds the point: the wall is overhead, at distance 0.
+    return np.where(inner > 0, np.maximum(root - along_m, 0.0), 0.0)
+
+
+def distance_bounds(
+    centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float,
+    least_radius_m: float, greatest_radius_m: float,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Least and greatest distance (...) to a rim between two circles, over boxes and azimuths as in `Terrain`.
+
+    A point within r of the centre c sees the circle of radius R no nearer than c sees the one of radius R - r, and no
+    farther than c sees the one of radius R + r. Over azimuths the distance grows steadily from the side that the point
+    is on to the opposite one.
+    """
+    reach = np.sqrt(2.0) * np.asarray(half_m)
+    if not np.any(azimuth_half_rad):
+        nearest = distance_to_circle(centres_m, azimuths_rad, least_radius_m - reach)
+        return nearest, distance_to_circle(centres_m, azimuths_rad, greatest_radius_m + reach)
+    x, y, sine, cosine = centres_m[..., 0], centres_m[..., 1], np.sin(azimuths_rad), np.cos(azimuths_rad)
+    along, across = x * sine + y * cosine, np.abs(x * cosine - y * sine)
+    half = np.minimum(azimuth_half_rad, np.pi)
+    off_centre, turn, turned = np.hypot(x, y), np.cos(half), np.sin(half)
+    side = off_centre * turn
+    most_along = np.where(along >= side, off_centre, along * turn + across * turned)
+    least_along = np.where(along <= -side, -off_centre, along * turn - across * turned)
+    nearest = chord(most_along, off_centre, least_radius_m - reach)
+    return nearest, chord(least_along, off_centre, greatest_radius_m + reach)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Crater(Terrain):
+    """A flat floor, z = 0, within a vertical wall about the origin. The search area may be infinite."""
+
+    name: str = "crater"
+    site: Site | None = None
+    diameter_m: float
+    depth_m: float
+    camera_height_m: float = Terrain.camera_height_m
+    search_radius_m: float = np.inf
+
+    @property
+    def radius_m(self) -> float:
+        """Of the rim, or of the round one that it differs from."""
+        return self.diameter_m / 2
+
+    @property
+    def rim(self) -> Rim:  # type: ignore[override]
+        """The top of the wall."""
+        return Rim(self.radius_m, self.wall_m)
+
+    @property
+    def radii_m(self) -> tuple[float, float]:
+        """Least and greatest radius of the rim [m]."""
+        return self.radius_m, self.radius_m
+
+    @property
+    def reach_m(self) -> float:
+        """The floor, or the search area and a quarter more."""
+        return float(min(self.radii_m[1], super().reach_m))
+
+    @property
+    def wall_m(self) -> float:
+        """Height of the rim above the camera [m], that of the middle of a tilted one."""
+        return self.depth_m - self.camera_height_m
+
+    def rim_m(self, points_m: Array) -> tuple[Array | float, Array | float]:
+        """Radius and height above the floor (...), (...) [m] of the rim on the side of the points (..., 2)."""
+        return self.radius_m, self.depth_m
+
+    def ground_m(self, points_m: Array) -> Array:
+        """Zero: the floor is the plane z = 0."""
+        return np.zeros(np.shape(points_m)[:-1])
+
+    def allowed(self, points_m: Array) -> Bools:
+        """Whether the points (..., 2) are on the floor and within reach."""
+        points = np.asarray(points_m)
+        away = np.hypot(points[..., 0], points[..., 1])
+        return np.asarray((away < self.rim_m(points)[0]) & (away <= self.reach_m))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeformedCrater(Crater):
+    """A crater with the rim at the radius R (1 + c cos 2 phi + s sin 2 phi).
+
+    phi is the azimuth of a point of the rim seen from the axis. The rim stands at depth + R (e sin phi + n cos phi)
+    above the floor. Ellipse and tilt are small: the wall surrounds the axis.
+    """
+
+    name: str = "deformed crater"
+    ellipse_cos_1: float = 0.0  # c
+    ellipse_sin_1: float = 0.0  # s
+    rim_tilt_east_rad: float = 0.0  # e
+    rim_tilt_north_rad: float = 0.0  # n
+    horizon_cost = 0.2
+
+    @property
+    def radii_m(self) -> tuple[float, float]:
+        """Least and greatest radius of the rim [m]."""
+        ellipse = float(np.hypot(self.ellipse_cos_1, self.ellipse_sin_1))
+        return self.radius_m * (1.0 - ellipse), self.radius_m * (1.0 + ellipse)
+
+    def rim_m(self, points_m: Array) -> tuple[Array, Array]:
+        """Radius and height above the floor (...), (...) [m] of the rim on the side of the points (..., 2)."""
+        around = np.arctan2(points_m[..., 0], points_m[..., 1])
+        radius = 1.0 + self.ellipse_cos_1 * np.cos(2 * around) + self.ellipse_sin_1 * np.sin(2 * around)
+        raised = self.rim_tilt_east_rad * np.sin(around) + self.rim_tilt_north_rad * np.cos(around)
+        return self.radius_m * radius, self.depth_m + self.radius_m * raised
+
+    def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """Horizon elevation [rad]; pi/2 from inside the wall. See `Terrain`."""
+        points = np.asarray(points_m, dtype=np.float64)
+        distance = self._distance_m(points, azimuths_rad)
+        height = self.rim_m(_points_ahead(points, distance, azimuths_rad))[1]
+        return np.arctan2(height - self.camera_height_m, distance)
+
+    def _distance_m(self, points: Array, azimuths_rad: Array) -> Array:
+        """Distance to the rim, halved in between the circles that lie wholly within and wholly outside of it."""
+        near = distance_to_circle(points, azimuths_rad, self.radii_m[0])
+        far = distance_to_circle(points, azimuths_rad, self.radii_m[1])
+        for _ in range(HALVINGS if np.any(far > near) else 0):
+            middle = 0.5 * (near + far)
+            within = self._is_within(_points_ahead(points, middle, azimuths_rad))
+            near, far = np.where(within, middle, near), np.where(within, far, middle)
+        return np.where(self._is_within(points), 0.5 * (near + far), 0.0)
+
+    def _is_within(self, points_m: Array) -> Bools:
+        return np.asarray(np.hypot(points_m[..., 0], points_m[..., 1]) < self.rim_m(points_m)[0])
+
+    def horizon_bounds_rad(
+        self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
+    ) -> tuple[Array, Array]:
+        """Bounds [rad] from the circles and the heights between which the rim lies; see `Terrain`."""
+        near, far = distance_bounds(centres_m, half_m, azimuths_rad, azimuth_half_rad, *self.radii_m)
+        raised = self.radius_m * float(np.hypot(self.rim_tilt_east_rad, self.rim_tilt_north_rad))
+        low, high = self.wall_m - raised, self.wall_m + raised
+        return np.arctan2(low, far if low > 0 else near), np.arctan2(high, near if high > 0 else far)
+
+    def facts(self) -> dict[str, Any]:
+        """Diameter, depth, ellipse and tilt, as JSON values."""
+        names = ("diameter_m", "depth_m", "ellipse_cos_1", "ellipse_sin_1", "rim_tilt_east_rad", "rim_tilt_north_rad")
+        return {"kind": "deformed crater", **{name: getattr(self, name) for name in names}}
+
+
+def slopes_of_round_crater(crater: Crater, points_m: Array, azimuths_rad: Array) -> dict[str, Array]:
+    """Change (...) of the horizon [rad] by one unit of each error of a round `crater`, by the error's name.
+
+    Seen from the points (..., 2) [m] at the azimuths (...) [rad]. With d the distance to the rim, w its height above
+    the camera and q its point there: tan H = w / d; where the rim moves outward by x, d grows by x R / (u q), u the
+    direction (u q = R cos of the angle to the wall's normal). Zero from inside the wall.
+    """
+    points = np.asarray(points_m, dtype=np.float64)
+    radius_m, wall = crater.radius_m, crater.wall_m
+    distance = distance_to_circle(points, azimuths_rad, radius_m)
+    rim = _points_ahead(points, distance, azimuths_rad)
+    east, north = rim[..., 0] / radius_m, rim[..., 1] / radius_m
+    facing = np.maximum(east * np.sin(azimuths_rad) + north * np.cos(azimuths_rad), 1e-12)
+    per_tan_m = np.where(distance > 0, 1.0 / (np.square(distance) + wall**2), 0.0)  # cos^2 H / d^2
+    raised, outward = distance * per_tan_m, -wall * radius_m / facing * per_tan_m
+    return {
+        "depth_1": crater.depth_m * raised,
+        "diameter_1": outward,
+        "ellipse_cos_1": outward * (np.square(north) - np.square(east)),
+        "ellipse_sin_1": outward * 2.0 * east * north,
+        "rim_tilt_east_rad": radius_m * east * raised,
+        "rim_tilt_north_rad": radius_m * north * raised,
+        "camera_height_m": -raised,
+    }
+
+
+def _points_ahead(points: Array, distance: Array, azimuths_rad: Array) -> Array:
+    """The points (..., 2) that lie at the distances (...) along the azimuths."""
+    return np.stack(
+        [points[..., 0] + distance * np.sin(azimuths_rad), points[..., 1] + distance * np.cos(azimuths_rad)], axis=-1
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

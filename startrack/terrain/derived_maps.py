@@ -11,9 +11,9 @@ import numpy as np
 from startrack.core.types import Array
 from startrack.frames import R_from_rotvec
 from startrack.kernels.library import kernel
+from startrack.terrain.horizon_table import rows_of_rays
 from startrack.terrain.map_errors import PostErrors
 from startrack.terrain.protocol import ForwardingTerrain, Terrain
-from startrack.terrain.rays import rows_of_rays
 from startrack.terrain.shape import wave_slopes_rad
 from startrack.terrain.table_cache import TABLES_IN_MEMORY
 from startrack.terrain.traced_map import TracedMap

@@ -13,15 +13,19 @@ from startrack.core.types import Array, Bools
 from startrack.terrain import shape
 from startrack.terrain.derived_maps import DeformedMap, HorizonInterpolator
 from startrack.terrain.horizon_table import AZIMUTH_BINS
-from startrack.terrain.map_ends import circular_runs, facts_of_ends, unknown_elevations_rad
+from startrack.terrain.map_ends import (
+    GLARE,
+    OFF_MAP,
+    Sectors,
+    are_in_sectors,
+    describe_masks,
+    facts_of_ends,
+    unknown_elevations_rad,
+)
 from startrack.terrain.map_errors import MapErrors
-from startrack.terrain.protocol import Terrain
-from startrack.terrain.refracted import with_refraction_error
+from startrack.terrain.protocol import Terrain, with_refraction_error
 from startrack.terrain.table_cache import load_table
 from startrack.terrain.traced_map import TracedMap
-
-GLARE, OFF_MAP = "glare of a lit rim", "ground off the map"
-Sectors = tuple[tuple[float, float], ...]  # azimuth ranges [rad], each from the first eastward to the second
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -112,38 +116,3 @@ class HeightMap(TracedMap):
         """The ground near a centre (2,), see `HorizonInterpolator`."""
         centre = np.asarray(centre_m, dtype=np.float64)
         return HorizonInterpolator(self, centre, half_m, np.unique(azimuths_rad), across)
-
-
-def are_in_sectors(azimuths_rad: Array, sectors_rad: Sectors) -> Bools:
-    """Whether the azimuths (...) are in one of the sectors."""
-    azimuths = np.asarray(azimuths_rad)
-    inside = np.zeros(azimuths.shape, dtype=bool)
-    for start, end in sectors_rad:
-        inside |= (azimuths - start) % (2 * np.pi) <= (end - start) % (2 * np.pi)
-    return inside
-
-
-def describe_masks(glare_rad: Sectors, unknown_rad: Array) -> list[str]:
-    """One line per masked range of azimuths.
-
-    `unknown_rad` (n,) of n equal sectors from north eastward is the elevation below which unmapped ground may stand,
-    or -pi/2.
-    """
-    lines = [
-        f"azimuths {_range_text(start, end)}: no evidence is taken there, {GLARE} (glare_deg)"
-        for start, end in glare_rad
-    ]
-    step = 2 * np.pi / len(unknown_rad)
-    for first, last in circular_runs(unknown_rad > -np.pi / 2):
-        highest = np.degrees(np.take(unknown_rad, range(first, last), mode="wrap").max())
-        lines.append(
-            f"azimuths {_range_text(first * step, last * step)}: the maps end, and {OFF_MAP} could stand up to "
-            f"{highest:.1f} degrees high; no evidence is taken below that"
-        )
-    return lines
-
-
-def _range_text(start_rad: float, end_rad: float) -> str:
-    if end_rad - start_rad >= 2 * np.pi - 1e-9:
-        return "0 to 360 degrees"
-    return f"{np.degrees(start_rad) % 360:.0f} to {np.degrees(end_rad) % 360:.0f} degrees"

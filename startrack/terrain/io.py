@@ -1,10 +1,11 @@
-"""Terrain files (TOML): the declaration of their keys, and the terrain that they describe."""
+"""Terrain files (TOML): their keys, the terrain that they describe, and files with errors written in."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,20 @@ from startrack.terrain import shape
 from startrack.terrain.cylinder import CYLINDER_KEYS, Cylinder
 from startrack.terrain.ground_brightness import GROUND_TABLE, GroundBrightness
 from startrack.terrain.protocol import Terrain, TerrainFile
+from startrack.terrain.shape import (
+    BIAS,
+    CAMERA_ERROR,
+    CYLINDER_FACTS,
+    DEPTH,
+    DIAMETER,
+    OFFSETS,
+    REFRACTION,
+    STRETCH,
+    WAVE_PER_POST,
+    WAVES,
+    Fact,
+    vertical_fact,
+)
 
 FILE = Text(max_chars=4000, is_path=True)
 HEIGHT = Number(low=-shape.MAX_LENGTH_M, high=shape.MAX_LENGTH_M)
@@ -103,6 +118,7 @@ KEYS = Table(
         ),
     },
 )  # fmt: skip
+HEIGHT_KEY = "height_sigma_m"
 
 
 def load_terrain(name_or_path: str | Path) -> Terrain:
@@ -172,7 +188,7 @@ def _files_of_maps(keys: dict[str, Any], folder: Path) -> tuple[Path, ...]:
     maps = _map_files(keys, folder)
     if not maps:
         return ()
-    from startrack.terrain.map_reading import files_of_map
+    from startrack.terrain.maps.reading import files_of_map
 
     return tuple(dict.fromkeys(file for path in maps for file in files_of_map(path)))
 
@@ -249,7 +265,7 @@ def _waves(degrees: float | tuple[float, ...] | None) -> tuple[float, ...] | Non
 
 def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) -> Terrain:
     from startrack.terrain.height_map import HeightMap
-    from startrack.terrain.map_reading import read_map, require_origin
+    from startrack.terrain.maps.reading import read_map, require_origin
 
     check_memory()  # its kernels come later: OpenBLAS ends the process before them
     dem, rover, search = keys["dem"], keys["rover"], keys["search"]
@@ -264,7 +280,7 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
         maps = tuple(fill_cut_out(one, dem["cut_out_m"]) for one in maps)
     on_earth = {}
     if site.body == "earth":
-        from startrack.terrain.ellipsoid_fit import check_height, maps_above_ellipsoid
+        from startrack.terrain.maps.ellipsoid import check_height, maps_above_ellipsoid
 
         check_height(site, maps)
         air = keys.get("air", {})
@@ -300,3 +316,106 @@ MAKERS: dict[str, Callable[[dict[str, Any], str, Site, Path], Terrain]] = {  # o
     "cylinder": _make_cylinder,
     "dem": _make_height_map,
 }
+
+
+@dataclass(frozen=True)
+class StateableError:
+    """A key of a terrain file that states an error."""
+
+    table: str  # of the file
+    key: str
+    meaning: str
+    default: str  # what counts where the key is absent
+    is_missing: bool  # and matters
+
+
+def stateable_errors(text: str) -> list[StateableError]:
+    """The errors that a terrain file with this `text` states or could state. Raises BadInput bad_terrain."""
+    keys = read_keys(text)
+    vertical = vertical_fact(keys["body"])
+    dem, rover, cylinder = keys.get("dem", {}), keys.get("rover", {}), keys.get("cylinder")
+    if cylinder is not None:
+        sizes_m = {DEPTH.key: cylinder["depth_m"], DIAMETER.key: cylinder["diameter_m"]}
+        inexact = not cylinder.get("exact", False)
+        rows = [
+            ("cylinder", fact, _default_text(fact, sizes_m.get(fact.key)), inexact and fact.key not in cylinder)
+            for fact in CYLINDER_FACTS
+        ]
+        rows.append(("rover", CAMERA_ERROR, "0", False))
+    else:
+        rows = [
+            ("dem", BIAS, f"three times what {HEIGHT_KEY} makes of the horizon", BIAS.key not in dem),
+            *(("dem", fact, _default_text(fact), fact.key not in dem) for fact in (STRETCH, vertical)),
+            ("dem", WAVES, _waves_text(), WAVES.key not in dem),
+            ("dem", OFFSETS, _default_text(OFFSETS), OFFSETS.key not in dem and not isinstance(dem["file"], str)),
+            ("rover", CAMERA_ERROR, _default_text(CAMERA_ERROR), CAMERA_ERROR.key not in rover),
+        ]
+        if keys["body"] == "earth":
+            rows.append(("air", REFRACTION, _default_text(REFRACTION), REFRACTION.key not in keys.get("air", {})))
+    found = [
+        StateableError(table=table, key=fact.key, meaning=fact.meaning, default=default, is_missing=missing)
+        for table, fact, default, missing in rows
+    ]
+    if cylinder is not None:
+        return found
+    meaning, default = "error of single heights of the map [m]", "0, with a warning"
+    return [StateableError("dem", HEIGHT_KEY, meaning, default, is_missing=HEIGHT_KEY not in dem), *found]
+
+
+def _waves_text() -> str:
+    """What counts where a file leaves the waves out."""
+    gross = f"with probability {100 * WAVES.gross_probability:g} % a seam of {np.degrees(WAVES.gross_sigma):.4g}"
+    return f"{WAVE_PER_POST:g} of what {HEIGHT_KEY} makes of the horizon, and {gross}"
+
+
+def _default_text(fact: Fact, size_m: float | None = None) -> str:
+    """The prior of a fact that a file leaves out, in the unit of its key; `size_m` is what a relative error is of."""
+    unit = 180.0 / np.pi if fact.key.endswith("_deg") else size_m or 1.0
+    text = f"{fact.sigma * unit:.4g}"
+    if fact.gross_probability:
+        text += f", and with probability {100 * fact.gross_probability:g} % {fact.gross_sigma * unit:.4g}"
+    return text
+
+
+def state_errors(text: str, values: Mapping[tuple[str, str], float | bool]) -> str:
+    """The `text` of a terrain file with `values` by table and key written in; all else is as before.
+
+    Raises BadInput bad_terrain where a key is there already, or the file's notation leaves no place for it.
+    """
+    for (table, key), value in values.items():
+        before = parse_toml(text, "bad_terrain")
+        if key in before.get(table, {}):
+            raise BadInput("bad_terrain", f"it states {table}.{key} already")
+        wanted = {**before, table: {**before.get(table, {}), key: value}}
+        line = f"{key} = {str(value).lower() if isinstance(value, bool) else repr(float(value))}"
+        fits = (changed for changed in _places(text, table, line) if _keys_of(changed) == wanted)
+        found = next(fits, None)
+        if found is None:
+            raise BadInput("bad_terrain", f"startrack finds no place for it: write `{line}` into [{table}] by hand")
+        text = found
+    return text
+
+
+def _keys_of(text: str) -> dict[str, Any] | None:
+    """The keys of a TOML text; None if it is none."""
+    try:
+        return parse_toml(text, "bad_terrain")
+    except BadInput:
+        return None
+
+
+def _places(text: str, table: str, line: str) -> Iterator[str]:
+    """Texts with the line after the last key of the table, after its header, or in a table of its own at the end."""
+    end = "\r\n" if "\r\n" in text else "\n"
+    lines = text.splitlines(keepends=True)
+    for at, one in enumerate(lines):
+        if re.match(rf"\s*\[\s*{table}\s*\]", one):
+            rest = at + 1
+            while rest < len(lines) and not re.match(r"\s*\[", lines[rest]):
+                rest += 1
+            while rest > at + 1 and re.match(r"\s*(#|$)", lines[rest - 1]):
+                rest -= 1
+            for place in (rest, at + 1):
+                head = "".join(lines[:place])
+                yield head + ("" if head.endswith("\n") else end) + line + end + "".join(lines[place:])
+    yield text + ("" if text.endswith("\n") else end) + f"{end}[{table}]{end}{line}{end}"

@@ -13,7 +13,6 @@ from startrack.core.types import MIDDLES_RAD, Array, Ints
 from startrack.kernels.library import kernel
 from startrack.terrain.ground import cell_posts, number_of_maps, post_positions
 from startrack.terrain.horizon_table import AZIMUTH_BINS, HorizonSigma
-from startrack.terrain.refracted import refraction_errors, refraction_slopes_rad
 from startrack.terrain.shape import (
     BIAS,
     CAMERA_ERROR,
@@ -24,6 +23,8 @@ from startrack.terrain.shape import (
     GroundErrors,
     ShapeError,
     offset_names,
+    refraction_errors,
+    refraction_slopes_rad,
     select_slopes,
     vertical_fact,
     wave_errors,

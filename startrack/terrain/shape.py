@@ -10,6 +10,7 @@ import numpy as np
 
 from startrack.core.declaration import Either, List, Number
 from startrack.core.types import Array, Ints
+from startrack.frames import AIR_KEYS, USUAL_SIGMA_1, Air
 
 NO_POST = -1
 EXACT = 0.0  # sigma of a ground without the error
@@ -163,6 +164,12 @@ CYLINDER_FACTS = (DEPTH, DIAMETER, ELLIPSE, RIM_TILT)
 MAP_FACTS = (BIAS, STRETCH, VERTICAL, WAVES, OFFSETS, CAMERA_ERROR)
 
 
+STAR_REFRACTION = Fact(
+    key="refraction_sigma_1", errors=("refraction_1",), sigma=USUAL_SIGMA_1,
+    meaning="error of the refraction of the stars, relative", limits=AIR_KEYS["refraction_sigma_1"],
+)  # fmt: skip
+
+
 def vertical_fact(body: str) -> Fact:
     """The fact of a tilt of the whole map, on the Moon or the Earth."""
     return VERTICAL_EARTH if body == "earth" else VERTICAL
@@ -176,6 +183,16 @@ def offset_names(maps: int) -> tuple[str, ...]:
 def sigmas_of_waves(sigma: float) -> tuple[float, ...]:
     """Those of waves 1 to WAVE_COUNT where one number, of wave 1, states them."""
     return tuple(sigma * m**WAVE_FALL for m in range(1, WAVE_COUNT + 1))
+
+
+def refraction_errors(air: Air | None) -> list[ShapeError]:
+    """The error of the refraction in an `air`; none without."""
+    return [] if air is None else STAR_REFRACTION.errors_of_shape(air.refraction_sigma_1)
+
+
+def refraction_slopes_rad(air: Air | None, horizon_rad: Array) -> dict[str, Array]:
+    """Change (...) [rad] of a skyline at the elevations `horizon_rad` (...) by one unit of each error, by its name."""
+    return {} if air is None else {"refraction_1": -air.lift_rad(horizon_rad)}
 
 
 def wave_errors(stated: tuple[float, ...] | None, post_rad: float) -> list[ShapeError]:

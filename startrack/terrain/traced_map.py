@@ -11,7 +11,6 @@ import numpy as np
 
 from startrack.core.types import SECTORS, Array, BadInput, Bools
 from startrack.frames import Site
-from startrack.terrain.earth_projection import EarthProjection
 from startrack.terrain.ground import Ground, ground_up_m, pack_maps, surfaces
 from startrack.terrain.horizon_table import (
     AZIMUTH_BINS,
@@ -19,16 +18,19 @@ from startrack.terrain.horizon_table import (
     HorizonTable,
     Square,
     box_bounds,
+    flatten,
+    flatten_rays,
+    rows_of_rays,
+    run_in_threads,
     sector_bounds,
     trace_horizons,
 )
-from startrack.terrain.map_cost import costs_of
-from startrack.terrain.projection import Projection
+from startrack.terrain.maps.projections import EarthProjection, Projection
+from startrack.terrain.maps.raster import Raster
 from startrack.terrain.protocol import Progress, Terrain, TerrainFile
-from startrack.terrain.raster import Raster
-from startrack.terrain.rays import flatten, flatten_rays, rows_of_rays, run_in_threads
 from startrack.terrain.table_cache import (
     TABLES_IN_MEMORY,
+    costs_of,
     discard_table,
     key_of_table,
     load_or_build_table,

@@ -13,8 +13,7 @@ from sky_helpers import EDGE_PX, GROUND_E, NOISE_E, level_horizon, paint_pixels
 
 from startrack.camera import load_camera
 from startrack.chain import Located, pipeline
-from startrack.core.smooth_image import SmoothImage
-from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Detections
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Detections, SmoothImage
 from startrack.evidence import Sources, measure
 from startrack.evidence.ground_levels import ANY_SIGMAS, BORDER_PROBABILITY, DRIFT, patch_levels
 from startrack.evidence.sky_levels import GROUND, SKY

@@ -264,7 +264,7 @@ def bytes_of_all_kernels():
 
 def photometry_of(rng):
     """Fluxes and variances of stars beside an edge of the background."""
-    from startrack.core.smooth_image import SmoothImage
+    from startrack.core.types import SmoothImage
     from startrack.evidence.photometry import Sources, measure
 
     image = rng.normal(100.0, 3.0, (96, 128)).astype(np.float32)

@@ -25,7 +25,7 @@ from startrack.cli.flags import Command
 from startrack.core import __version__, errors
 from startrack.core.errors import BadInput, BadOutput, NoSolution
 from startrack.core.files import FULL_DISK
-from startrack.core.memory import COMMAND_BYTES, START_BYTES, check_memory, refusing_shortage
+from startrack.core.limits import COMMAND_BYTES, START_BYTES, check_memory, refusing_shortage
 from startrack.kernels import LibraryMissing
 
 COMMANDS = {  # name to the module of startrack.cli that declares it

@@ -25,7 +25,7 @@ from multiprocessing.process import BaseProcess
 from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar, cast
 
 from startrack.core.errors import BadInput
-from startrack.core.time_limit import check_time
+from startrack.core.limits import check_time
 
 if TYPE_CHECKING:
     from distributed import Client

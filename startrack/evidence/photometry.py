@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.core.smooth_image import Image
-from startrack.core.types import Array, Bools, Detections, Ints
+from startrack.core.types import Array, Bools, Detections, Image, Ints
 from startrack.evidence.stamp_edge import (
     CONTRAST_SIGMAS,
     EDGE_PLACES,

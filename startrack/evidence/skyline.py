@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.core.circle import interpolate_circle
+from startrack.core.statistics import interpolate_circle
 from startrack.core.types import MIDDLES_RAD, Array, Bools, Ints
 from startrack.frames import off_axis_rad, rays_from_azel
 from startrack.terrain import Terrain

@@ -17,7 +17,7 @@ import numpy as np
 
 from startrack.core.errors import BadInput, how_to_install
 from startrack.core.files import MAX_CAUSE_CHARS, MAX_TEXT_BYTES, FilePath, printable
-from startrack.core.memory import memory_refusal
+from startrack.core.limits import memory_refusal
 from startrack.core.types import Exposure
 from startrack.exposure.bounded_path import BoundedPath
 from startrack.exposure.decoding import Decoded, bad_image, check_size, decode_bytes, grey_float32, largest_value

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.files import MAX_CAUSE_CHARS, FilePath, missing_text, printable
-from startrack.core.memory import check_memory, memory_refusal
+from startrack.core.limits import check_memory, memory_refusal
 from startrack.core.types import MAX_PIXELS, BadInput
 from startrack.exposure.sidecar import RAW_SUFFIXES
 

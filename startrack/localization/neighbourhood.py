@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from startrack.core.circle import interpolate_circle
+from startrack.core.statistics import interpolate_circle
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, ImageErrors
 from startrack.localization.obstacle_chain import (
     LIT_MOVES,

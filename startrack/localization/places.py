@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from startrack.core.time_limit import check_time
+from startrack.core.limits import check_time
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, sector_of
 from startrack.localization.search_profiles import SearchProfiles, sum_contributions
 from startrack.localization.shared_errors import SharedErrors

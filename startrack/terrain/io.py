@@ -15,7 +15,7 @@ import numpy as np
 from startrack.core.declaration import Choice, Either, Flag, List, Number, Table, Text
 from startrack.core.errors import Reason
 from startrack.core.files import parse_toml, printable, read_text, resolve_named
-from startrack.core.memory import check_memory
+from startrack.core.limits import check_memory
 from startrack.core.obstacles import read_obstacles
 from startrack.core.types import BadInput
 from startrack.frames import AIR_TABLE, Site

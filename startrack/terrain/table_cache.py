@@ -15,12 +15,11 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-from startrack.core.cache import cache_folder, limit_bytes, remove_oldest
 from startrack.core.errors import BadInput
 from startrack.core.files import hold_lock
+from startrack.core.limits import uncounted_time
 from startrack.core.runner import count_cores
-from startrack.core.stored import read_sealed, write_sealed
-from startrack.core.time_limit import uncounted_time
+from startrack.core.stored import cache_folder, limit_bytes, read_sealed, remove_oldest, write_sealed
 from startrack.core.types import Ints
 from startrack.terrain.horizon_table import (
     AZIMUTH_BINS,

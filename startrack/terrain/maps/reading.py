@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from startrack.core.errors import how_to_install
 from startrack.core.files import MAX_CAUSE_CHARS, data_dir
-from startrack.core.memory import memory_refusal
+from startrack.core.limits import memory_refusal
 from startrack.core.types import MAX_PIXELS, BadInput
 from startrack.terrain.maps.heights import Stored, heights_of, note_bands
 from startrack.terrain.maps.projections import (

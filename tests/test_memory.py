@@ -115,7 +115,7 @@ def test_a_lack_of_memory_is_known_by_its_exception(cause, picture, monkeypatch,
 def test_other_errors_are_a_lack_of_memory_where_no_library_can_be_loaded(monkeypatch):
     cause = RuntimeError("Could not locate or load CSPICE shared library")
     assert limits.memory_refusal(cause) is None
-    monkeypatch.setattr(limits, "_has_room", lambda: False)
+    monkeypatch.setattr(limits, "has_room", lambda: False)
     refusal = limits.memory_refusal(cause)
     assert refusal is not None and "CSPICE" in str(refusal)
 

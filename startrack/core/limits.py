@@ -56,7 +56,7 @@ def memory_refusal(cause: BaseException) -> BadInput | None:
         chain.append(one)
         one = one.__cause__ or one.__context__
     lacking = next((one for one in chain if _states_shortage(one)), None)
-    if lacking is None and _has_room():
+    if lacking is None and has_room():
         return None
     lacking = lacking or cause
     limit_bytes = _limit_bytes()
@@ -74,7 +74,7 @@ def _states_shortage(cause: BaseException) -> bool:
     )
 
 
-def _has_room() -> bool:
+def has_room() -> bool:
     """Whether a library could still be loaded: libraries and threads fail with exceptions of any class without it."""
     with suppress(OSError, ValueError):
         mmap.mmap(-1, LIBRARY_BYTES).close()

@@ -476,7 +476,7 @@ def test_other_maps_need_the_extra_dem(tmp_path, monkeypatch):
     case = Case(tmp_path, POLAR, SOUTH, 60.0)
     path = case.write(case.heights_m.astype(np.float32))
     raster = read_map(path)
-    for module in ("map_reading", "map_writing"):
+    for module in ("maps.reading", "maps.writing"):
         monkeypatch.setattr(f"startrack.terrain.{module}.find_spec", lambda name: None)
     for use in (lambda: read_map(path), lambda: write_map(tmp_path / "b.tif", raster)):
         with pytest.raises(BadInput, match=r"pip install '\.\[dem\]'"):

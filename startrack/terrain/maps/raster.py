@@ -87,7 +87,7 @@ class Raster:
         """Projection of a vector from the sphere's centre in the site's enu axes to (column, row), as 16 numbers.
 
         kind, R_projection_enu (9), size along x and y [m], column = (x - n12) n13, row = (y - n14) n15. On the Earth
-        (n, 2) numbers, see `ellipsoid_fit.fit_cells`.
+        (n, 2) numbers, see `ellipsoid.fit_cells`.
         """
         p = self.projection
         if isinstance(p, EarthProjection):

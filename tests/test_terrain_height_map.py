@@ -290,6 +290,7 @@ def tracer(monkeypatch):
         traced.cells.append({tuple(centre) for centre in centres})
 
     monkeypatch.setattr(cache, "fill_table", count)
+    monkeypatch.setattr(cache, "seconds_of_table", lambda ground: 1.0)  # which traces some
     monkeypatch.setattr(cache, "PART_CELLS", 2)
     monkeypatch.setattr(cache, "count_cores", lambda: 1)
     return traced

@@ -6,10 +6,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from startrack.terrain.cylinder import Cylinder
-from startrack.terrain.ground_brightness import GroundBrightness
-from startrack.terrain.io import KEYS as TERRAIN_KEYS
 from startrack.terrain.io import (
-    MAKERS,
+    GROUNDS,
+    GroundBrightness,
     StateableError,
     files_of_terrain,
     load_terrain,
@@ -18,6 +17,7 @@ from startrack.terrain.io import (
     stateable_errors,
     terrain_from_dict,
 )
+from startrack.terrain.io import KEYS as TERRAIN_KEYS
 from startrack.terrain.maps.projections import EQUIRECTANGULAR, STEREOGRAPHIC, EarthProjection, Projection
 from startrack.terrain.maps.raster import Raster
 from startrack.terrain.protocol import (
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from startrack.terrain.maps.writing import can_write_maps, write_bands, write_map
 
 __all__ = [
-    "DIAMETER", "EQUIRECTANGULAR", "MAKERS", "NO_POST", "STEREOGRAPHIC", "TERRAIN_KEYS", "WAVES", "Cylinder",
+    "DIAMETER", "EQUIRECTANGULAR", "GROUNDS", "NO_POST", "STEREOGRAPHIC", "TERRAIN_KEYS", "WAVES", "Cylinder",
     "EarthProjection", "ExpectedCrests", "ForwardingTerrain", "Grid", "GroundBrightness", "GroundErrors", "HeightMap",
     "Projection", "Raster", "Rim", "ShapeError", "StateableError", "Terrain", "TerrainFile", "can_write_maps",
     "cell_posts", "files_of_terrain", "import_maps", "is_geotiff", "load_terrain", "map_of_array", "read_map",

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from startrack.core.declaration import Flag
+from startrack.core.declaration import Flag, Table
 from startrack.core.types import Array, BadInput, Bools
 from startrack.frames import Site
 from startrack.kernels.library import kernel
@@ -25,6 +26,7 @@ from startrack.terrain.shape import (
     GroundErrors,
     ShapeError,
     errors_by_name,
+    radians,
     refraction_errors,
     refraction_slopes_rad,
     select_slopes,
@@ -34,11 +36,11 @@ HALVINGS = 60  # of the range of distances: to the last digit of a length
 MAX_SHAPE_SIGMA = 0.5  # of depth and diameter; beyond, a normal distribution holds sizes below 0
 LINEAR_SHAPE_1 = 0.05  # of depth over diameter: beyond, the shape that the rows show is searched, as it is not linear
 _SIZES = {"diameter_m": replace(LENGTH, required=True), "depth_m": replace(LENGTH, required=True)}
-CYLINDER_KEYS = {  # of [cylinder] in a terrain file
+CYLINDER_TABLE = Table(description="Axis through the origin; floor at z = 0.", keys={
     **_SIZES,
     "exact": Flag(description="true: a model, without errors of its shape"),
     **{fact.key: fact.limits for fact in CYLINDER_FACTS},
-}
+})  # fmt: skip
 _SIGMAS = {
     **{fact.key: fact.limits for fact in (DEPTH, DIAMETER, ELLIPSE, CAMERA_ERROR)},
     "rim_tilt_sigma_rad": replace(RIM_TILT.limits, high=float(np.radians(RIM_TILT.limits.high))),
@@ -361,6 +363,26 @@ class CylinderErrors(GroundErrors):
     def steepness_1(self) -> float:  # type: ignore[override]
         """That of its depth."""
         return self.crater.wall_m / (self.crater.about_depth_m - self.crater.camera_height_m)
+
+
+def make_cylinder(keys: dict[str, Any], folder: Path, **shared: Any) -> Cylinder:
+    """The terrain of the checked `keys` of a file with a [cylinder]; see `io.Kind`. Raises BadInput bad_terrain."""
+    cylinder, rover = keys["cylinder"], keys["rover"]
+    sigmas: dict[str, Any] = {fact.key: cylinder.get(fact.key) for fact in CYLINDER_FACTS}
+    if cylinder.get("exact", False):
+        wrong = [key for key, sigma in sigmas.items() if sigma]
+        if wrong:
+            raise BadInput("bad_terrain", f"cylinder.exact is true, but {wrong[0]} is not 0: leave one of them out")
+        sigmas = dict.fromkeys(sigmas, 0.0)
+    return Cylinder(
+        **shared,
+        diameter_m=cylinder["diameter_m"],
+        depth_m=cylinder["depth_m"],
+        search_radius_m=keys["search"].get("radius_m", cylinder["diameter_m"] / 2),
+        camera_height_sigma_m=rover.get("camera_height_sigma_m", 0.0),
+        rim_tilt_sigma_rad=radians(sigmas.pop("rim_tilt_sigma_deg")),
+        **sigmas,
+    )
 
 
 _horizons_of_circle = kernel(

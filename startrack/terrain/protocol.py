@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 from startrack.core.obstacles import Obstacles
 from startrack.core.types import Array, BadInput, Bools
 from startrack.frames import Air, Site
-from startrack.terrain.ground_brightness import GroundBrightness
 from startrack.terrain.maps.projections import STEREOGRAPHIC, EarthProjection, Projection
 from startrack.terrain.shape import GroundErrors
+
+if TYPE_CHECKING:
+    from startrack.terrain.io import GroundBrightness
 
 Progress = Callable[[int, int], None]  # parts done, of how many
 BOUNDS_ROUNDING_RAD = 1e-9  # by which a least horizon may exceed the greatest

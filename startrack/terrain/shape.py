@@ -170,6 +170,11 @@ STAR_REFRACTION = Fact(
 )  # fmt: skip
 
 
+def radians(degrees: float | None) -> float | None:
+    """The angle [rad] of one in `degrees`; None of None."""
+    return None if degrees is None else float(np.radians(degrees))
+
+
 def vertical_fact(body: str) -> Fact:
     """The fact of a tilt of the whole map, on the Moon or the Earth."""
     return VERTICAL_EARTH if body == "earth" else VERTICAL

@@ -7,8 +7,8 @@ import json
 from contextlib import suppress
 from pathlib import Path
 
-from startrack.core.cache import cache_folder, limit_bytes
 from startrack.core.files import Locked, hold_lock, printable, remove_file
+from startrack.core.stored import cache_folder, limit_bytes
 
 TABLES, KIND = "tables of horizons", "horizons"
 

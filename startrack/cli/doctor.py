@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from startrack import __version__
+from startrack.core import __version__
 
 REQUIRED = (
     "numpy", "scipy", "opencv-contrib-python-headless", "scikit-image", "astropy", "pillow", "tifffile",

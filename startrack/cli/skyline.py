@@ -14,7 +14,7 @@ from startrack.cli.flags import check_localizer
 from startrack.cli.images import prepare
 from startrack.core.errors import BadInput, BadOutput
 from startrack.core.files import make_folder, printable
-from startrack.core.memory import refusing_shortage
+from startrack.core.limits import refusing_shortage
 from startrack.core.types import PositionPrior
 from startrack.frames import parse_utc
 from startrack.localization import DEFAULT_LOCALIZER

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from startrack import __version__
 from startrack.chain import STAGES, Detected, Identified, Inputs, Outcome, last_value
+from startrack.core import __version__
 from startrack.core.errors import Reason
 from startrack.core.types import Exposure
 from startrack.kernels.library import LEVEL

@@ -17,9 +17,9 @@ from startrack.output.quantity import (
     schema_of_kind,
 )
 from startrack.output.record import FORMATS
-from startrack.terrain import MAKERS, TERRAIN_KEYS
+from startrack.terrain import GROUNDS, TERRAIN_KEYS
 
-TERRAIN_FILE: Schema = TERRAIN_KEYS.schema() | {"oneOf": [{"required": [ground]} for ground in MAKERS]}
+TERRAIN_FILE: Schema = TERRAIN_KEYS.schema() | {"oneOf": [{"required": [ground]} for ground in GROUNDS]}
 REFUSALS = [one.value for one in Reason if one is not Reason.AMBIGUOUS]
 SECTIONS = {
     name: schema_of(QUANTITIES, name, description)

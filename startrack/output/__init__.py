@@ -46,6 +46,7 @@ from startrack.output.record import (
     record_of,
     refused_dict,
     result_dict,
+    section_values,
     stage_values,
 )
 from startrack.output.schema import SCHEMAS
@@ -93,6 +94,7 @@ __all__ = [
     "prepare_folder", "qgis_style_text", "quantity_columns", "radius_classes", "ranges_deg", "ranges_text",
     "record_from", "record_of", "refusal_line", "refused_dict", "relief_picture",
     "remove_companions", "result_at", "result_dict", "results_under", "rows", "schema_of", "schema_of_kind",
+    "section_values",
     "sectors_off_map", "show_everywhere", "skyline_picture", "skyline_table_text", "skyline_texts_deg", "stage_values",
     "star_table_text", "summary_line", "table_columns", "verbose_text", "write_annotated", "write_geo",
     "write_json", "write_page", "write_results", "write_star_table", "write_wcs",

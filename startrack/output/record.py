@@ -12,7 +12,7 @@ from startrack.core.errors import Reason
 from startrack.core.types import Exposure
 from startrack.kernels.library import LEVEL
 from startrack.output.quantities import BY_PATH, QUANTITIES
-from startrack.output.quantity import Schema, record_from, schema_of_kind
+from startrack.output.quantity import Quantity, Schema, record_from, schema_of_kind
 from startrack.output.values import At
 
 FORMATS = {kind: f"startrack.{kind}/1" for kind in ("fix", "identification", "detection")}
@@ -127,6 +127,16 @@ OWN_KEYS: dict[str, tuple[Callable[[Inputs | None], dict[str, Any]], tuple[str, 
 }
 
 
+def section_values(value: Inputs, section: str) -> list[tuple[Quantity, Any]]:
+    """The quantities of a `section` of the record, with what a `value` of the pipeline determines of each, else None.
+
+    Empty where none is determined. A quantity that is not stated is infinite.
+    """
+    known = [one for one in QUANTITIES if one.section == section and one.in_record]
+    found = [(one, one.value(value) if one.is_determined(value) else None) for one in known]
+    return found if any(one.is_determined(value) for one in known) else []
+
+
 def stage_values(value: Inputs) -> At:
     """From the path of a quantity to its value in a `value` of the pipeline; None where it is not determined there."""
     known: dict[str, Any] = {}
@@ -134,7 +144,8 @@ def stage_values(value: Inputs) -> At:
     def value_at(path: str) -> Any:
         if path not in known:
             one = BY_PATH[path]
-            known[path] = one.value(value_at if one.derived else value) if one.is_determined(value) else None
+            given = value_at if one.derived else value
+            known[path] = one.json_value(given) if one.is_determined(value) else None
         return known[path]
 
     return value_at

@@ -278,7 +278,7 @@ class Solution:
 
     def to_dict(self) -> dict[str, Any]:
         """Content of `NAME.fix.json`, or `NAME.identification.json`, or `NAME.detections.json`."""
-        return output.record_of(self.result, self.kind)
+        return output.result_dict(self.result, self.kind)
 
     def write(self, folder: str | os.PathLike[str], *, plots: bool = True, overwrite: bool = False) -> Path:
         """Write the files of the command (record, star table, world coordinates, picture); returns the record's path.

@@ -93,7 +93,7 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve, limit_s: floa
             with refusing_shortage():
                 record, line = _solve_image(args, path, Path(args.dir) / f"{stem}.{kind}.json", solve, limit_s)
         except BadInput as cause:
-            record = output.refused_dict(path, cause.reason, str(cause), kind.removesuffix("s"))
+            record = output.refused_dict(path, cause.reason, str(cause), kind)
             if isinstance(cause, BadOutput):
                 record["advice"] = None  # it is about the picture, as is the reason, for lack of a better code
             line = output.refusal_line(path, cause.reason, str(cause))
@@ -101,7 +101,7 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve, limit_s: floa
             if args.verbose:
                 raise
             message = f"internal error: {type(cause).__name__}: {cause} (-v shows the traceback)"
-            record = output.refused_dict(path, INTERNAL_ERROR, message, kind.removesuffix("s"))
+            record = output.refused_dict(path, INTERNAL_ERROR, message, kind)
             line = f"{printable(name)}  {message}"
         print_warnings(args, name, record.get("warnings", ()))
         codes.add(print_outcome(args, record, line))

@@ -1,47 +1,38 @@
-"""Results as plain dictionaries, ready for JSON: fix, identification, detection. The keys are a public format."""
+"""Results as plain dictionaries, ready for JSON: fix, identification, detections. The keys are a public format."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from startrack import __version__
-from startrack.chain import STAGES, Detected, Identified, Inputs, Outcome, last_value
+from startrack.chain import STAGES, Inputs, Outcome, last_value
 from startrack.core.errors import Reason
 from startrack.core.types import Exposure
 from startrack.kernels.library import LEVEL
-from startrack.output.quantities import BY_PATH, QUANTITIES
+from startrack.output.quantities import BY_PATH, OWN_QUANTITIES, QUANTITIES
 from startrack.output.quantity import Quantity, Schema, record_from, schema_of_kind
 from startrack.output.values import At
 
-FORMATS = {kind: f"startrack.{kind}/1" for kind in ("fix", "identification", "detection")}
-BEFORE_OWN = ("position", "modes", "search", "attitude", "middle")
-OF_A_POSITION = ("position", "modes", "search", "evidence", "sky", "clock")  # sections of a fix alone
+KINDS = {  # of the files NAME.KIND.json: what their records have of a result, in this order
+    "fix": ("position", "modes", "search", "attitude", "middle", "explain", "stars", "bodies", "evidence", "sky",
+            "clock"),
+    "identification": ("attitude", "middle", "camera", "matches", "stars", "bodies"),
+    "detections": ("detections", "stars"),
+}  # fmt: skip
+FORMATS = {kind: f"startrack.{kind.removesuffix('s')}/1" for kind in KINDS}
 
 
-def result_dict(result: Outcome) -> dict[str, Any]:
-    """The fix of one image, of its `result`: the keys are the same whether it is solved or refused.
+def result_dict(result: Outcome, kind: str = "fix") -> dict[str, Any]:
+    """The record of one image, of its `result`: the keys of a `kind` are the same whether it is solved or refused.
 
     A section is null where nothing of it is known: `position` unless the status is ok. Lists are then empty. Quantities
     of stages that have not run are null: those in `enu` without terrain and time.
     """
-    return _record_of("fix", result)
-
-
-def identification_dict(result: Outcome) -> dict[str, Any]:
-    """Attitude, the camera that was used and the matches of a `result`: stars with the positions measured for them."""
-    return _record_of("identification", result)
-
-
-def detection_dict(result: Outcome) -> dict[str, Any]:
-    """The point sources of a `result`, brightest first; fluxes are in ADU where the gain is not known."""
-    return _record_of("detection", result)
-
-
-def record_of(result: Outcome, kind: str) -> dict[str, Any]:
-    """The record of a `result`, of the `kind` that its file is named after: fix, identification or detections."""
-    return {"fix": result_dict, "identification": identification_dict, "detections": detection_dict}[kind](result)
+    record = _record(kind, image_name(result.exposure), result.reason, result.message, last_value(result))
+    timing_ms = {stage: round(result.timing_ms.get(stage, 0.0), 3) for stage in STAGES}
+    return record | {"status": result.status, "timing_ms": timing_ms, "warnings": result.warnings}
 
 
 def refused_dict(
@@ -49,7 +40,7 @@ def refused_dict(
 ) -> dict[str, Any]:
     """The record of an `image` that could not be read, or whose camera or terrain could not: `reason` and `message`.
 
-    `kind` is fix, identification or detection; `image_sha256` that of the file, if it is known.
+    `kind` is one of KINDS; `image_sha256` that of the file, if it is known.
     """
     record = _record(kind, Path(image).name, reason, message, None)
     known = {"version": __version__, "kernels": LEVEL, "image_sha256": image_sha256}
@@ -62,22 +53,9 @@ def image_name(exposure: Exposure) -> str:
     return Path(exposure.path).name or exposure.name
 
 
-def _record_of(kind: str, result: Outcome) -> dict[str, Any]:
-    """The record of a `result`."""
-    record = _record(kind, image_name(result.exposure), result.reason, result.message, last_value(result))
-    timing_ms = {stage: round(result.timing_ms.get(stage, 0.0), 3) for stage in STAGES}
-    return record | {"status": result.status, "timing_ms": timing_ms, "warnings": result.warnings}
-
-
 def _record(kind: str, image: str, reason: str | None, message: str, value: Inputs | None) -> dict[str, Any]:
-    """The record of a refused image; its own keys stand after the attitude. The `value` is None where nothing is known.
-
-    The keys of each kind are the same for every image.
-    """
-    own, without = OWN_KEYS[kind]
-    sections = {key: part for key, part in record_from(QUANTITIES, value).items() if key not in without}
-    first: dict[str, Any] = {key: sections.pop(key) for key in BEFORE_OWN if key in sections}
-    provenance = sections.pop("provenance")
+    """The record of a refused image. The `value` is None where nothing is known."""
+    found = record_from((*QUANTITIES, *OWN_QUANTITIES), value)
     return {
         "format": FORMATS[kind],
         "image": image,
@@ -85,46 +63,11 @@ def _record(kind: str, image: str, reason: str | None, message: str, value: Inpu
         "reason": None if reason is None else str(reason),
         "message": message,
         "advice": None if reason is None else Reason(reason).advice,
-        **first,
-        **own(value),
-        **sections,
+        **{key: found[key] for key in KINDS[kind]},
         "timing_ms": None,
-        "provenance": provenance,
+        "provenance": found["provenance"],
         "warnings": [],
     }
-
-
-def _camera_and_matches(value: Inputs | None) -> dict[str, Any]:
-    """The camera of a `value`, null without one, and the identified stars."""
-    from startrack.camera import camera_to_dict
-
-    matches = []
-    if isinstance(value, Identified):
-        named = value.names.stars
-        columns = (value.stars.hip[named.star].tolist(), named.xy_px.tolist(), named.saturated.tolist())
-        matches = [
-            {"hip": hip or None, "x_px": x, "y_px": y, "saturated": saturated}
-            for hip, (x, y), saturated in zip(*columns, strict=True)
-        ]
-    camera = None if value is None or value.camera is None else camera_to_dict(value.camera)
-    return {"camera": camera, "matches": matches}
-
-
-def _point_sources(value: Inputs | None) -> dict[str, Any]:
-    """The point sources of a `value`."""
-    rows = list[dict[str, float]]()
-    if isinstance(value, Detected):
-        found = value.detections
-        columns = zip(found.xy_px.tolist(), found.flux_e.tolist(), found.snr.tolist(), strict=True)
-        rows = [{"x_px": x, "y_px": y, "flux_e": flux, "snr": snr} for (x, y), flux, snr in columns]
-    return {"detections": rows}
-
-
-OWN_KEYS: dict[str, tuple[Callable[[Inputs | None], dict[str, Any]], tuple[str, ...]]] = {  # and the sections left out
-    "fix": (lambda value: {"explain": []}, ()),
-    "identification": (_camera_and_matches, OF_A_POSITION),
-    "detection": (_point_sources, (*OF_A_POSITION, "attitude", "middle", "bodies")),
-}
 
 
 def section_values(value: Inputs, section: str) -> list[tuple[Quantity, Any]]:

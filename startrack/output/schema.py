@@ -16,7 +16,7 @@ from startrack.output.quantity import (
     schema_of,
     schema_of_kind,
 )
-from startrack.output.record import FORMATS
+from startrack.output.record import FORMATS, KINDS
 from startrack.terrain import MAKERS, TERRAIN_KEYS
 
 TERRAIN_FILE: Schema = TERRAIN_KEYS.schema() | {"oneOf": [{"required": [ground]} for ground in MAKERS]}
@@ -41,12 +41,6 @@ COMMON: Schema = {
     "reason": {"enum": [None, *(one.value for one in Reason)]},
     "message": "text",
 }
-# Every record has every key; those beyond the common ones are absent from refusals that earlier versions wrote.
-STAGE_KEYS: Schema = {
-    "stars": SECTIONS["stars"],
-    "timing_ms": object_schema(dict.fromkeys(STAGES, "positive")),
-    "provenance": SECTIONS["provenance"],
-}
 NULL: Schema = {"const": None}
 ADVICE = "what to do next, by the reason"
 
@@ -65,27 +59,34 @@ def _if_status(status: str, then: Schema) -> Schema:
     return {"if": {"properties": {"status": {"const": status}}}, "then": then}
 
 
-def _result(kind: str, title: str, own: Schema, rules: list[Schema]) -> Schema:
+def _schema_of_key(key: str) -> Schema:
+    """The schema of a `key` of a record, a section or a quantity."""
+    if key in SECTIONS:
+        return _section_or_null(SECTIONS[key])
+    one = BY_PATH[key]
+    schema = schema_of_kind(one.schema, one.description)
+    return _section_or_null(schema) if one.nullable else schema
+
+
+def _result(kind: str, title: str, rules: list[Schema]) -> Schema:
+    """The schema of the records of a `kind`; keys beyond the common ones are absent from refusals of old versions."""
     keys = {"format": {"const": FORMATS[kind]}, **COMMON}
-    more = {"advice": or_null("text", f"{ADVICE}; null: solved"), **own}
-    more |= {key: _section_or_null(part) for key, part in STAGE_KEYS.items()}
-    more["warnings"] = list_schema("text", "what was found in the image's file and not used")
+    more = {
+        "advice": or_null("text", f"{ADVICE}; null: solved"),
+        **{key: _schema_of_key(key) for key in KINDS[kind]},
+        "timing_ms": _section_or_null(object_schema(dict.fromkeys(STAGES, "positive"))),
+        "provenance": _schema_of_key("provenance"),
+        "warnings": list_schema("text", "what was found in the image's file and not used"),
+    }
+    of_stages = ("stars", "timing_ms", "provenance")
     by_status = [
-        _if_status("ok", _has(*STAGE_KEYS, reason=NULL, advice=NULL)),
-        _if_status("ambiguous", _has(*STAGE_KEYS, reason={"const": "ambiguous"})),
+        _if_status("ok", _has(*of_stages, reason=NULL, advice=NULL)),
+        _if_status("ambiguous", _has(*of_stages, reason={"const": "ambiguous"})),
         _if_status("refused", {"properties": {"reason": {"enum": REFUSALS}}}),
     ]
     return file_schema(title, object_schema(keys, optional=more) | {"allOf": [*by_status, *rules]})
 
 
-MATCH = object_schema({
-    "hip": or_null({"type": "integer", "minimum": 1}, "Hipparcos number; null: the star has none"),
-    "x_px": "number",
-    "y_px": "number",
-    "saturated": schema_of_kind("flag", "whether its light is cut off: it may be named by place and brightness"),
-})  # fmt: skip
-BODIES = schema_of_kind(BY_PATH["bodies"].schema, BY_PATH["bodies"].description)
-POINT_SOURCE = object_schema({"x_px": "number", "y_px": "number", "flux_e": "number", "snr": "number"})
 HORIZON = object_schema(
     {
         "format": {"const": "startrack.horizon/1"},
@@ -116,15 +117,6 @@ SCHEMAS: dict[str, Schema] = {
     "fix": _result(
         "fix",
         "Position and attitude of one image",
-        {
-            "modes": schema_of_kind(BY_PATH["modes"].schema, BY_PATH["modes"].description),
-            **{
-                name: _section_or_null(SECTIONS[name])
-                for name in ("position", "search", "attitude", "middle", "evidence", "sky", "clock")
-            },
-            "bodies": BODIES,
-            "explain": list_schema("text", "with --explain: what a refused or wide answer would need"),
-        },
         [
             _if_status("ok", _has("position", "attitude")),
             _if_status("ambiguous", _has("attitude", position=NULL, modes={"minItems": 1})),
@@ -135,21 +127,9 @@ SCHEMAS: dict[str, Schema] = {
     "identification": _result(
         "identification",
         "Stars and attitude of one image",
-        {
-            "attitude": _section_or_null(SECTIONS["attitude"]),
-            "middle": _section_or_null(SECTIONS["middle"]),
-            "camera": _section_or_null({"title": "Camera file", **camera_keys().schema()}),
-            "matches": list_schema(MATCH),
-            "bodies": BODIES,
-        },
         [_if_status("ok", _has("attitude", "camera")), _if_status("ok", {"required": ["matches"]})],
     ),
-    "detection": _result(
-        "detection",
-        "Point sources of one image",
-        {"detections": list_schema(POINT_SOURCE)},
-        [_if_status("ok", {"required": ["detections"]})],
-    ),
+    "detection": _result("detections", "Point sources of one image", [_if_status("ok", {"required": ["detections"]})]),
     "horizon": file_schema("Summary of a measured skyline", HORIZON | {"allOf": _HORIZON_RULES}),
     "truth": file_schema(
         "What is true of a rendered image, for tests and scorers",

@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.chain import Located, Measured, Oriented, Positioned
+from startrack.chain import Detected, Identified, Located, Measured, Oriented, Positioned
 from startrack.core.files import is_path
 from startrack.core.statistics import error_ellipse
 from startrack.core.types import MIDDLES_RAD, Array, Blocked, Fix
@@ -145,11 +145,6 @@ def ellipse(at: At) -> tuple[float, float, float] | None:
     return float(major_m), float(minor_m), float(np.degrees(azimuth_rad))
 
 
-def finite_or_none(value: Any) -> Any:
-    """A number or an array as JSON values, None where it is infinite: not stated."""
-    return np.asarray(value).tolist() if np.isfinite(value).all() else None
-
-
 def lacking_circle(at: At) -> str | None:
     """A text where a position has no circle."""
     return "no circle" if at("position.east_m") is not None and at("position.radius95_m") is None else None
@@ -169,12 +164,8 @@ def sigma_m(at: At, axis: int) -> float | None:
 
 def modes_record(fix: Fix) -> list[dict[str, Any]]:
     """The modes of a `fix` as JSON values; a circle is null where none is stated."""
-    circles = ("radius95_m", "radius999_m")
-    return [
-        {"east_m": mode.east_m, "north_m": mode.north_m, "weight": mode.weight}
-        | {key: finite_or_none(getattr(mode, key)) for key in circles}
-        for mode in fix.modes
-    ]
+    keys = ("east_m", "north_m", "weight", "radius95_m", "radius999_m")
+    return [{key: at if np.isfinite(at := getattr(mode, key)) else None for key in keys} for mode in fix.modes]
 
 
 def mode_text(mode: dict[str, Any]) -> str:
@@ -232,3 +223,20 @@ def bodies_record(value: Oriented) -> list[dict[str, Any]]:
         for body, (x, y), is_inside in zip(value.bodies, xy_px.tolist(), inside, strict=True)
         if is_inside
     ]
+
+
+def matches_record(value: Identified) -> list[dict[str, Any]]:
+    """The identified stars of a `value`, each with the position measured for it."""
+    named = value.names.stars
+    columns = (value.stars.hip[named.star].tolist(), named.xy_px.tolist(), named.saturated.tolist())
+    return [
+        {"hip": hip or None, "x_px": x, "y_px": y, "saturated": saturated}
+        for hip, (x, y), saturated in zip(*columns, strict=True)
+    ]
+
+
+def sources_record(value: Detected) -> list[dict[str, float]]:
+    """The point sources of a `value`, brightest first; fluxes are in ADU where the gain is not known."""
+    found = value.detections
+    columns = zip(found.xy_px.tolist(), found.flux_e.tolist(), found.snr.tolist(), strict=True)
+    return [{"x_px": x, "y_px": y, "flux_e": flux, "snr": snr} for (x, y), flux, snr in columns]

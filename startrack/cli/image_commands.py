@@ -5,15 +5,18 @@ from __future__ import annotations
 import argparse
 
 from startrack.cli import flags
-from startrack.cli.flag_types import (
+from startrack.cli.flags import (
+    Command,
+    Either,
     cluster_address,
     count,
     field_or_range_rad,
+    flag,
+    function_at,
     geo_formats,
     half_turn,
     seconds,
 )
-from startrack.cli.flags import Command, Either, flag, function_at
 from startrack.core import NARROWEST_DEG, REPORTED_IMAGES, WIDEST_DEG
 
 INPUT = (flags.IMAGES, flags.TOPIC, *flags.FACTS)

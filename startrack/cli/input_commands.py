@@ -3,8 +3,17 @@
 from __future__ import annotations
 
 from startrack.cli import flags
-from startrack.cli.flag_types import amount, field_of_view_rad, limit_type, number, positive_number
-from startrack.cli.flags import Command, Either, flag, function_at
+from startrack.cli.flags import (
+    Command,
+    Either,
+    amount,
+    field_of_view_rad,
+    flag,
+    function_at,
+    limit_type,
+    number,
+    positive_number,
+)
 
 CALIBRATE = """usage: startrack calibrate [ACTION] ... (startrack calibrate --help lists the flags of each action)
 

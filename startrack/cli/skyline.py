@@ -9,8 +9,7 @@ from pathlib import Path
 from startrack import chain, output
 from startrack.camera import load_camera
 from startrack.cli.console import Outcome, print_outcome, print_warnings, wait_lines
-from startrack.cli.flag_types import attitude
-from startrack.cli.flags import check_localizer
+from startrack.cli.flags import attitude, check_localizer
 from startrack.cli.images import prepare
 from startrack.core.errors import BadInput, BadOutput
 from startrack.core.files import make_folder, printable

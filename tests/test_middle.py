@@ -27,7 +27,7 @@ from startrack.exposure import read_exposure
 from startrack.identification.found_lens import fit_found_lens
 from startrack.identification.unknown_lens import identify_unknown_lens
 from startrack.output import result_dict
-from startrack.output.middle import has_middle, sky_at_middle
+from startrack.output.values import has_middle, sky_at_middle
 from startrack.output.wcs import wcs_bytes
 
 MIDDLE_PX = (np.array(SIZE) - 1) / 2

@@ -8,8 +8,8 @@ from startrack.chain import Measured, Oriented, Positioned
 from startrack.frames import quat_xyzw_from_R
 from startrack.localization import RISK
 from startrack.output import values
-from startrack.output.middle import has_middle, in_middle, middle_px
 from startrack.output.quantity import Listed, Quantity, Schema, Show, list_schema, object_schema, or_null
+from startrack.output.values import has_middle, in_middle, middle_px
 
 Q = Quantity
 DEG_PER_RAD = 180.0 / np.pi

@@ -15,8 +15,18 @@ from startrack.core.types import Array, Bools, Ints
 from startrack.frames import Site, latlon_from_enu
 from startrack.output.picture.axes import NICE, Axes
 from startrack.output.picture.canvas import LINE_PX, TEXT_PX, TITLE_PX, Canvas, Colour, Ink, rgb_colours
-from startrack.output.picture.maps import BELOW_PX, MARGIN_PX, SEARCH_MARGIN, SIDE_PX, Map, ring
-from startrack.output.picture.relief import cell_points, edge_cover, extrapolate_values, hill_shading
+from startrack.output.picture.maps import (
+    BELOW_PX,
+    MARGIN_PX,
+    SEARCH_MARGIN,
+    SIDE_PX,
+    Map,
+    cell_points,
+    edge_cover,
+    extrapolate_values,
+    hill_shading,
+    ring,
+)
 
 if TYPE_CHECKING:
     from startrack.terrain import Raster, Terrain

@@ -124,7 +124,7 @@ ENTRIES = {  # of the module of each list: entries, each with the beginning of t
     ],
     "startrack.exposure.decoding": [('    "COUNTS": (b"COUNTS",),', '    "PNG": (')],
     "startrack.exposure.sidecar": [('PICTURE_SUFFIXES |= {".counts"}', "PACKING_SUFFIXES = ")],
-    "startrack.cli.main": [('    "size": "size",', '    "locate": "image_commands"')],
+    "startrack.cli.main": [('    "size": "size",', '    "locate": "pictures"')],
 }
 SITECUSTOMIZE = """
 import importlib.machinery, importlib.util, json, pathlib, sys

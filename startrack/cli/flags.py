@@ -103,11 +103,11 @@ class _Formatter(argparse.HelpFormatter):
 
 
 def function_at(path: str) -> Callable[[argparse.Namespace], int]:
-    """The function at `path` in startrack.cli, as "module.function"; its module is loaded when the function is called.
+    """The function at `path` in startrack.cli, as "folder.module.function"; its module is loaded when it is called.
 
     So the help, which needs no result, is printed without numpy.
     """
-    module, _, name = path.partition(".")
+    module, _, name = path.rpartition(".")
     return lambda args: int(getattr(importlib.import_module(f"startrack.cli.{module}"), name)(args))
 
 

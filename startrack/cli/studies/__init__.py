@@ -30,7 +30,7 @@ look             startrack cache show     tables of horizons: folder, files, siz
 remove           startrack cache clear    the next commands compute them again"""
 COMMANDS = (
     Command(
-        "render", function_at("render.run"), "make synthetic exposures and files with their truth",
+        "render", function_at("studies.render.run"), "make synthetic exposures and files with their truth",
         "Render the image of a camera on the crater's floor. Position, heading, tilt and time are drawn from the seed "
         "unless they are given. With --every the exposures are at equal steps of time, at rest or, with --path, on a "
         "drive with odometry. Beside NAME.png: NAME.json (time, exposure, camera, terrain), NAME.truth.json (pose, "
@@ -103,7 +103,7 @@ COMMANDS = (
         "startrack render --seed 1",
     ),
     Command(
-        "predict", function_at("studies.predict"), "expected accuracy over a terrain, before a drive",
+        "predict", function_at("studies.predict.predict"), "expected accuracy over a terrain, before a drive",
         "Predict how well images would be located: stars and the sky's light are drawn at every place and located as "
         "`locate` does. Writes predict.tif, predict.qml, predict.png, predict.ecsv and predict.json. Draws are kept in "
         "OUT/.predict: a stopped run is resumed.",
@@ -138,7 +138,7 @@ COMMANDS = (
         "startrack predict -t shackleton -c fisheye-2048 --time 2030-01-01T00:00:00",
     ),
     Command(
-        "reproduce", function_at("studies.reproduce"), "the thesis's tables and figures, ours beside them",
+        "reproduce", function_at("studies.predict.reproduce"), "the thesis's tables and figures, ours beside them",
         "Reproduce the tables and figures of Kua 2008 in its crater simulator, with its method and ours on the same "
         "draws. Each NAME gives NAME.md, NAME.png and, with numbers, NAME.ecsv. Computed chunks are kept in "
         "OUT/.chunks: a stopped run is resumed.",
@@ -161,7 +161,7 @@ COMMANDS = (
         "startrack reproduce table3.1 --quick",
     ),
     Command(
-        "doctor", function_at("doctor.run"), "versions, data files, C library, self-test",
+        "doctor", function_at("studies.doctor.run"), "versions, data files, C library, self-test",
         "Check the installation: versions, extras, data files, the C library, and one rendered exposure located from "
         "its pixels. Exit code 0 if all is well, 1 otherwise.",
         {
@@ -175,20 +175,20 @@ COMMANDS = (
         start=CACHE,
         actions=(
             Command(
-                "show", function_at("doctor.show_cache"), "folder, files and size",
+                "show", function_at("studies.doctor.show_cache"), "folder, files and size",
                 "Tables of horizons take at most 2 GB, or STARTRACK_CACHE_GB: above that those leave that were not "
                 "used for longest.",
                 {"more": (flags.JSON, *flags.MORE)}, "startrack cache show", memory_later=True,
             ),
             Command(
-                "clear", function_at("doctor.clear_cache"), "remove all of it",
+                "clear", function_at("studies.doctor.clear_cache"), "remove all of it",
                 "The next commands compute them again.",
                 {"more": (flags.JSON, *flags.MORE)}, "startrack cache clear", memory_later=True,
             ),
         ),
     ),
     Command(
-        "schema", function_at("doctor.run_schema"), "JSON schemas of the files",
+        "schema", function_at("studies.doctor.run_schema"), "JSON schemas of the files",
         "Print the JSON schema of one kind of file, or without a name the list of kinds.",
         {"input": (flag("name KIND", "such as fix, identification, camera, terrain", nargs="?"),)},
         "startrack schema fix", memory_later=True,

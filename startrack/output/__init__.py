@@ -40,12 +40,12 @@ from startrack.output.quantity import (
     show_everywhere,
 )
 from startrack.output.record import (
+    SCHEMAS,
     refused_dict,
     result_dict,
     section_values,
     stage_values,
 )
-from startrack.output.schema import SCHEMAS
 from startrack.output.tables import (
     cloud_texts,
     quantity_columns,

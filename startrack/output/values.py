@@ -16,7 +16,7 @@ from startrack.chain import Detected, Identified, Located, Measured, Oriented, P
 from startrack.core.files import is_path
 from startrack.core.statistics import error_ellipse
 from startrack.core.types import MIDDLES_RAD, Array, Blocked, Fix
-from startrack.estimation.misfit import smooth_shifts
+from startrack.estimation.lens_correction import smooth_shifts
 from startrack.frames import R_from_rotvec, heading_pitch_roll_from_R_body_enu, latlon_from_enu
 from startrack.terrain import Terrain
 

@@ -11,7 +11,6 @@ from scipy.special import ndtr
 from startrack.core.errors import Reason
 from startrack.core.types import SECTORS, Array, Evidence, Fix, NotLocated
 from startrack.localization import ExactPosterior
-from startrack.localization.chain_states import transitions
 from startrack.localization.obstacle_chain import (
     LEVELS_RAD,
     MOVES,
@@ -21,10 +20,10 @@ from startrack.localization.obstacle_chain import (
     STOP,
     WRONG_SECTOR,
     Moves,
+    transitions,
 )
-from startrack.localization.profile_cells import HIGH_RAD, LOW_RAD, Profiles
 from startrack.localization.search_profiles import HIDE, SEARCH_EPSILON
-from startrack.localization.skyline_profiles import ROW_NATS, sector_of
+from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS, Profiles, sector_of
 from startrack.terrain import Cylinder, ForwardingTerrain, Terrain, load_terrain
 
 TERRAIN = load_terrain("shackleton-thesis")
@@ -63,7 +62,7 @@ def slow_sums(points_m: Array, evidence: Evidence, terrain: Terrain) -> Array:
     """Sums (n, SECTORS) of the contributions of rows at positions (n, 2), each with its own horizon."""
     evidence = replace(evidence, llr=np.where(evidence.extended_nats > 0, evidence.llr, capped_llr(evidence)))
     horizon = terrain.horizon_rad(points_m[:, None], evidence.azimuth_rad)
-    sigma = np.hypot(evidence.edge_sigma_rad, terrain.horizon_sigma_rad(points_m[:, None], evidence.azimuth_rad))
+    sigma = np.hypot(evidence.edge_sigma_rad, terrain.errors.sigma_rad(points_m[:, None], evidence.azimuth_rad))
     value = slow_contributions(evidence, evidence.elevation_rad - horizon, sigma)
     key = np.arange(len(points_m))[:, None] * SECTORS + sector_of(evidence.azimuth_rad)
     sums = np.bincount(key.ravel(), weights=value.ravel(), minlength=len(points_m) * SECTORS)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from startrack.core import circle
+from startrack.core import statistics
 from startrack.core.statistics import NORMAL_CDF
 from startrack.evidence import sky_levels, sky_light, sky_pixels
 from startrack.frames import wahba
 from startrack.identification import attitude_refinement, star_grid
-from startrack.localization import free_skyline, search_profiles
+from startrack.localization import search_profiles, smooth_skyline
 
 SEEDS = range(3)
 
@@ -23,14 +23,14 @@ def test_interpolation_around_the_circle(size):
     azimuth = np.concatenate([rng.uniform(-30.0, 30.0, 500), [0.0, -1e-17, 2 * np.pi, -2 * np.pi, 1e6]])
     around = np.append(values, values[0])
     expected = np.interp(azimuth % (2 * np.pi), np.linspace(0.0, 2 * np.pi, size + 1), around)
-    np.testing.assert_allclose(circle.interpolate_circle(values, azimuth), expected, atol=1e-8)
+    np.testing.assert_allclose(statistics.interpolate_circle(values, azimuth), expected, atol=1e-8)
 
 
 def test_interpolation_of_nothing_and_of_no_number():
-    assert circle.interpolate_circle(np.arange(4.0), np.zeros((0, 3))).shape == (0, 3)
-    found = circle.interpolate_circle(np.arange(4.0), np.array([np.nan, np.inf, -np.inf, 0.0]))
+    assert statistics.interpolate_circle(np.arange(4.0), np.zeros((0, 3))).shape == (0, 3)
+    found = statistics.interpolate_circle(np.arange(4.0), np.array([np.nan, np.inf, -np.inf, 0.0]))
     assert np.isnan(found[:3]).all() and found[3] == 0.0
-    assert np.isnan(circle.interpolate_circle(np.array([1.0, np.nan, 1.0]), np.array([2.0])))
+    assert np.isnan(statistics.interpolate_circle(np.array([1.0, np.nan, 1.0]), np.array([2.0])))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -126,16 +126,16 @@ def test_the_circle_is_the_trace_of_the_products_of_its_sectors(every):
 
 def test_a_curve_passes_from_sector_to_sector_by_a_full_matrix():
     rng = np.random.default_rng(6)
-    heights = 0.2 * free_skyline.HEIGHTS
+    heights = 0.2 * smooth_skyline.HEIGHTS
     likelihood, cells, rough = rng.uniform(0.1, 1.0, (12, len(heights))), np.gradient(heights), 2e-3
     near = np.exp(-np.abs(heights[:, None] - heights) / rough)
-    step = (1.0 - free_skyline.JUMP) * near / (near @ cells) + free_skyline.JUMP / cells.sum()
+    step = (1.0 - smooth_skyline.JUMP) * near / (near @ cells) + smooth_skyline.JUMP / cells.sum()
     state, expected = cells / cells.sum(), []
     for s, one in enumerate(likelihood):
         state = (cells * (step @ state) if s else state) * one
         expected.append(np.log(state.sum()))
         state /= state.sum()
-    np.testing.assert_allclose(free_skyline._pass(likelihood, heights, cells, rough), expected, rtol=1e-9)
+    np.testing.assert_allclose(smooth_skyline._pass(likelihood, heights, cells, rough), expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("seed", SEEDS)

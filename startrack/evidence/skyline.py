@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.core.circle import interpolate_circle
+from startrack.core.statistics import interpolate_circle
 from startrack.core.types import MIDDLES_RAD, Array, Bools, Ints
 from startrack.frames import off_axis_rad, rays_from_azel
 from startrack.terrain import Terrain
@@ -68,7 +68,7 @@ class SkylineEstimate:
         variance_m2, axes = np.linalg.eigh(covariance_m2)
         axes = (axes * np.sqrt(np.maximum(variance_m2, 0.0))).T
         there = terrain.horizon_rad((position_m + np.vstack([np.zeros(2), axes, -axes]))[:, None], MIDDLES_RAD)
-        by_map = np.asarray(terrain.horizon_sigma_rad(np.asarray(position_m)[None], MIDDLES_RAD)).ravel()
+        by_map = np.asarray(terrain.errors.sigma_rad(np.asarray(position_m)[None], MIDDLES_RAD)).ravel()
         moved = (
             np.abs(there[1:] - there[0]).reshape(2, 2, -1).min(axis=0)
         )  # beyond a wall nearby the horizon is no measure
@@ -121,7 +121,9 @@ def skyline_band(
     picture = np.full(shape, 0, dtype=np.uint8)  # np.zeros would take small memory pages
     points = np.rint(xy).astype(np.int32)
     both = np.flatnonzero(inside & np.roll(inside, 1))
-    cv2.polylines(picture, list(np.stack([points[both - 1], points[both]], axis=1)), False, 1, int(2 * half_px) + 3)
+    cv2.polylines(
+        picture, list(np.stack([points[both - 1], points[both]], axis=1)), False, (1.0,), int(2 * half_px) + 3
+    )
     return picture.view(np.bool_)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from startrack.core.types import Array, Bools, Clock, Ints
 from startrack.frames import R_from_rotvec, turn_sky
-from startrack.localization.sector_moments import SectorMoments
+from startrack.localization.skyline_profiles import SectorMoments
 from startrack.terrain import ShapeError, Terrain
 
 LEAST_SIZE = 1e-3  # of a crater, in the stated one: a normal error reaches beyond
@@ -60,7 +60,7 @@ class SharedErrors:
     @staticmethod
     def doubtable(terrain: Terrain) -> tuple[str, ...]:
         """Stated facts of a `terrain` whose errors would be larger if the statement were wrong."""
-        known = terrain.shape_errors
+        known = terrain.errors.shape
         return tuple(
             dict.fromkeys(one.fact for one in known if one.gross_probability == 0.0 and one.gross_sigma > one.sigma)
         )
@@ -177,7 +177,7 @@ def _sigma(errors: Sequence[ShapeError], gross: str) -> Array:
 
 def _known_errors(terrain: Terrain, clock: Clock | None) -> list[ShapeError]:
     """The errors of a `terrain`, and of a `clock`, those that are stated as zero too."""
-    return [*terrain.shape_errors, *([] if clock is None else [_clock_error(clock, terrain)])]
+    return [*terrain.errors.shape, *([] if clock is None else [_clock_error(clock, terrain)])]
 
 
 def is_noticeable(clock: Clock, error_s: float, terrain: Terrain) -> bool:

@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from startrack import __version__, output
+from startrack import output
 from startrack.applications.tracking.picture import known_points, track_extent
 from startrack.applications.tracking.track import SizeError, Track, TrackFrame, Trajectory
+from startrack.core import __version__
 from startrack.core.errors import Reason
 from startrack.core.files import write_atomically
 from startrack.core.types import Array

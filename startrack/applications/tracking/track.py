@@ -186,7 +186,7 @@ def estimate_track(
     crater = terrain
     if shared.size_sigma_1:
         shape = [errors[one.name].mean + errors[one.name].error if one.name in errors else one.mean
-                 for one in terrain.shape_errors]  # fmt: skip
+                 for one in terrain.errors.shape]  # fmt: skip
         crater = terrain.with_shape(np.array(shape))
     depth, width = (
         SizeError.of(errors[name], crater.facts().get(key, np.nan)) if name in errors else None

@@ -88,18 +88,15 @@ class OnlineTrack:
     def position(self) -> tuple[Array, Array]:
         """Position (2,) of the last frame and its covariance (2, 2), by all moves that it may have made.
 
-        Where the filter differs from the explanation it follows, by posts, the variants differ alike.
+        About a position of which explanations differ nothing is known. Where the filter differs from the explanation it
+        follows, by posts, the variants differ alike.
         """
         best, (parts, share) = self._best, self._best.parts
         found = mixed_normal([one.position_m for one in parts], [one.covariance_m2 for one in parts], share)
         sizes, axes = np.linalg.eigh(found[1] - best.covariance_m2)
         more = (axes * np.maximum(sizes, 0.0)) @ axes.T
-        return self.filter.position_m + found[0] - best.position_m, self.filter.covariance_m2 + more
-
-    @property
-    def known_m2(self) -> Array:
-        """(2, 2) covariance of the last frame; of a position about which explanations differ, of an unknown one."""
-        return self.position[1] if self.is_vouched else UNKNOWN_M**2 * np.eye(2)
+        covariance_m2 = known_m2(self.filter.covariance_m2 + more, self.is_vouched)
+        return self.filter.position_m + found[0] - best.position_m, covariance_m2
 
     def _settle(self, first: int) -> None:
         """The filters that begin anew have the settled frames from this number on, as they are settled."""
@@ -156,7 +153,7 @@ def filter_positions(modes: Sequence[Modes], moves: Sequence[Moves], shared_coun
     found = Filtered(np.zeros((n, 2)), np.zeros((n, 2, 2)), mode, alone, track.compared)
     for k, of in enumerate(modes):
         track.add(of, moves)
-        found.position_m[k], found.covariance_m2[k], mode[k] = track.position[0], track.known_m2, track.mode
+        (found.position_m[k], found.covariance_m2[k]), mode[k] = track.position, track.mode
         alone[k] = k if track.is_first else -1
     return found
 
@@ -165,9 +162,8 @@ def filter_positions(modes: Sequence[Modes], moves: Sequence[Moves], shared_coun
 class RobustTrack:
     """The estimate without the moves and frames that contradict the others."""
 
-    smoothed: Smoothed
+    smoothed: Smoothed  # where explanations of another position are likely together, nothing is known
     mode: Ints  # (n,) which mode of each frame is used; -1: none
-    vouched: Bools  # (n,) whether explanations of another position are unlikely together
     best: Explanation  # with the moves, and the legs that slipped; odometry with a fault is left out
 
     @property
@@ -202,7 +198,13 @@ def conclude(modes: Sequence[Modes], compared: Explanations, names: Sequence[str
         raise BadInput("inconsistent_evidence", f"{' and '.join(texts)} {what}, and neither is clearly right{why}")
     if (mode != best.mode).any():
         found = _smooth(modes, best, mode) or found
-    return RobustTrack(found, mode, vouched, best)
+    found = replace(found, covariance_m2=known_m2(found.covariance_m2, vouched))
+    return RobustTrack(found, mode, best)
+
+
+def known_m2(covariance_m2: Array, known: Bools | bool) -> Array:
+    """The covariances (..., 2, 2), of positions that are not `known` (...) those of unknown ones."""
+    return np.where(np.asarray(known)[..., None, None], covariance_m2, UNKNOWN_M**2 * np.eye(2))
 
 
 def disagrees(position_m: Array, covariance_m2: Array, other_m: Array, other_m2: Array) -> Bools:
@@ -327,7 +329,8 @@ def positions_at_rest(
 
     first, *later = np.flatnonzero(agreeing.mode >= 0).tolist()
     one = frames[first].modes[agreeing.mode[first]]
-    found, reference, spread = take(first, one), agreeing.smoothed.position_m[0], agreeing.smoothed.covariance_m2[0]
+    compared_as = agreeing.smoothed
+    found, reference, spread = take(first, one), compared_as.position_m[first], compared_as.covariance_m2[first]
     if errors.bends:  # models have positions before these are scaled with the crater
         reference, spread = one.mean[:2], one.covariance[:2, :2]
     half = max(FRAME_REACH_SIGMAS * largest_sigma(found.covariance_m2[0]), LEAST_FRAME_HALF_M)
@@ -340,4 +343,8 @@ def positions_at_rest(
             points = sample_together(models, reference, spread)
             found = take(k, observe_together(models, points))
     alone = np.where(np.cumsum(agreeing.mode >= 0) == 1, first, -1)
+    known = compared_as.covariance_m2[:, 0, 0] < UNKNOWN_M**2  # explanations do not differ
+    found = replace(
+        found, position_m=np.repeat(found.position_m, n, axis=0), covariance_m2=known_m2(found.covariance_m2, known)
+    )  # fmt: skip
     return replace(agreeing, smoothed=found), Filtered(position, covariance, agreeing.mode, alone, compared)

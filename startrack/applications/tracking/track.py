@@ -17,12 +17,13 @@ from startrack.applications.tracking.positions import (
     OnlineTrack,
     conclude,
     filter_positions,
+    known_m2,
     place_modes,
     positions_at_rest,
 )
 from startrack.applications.tracking.track_errors import BIAS, CLOCK, ErrorFound, TrackErrors
 from startrack.core.types import Array, BadInput, Bools, ClockError, Ints
-from startrack.estimation.observations import UNKNOWN_M, USUAL_ODOMETRY, OdometryErrors, Steps
+from startrack.estimation.observations import USUAL_ODOMETRY, OdometryErrors, Steps
 from startrack.estimation.trajectory import radius_holding
 from startrack.frames import quat_xyzw_from_R
 from startrack.localization import camera_at
@@ -176,12 +177,12 @@ def estimate_track(
     found, best = robust.smoothed, robust.best
     alone = np.where(robust.mode[filtered.alone] >= 0, filtered.alone, -1)  # -1 is the last one, or no frame
     by_first = _trajectory(
-        filtered.position_m, _known_m2(filtered.covariance_m2, (filtered.mode < 0) | (robust.mode >= 0)), terrain,
+        filtered.position_m, known_m2(filtered.covariance_m2, (filtered.mode < 0) | (robust.mode >= 0)), terrain,
         {k: frames[of].fixes for k, of in enumerate(alone.tolist()) if of >= 0},
     )  # fmt: skip
     used = np.flatnonzero(robust.mode >= 0).tolist()
     own = dict.fromkeys(range(len(frames)) if at_rest else used, frames[used[0]].fixes) if len(used) == 1 else {}
-    smoothed = _trajectory(found.position_m, _known_m2(found.covariance_m2, robust.vouched), terrain, own)
+    smoothed = _trajectory(found.position_m, found.covariance_m2, terrain, own)
     errors = dict(zip(shared.names, shared.errors_found(found.shared, found.shared_covariance), strict=True))
     crater = terrain
     if shared.size_sigma_1:
@@ -212,7 +213,7 @@ def track_of_newest(
     `is_outside`: the odometry does not cover the frame.
     """
     own = {0: frame.fixes} if online.is_first else {}
-    found = _trajectory(online.position[0][None], online.known_m2[None], terrain, own)
+    found = _trajectory(online.position[0][None], online.position[1][None], terrain, own)
     return Track((_track_frame(frame, online.mode, True, is_outside),), found, found, terrain)
 
 
@@ -229,19 +230,14 @@ def _track_frame(frame: ObservedFrame, mode: int, attitude_fits: bool, is_outsid
     return TrackFrame(frame.name, frame.time_utc, *found, quat, frame.search, is_outside)
 
 
-def _known_m2(covariance_m2: Array, known: Bools) -> Array:
-    """The covariances (n, 2, 2), of positions that are not `known` (n,) those of unknown ones."""
-    return np.where(known[:, None, None], covariance_m2, UNKNOWN_M**2 * np.eye(2))
-
-
 def _trajectory(
     position_m: Array, covariance_m2: Array, terrain: Terrain, alone: Mapping[int, Sequence[ImageFix]]
 ) -> Trajectory:
-    """Positions (n, 2) or (1, 2) and covariances (n, 2, 2) as a trajectory; `alone` are those of one image."""
+    """Positions (n, 2) and covariances (n, 2, 2) as a trajectory; `alone` are those of one image."""
     known = np.sqrt(np.trace(covariance_m2, axis1=1, axis2=2)) < UNKNOWN_SIGMA_M
     position = np.full((len(known), 3), np.nan)
     for k in np.flatnonzero(known):
-        position[k] = camera_at(np.broadcast_to(position_m, (len(known), 2))[k], terrain)
+        position[k] = camera_at(position_m[k], terrain)
     found = Trajectory.of_normal(position, np.where(known[:, None, None], covariance_m2, np.inf))
     for at, fixes in ((at, fixes) for at, fixes in alone.items() if len(fixes) == 1):
         found.position_enu_m[at], found.covariance_m2[at] = fixes[0].position_enu_m, fixes[0].covariance_m2

@@ -139,8 +139,13 @@ COMMANDS = (
                 ),
             ),
             "output": (
-                flag("-o --output FILE", "the skyline; several -o: in several formats", action="append", required=True),
-                *flags.OUTPUT,
+                flag(
+                    "-o --output FILE",
+                    "the skyline, and beside it its picture, NAME.skyline.png; several -o: in several formats",
+                    action="append", required=True,
+                ),
+                flag("-D --dir OUT", "folder of FILE, where that is relative (default: the current one)"),
+                flags.OVERWRITE, flags.JSON, flag("--no-plots", "no picture beside FILE"),
             ),
             "more": (flags.TIME_LIMIT, flags.NO_SEED, *flags.MORE),
         },

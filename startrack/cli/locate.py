@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import importlib
 import math
-import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -18,7 +17,7 @@ from startrack import chain, output
 from startrack.applications.batch import result_stems
 from startrack.camera import Camera, load_camera
 from startrack.catalog import load_catalog
-from startrack.cli.console import Outcome, print_outcome, print_warnings, wait_lines, worst_code
+from startrack.cli.console import Outcome, print_files, print_outcome, print_warnings, wait_lines, worst_code
 from startrack.cli.flags import check_localizer
 from startrack.cli.images import check_fov, flag_site, near_attitude_of, prepare, read, settings_of
 from startrack.cli.report import write_page_of_images
@@ -51,8 +50,7 @@ def locate(args: argparse.Namespace) -> int:
     settings = settings_of(args)
     code = _run_images(args, "fix", lambda exposure, _: chain.locate_exposure(exposure, settings), args.time_limit)
     page = write_page_of_images(args.dir, args.images) if args.report else None
-    if page is not None and not args.quiet:
-        print(f"page {printable(page)}", file=sys.stderr)
+    _print_folder(args, "fix", page)
     return code
 
 
@@ -69,12 +67,16 @@ def identify(args: argparse.Namespace) -> int:
             return chain.identify_blind(exposure, args.fov, load_catalog(), settings, site)
         return chain.identify(exposure, camera, load_catalog(), settings, site)
 
-    return _run_images(args, "identification", solve, args.time_limit)
+    code = _run_images(args, "identification", solve, args.time_limit)
+    _print_folder(args, "identification")
+    return code
 
 
 def detect(args: argparse.Namespace) -> int:
     """Detect in every image; the exit code of the worst."""
-    return _run_images(args, "detections", chain.detect)
+    code = _run_images(args, "detections", chain.detect)
+    _print_folder(args, "detections")
+    return code
 
 
 def _run_images(args: argparse.Namespace, kind: str, solve: Solve, limit_s: float | None = None) -> int:
@@ -105,9 +107,13 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve, limit_s: floa
             line = f"{printable(name)}  {message}"
         print_warnings(args, name, record.get("warnings", ()))
         codes.add(print_outcome(args, record, line))
-    if not (args.quiet or args.json) and any(Path(args.dir).glob(f"*.{kind}.json")):
-        print(f"files in {printable(args.dir)}", file=sys.stderr, flush=True)
     return worst_code(codes)
+
+
+def _print_folder(args: argparse.Namespace, kind: str, page: Path | None = None) -> None:
+    """The last line: the folder of results, if it has any, and the `page`."""
+    if any(Path(args.dir).glob(f"*.{kind}.json")):
+        print_files(args, f"in {printable(args.dir)}", page)
 
 
 def _import_beside(names: Sequence[str]) -> None:

@@ -21,7 +21,7 @@ from typing import Any, NoReturn
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: a second thread waits for work, 0.2 s a start
 
 from startrack import __version__
-from startrack.cli.console import discard_stdout, open_closed_streams, print_advice
+from startrack.cli.console import discard_stdout, open_closed_streams, print_refusal
 from startrack.cli.flags import Command
 from startrack.core import errors
 from startrack.core.errors import BadInput, BadOutput, NoSolution
@@ -112,8 +112,8 @@ def _run(args: argparse.Namespace) -> int:
         return USAGE
     except (BadInput, NoSolution) as cause:
         code = errors.EXIT_BAD_INPUT if isinstance(cause, BadInput) else errors.EXIT_REFUSED
-        _report_failure(f"{cause.reason}: {cause}", code)
-        print_advice(cause.reason, str(cause), args)
+        line = f"startrack {args.command}  refused  {cause.reason}: {errors.one_line(str(cause))}"
+        print_refusal(args, line, cause.reason, str(cause))
         return code
     except LibraryMissing as cause:
         return _report_failure(str(cause), errors.EXIT_INTERNAL_ERROR)

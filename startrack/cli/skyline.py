@@ -8,7 +8,7 @@ from pathlib import Path
 
 from startrack import chain, output
 from startrack.camera import load_camera
-from startrack.cli.console import Outcome, print_outcome, print_warnings, wait_lines
+from startrack.cli.console import Outcome, print_files, print_outcome, print_warnings, wait_lines
 from startrack.cli.flag_types import attitude
 from startrack.cli.flags import check_localizer
 from startrack.cli.images import prepare
@@ -35,7 +35,10 @@ def locate_skyline(args: argparse.Namespace) -> int:
         record = output.refused_dict(args.skyline, cause.reason, str(cause))
         line = output.refusal_line(args.skyline, cause.reason, str(cause))
     print_warnings(args, Path(args.skyline).name, record.get("warnings", ()))
-    return print_outcome(args, record, line)
+    code = print_outcome(args, record, line)
+    if record["status"] == "ok":
+        print_files(args, f"in {printable(args.dir)}")
+    return code
 
 
 def _solve(args: argparse.Namespace) -> Outcome:

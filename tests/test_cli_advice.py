@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from startrack.chain import detect, stating_sky
-from startrack.cli.console import print_outcome, print_warnings
+from startrack.cli.console import Columns, print_outcome, print_warnings
 from startrack.cli.main import main
 from startrack.core.errors import NotIdentified, Reason, next_step
 from startrack.exposure import read_exposure
@@ -234,3 +234,14 @@ def test_fields_that_were_tried_are_not_advised(low: float, high: float, text: s
     assert text in advice and ("--fov" in advice) == bool(text)
     assert "near_sky" not in advice
     assert "leave out near_sky" in advise_on_fields(0.1, 0.4, NearSky.from_degrees([10.0, 20.0, 5.0]))
+
+
+def test_lines_of_several_images_have_steady_columns() -> None:
+    columns = Columns(["near-centre.png", "a.png"])
+    first = "near-centre.png  ok  E 425.3 m  N -310.5 m  ±8.9 m (95 %)  heading 32.0°  2248 stars  1.2 s with files"
+    second = "a.png  ok  E -6899.5 m  N 4700.6 m  ±13.0 m (95 %)  heading 205.0°  835 stars  11.2 s with files"
+    lines = [columns.aligned(line) for line in (first, second)]
+    places = [[line.index(word) for word in (" ok ", " m  N", " m  ±", " m (95", "°", " stars")] for line in lines]
+    assert places[0] == places[1]
+    assert [re.sub(r" +", "", line) for line in lines] == [re.sub(r" +", "", line) for line in (first, second)]
+    assert columns.aligned("a.png  ok  1979 point sources\n  more  1 s").endswith("\n  more  1 s")

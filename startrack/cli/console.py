@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -33,6 +34,8 @@ ADVICE_BY_MESSAGE = {  # part of a message: what to do, where the advice of its 
     "no such folder of results": "Give the folder OUT of startrack locate or batch, or one NAME.fix.json.",
     "images there": "Give the folder that holds the pictures.",
 }
+NUMBER_COLUMN = re.compile(r"([^\d+-]*)([+-]?\d+(?:\.\d+)?)(.*)")
+NUMBER_WIDTHS = {"E ": 8, "N ": 8, "±": 5, "heading ": 5, "": 4}  # least widths, by the text before the number
 Outcome = tuple[dict[str, Any], str]  # of an image: the JSON object, and the line or lines
 
 
@@ -83,6 +86,29 @@ def _advice(reason: str, message: str, own: str) -> str:
         return fitting
     advice = errors.next_step(reason, message)
     return own if advice and own not in ("", errors.Reason(reason).advice) else advice
+
+
+class Columns:
+    """Lines of several images in steady columns: names as wide as the longest, numbers to the right."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self._name_width = max((len(errors.one_line(name)) for name in names), default=0)
+        self._widths: dict[tuple[str, str], int] = {}
+
+    def aligned(self, line: str) -> str:
+        """The `line` of an image, whose columns two spaces part, with the widths of the lines before."""
+        first, newline, rest = line.partition("\n")
+        name, *columns = first.split("  ")
+        return "  ".join([name.ljust(self._name_width), *map(self._padded, columns)]) + newline + rest
+
+    def _padded(self, column: str) -> str:
+        match = NUMBER_COLUMN.fullmatch(column)
+        if match is None:
+            return column
+        before, number, after = match.groups()
+        width = max(self._widths.get((before, after), NUMBER_WIDTHS.get(before, 0)), len(number))
+        self._widths[before, after] = width
+        return f"{before}{number.rjust(width)}{after}"
 
 
 def print_files(args: argparse.Namespace, files: str, page: str | os.PathLike[str] | None = None) -> None:

@@ -37,7 +37,7 @@ def state_flag(key: str) -> str:
 
 COMMANDS = (
     Command(
-        "calibrate", function_at("calibrate.run"), "a camera file from star exposures",
+        "calibrate", function_at("calibrate.run"), "a camera file from pictures of the stars",
         "Fit the lens of a camera to the stars of one or more exposures of the open night sky, check the fit, and "
         "write the camera file with its covariance, a report and a JSON record. A fit that fails a check is refused, "
         "with the exposures that would help.",

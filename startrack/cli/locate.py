@@ -17,7 +17,7 @@ from startrack import chain, output
 from startrack.applications.batch import result_stems
 from startrack.camera import Camera, load_camera
 from startrack.catalog import load_catalog
-from startrack.cli.console import Outcome, print_files, print_outcome, print_warnings, wait_lines, worst_code
+from startrack.cli.console import Columns, Outcome, print_files, print_outcome, print_warnings, wait_lines, worst_code
 from startrack.cli.flags import check_localizer
 from startrack.cli.images import check_fov, flag_site, near_attitude_of, prepare, read, settings_of
 from startrack.cli.report import write_page_of_images
@@ -88,7 +88,7 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve, limit_s: floa
         args.usage_error("--image-topic is for ROS bags, and none is given")
     needed = NEEDED_LATER[:-1] if args.no_plots else NEEDED_LATER
     Thread(target=_import_beside, args=(needed,)).start()
-    codes = set()
+    codes, columns = set(), Columns(Path(path).name for path in args.images)
     for path, stem in zip(args.images, result_stems(args.images), strict=True):
         name = Path(path).name
         try:
@@ -106,7 +106,8 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve, limit_s: floa
             record = output.refused_dict(path, INTERNAL_ERROR, message, kind.removesuffix("s"))
             line = f"{printable(name)}  {message}"
         print_warnings(args, name, record.get("warnings", ()))
-        codes.add(print_outcome(args, record, line))
+        aligned = columns.aligned(line) if len(args.images) > 1 and record["status"] == "ok" else line
+        codes.add(print_outcome(args, record, aligned))
     return worst_code(codes)
 
 

@@ -11,7 +11,6 @@ from scipy.special import ndtr
 from startrack.core.errors import Reason
 from startrack.core.types import SECTORS, Array, Evidence, Fix, NotLocated
 from startrack.localization import ExactPosterior
-from startrack.localization.chain_states import transitions
 from startrack.localization.obstacle_chain import (
     LEVELS_RAD,
     MOVES,
@@ -21,10 +20,10 @@ from startrack.localization.obstacle_chain import (
     STOP,
     WRONG_SECTOR,
     Moves,
+    transitions,
 )
-from startrack.localization.profile_cells import HIGH_RAD, LOW_RAD, Profiles
 from startrack.localization.search_profiles import HIDE, SEARCH_EPSILON
-from startrack.localization.skyline_profiles import ROW_NATS, sector_of
+from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS, Profiles, sector_of
 from startrack.terrain import Cylinder, ForwardingTerrain, Terrain, load_terrain
 
 TERRAIN = load_terrain("shackleton-thesis")

@@ -15,9 +15,7 @@ from test_localization_shape import evidence_at
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Clock, Evidence, sector_of
 from startrack.frames import Site, sky_rotvec_rad
 from startrack.localization import ExactPosterior, importance_sampling
-from startrack.localization.chain_states import state_probabilities, transitions
 from startrack.localization.clock import turn_evidence
-from startrack.localization.free_skyline import free_log_likelihood
 from startrack.localization.importance_sampling import moments
 from startrack.localization.joint_posterior import sample_posterior
 from startrack.localization.neighbourhood import Neighbourhood
@@ -29,11 +27,13 @@ from startrack.localization.obstacle_chain import (
     WRONG_SECTOR,
     emissions,
     prepare_levels,
+    state_probabilities,
+    transitions,
 )
-from startrack.localization.profile_cells import HIGH_RAD, LOW_RAD
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel
-from startrack.localization.skyline_profiles import ROW_NATS, profiles_of
+from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS, profiles_of
+from startrack.localization.smooth_skyline import free_log_likelihood
 from startrack.terrain import Cylinder, Terrain, load_terrain
 
 CRATER = load_terrain("shackleton-thesis")

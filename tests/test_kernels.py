@@ -325,8 +325,8 @@ def small_frames_of(rng):
 def chain_of(rng):
     """Profiles of random stars and sky light, and the likelihoods of skylines by them."""
     from startrack.core.types import MIDDLES_RAD, SECTORS, Evidence
-    from startrack.localization import chain_states, free_skyline, obstacle_chain, search_profiles, sector_moments
-    from startrack.localization.skyline_profiles import profiles_of
+    from startrack.localization import obstacle_chain, search_profiles, smooth_skyline
+    from startrack.localization.skyline_profiles import measure_moments, profiles_of
 
     stars, height = 3000, 0.02 * np.linspace(-1.0, 1.0, 13)
     rows = Evidence(
@@ -342,13 +342,13 @@ def chain_of(rng):
     levels = obstacle_chain.Levels(reach, obstacle_chain.prepare_levels(soft, reach), hard, rng.random(SECTORS))
     likely = np.empty(len(shifts))
     obstacle_chain.chain_log_likelihoods(soft, levels, moves, shifts, 17, np.array([0, 3, 15]), likely)
-    states = chain_states.state_probabilities(obstacle_chain.emissions(soft, shifts[0]), moves)
+    states = obstacle_chain.state_probabilities(obstacle_chain.emissions(soft, shifts[0]), moves)
     logs = obstacle_chain.log_clear_emissions(hard, shifts.T, rng.random(SECTORS))
     search = search_profiles.SearchProfiles.of(rows)
     low = rng.uniform(-0.1, 0.1, (5, SECTORS))
     found = search.bound(low, low + 0.02), search.average(low[:, ::4], low[:, ::4] + 0.02), search.integral
-    moments = sector_moments.measure_moments(soft)
-    curve = free_skyline.list_free_logs(hard, shifts[1], 0.2, np.array([1e-4, 1e-3]))
+    moments = measure_moments(soft)
+    curve = smooth_skyline.list_free_logs(hard, shifts[1], 0.2, np.array([1e-4, 1e-3]))
     assert np.isfinite(likely).all() and np.isfinite(curve).all()
     return (*soft, *hard, likely, states, logs, *found, *moments, curve)
 

@@ -11,7 +11,7 @@ from startrack.core.statistics import NORMAL_CDF
 from startrack.evidence import sky_levels, sky_light, sky_pixels
 from startrack.frames import wahba
 from startrack.identification import attitude_refinement, star_grid
-from startrack.localization import free_skyline, search_profiles
+from startrack.localization import search_profiles, smooth_skyline
 
 SEEDS = range(3)
 
@@ -126,16 +126,16 @@ def test_the_circle_is_the_trace_of_the_products_of_its_sectors(every):
 
 def test_a_curve_passes_from_sector_to_sector_by_a_full_matrix():
     rng = np.random.default_rng(6)
-    heights = 0.2 * free_skyline.HEIGHTS
+    heights = 0.2 * smooth_skyline.HEIGHTS
     likelihood, cells, rough = rng.uniform(0.1, 1.0, (12, len(heights))), np.gradient(heights), 2e-3
     near = np.exp(-np.abs(heights[:, None] - heights) / rough)
-    step = (1.0 - free_skyline.JUMP) * near / (near @ cells) + free_skyline.JUMP / cells.sum()
+    step = (1.0 - smooth_skyline.JUMP) * near / (near @ cells) + smooth_skyline.JUMP / cells.sum()
     state, expected = cells / cells.sum(), []
     for s, one in enumerate(likelihood):
         state = (cells * (step @ state) if s else state) * one
         expected.append(np.log(state.sum()))
         state /= state.sum()
-    np.testing.assert_allclose(free_skyline._pass(likelihood, heights, cells, rough), expected, rtol=1e-9)
+    np.testing.assert_allclose(smooth_skyline._pass(likelihood, heights, cells, rough), expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("seed", SEEDS)

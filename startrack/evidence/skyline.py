@@ -121,7 +121,9 @@ def skyline_band(
     picture = np.full(shape, 0, dtype=np.uint8)  # np.zeros would take small memory pages
     points = np.rint(xy).astype(np.int32)
     both = np.flatnonzero(inside & np.roll(inside, 1))
-    cv2.polylines(picture, list(np.stack([points[both - 1], points[both]], axis=1)), False, 1, int(2 * half_px) + 3)
+    cv2.polylines(
+        picture, list(np.stack([points[both - 1], points[both]], axis=1)), False, (1.0,), int(2 * half_px) + 3
+    )
     return picture.view(np.bool_)
 
 

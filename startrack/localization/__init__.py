@@ -10,13 +10,11 @@ from startrack.localization.importance_sampling import ENOUGH, Gaussian, Weighte
 from startrack.localization.integrity import RISK, clear_logs
 from startrack.localization.linear_errors import LinearErrors
 from startrack.localization.posterior import MIN_ROW_NATS, ExactPosterior
-from startrack.localization.profile_cells import HIGH_RAD, LOW_RAD
 from startrack.localization.pseudo_gradient import PseudoGradient, descend
-from startrack.localization.sector_moments import solve_linear
 from startrack.localization.shared_errors import ErrorBasis, SharedErrors
 from startrack.localization.skyline_model import SkylineModel
 from startrack.localization.skyline_points import SkylinePoints
-from startrack.localization.skyline_profiles import ROW_NATS
+from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS, solve_linear
 from startrack.localization.steepness import settle_steepness
 from startrack.localization.summary import camera_at
 from startrack.localization.turned_skylines import locate_points

@@ -20,10 +20,8 @@ from startrack.localization.obstacle_chain import (
     emissions,
     prepare_levels,
 )
-from startrack.localization.profile_cells import Profiles
-from startrack.localization.sector_moments import SectorMoments, measure_moments
 from startrack.localization.shared_errors import SharedErrors
-from startrack.localization.skyline_profiles import profiles_of
+from startrack.localization.skyline_profiles import Profiles, SectorMoments, measure_moments, profiles_of
 from startrack.terrain import NO_POST, ExpectedCrests, Terrain, require_horizons
 
 SAMPLES = 6 * SECTORS  # of the skyline around the reference, between which rows are compared with it

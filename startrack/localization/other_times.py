@@ -27,9 +27,9 @@ from startrack.localization.hypothesis import (
 )
 from startrack.localization.importance_sampling import FEW, Gaussian, moments
 from startrack.localization.places import choose_apart
-from startrack.localization.sector_moments import heavy_log_likelihood, solve_linear
 from startrack.localization.shared_errors import CLOCK_FACT, is_noticeable
 from startrack.localization.skyline_model import SkylineModel
+from startrack.localization.skyline_profiles import heavy_log_likelihood, solve_linear
 
 WRONG_TIME_PROBABILITY = 0.005  # of a stated time; see docs/method.md, section 8
 GROSS_REACH_SIGMAS, MOST_TIME_STEPS = 3.0, 60  # of a gross error, to the last time: 16 degrees of turn at most

@@ -14,12 +14,11 @@ from functools import cached_property
 import numpy as np
 
 from startrack.core.types import SECTORS, Array, Evidence, ImageErrors, Ints
-from startrack.localization.chain_states import closing_of, state_probabilities
 from startrack.localization.linear_errors import LinearErrors
 from startrack.localization.neighbourhood import NO_IMAGE_ERRORS, Neighbourhood, SectorRows
-from startrack.localization.obstacle_chain import RISEN, Levels, chain_log_likelihoods
-from startrack.localization.sector_moments import solve_linear
+from startrack.localization.obstacle_chain import RISEN, Levels, chain_log_likelihoods, closing_of, state_probabilities
 from startrack.localization.shared_errors import ErrorBasis, SharedErrors
+from startrack.localization.skyline_profiles import solve_linear
 from startrack.terrain import Terrain
 
 LEAST_REACH_RAD = np.radians(0.1)  # of shifts, for which levels are prepared

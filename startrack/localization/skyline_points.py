@@ -29,7 +29,7 @@ from startrack.core.types import (
 )
 from startrack.frames import R_from_rotvec, turn_azel
 from startrack.localization.neighbourhood import Neighbourhood
-from startrack.localization.sector_moments import SectorMoments, solve_linear
+from startrack.localization.skyline_profiles import SectorMoments, solve_linear
 from startrack.terrain import Terrain
 
 COLUMN_SIGMAS = 2.0  # width of the edge of a column of rows, and their distance: normal up to 3 sigma, linear beyond

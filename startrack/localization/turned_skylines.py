@@ -19,8 +19,8 @@ from startrack.localization.places import FINEST_M, Place, split_boxes
 from startrack.localization.position_prior import SearchedNear, name_prior, require_prior_inside
 from startrack.localization.posterior import Part, weigh_parts
 from startrack.localization.search import NATS, boxes_about
-from startrack.localization.sector_moments import FREEDOM, REWEIGHTINGS
 from startrack.localization.skyline_points import LEAST_HEIGHT_SIGMA_RAD, TURN, SeenSkyline, SkylinePoints
+from startrack.localization.skyline_profiles import FREEDOM, REWEIGHTINGS
 from startrack.localization.steepness import settle_steepness
 from startrack.terrain import Terrain, require_terrain
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from startrack.core.statistics import shares
 from startrack.core.types import Array, Blocked, NotLocated
-from startrack.localization.free_skyline import free_log_likelihood
 from startrack.localization.hypothesis import (
     FEW_ROUNDS,
     GROSS_ROUNDS,
@@ -19,6 +18,7 @@ from startrack.localization.hypothesis import (
 )
 from startrack.localization.shared_errors import CLOCK_FACT, OWN_EDGE, OWN_EDGE_PROBABILITY, SharedErrors
 from startrack.localization.skyline_model import SkylineModel
+from startrack.localization.smooth_skyline import free_log_likelihood
 
 WRONG_FACT_NATS = 3.0  # by which a gross error of a stated fact must explain the rows better: 1 of 100 clean skies
 MOST_BLOCKED = 0.5  # of the skyline that the rows show: where more is on no map, another place may explain them as well

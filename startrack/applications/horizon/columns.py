@@ -100,7 +100,7 @@ def sample_columns(
     elevation = np.arange(LOWEST_RAD, TOP_RAD, px_rad / COLUMN_SAMPLES)
     disks = np.zeros_like(lost)
     for (i, j), radius in zip(np.rint(stars[0]).astype(int).tolist(), stars[1], strict=True):
-        cv2.circle(disks, (i, j), round(radius), 1, -1)
+        cv2.circle(disks, (i, j), round(radius), (1.0,), -1)
     shape = len(elevation), AZIMUTH_COLUMNS
     total, spread, points = np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=bool)
     # Of the columns' middles: four lie evenly about each degree.

@@ -1,0 +1,82 @@
+"""Any smooth skyline near the map's: what a wrong map, time or camera file shows, and light with an edge of its own.
+
+Lit ground below the crest, which stars do not show, is taken for sky: over some directions the light then has any
+smooth edge near the skyline, and the stars alone show the skyline. This is a hypothesis as that of a gross error of a
+fact, with the same rows, errors and chain of obstacles, in which a state "the light has its own edge" stands for the
+notches. The evidence decides between it and light that ends at the skyline.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import log
+
+import numpy as np
+
+from startrack.core.statistics import shares
+from startrack.core.types import SECTORS, Array
+from startrack.kernels.library import kernel
+from startrack.localization.hypothesis import Hypothesis
+from startrack.localization.neighbourhood import OwnEdge, SectorRows
+from startrack.localization.obstacle_chain import clear_emissions
+from startrack.localization.shared_errors import OWN_EDGE
+from startrack.localization.skyline_model import SkylineModel
+from startrack.localization.skyline_profiles import LOW_RAD, Profiles
+
+FREE_HEIGHTS, SPREAD = 121, 6.5  # of heights about the map's skyline, closer about it
+ROUGHNESS_RAD = np.radians([0.003, 0.01, 0.03, 0.1])  # mean steps from sector to sector, equally likely
+JUMP = 1e-4  # probability of a step to anywhere
+HEIGHTS = np.sinh(SPREAD * np.linspace(-1, 1, FREE_HEIGHTS)) / np.sinh(SPREAD)  # in the farthest one
+EDGE_REACH = 5.0  # of heights of the light's own edge, in its width: the cells reach no farther
+EDGE_ROUGHNESS = np.array([0.01, 0.03, 0.1, 0.3])  # mean steps from sector to sector, in its width, equally likely
+
+
+def free_log_likelihood(profiles: Profiles, shift: Array) -> float:
+    """Log-likelihood of the rows if the skyline is the map's, higher by `shift` (SECTORS,), and any smooth curve."""
+    logs = list_free_logs(profiles, shift, -LOW_RAD, ROUGHNESS_RAD).sum(axis=1)
+    return float(np.logaddexp.reduce(logs)) - log(len(logs))
+
+
+def list_free_logs(profiles: Profiles, shift: Array, reach_rad: float, roughness_rad: Array) -> Array:
+    """Log-likelihoods (n, SECTORS) of each sector by the sectors before it, for each roughness (n,) of the curve.
+
+    The skyline is the map's, higher by `shift` (SECTORS,), and a curve within `reach_rad` of zero.
+    """
+    heights = reach_rad * HEIGHTS
+    likelihood, cells = clear_emissions(profiles, shift[:, None] + heights), np.gradient(heights)
+    return np.array([_pass(likelihood, heights, cells, rough) for rough in roughness_rad])
+
+
+def _pass(likelihood: Array, heights: Array, cells: Array, rough: float) -> Array:
+    """Log-likelihoods (SECTORS,) by one pass around the circle, with steps of a mean size `rough` to either side."""
+    found = np.empty(len(likelihood))
+    _pass_curve(likelihood, heights, cells, rough, JUMP, np.empty((5, len(heights))), found)
+    return found
+
+
+_pass_curve = kernel(
+    "pass_curve", "likelihood: float64[sectors, n >= 1]", "heights: float64[n]", "cells: float64[n]", "rough: float64",
+    "jump: float64", "scratch: out float64[5, n]", "found: out float64[sectors]",
+)  # fmt: skip
+
+
+def with_own_edge(plain: Hypothesis, half_m: float) -> SkylineModel | None:
+    """The model of a hypothesis without gross error where the light has an edge of its own; None without both.
+
+    It serves positions within `half_m` of the same reference.
+    """
+    seen, errors = plain.model.seen, plain.model.errors
+    rows = seen.rows
+    is_light = rows.extended_nats > 0.0
+    if is_light.all() or not is_light.any():
+        return None
+    around = replace(plain.model.around, half_m=half_m)
+    stars, light = (SectorRows(around, rows.take(np.flatnonzero(own))) for own in (~is_light, is_light))
+    width_rad = float(np.median(rows.edge_sigma_rad[is_light]))
+    shift = plain.model.shift_of(plain.found.share @ plain.found.points)
+    logs = list_free_logs(light.profiles, shift, EDGE_REACH * width_rad, EDGE_ROUGHNESS * width_rad)
+    whole, likely = logs.sum(axis=1), shares(logs.sum(axis=1)) @ logs
+    likely += (np.logaddexp.reduce(whole) - np.log(len(whole)) - likely.sum()) / SECTORS  # all equally likely before
+    offset = light.profiles.offset + stars.profiles.offset - seen.profiles.offset  # the same about one reference
+    edge = OwnEdge(stars.profiles, np.exp(likely + offset))
+    return SkylineModel(replace(seen, around=around, edge=edge), errors, around.error_slopes_rad(errors), OWN_EDGE)

@@ -14,6 +14,7 @@ from threading import Event, Thread
 from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 from startrack.core import errors
+from startrack.core.advice import fitting_advice
 from startrack.core.errors import BadInput, NoSolution, Reason
 from startrack.core.files import printable
 
@@ -28,12 +29,6 @@ LINE_S = 10.0
 ANNOUNCED_S = 5.0  # a longer wait is announced
 MOST_UNITS = 100  # of a duration, from which a larger unit is used
 UNITS = (1.0, "s"), (60.0, "minutes"), (3600.0, "hours")
-ADVICE_BY_MESSAGE = {  # part of a message: what to do, where the advice of its reason does not fit
-    "or a sidecar with terrain": "A picture from the Earth needs no terrain for its stars (startrack identify) and its "
-    "skyline (startrack horizon).",
-    "no such folder of results": "Give the folder OUT of startrack locate or batch, or one NAME.fix.json.",
-    "images there": "Give the folder that holds the pictures.",
-}
 NUMBER_COLUMN = re.compile(r"([^\d+-]*)([+-]?\d+(?:\.\d+)?)(.*)")
 NUMBER_WIDTHS = {"E ": 8, "N ": 8, "±": 5, "heading ": 5, "": 4}  # least widths, by the text before the number
 Outcome = tuple[dict[str, Any], str]  # of an image: the JSON object, and the line or lines
@@ -81,7 +76,7 @@ def print_refusal(
 
 def _advice(reason: str, message: str, own: str) -> str:
     """What to do after a refusal: by its `message`, else the command's `own`, else that of the `reason`."""
-    fitting = next((advice for end, advice in ADVICE_BY_MESSAGE.items() if end in message), None)
+    fitting = fitting_advice(message)
     if fitting is not None:
         return fitting
     advice = errors.next_step(reason, message)

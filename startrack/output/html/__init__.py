@@ -17,6 +17,7 @@ from urllib.parse import quote
 import numpy as np
 
 from startrack.core import REPORTED_IMAGES
+from startrack.core.advice import fitting_advice
 from startrack.core.errors import Reason
 from startrack.core.files import write_atomically
 from startrack.core.types import BadInput
@@ -146,6 +147,7 @@ def _detail(found: Found, terrains: Mapping[str, Terrain], size: tuple[int, int,
     return {
         "record": {k: value for k, value in found.record.items() if k not in ("matches", "detections", "camera")},
         "facts": facts_of(found.at),
+        "advice": fitting_advice(str(found.record.get("message") or "")),
         "picture": picture_of(found.companion(".annotated.png"), longest_px),
         "stars": shown,
         "horizon": line,

@@ -48,6 +48,9 @@ SCRIPTS = (
     "sky.js", "panorama.js", "picture.js", "evidence.js", "designations.js", "search.js", "map.js", "errors.js",
     "detail.js", "table.js", "page.js",
 )  # fmt: skip
+DRAWN_MAIN = """<noscript><p>This page draws its results with JavaScript, which is switched off here.</p></noscript>
+<div id="overview" hidden></div>
+<div id="detail" hidden></div>"""
 FEW_IMAGES = 4  # images whose details may be large
 LARGE, SMALL = (1400, 4000, 1441), (1000, 1500, 721)  # px of the picture, stars, azimuths of the horizon
 FILES = (".annotated.png", ".stars.ecsv", ".skyline.ecsv", ".skyline.png", ".wcs", ".corr")
@@ -111,14 +114,17 @@ def page_text(
 
 
 def fill_frame(
-    title: str, data: Mapping[str, Any], scripts: Sequence[str], *, style: str = "", script: str = ""
-) -> str:
+    title: str, data: Mapping[str, Any], scripts: Sequence[str], *, style: str = "", script: str = "",
+    main: str = DRAWN_MAIN,
+) -> str:  # fmt: skip
     """A page with a `title`, the `data` by their names, the style, and this room's DRAWING and further `scripts`.
 
-    `style` and `script` are texts that follow those of this room.
+    `style` and `script` are texts that follow those of this room. `main` is its content as HTML, for pages that no
+    script draws.
     """
     parts = {
         "TITLE": html.escape(title),
+        "MAIN": main,
         "STYLE": _join_files(["page.css"]) + style,
         "DATA": "\n".join(_script_of_data(name, value) for name, value in data.items()),
         "SCRIPT": _join_files(dict.fromkeys((*DRAWING, *scripts))) + script,

@@ -24,7 +24,7 @@ PLOT_STYLE: dict[Any, Any] = {
     "axes.edgecolor": "#4a5668", "legend.facecolor": "#131924", "legend.edgecolor": "#4a5668",
 }  # fmt: skip
 PLAIN, GOOD, BAD, LINE = "#ecf0f5", "#56b4e9", "#e69f00", "#2fd3a0"
-BRIGHT_PART = 0.45  # of the colour map, from which dark letters are read on it
+DARK_LETTERS_FROM = 0.45  # of the colour map, from which dark letters are read on it
 ARROW_FRACTION = 0.02  # of the frame's width: length of an arrow of the RMS residual
 MAP_SIDE = 160
 MAX_ARROWS = 1000  # more overlap
@@ -116,7 +116,7 @@ def _draw_sectors(axes: Axes, calibration: Calibration) -> None:
     cover = star_coverage(calibration.joint)
     drawn = axes.imshow(np.ma.masked_invalid(cover.rms_px), cmap="viridis", aspect="auto", vmin=0.0)
     axes.figure.colorbar(drawn, ax=axes, shrink=0.85, label="RMS error, px")
-    dark = np.nanmax(cover.rms_px) * BRIGHT_PART if np.isfinite(cover.rms_px).any() else 0.0
+    dark = np.nanmax(cover.rms_px) * DARK_LETTERS_FROM if np.isfinite(cover.rms_px).any() else 0.0
     for ring, row in enumerate(cover.rms_px):
         for sector, value in enumerate(row):
             text = f"{value:.2f}\n{cover.stars[ring, sector]:.0f} stars" if np.isfinite(value) else "no star"

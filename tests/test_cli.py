@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import pytest
 
-from startrack.cli import doctor
 from startrack.cli.main import main
+from startrack.cli.studies import doctor
 from startrack.kernels.library import LEVEL
 
 ROOT = Path(__file__).parent.parent
@@ -514,7 +514,7 @@ def test_the_help_of_a_command_begins_with_what_it_needs_and_an_example(capsys, 
 
 
 def test_doctor_prints_one_line_for_each_extra(capsys, monkeypatch):
-    from startrack.cli.doctor import OPTIONAL, extra_lines, print_check
+    from startrack.cli.studies.doctor import OPTIONAL, extra_lines, print_check
 
     def version(name):
         if name == "rosbags":
@@ -533,7 +533,7 @@ def test_doctor_prints_one_line_for_each_extra(capsys, monkeypatch):
 
 
 def test_doctor_knows_the_packages_and_extras_of_the_project():
-    from startrack.cli.doctor import OPTIONAL, REQUIRED
+    from startrack.cli.studies.doctor import OPTIONAL, REQUIRED
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert {*REQUIRED} == {re.split("[><=]", one)[0] for one in project["dependencies"]}

@@ -20,21 +20,19 @@ from typing import Any, NoReturn
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: a second thread waits for work, 0.2 s a start
 
-from startrack import __version__
 from startrack.cli.console import discard_stdout, open_closed_streams, print_refusal
 from startrack.cli.flags import Command
-from startrack.core import errors
+from startrack.core import __version__, errors
 from startrack.core.errors import BadInput, BadOutput, NoSolution
 from startrack.core.files import FULL_DISK
-from startrack.core.memory import COMMAND_BYTES, START_BYTES, check_memory, refusing_shortage
+from startrack.core.limits import COMMAND_BYTES, START_BYTES, check_memory, refusing_shortage
 from startrack.kernels import LibraryMissing
 
 COMMANDS = {  # name to the module of startrack.cli that declares it
-    "locate": "image_commands", "batch": "image_commands", "track": "image_commands", "identify": "image_commands",
-    "detect": "image_commands", "render": "study_commands", "calibrate": "input_commands",
-    "horizon": "input_commands", "predict": "study_commands", "report": "image_commands",
-    "reproduce": "study_commands", "terrain": "input_commands", "doctor": "study_commands", "cache": "study_commands",
-    "schema": "study_commands", "demo": "image_commands",
+    "locate": "pictures", "batch": "pictures", "track": "pictures", "identify": "pictures", "detect": "pictures",
+    "render": "studies", "calibrate": "inputs", "horizon": "inputs", "predict": "studies", "report": "pictures",
+    "reproduce": "studies", "terrain": "inputs", "doctor": "studies", "cache": "studies", "schema": "studies",
+    "demo": "pictures",
 }  # fmt: skip
 USAGE, INTERRUPTED = 2, 130
 NEW_OBJECTS = 50_000  # until garbage is collected: Python's 700 cost a tenth of the time of a start

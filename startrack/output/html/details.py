@@ -19,7 +19,7 @@ from startrack.core.types import Array, Bools
 from startrack.localization import ROW_NATS
 from startrack.output.picture.annotate import layers_of, picture_in
 from startrack.output.picture.canvas import QUALITY, encoded_bytes
-from startrack.output.picture.relief import edge_cover, ground_cells, hill_shading
+from startrack.output.picture.maps import edge_cover, ground_cells, hill_shading
 from startrack.output.tables import half_range_rad
 from startrack.terrain import Terrain
 
@@ -219,8 +219,8 @@ def ground_map(
         "search_m": terrain.search_radius_m,
         "site": terrain.site.body if terrain.site is not None else None,
     }
-    if terrain.rim_radius_m is not None:
-        return {**shape, "rim_m": terrain.rim_radius_m}
+    if terrain.rim is not None:
+        return {**shape, "rim_m": terrain.rim.radius_m}
     half_m = MAP_MARGIN * terrain.reach_m if half_m is None else half_m
     cells = RELIEF_CELLS, RELIEF_CELLS
     ground_m, known = ground_cells(terrain, (half_m, half_m), cells, centre_m)

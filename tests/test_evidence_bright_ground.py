@@ -15,8 +15,7 @@ from startrack.camera import load_camera
 from startrack.chain import Located, pipeline
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Detections, SmoothImage
 from startrack.evidence import Sources, measure
-from startrack.evidence.ground_levels import ANY_SIGMAS, BORDER_PROBABILITY, DRIFT, patch_levels
-from startrack.evidence.sky_levels import GROUND, SKY
+from startrack.evidence.sky_levels import ANY_SIGMAS, BORDER_PROBABILITY, DRIFT, GROUND, SKY, patch_levels
 from startrack.evidence.sky_light import SkyLight, measure_sky_light, sectors_with_step
 from startrack.rendering import Series, render
 from startrack.terrain import GroundBrightness, TerrainFile, load_terrain

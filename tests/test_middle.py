@@ -21,7 +21,7 @@ from startrack.catalog import load_catalog
 from startrack.chain import Oriented, identify_blind
 from startrack.core.types import Exposure, NotIdentified
 from startrack.estimation.attitude import solve_attitude
-from startrack.estimation.misfit import solve_with_misfit
+from startrack.estimation.lens_correction import solve_with_misfit
 from startrack.estimation.normal_equations import observations_of_image
 from startrack.exposure import read_exposure
 from startrack.identification.found_lens import fit_found_lens

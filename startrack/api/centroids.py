@@ -15,7 +15,7 @@ from startrack.core import STAR_COUNT_SLOPE
 from startrack.core.errors import Reason
 from startrack.core.types import Array, Attitude, Centroids, Identification, Ints, NotIdentified, Stars
 from startrack.estimation.attitude import AttitudeFit, solve_attitude
-from startrack.estimation.misfit import solve_with_misfit
+from startrack.estimation.lens_correction import solve_with_misfit
 from startrack.identification import Identifier, identify_unknown_lens
 
 DEFAULT_SIGMA_PX = 0.3  # centroid error per axis where none is given

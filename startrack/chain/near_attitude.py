@@ -20,7 +20,7 @@ MAX_BYTES = 16 * 2**20  # of it: an identification lists its matches
 
 @dataclass(frozen=True)
 class NearAttitude:
-    """A rough attitude: `startrack.identification.near_attitude` has the error that it may have.
+    """A rough attitude: `startrack.identification.attitude_search` has the error that it may have.
 
     `quat_xyzw_cam_icrs`: v_cam = R v_icrs, as in result files. Without its time it is used as it is.
     """

@@ -25,8 +25,7 @@ from startrack.core.types import (
     Stars,
 )  # fmt: skip
 from startrack.detection import Detector, image_circle
-from startrack.estimation.lens_correction import correct_lens
-from startrack.estimation.misfit import solve_with_misfit
+from startrack.estimation.lens_correction import correct_lens, solve_with_misfit
 from startrack.exposure import NO_TIME, are_fractions
 from startrack.frames import Site
 from startrack.identification import WIDE_FIELD_RAD, NearSky

@@ -506,7 +506,7 @@ KERNEL int64_t count_alike(int64_t n, int64_t m, const double *restrict v_mag, c
    `outlier`: squared sigma from which a pixel is masked, at most `most_masked`; `model`: variance of a star's squared
    light; `shape_variance`: of the part by which the background's shape is wrong. `edges` [2, phases + 1, table_places]:
    light of an edge and its slope, at places `step_px` (of the PSF's width `sigma_px`) apart; `flat_excess`,
-   `width_part`, `contrast_sigmas`: see stamp_edge.py. Scratch: `across` to `near`; `stamp` [8, room], room: the pixels
+   `width_part`, `contrast_sigmas`: see photometry.py. Scratch: `across` to `near`; `stamp` [8, room], room: the pixels
    of a stamp, filled up to a multiple of 8; `sums` [15, 32], at most 32 places. The image is finite, in dead pixels
    too. */
 KERNEL void measure_sources(int64_t height, int64_t width, int64_t background_rows, int64_t noise_rows, int64_t n,

@@ -16,7 +16,7 @@ from startrack.camera import lens_jacobian
 from startrack.catalog import catalog_rays
 from startrack.chain import Oriented
 from startrack.core.types import Array
-from startrack.estimation.misfit import smooth_shifts
+from startrack.estimation.lens_correction import smooth_shifts
 from startrack.output.values import turn_rad
 
 HALF_STEP_PX = 0.5  # of the numerical derivative of the sky by pixels

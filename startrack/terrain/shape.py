@@ -250,7 +250,9 @@ class ExpectedCrests(NamedTuple):
 class GroundErrors:
     """Errors of the map of a ground: of single posts, and of its shape, which all azimuths share.
 
-    The defaults are those of exact ground. Positions and directions are as in `Terrain`.
+    The defaults are those of exact ground. Arguments of the methods are as in `Terrain`: `points_m` (..., 2)
+    positions; `centres_m` (..., 2) and `half_m` centres and half sides of boxes of positions; `point_m` (2,) one
+    position; `azimuths_rad` (...) directions in enu; `azimuth_half_rad` half the width of a range of azimuths.
     """
 
     height_sigma_m: float = 0.0  # standard deviation of the height of a post, independent of the others

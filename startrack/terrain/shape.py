@@ -258,7 +258,6 @@ class GroundErrors:
     height_sigma_m: float = 0.0  # standard deviation of the height of a post, independent of the others
     common_sigma_rad: float = 0.0  # standard deviation of an error of the horizon that all azimuths and positions share
     shape: tuple[ShapeError, ...] = ()  # errors that all azimuths share, those that are stated as zero too
-    unstated: tuple[str, ...] = ()  # keys of errors that the terrain file leaves out: they count as zero
     crest_distance_m: float = 10_000.0  # of the skyline from about the origin: over it waves of the map's error change
     unknown_steepness_1: float = 0.0  # relative sigma of the horizon's tangent, where a search must find it; 0: known
     steepness_1: float = 1.0  # the horizon's tangent that errors are counted from, over that of the stated shape
@@ -294,5 +293,5 @@ class GroundErrors:
         return np.zeros((len(posts), 3))
 
     def warnings(self) -> list[str]:
-        """One line of text for each error that the terrain file leaves out: the ground then counts as exact."""
+        """Lines of text: what makes the errors larger than they are stated."""
         return []

@@ -91,6 +91,17 @@ def test_the_position_has_units_and_an_uncertainty(solution):
     assert re.search(r"^  evidence +both$", repr(p), flags=re.MULTILINE)
 
 
+def test_every_quantity_of_a_section_is_an_attribute(solution):
+    record = solution.to_dict()
+    for section, value in (("position", solution.position), ("attitude", solution.attitude), ("clock", solution.clock)):
+        names = {re.sub("_(m2?|deg|arcsec|s)$", "", key) for key in record[section]}
+        assert names <= set(dir(value))
+    assert solution.position.protection_level.to_value("m") == record["position"]["protection_level_m"]
+    assert solution.attitude.sigma_heading.deg == pytest.approx(record["attitude"]["sigma_heading_deg"])
+    with pytest.raises(AttributeError, match="Position has no attribute 'nort'"):
+        _ = solution.position.nort
+
+
 def test_a_method_without_a_posterior_states_no_uncertainty(tmp_path):
     """Near the wall the hull is 4 km off: no number of ours is as large as its errors."""
     solution = startrack.locate(IMAGE, settings=Settings(localizer=Hull()))

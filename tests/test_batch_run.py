@@ -103,7 +103,7 @@ def test_an_early_signal_ends_the_batch_at_once(many_frames, tmp_path, delay_s):
 def test_a_later_signal_drops_the_images_in_progress_and_writes_the_tables(tmp_path, monkeypatch):
     """The signal is raised inside the process, so that it arrives between two images."""
     frames(tmp_path / "images", 40)
-    monkeypatch.setattr("startrack.cli.batch.SAME_SIGNAL_S", -1.0)
+    monkeypatch.setattr("startrack.cli.pictures.batch.SAME_SIGNAL_S", -1.0)
     results = []
 
     def interrupt(*_: object, **__: object) -> None:

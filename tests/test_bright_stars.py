@@ -18,7 +18,7 @@ from startrack.chain import identify
 from startrack.chain.bright_stars import name_bright_sources
 from startrack.core.types import Body
 from startrack.exposure import read_exposure
-from startrack.output import identification_dict
+from startrack.output import result_dict
 
 ROOT = Path(__file__).parent.parent
 PHOTO = ROOT / "sample_images/lowell-2018-08-06.fits.bz2"
@@ -84,7 +84,7 @@ def test_the_brightest_stars_are_named_and_none_is_wrong(result, reference):
 
 
 def test_they_are_in_the_record_and_not_in_the_fit(result):
-    record = identification_dict(result)
+    record = result_dict(result, "identification")
     assert len(record["matches"]) == record["stars"]["identified"] > len(result.identification)
     vega = next(match for match in record["matches"] if match["hip"] == 91262)
     assert vega["saturated"]
@@ -94,7 +94,7 @@ def test_they_are_in_the_record_and_not_in_the_fit(result):
 
 def test_planets_are_named_where_a_time_is_known_and_no_site(result, clipped):
     time = Time(clipped.time_utc.replace(tzinfo=None))
-    found = {body["name"]: body for body in identification_dict(result)["bodies"]}
+    found = {body["name"]: body for body in result_dict(result, "identification")["bodies"]}
     assert {"Mars", "Jupiter", "Saturn"} == set(found)
     for name, body in found.items():
         ray = get_body(name.lower(), time).gcrs.cartesian.get_xyz().value

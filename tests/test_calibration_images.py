@@ -27,7 +27,7 @@ from startrack.applications.calibration.static_parts import find_obstructions
 from startrack.applications.calibration.verify import Verification, verify, verify_dict, verify_line
 from startrack.camera import load_camera, save_camera
 from startrack.catalog import load_catalog
-from startrack.cli.camera_files import write_camera
+from startrack.cli.inputs.camera_files import write_camera
 from startrack.cli.main import main
 from startrack.core.types import BadInput, Exposure, NotIdentified
 from startrack.exposure import read_exposure, read_mask, write_exposure

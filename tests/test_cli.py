@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
-from startrack.cli import doctor
 from startrack.cli.main import main
+from startrack.cli.studies import doctor
 from startrack.kernels.library import LEVEL
 
 ROOT = Path(__file__).parent.parent
@@ -485,7 +485,7 @@ def test_shell_completion_knows_the_commands(folder, tmp_path, shell, answers):
 
 
 def test_doctor_knows_the_packages_and_extras_of_the_project():
-    from startrack.cli.doctor import OPTIONAL, REQUIRED
+    from startrack.cli.studies.doctor import OPTIONAL, REQUIRED
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert {*REQUIRED} == {re.split("[><=]", one)[0] for one in project["dependencies"]}

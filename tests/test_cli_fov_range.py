@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from startrack.cli.flag_types import field_or_range_rad
+from startrack.cli.flags import field_or_range_rad
 from startrack.cli.main import main
 from startrack.estimation.radial_fit import PINHOLE_BEND, largest_angle_rad, radius_of
 from startrack.identification.lens_guesses import WIDE_FIELD_RAD, guess_fields

@@ -10,7 +10,7 @@ import pytest
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog, load_deep_catalog
-from startrack.cli.study_commands import COMMANDS
+from startrack.cli.studies import COMMANDS
 from startrack.core.types import BadInput
 from startrack.exposure import read_exposure
 from startrack.frames import (

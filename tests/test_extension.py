@@ -120,7 +120,7 @@ ENTRIES = {  # of the module of each list: the entry, with the beginning of the 
         (f'    "wall": Kind({WALL}.TABLE, {WALL}.make_wall),', '    "cylinder": Kind('),
     ],
     "startrack.exposure.sidecar": [('    "COUNTS": Format((b"COUNTS",), (".counts",)),', '    "PNG": Format(')],
-    "startrack.cli.main": [('    "size": "size",', '    "locate": "image_commands"')],
+    "startrack.cli.main": [('    "size": "size",', '    "locate": "pictures"')],
 }
 SITECUSTOMIZE = """
 import importlib.machinery, importlib.util, json, pathlib, sys

@@ -21,7 +21,7 @@ from startrack.applications.horizon.measure import PLACE_SIGMA_RAD, join_skyline
 from startrack.applications.horizon.posterior import limit_llr
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.cli.horizon import UNTESTED
+from startrack.cli.inputs.horizon import UNTESTED
 from startrack.cli.main import main
 from startrack.core.errors import BadInput, NoSolution
 from startrack.core.types import MeasuredSkyline

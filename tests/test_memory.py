@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
-from startrack.cli import locate
 from startrack.cli.main import main
+from startrack.cli.pictures import locate
 from startrack.core import limits
 from startrack.core.types import BadInput
 from startrack.exposure import decoding

@@ -26,8 +26,8 @@ from startrack.estimation.normal_equations import observations_of_image
 from startrack.exposure import read_exposure
 from startrack.identification.found_lens import fit_found_lens
 from startrack.identification.unknown_lens import identify_unknown_lens
-from startrack.output import identification_dict
-from startrack.output.middle import has_middle, sky_at_middle
+from startrack.output import result_dict
+from startrack.output.values import has_middle, sky_at_middle
 from startrack.output.wcs import wcs_bytes
 
 MIDDLE_PX = (np.array(SIZE) - 1) / 2
@@ -69,7 +69,7 @@ def test_the_middle_is_that_of_the_world_coordinates_by_astropy(located) -> None
     value = as_stage(located.result, Oriented, terrain=None, bodies=())
     header = fits.Header.fromstring(wcs_bytes(value).decode("ascii"))
     world = WCS(header)
-    found = identification_dict(value)["middle"]
+    found = result_dict(value, "identification")["middle"]
     x, y = found["x_px"], found["y_px"]
     assert (x, y) == ((value.camera.size_px[0] - 1) / 2, (value.camera.size_px[1] - 1) / 2)
     here, above, right = world.pixel_to_world([x, x, x + 1], [y, y - 1, y])
@@ -87,8 +87,8 @@ def test_a_middle_beyond_the_lens_is_null(located) -> None:
     camera = replace(value.camera, centre_px=(0.0, 0.0), max_angle_rad=0.2)
     away = replace(value, camera=camera)
     assert not has_middle(away)
-    assert identification_dict(away)["middle"] is None
-    assert identification_dict(away)["attitude"] is not None
+    assert result_dict(away, "identification")["middle"] is None
+    assert result_dict(away, "identification")["attitude"] is not None
 
 
 def test_without_a_time_the_middle_is_a_minute_of_arc_wider(located) -> None:

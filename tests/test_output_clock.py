@@ -14,7 +14,7 @@ from startrack.api.solution import Solution
 from startrack.applications.batch.tables import COLUMNS, column_values, table_values
 from startrack.chain.stages import Measured, Refused
 from startrack.core.types import ClockError, Mode
-from startrack.output import SCHEMAS, detection_dict, identification_dict, result_dict, verbose_text
+from startrack.output import SCHEMAS, result_dict, verbose_text
 from startrack.output.html.rows import facts_of
 from startrack.output.record import record_values
 
@@ -63,7 +63,7 @@ def test_only_a_fix_has_a_clock(located):
     result = with_clock(located, CLOCK)
     refused = Refused(reason="inconsistent_evidence", message="no", reached=as_stage(result, Measured))
     assert result_dict(refused)["clock"] is None
-    for record in (identification_dict(result), detection_dict(result)):
+    for record in (result_dict(result, "identification"), result_dict(result, "detections")):
         assert "clock" not in record
         assert record["provenance"]["time_sigma_s"] == 20.0
     assert Solution(refused).clock is None

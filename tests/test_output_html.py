@@ -19,7 +19,7 @@ from astropy.table import Table
 from html_helpers import NASTY, results_in
 
 from startrack.cli.main import main
-from startrack.cli.report import write_page_of_images
+from startrack.cli.pictures.report import write_page_of_images
 from startrack.core.errors import Reason
 from startrack.exposure import insert_png_chunks
 from startrack.localization.rim_plane import point_fix

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 
+from startrack.api.solution import Solution
 from startrack.chain import Located, Measured
 from startrack.core.errors import Reason
 from startrack.core.types import Attitude
@@ -47,6 +48,7 @@ def test_a_new_quantity_is_one_entry(located, monkeypatch):
     monkeypatch.setitem(quantities.BY_PATH, new.path, new)
     at, found = stage_values(located.result), result_dict(located.result)
     assert found["position"]["twice_m"] == 2 * located.result.fix.radius95_m
+    assert Solution(located.result).position.twice.to_value("m") == found["position"]["twice_m"]
     assert schema_of(table, "position")["properties"]["twice_m"]["minimum"] == 0
     assert table_columns()[-1].name == "twice_m"
     words = f"{2 * located.result.fix.radius95_m:.1f} m"

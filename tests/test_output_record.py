@@ -17,8 +17,6 @@ from startrack.core.types import BadInput, Mode
 from startrack.localization.rim_plane import point_fix
 from startrack.output import (
     boresight_rad,
-    detection_dict,
-    identification_dict,
     refused_dict,
     result_dict,
     verbose_text,
@@ -147,7 +145,7 @@ def test_star_counts(fix, located):
 
 
 def test_matches_are_the_measured_positions_of_their_stars(located):
-    d = identification_dict(located.result)
+    d = result_dict(located.result, "identification")
     assert d["format"] == "startrack.identification/1"
     assert "position" not in d
     assert "modes" not in d
@@ -160,12 +158,12 @@ def test_matches_are_the_measured_positions_of_their_stars(located):
 
 def test_a_star_without_hipparcos_number_is_null(located):
     nameless = replace(located.result.stars, hip=np.zeros(len(located.result.stars)))
-    d = identification_dict(replace(located.result, stars=nameless))
+    d = result_dict(replace(located.result, stars=nameless), "identification")
     assert {m["hip"] for m in d["matches"]} == {None}
 
 
 def test_detections_are_brightest_first(located):
-    d = detection_dict(located.result)
+    d = result_dict(located.result, "detections")
     assert d["format"] == "startrack.detection/1"
     assert set(d["detections"][0]) == {"x_px", "y_px", "flux_e", "snr"}
     assert len(d["detections"]) == len(located.result.detections)
@@ -216,7 +214,7 @@ def test_provenance(located, fix):
     assert fix["provenance"]["catalog"] == "hipparcos"
     assert fix["provenance"]["localizer"] == "posterior"
     stars_only = pipeline.identify(located.result.exposure, located.result.camera, load_catalog().brighter_than(7.0))
-    assert identification_dict(stars_only)["provenance"]["localizer"] is None
+    assert result_dict(stars_only, "identification")["provenance"]["localizer"] is None
     unknown = replace(located.result, exposure=replace(located.result.exposure, time_utc=None))
     assert result_dict(unknown)["provenance"]["time_utc"] is None
     assert refused_dict("night/a.png", "bad_image", "it is truncated")["image"] == "a.png"

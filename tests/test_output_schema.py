@@ -6,6 +6,7 @@ import json
 import tomllib
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -20,8 +21,10 @@ from startrack.cli.main import main
 from startrack.core.files import data_dir
 from startrack.core.types import Mode
 from startrack.exposure import write_sidecar
-from startrack.output import SCHEMAS, detection_dict, identification_dict, refused_dict, result_dict
+from startrack.output import SCHEMAS, refused_dict, result_dict
 from startrack.rendering import write_truth
+
+FILES = {"fix": "fix", "identification": "identification", "detection": "detections"}  # schema to NAME.KIND.json
 
 
 def fits_schema(kind, value):
@@ -33,23 +36,22 @@ def results(result):
     ambiguous = replace(result, fix=replace(result.fix, modes=two, ambiguous=True))
     refused = Refused(reason="inconsistent_evidence", message="no", reached=as_stage(result, Measured))
     yield from (("fix", result_dict(r)) for r in (result, ambiguous, refused))
-    yield "identification", identification_dict(as_stage(result, Oriented, terrain=None))
-    yield "detection", detection_dict(result)
-    yield from (
-        (kind, refused_dict("a.png", "bad_image", "no", kind)) for kind in ("fix", "identification", "detection")
-    )
+    yield "identification", result_dict(as_stage(result, Oriented, terrain=None), "identification")
+    yield "detection", result_dict(result, "detections")
+    yield from ((kind, refused_dict("a.png", "bad_image", "no", file)) for kind, file in FILES.items())
 
 
-@pytest.mark.parametrize("kind", ["fix", "identification", "detection"])
+@pytest.mark.parametrize("kind", FILES)
 def test_solved_and_refused_records_have_the_same_keys(located, kind):
     """Also within the sections that are there; lists are empty, not null."""
     flat = replace(located.result.exposure, pixels_adu=np.full((1024, 1024), 300.0, dtype=np.float32))
-    make = {"fix": result_dict, "identification": identification_dict, "detection": detection_dict}[kind]
+    file = FILES[kind]
+    make = partial(result_dict, kind=file)
     solved = make(located.result)
     others = [
         make(detect(flat, located.result.camera)),
         make(Refused(reason="no_time", message="no", reached=as_stage(located.result, Oriented, terrain=None))),
-        *(refused_dict("a.png", reason, "no", kind) for reason in ("bad_image", "internal_error")),
+        *(refused_dict("a.png", reason, "no", file) for reason in ("bad_image", "internal_error")),
     ]
     for other in others:
         fits_schema(kind, other)
@@ -103,8 +105,7 @@ SPOILED = [
 
 @pytest.mark.parametrize(("kind", "spoil", "message"), SPOILED)
 def test_a_spoiled_result_does_not_fit(located, kind, spoil, message):
-    make = {"fix": result_dict, "identification": identification_dict, "detection": detection_dict}[kind]
-    record = deepcopy(make(located.result))
+    record = deepcopy(result_dict(located.result, FILES[kind]))
     fits_schema(kind, record)
     spoil(record)
     with pytest.raises(ValidationError, match=message):

@@ -43,7 +43,7 @@ from startrack.applications.reproduction.simulator import (
 )
 from startrack.cli.console import Progress, progress
 from startrack.cli.main import main
-from startrack.cli.study_commands import ARTEFACT_NAMES
+from startrack.cli.studies import ARTEFACT_NAMES
 from startrack.core import chunk_store, runner
 from startrack.core.files import hold_lock
 from startrack.localization import ExactPosterior, Hull, PseudoGradient

@@ -1,28 +1,142 @@
-"""The solution of one image, with astropy's types."""
+"""The solution of one image: what the chain returns, and the quantities of the table with astropy's types."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from datetime import UTC
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from startrack import output
-from startrack.api.values import ClockOffset, Orientation, Position, html_table
-from startrack.chain import Located, Measured, Oriented, Outcome, Positioned, last_value
-from startrack.frames import heading_pitch_roll_from_R_body_enu, latlon_from_enu
+from startrack.chain import Located, Oriented, Outcome, Positioned, last_value
+from startrack.core.statistics import error_ellipse
 
 if TYPE_CHECKING:
     from astropy.coordinates import Angle, SkyCoord
     from astropy.table import QTable
     from astropy.time import Time
+    from astropy.units import Quantity
+    from scipy.spatial.transform import Rotation
 
     from startrack.core.types import Array, Fix
+
+
+class Shown:
+    """Prints itself as rows of a name and a text, in a notebook as a table."""
+
+    shown: output.Rows
+
+    def __repr__(self) -> str:
+        width = max(len(name) for name, _ in self.shown)
+        lines = (f"  {name:<{width}}  {text}" for name, text in self.shown)
+        return "\n".join([type(self).__name__, *lines])
+
+    def _repr_html_(self) -> str:
+        return html_table(type(self).__name__, self.shown)
+
+
+def html_table(caption: str, rows: output.Rows) -> str:
+    """Rows as a table for a notebook."""
+    body = "".join(
+        f'<tr><th style="text-align:left">{escape(name)}</th><td style="text-align:left">{escape(text)}</td></tr>'
+        for name, text in rows
+    )
+    return f'<table><caption style="text-align:left"><b>{escape(caption)}</b></caption><tbody>{body}</tbody></table>'
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Section(Shown):
+    """The quantities of one section of the record as attributes: their keys without the unit, which the values have.
+
+    A quantity that is not stated is infinite; one that is not known is None.
+    """
+
+    quantities: Mapping[str, Any]
+    shown: output.Rows
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return vars(self)["quantities"][name]
+        except KeyError:
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}") from None
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *self.quantities]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Ellipse(Shown):
+    """One sigma of a position; 39 % of a Gaussian lie within."""
+
+    semi_major: Quantity  # [m]
+    semi_minor: Quantity  # [m]
+    azimuth: Angle  # of the major axis, from north through east, [0, 180) deg
+
+    @property
+    def shown(self) -> output.Rows:  # type: ignore[override]
+        """The ellipse in one row."""
+        lengths = f"{self.semi_major:.2f} by {self.semi_minor:.2f}"
+        return [("one sigma", f"{lengths}, long axis at azimuth {self.azimuth.deg:.1f}°")]
+
+
+class Position(Section):
+    """Position of the camera, the posterior's mean in the terrain's frame `enu`: `east`, `north`, `up`, `latitude`, ...
+
+    `covariance` (2, 2) is that of (east, north), `radius95` and `radius999` are the circles about the position: of a
+    method that states none they are infinite.
+    """
+
+    @property
+    def sigma(self) -> Quantity:
+        """Standard deviations (2,) of east and north [m]."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def ellipse(self) -> Ellipse:
+        """The covariance as an ellipse of one sigma; of an infinite one both semi-axes are infinite."""
+        from astropy import units as u
+        from astropy.coordinates import Angle
+
+        covariance_m2 = self.covariance.to_value(u.m**2)
+        if not np.isfinite(covariance_m2).all():
+            return Ellipse(np.inf * u.m, np.inf * u.m, Angle(0.0, u.deg))
+        major_m, minor_m, azimuth_rad = error_ellipse(covariance_m2)
+        return Ellipse(major_m * u.m, minor_m * u.m, Angle(np.degrees(azimuth_rad), u.deg))
+
+
+class Orientation(Section):
+    """Attitude of the camera to the stars, `ra`, `dec`, `roll`, and with a terrain and a time `heading`, `pitch`, ...
+
+    `sigma` (3,) is that of rotations about cam x, y, z; it holds the lens's errors where `lens_error_included` is true.
+    """
+
+    @property
+    def rotation(self) -> Rotation:
+        """From icrs to cam: rotation.apply(rays_icrs) are rays_cam."""
+        from scipy.spatial.transform import Rotation
+
+        return Rotation.from_quat(self.quat_xyzw_cam_icrs)
+
+    @property
+    def body(self) -> Rotation | None:
+        """From enu to the rover's body; None without a terrain or a time."""
+        from scipy.spatial.transform import Rotation
+
+        quaternion = self.quat_xyzw_body_enu
+        return None if quaternion is None else Rotation.from_quat(quaternion)
+
+
+class ClockOffset(Section):
+    """Error of the stated time, as the image shows it: `offset`, true minus stated time, and its `sigma`."""
+
+
+OneSection = TypeVar("OneSection", bound=Section)
 
 
 @dataclass(frozen=True, eq=False, repr=False)  # eq: arrays have no single answer to ==
@@ -53,53 +167,27 @@ class Solution:
     @cached_property
     def position(self) -> Position | None:
         """East, north, up, their sigma and ellipse, latitude and longitude, with units; None unless located."""
-        result = self.result
-        if not isinstance(result, Positioned) or result.fix.ambiguous:
-            return None
-        from astropy import units as u
-        from astropy.coordinates import Angle
-
-        fix = result.fix
-        east, north, up = fix.position_enu_m * u.m
-        latlon_rad = latlon_from_enu(result.site, *fix.position_enu_m)
-        latitude, longitude = (Angle(np.degrees(angle), u.deg) for angle in latlon_rad)
-        return Position(
-            east, north, up, fix.covariance_m2 * u.m**2, fix.radius95_m * u.m, fix.radius999_m * u.m, latitude,
-            longitude, result.terrain.name, self._shown("position", "sky", "clock"),
-        )  # fmt: skip
+        return self._section(Position, "position", "sky", "clock")
 
     @cached_property
     def attitude(self) -> Orientation | None:
         """Rotation, right ascension, declination and roll of the camera, heading and pitch of the rover."""
-        result = last_value(self.result)
-        if not isinstance(result, Oriented):
-            return None
-        from astropy import units as u
-        from astropy.coordinates import Angle
-        from scipy.spatial.transform import Rotation
-
-        attitude = result.attitude
-        ra, dec, roll = (Angle(np.degrees(angle), u.deg) for angle in output.boresight_rad(attitude.R_cam_icrs))
-        sigma = np.sqrt(np.diag(attitude.covariance_rad2)) * output.ARCSEC_PER_RAD * u.arcsec
-        has_lens_error = result.camera.covariance is not None
-        rotation = Rotation.from_matrix(attitude.R_cam_icrs)
-        found = Orientation(rotation, ra, dec, roll, sigma, has_lens_error, self._shown("attitude"))
-        if not isinstance(result, Measured):
-            return found
-        body = output.R_body_enu(result)
-        angles_rad = heading_pitch_roll_from_R_body_enu(body)
-        heading, pitch, roll_body = (Angle(np.degrees(angle), u.deg) for angle in angles_rad)
-        return replace(found, body=Rotation.from_matrix(body), heading=heading, pitch=pitch, roll_body=roll_body)
+        return self._section(Orientation, "attitude")
 
     @cached_property
     def clock(self) -> ClockOffset | None:
         """Offset (true minus stated time) and its sigma, with units; None where it is not estimated."""
-        if not isinstance(self.result, Located) or self.result.fix.clock is None:
-            return None
-        from astropy import units as u
+        is_estimated = isinstance(self.result, Located) and self.result.fix.clock is not None
+        return self._section(ClockOffset, "clock") if is_estimated else None
 
-        clock = self.result.fix.clock
-        return ClockOffset(clock.offset_s * u.s, clock.sigma_s * u.s, self._shown("clock"))
+    def _section(self, kind: type[OneSection], *sections: str) -> OneSection | None:
+        """The quantities of the first of `sections` with the notebook's rows of all; None where none is determined."""
+        value = last_value(self.result)
+        found = output.section_values(value, sections[0])
+        if not found:
+            return None
+        rows = output.rows("notebook", output.stage_values(value), sections)
+        return kind({one.name: _with_unit(entry, one) for one, entry in found}, rows)
 
     @property
     def heading(self) -> Angle | None:
@@ -129,10 +217,6 @@ class Solution:
     def _fix(self) -> Fix | None:
         return self.result.fix if isinstance(self.result, Positioned) and self else None
 
-    def _shown(self, *groups: str) -> output.Rows:
-        """The rows of the notebook's table of these groups of quantities."""
-        return output.rows("notebook", output.stage_values(last_value(self.result)), groups)
-
     @cached_property
     def modes(self) -> QTable | None:
         """Every position that fits: east, north, weight, radius95 and radius999; heaviest first.
@@ -161,13 +245,11 @@ class Solution:
     @cached_property
     def boresight(self) -> SkyCoord | None:
         """Direction of the camera's axis, ICRS."""
-        value = last_value(self.result)
-        if not isinstance(value, Oriented):
+        if self.attitude is None:
             return None
         from astropy.coordinates import SkyCoord
 
-        ra, dec, _ = output.boresight_rad(value.attitude.R_cam_icrs)
-        return SkyCoord(ra, dec, unit="rad", frame="icrs")
+        return SkyCoord(self.attitude.ra, self.attitude.dec, frame="icrs")
 
     @cached_property
     def stars(self) -> QTable | None:
@@ -196,7 +278,7 @@ class Solution:
 
     def to_dict(self) -> dict[str, Any]:
         """Content of `NAME.fix.json`, or `NAME.identification.json`, or `NAME.detections.json`."""
-        return output.record_of(self.result, self.kind)
+        return output.result_dict(self.result, self.kind)
 
     def write(self, folder: str | os.PathLike[str], *, plots: bool = True, overwrite: bool = False) -> Path:
         """Write the files of the command (record, star table, world coordinates, picture); returns the record's path.
@@ -228,3 +310,14 @@ class Solution:
         notes = [("warning", text) for text in self.warnings]
         tables += [html_table("Warnings", notes)] if notes else []
         return f"<p>{escape(output.summary_line(self.result))}</p>" + "".join(tables)
+
+
+def _with_unit(value: Any, quantity: output.Quantity) -> Any:
+    """A `value` of a `quantity` as astropy's Angle or Quantity; as it is where it has no unit, or is not known."""
+    if value is None or quantity.astropy_unit is None:
+        return value
+    from astropy.coordinates import Angle
+    from astropy.units import Quantity
+
+    is_angle = quantity.astropy_unit == "deg" and isinstance(value, float)
+    return (Angle if is_angle else Quantity)(value, quantity.astropy_unit)

@@ -29,11 +29,10 @@ from startrack.core.limits import COMMAND_BYTES, START_BYTES, check_memory, refu
 from startrack.kernels import LibraryMissing
 
 COMMANDS = {  # name to the module of startrack.cli that declares it
-    "locate": "image_commands", "batch": "image_commands", "track": "image_commands", "identify": "image_commands",
-    "detect": "image_commands", "render": "study_commands", "calibrate": "input_commands",
-    "horizon": "input_commands", "predict": "study_commands", "report": "image_commands",
-    "reproduce": "study_commands", "terrain": "input_commands", "doctor": "study_commands", "cache": "study_commands",
-    "schema": "study_commands", "demo": "image_commands",
+    "locate": "pictures", "batch": "pictures", "track": "pictures", "identify": "pictures", "detect": "pictures",
+    "render": "studies", "calibrate": "inputs", "horizon": "inputs", "predict": "studies", "report": "pictures",
+    "reproduce": "studies", "terrain": "inputs", "doctor": "studies", "cache": "studies", "schema": "studies",
+    "demo": "pictures",
 }  # fmt: skip
 USAGE, INTERRUPTED = 2, 130
 NEW_OBJECTS = 50_000  # until garbage is collected: Python's 700 cost a tenth of the time of a start

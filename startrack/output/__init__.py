@@ -1,7 +1,7 @@
 """Results for people and programs: JSON, tables, pictures, pages, one-line summaries, and the table of quantities."""
 
 from startrack.core.ecsv import Column, ecsv_text
-from startrack.output.geo import feature, geojson_text
+from startrack.output.geo import feature, geojson_text, qgis_style_text
 from startrack.output.html import fill_frame, page_text, write_page
 from startrack.output.html.details import ground_map
 from startrack.output.html.rows import Found, result_at, results_under
@@ -23,7 +23,6 @@ from startrack.output.picture.canvas import (
 from startrack.output.picture.maps import MARGIN_PX, SIDE_PX, Map, draw_overview, ellipse_m, relief_picture
 from startrack.output.picture.panorama import horizon_picture, skyline_picture
 from startrack.output.picture.prediction import comparison_picture, path_picture, prediction_picture, radius_classes
-from startrack.output.qgis import qgis_style_text
 from startrack.output.quantities import QUANTITIES, table_columns
 from startrack.output.quantity import (
     ABSENT,
@@ -41,14 +40,12 @@ from startrack.output.quantity import (
     show_everywhere,
 )
 from startrack.output.record import (
-    detection_dict,
-    identification_dict,
-    record_of,
+    SCHEMAS,
     refused_dict,
     result_dict,
+    section_values,
     stage_values,
 )
-from startrack.output.schema import SCHEMAS
 from startrack.output.tables import (
     cloud_texts,
     quantity_columns,
@@ -59,7 +56,6 @@ from startrack.output.tables import (
 from startrack.output.text import Rows, explain, lens_text, refusal_line, rows, summary_line, verbose_text
 from startrack.output.values import (
     ARCSEC_PER_RAD,
-    R_body_enu,
     boresight_rad,
     off_map,
     ranges_deg,
@@ -84,15 +80,16 @@ from startrack.output.write import (
 __all__ = [
     "ABSENT", "ARCSEC_PER_RAD", "COMPANIONS", "MARGIN_PX", "PICTURES", "QUANTITIES", "SCHEMAS", "SIDE_PX",
     "SKYLINE_FILES", "TEXT_PX", "TITLE_PX", "Axes", "Box", "Canvas", "Colour", "Column", "Found", "Ink", "Kind",
-    "Legend", "Map", "Quantity", "R_body_enu", "Rows", "Schema", "annotate", "boresight_rad", "box_around",
-    "cloud_texts", "comparison_picture", "detection_dict", "draw_overview", "ecsv_text", "ellipse_m", "encoded_bytes",
+    "Legend", "Map", "Quantity", "Rows", "Schema", "annotate", "boresight_rad", "box_around",
+    "cloud_texts", "comparison_picture", "draw_overview", "ecsv_text", "ellipse_m", "encoded_bytes",
     "explain",
     "feature", "file_schema", "fill_frame", "geojson_text", "ground_map", "horizon_picture",
-    "identification_dict", "json_text", "lens_text", "list_schema", "markdown_table", "mix_colours", "nice_step",
+    "json_text", "lens_text", "list_schema", "markdown_table", "mix_colours", "nice_step",
     "object_schema", "off_map", "or_null", "page_text", "path_picture", "png_bytes", "prediction_picture",
     "prepare_folder", "qgis_style_text", "quantity_columns", "radius_classes", "ranges_deg", "ranges_text",
-    "record_from", "record_of", "refusal_line", "refused_dict", "relief_picture",
+    "record_from", "refusal_line", "refused_dict", "relief_picture",
     "remove_companions", "result_at", "result_dict", "results_under", "rows", "schema_of", "schema_of_kind",
+    "section_values",
     "sectors_off_map", "show_everywhere", "skyline_picture", "skyline_table_text", "skyline_texts_deg", "stage_values",
     "star_table_text", "summary_line", "table_columns", "verbose_text", "write_annotated", "write_geo",
     "write_json", "write_page", "write_results", "write_star_table", "write_wcs",

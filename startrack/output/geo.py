@@ -1,4 +1,6 @@
-"""A fix as GeoJSON and as KML: the position or the modes as points, the 95 % circle as a polygon.
+"""Files for maps: a fix as GeoJSON and as KML, and the style of a raster for QGIS.
+
+The position or the modes are points, the 95 % circle a polygon.
 
 Coordinates are longitude and latitude in degrees: WGS 84 on the Earth, planetocentric on the sphere of 1737.4 km
 (IAU_2015:30100) on the Moon.
@@ -8,12 +10,16 @@ from __future__ import annotations
 
 import html
 import json
+from collections.abc import Sequence
+from math import isfinite
 from typing import TYPE_CHECKING, Any
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 
 from startrack.core.errors import one_line
 from startrack.frames import Site, latlon_from_enu
+from startrack.output.picture.canvas import Colour
 from startrack.output.record import result_dict
 
 if TYPE_CHECKING:
@@ -26,6 +32,8 @@ CIRCLE_POINTS = 72
 MOON_CRS = {"type": "name", "properties": {"name": "urn:ogc:def:crs:IAU_2015::30100"}}  # RFC 7946 has WGS 84 alone
 ATTITUDE_KEYS = ("ra_deg", "dec_deg", "roll_deg", "heading_deg", "pitch_deg", "roll_body_deg", "sigma_arcsec")
 POSITION_KEYS = ("east_m", "north_m", "up_m", "radius95_m", "radius999_m", "protection_level_m", "covariance_m2")
+DOCTYPE = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>"
+QGIS_VERSION = "3.22.0"  # whose elements these are; later ones read them
 KML_HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"{hint}>\n<Document>\n'
 
 
@@ -118,3 +126,30 @@ def _placemark(feature: dict[str, Any]) -> str:
     else:
         shape = f"<Polygon><outerBoundaryIs><LinearRing>{shape}</LinearRing></outerBoundaryIs></Polygon>"
     return f"<Placemark><name>{escape(name)}</name><ExtendedData>{data}</ExtendedData>{shape}</Placemark>\n"
+
+
+def qgis_style_text(band: int, classes: Sequence[tuple[float, str, Colour]]) -> str:
+    """The style (QML) of a raster that shows one `band` (from 1) in colours of `classes`: QGIS loads NAME.qml with it.
+
+    A class has an upper bound, words for the legend and a colour; bounds ascend, and the last may be infinite, but not
+    the only one. Where the raster has no value nothing is drawn.
+    """
+    root = Element("qgis", version=QGIS_VERSION, styleCategories="Symbology")
+    pipe = SubElement(root, "pipe")
+    lowest, highest = "0", f"{max(bound for bound, *_ in classes if isfinite(bound)):g}"
+    renderer = SubElement(
+        pipe, "rasterrenderer", type="singlebandpseudocolor", band=str(band), alphaBand="-1", opacity="1",
+        nodataColor="", classificationMin=lowest, classificationMax=highest,
+    )  # fmt: skip
+    SubElement(renderer, "rasterTransparency")
+    SubElement(SubElement(renderer, "minMaxOrigin"), "limits").text = "None"  # the bounds are not those of the view
+    shader = SubElement(
+        SubElement(renderer, "rastershader"), "colorrampshader", colorRampType="DISCRETE", classificationMode="1",
+        clip="0", minimumValue=lowest, maximumValue=highest,
+    )  # fmt: skip
+    for bound, words, colour in classes:
+        code = "#" + bytes(colour).hex()
+        SubElement(shader, "item", value=f"{bound:g}", label=words, color=code, alpha="255")
+    SubElement(root, "blendMode").text = "0"
+    indent(root)
+    return f"{DOCTYPE}\n{tostring(root, encoding='unicode')}\n"

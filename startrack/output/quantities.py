@@ -6,21 +6,33 @@ and a table of docs/formats.md are made from `QUANTITIES`. A new quantity is one
 
 from __future__ import annotations
 
+from startrack.camera import camera_keys, camera_to_dict
 from startrack.chain import Detected, Identified, Inputs, Located, Measured, Oriented, Positioned
 from startrack.core import __version__
 from startrack.core.ecsv import Column
 from startrack.frames import format_utc
 from startrack.kernels.library import LEVEL
 from startrack.output.quantities_pose import ATTITUDE_QUANTITIES, MIDDLE_QUANTITIES, POSITION_QUANTITIES
-from startrack.output.quantity import Listed, Quantity, Show, list_schema, object_schema, show_everywhere
+from startrack.output.quantity import (
+    Listed,
+    Quantity,
+    Show,
+    list_schema,
+    object_schema,
+    or_null,
+    schema_of_kind,
+    show_everywhere,
+)
 from startrack.output.values import (
     bodies_record,
     chance_text,
     file_or_name,
+    matches_record,
     off_map,
     predicted_visible,
     ranges_deg,
     ranges_text,
+    sources_record,
 )
 
 Q = Quantity
@@ -136,10 +148,25 @@ RUN_QUANTITIES: tuple[Quantity, ...] = (
       lambda v: None if v.exposure.correction is None else v.exposure.correction.flat_sha256,
       "of the file of the flat field; null: none was used", "text", before=None, nullable=True, optional=True),
 )  # fmt: skip
+MATCH = object_schema({
+    "hip": or_null({"type": "integer", "minimum": 1}, "Hipparcos number; null: the star has none"),
+    "x_px": "number",
+    "y_px": "number",
+    "saturated": schema_of_kind("flag", "whether its light is cut off: it may be named by place and brightness"),
+})  # fmt: skip
+POINT_SOURCE = object_schema({"x_px": "number", "y_px": "number", "flux_e": "number", "snr": "number"})
+OWN_QUANTITIES: tuple[Quantity, ...] = (  # of one kind of record alone
+    Q("explain", "", Inputs, lambda v: [], "with --explain: what a refused or wide answer would need",
+      list_schema("text"), before=[]),
+    Q("camera", "", Inputs, lambda v: None if v.camera is None else camera_to_dict(v.camera), "",
+      {"title": "Camera file", **camera_keys().schema()}, before=None, nullable=True),
+    Q("matches", "", Identified, matches_record, "", list_schema(MATCH), before=[]),
+    Q("detections", "", Detected, sources_record, "", list_schema(POINT_SOURCE), before=[]),
+)  # fmt: skip
 QUANTITIES: tuple[Quantity, ...] = (
     POSITION_QUANTITIES + ATTITUDE_QUANTITIES + MIDDLE_QUANTITIES + LIGHT_QUANTITIES + RUN_QUANTITIES
 )
-BY_PATH = {one.path: one for one in QUANTITIES}
+BY_PATH = {one.path: one for one in (*QUANTITIES, *OWN_QUANTITIES)}
 # The batch's columns came in this order before the table did; a column that is not named here is appended.
 FIRST_COLUMNS = (
     "time_utc", "exposure_s", "east_m", "north_m", "up_m", "cov_east_east_m2", "cov_east_north_m2",

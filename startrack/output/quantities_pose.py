@@ -8,8 +8,8 @@ from startrack.chain import Measured, Oriented, Positioned
 from startrack.frames import quat_xyzw_from_R
 from startrack.localization import RISK
 from startrack.output import values
-from startrack.output.middle import has_middle, in_middle, middle_px
 from startrack.output.quantity import Listed, Quantity, Schema, Show, list_schema, object_schema, or_null
+from startrack.output.values import has_middle, in_middle, middle_px
 
 Q = Quantity
 DEG_PER_RAD = 180.0 / np.pi
@@ -43,7 +43,7 @@ POSITION_QUANTITIES: tuple[Quantity, ...] = (
     Q("position.on", "", Positioned, lambda at: at("position.terrain"), "the terrain, after the coordinates",
       derived=True,
       shown=(Show("text", "position", " on {}"), Show("notebook", "on", "{}"))),
-    Q("position.covariance_m2", "m^2", values.has_position, lambda v: values.finite_or_none(v.fix.covariance_m2),
+    Q("position.covariance_m2", "m^2", values.has_position, lambda v: v.fix.covariance_m2,
       "2 x 2, (east, north); this and the circles are null of a method that states none",
       list_schema(list_schema("number", count=2), count=2), nullable=True, form="%.6g",
       columns={"cov_east_east_m2": (0, 0), "cov_east_north_m2": (0, 1), "cov_north_north_m2": (1, 1)}),
@@ -55,17 +55,17 @@ POSITION_QUANTITIES: tuple[Quantity, ...] = (
       derived=True, shown=(Show("text", "error", "sigma {0[0]:.2f} m by {0[1]:.2f} m"),
              Show("notebook", "one sigma", "{0[0]:.2f} m by {0[1]:.2f} m, long axis at azimuth {0[2]:.1f}°"),
              Show("page", "Sigma", "{0[0]:.2f} m by {0[1]:.2f} m"))),
-    Q("position.radius95_m", "m", values.has_position, lambda v: values.finite_or_none(v.fix.radius95_m),
+    Q("position.radius95_m", "m", values.has_position, lambda v: v.fix.radius95_m,
       "circle about the position that holds 95 % of the posterior", "positive", nullable=True, form="%.4f",
       shown=(Show("summary", "radius", "±{:.1f} m (95 %)"), Show("text", "error", "; within {:.1f} m (95 %)"),
              Show("panel", "Position", "   ±{:.1f} m (95 %)"), Show("notebook", "95 % within", "{:.1f} m"),
              Show("page", "95 % within", "{:,.1f} m")), listed=Listed("± 95 %", 1, always=True)),
-    Q("position.radius999_m", "m", values.has_position, lambda v: values.finite_or_none(v.fix.radius999_m),
+    Q("position.radius999_m", "m", values.has_position, lambda v: v.fix.radius999_m,
       "circle about the position that holds 99.9 %", "positive", nullable=True, form="%.4f",
       shown=(Show("text", "error", ", {:.1f} m (99.9 %)"), Show("notebook", "99.9 % within", "{:.1f} m"),
              Show("page", "99.9 % within", "{:,.1f} m"))),
     Q("position.protection_level_m", "m", values.has_position,
-      lambda v: None if v.fix.integrity is None else values.finite_or_none(v.fix.integrity.protection_level_m),
+      lambda v: None if v.fix.integrity is None else v.fix.integrity.protection_level_m,
       "radius about the position beyond which the true one lies with probability `protection_risk` at most, also where "
       "the directions within 45 degrees of azimuth show something on no map; null: such a group alone holds the "
       "position in some direction, or a method without a posterior",

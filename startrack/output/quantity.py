@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
 from startrack.core.ecsv import Column
 
 Schema = dict[str, Any]
@@ -99,7 +101,7 @@ class Quantity:
     path: str  # KEY or SECTION.KEY of the record
     unit: str  # as docs/formats.md spells it; empty for texts and pure numbers
     since: type[Any] | Callable[[Any], bool]  # the values that determine it: of a class, or those that fulfil this
-    value: Callable[[Any], Any]  # of such a value; where `derived`, of the function from paths to values
+    value: Callable[[Any], Any]  # of such a value, infinite where it is not stated; where `derived`, of an `At`
     description: str
     schema: Kind = field(default_factory=dict)
     before: Any = ABSENT  # in the record of a value that has not come as far: ABSENT, None, 0, [], or a function
@@ -113,6 +115,11 @@ class Quantity:
     recorded: bool = True
 
     @property
+    def in_record(self) -> bool:
+        """Whether records have it."""
+        return self.recorded and not self.derived
+
+    @property
     def section(self) -> str:
         """The part of the record that holds it; empty for a key of the record itself."""
         return self.path.rpartition(".")[0]
@@ -122,19 +129,35 @@ class Quantity:
         """Its key in the section."""
         return self.path.rpartition(".")[2]
 
+    @property
+    def name(self) -> str:
+        """Its key without the unit, for values that have their unit themselves."""
+        return self.key.removesuffix(f"_{self.unit.replace('^', '')}")
+
     def is_determined(self, value: Any) -> bool:
         """Whether the `value` has come as far."""
         return isinstance(value, self.since) if isinstance(self.since, type) else self.since(value)
+
+    def json_value(self, value: Any) -> Any:
+        """What a record holds of a `value` that determines it: null where it is not finite."""
+        found = self.value(value)
+        if isinstance(found, float | np.ndarray):
+            return np.asarray(found).tolist() if np.isfinite(found).all() else None
+        return found
+
+    @property
+    def astropy_unit(self) -> str | None:
+        """Its unit as astropy spells it; None of texts and pure numbers."""
+        return ASTROPY_UNITS.get(self.unit)
 
     @property
     def table_columns(self) -> list[Column]:
         """Its columns in a table; none without a format."""
         if not self.form:
             return []
-        kind, unit = {"d": "int64", "s": "string"}.get(self.form[-1], "float64"), ASTROPY_UNITS.get(self.unit)
-        columns = self.columns or {self.key: ()}
+        kind, columns = {"d": "int64", "s": "string"}.get(self.form[-1], "float64"), self.columns or {self.key: ()}
         return [
-            Column(name, (), kind, unit, self.form, self.description, (*self.path.split("."), *at))
+            Column(name, (), kind, self.astropy_unit, self.form, self.description, (*self.path.split("."), *at))
             for name, at in columns.items()
         ]
 
@@ -155,10 +178,10 @@ def record_from(quantities: Iterable[Quantity], value: Any) -> dict[str, Any]:
     """
     found: dict[str, Any] = {}
     for one in quantities:
-        if one.derived or not one.recorded:
+        if not one.in_record:
             continue
         if one.is_determined(value):
-            entry = one.value(value)
+            entry = one.json_value(value)
         elif one.section and value is None:
             entry = ABSENT
         else:
@@ -177,7 +200,7 @@ def schema_of(quantities: Iterable[Quantity], section: str = "", description: st
     required: Schema = {}
     optional: Schema = {}
     for one in quantities:
-        if one.section == section and not one.derived and one.recorded:
+        if one.section == section and one.in_record:
             words = f"{one.description} [{one.unit}]" if units and one.unit else one.description
             schema = {**schema_of_kind(one.schema), "description": words}
             if one.nullable:  # a list of types, so that a validator names what is wrong with an array
@@ -190,7 +213,5 @@ def schema_of(quantities: Iterable[Quantity], section: str = "", description: st
 
 def markdown_table(quantities: Sequence[Quantity], heading: str) -> str:
     """The recorded `quantities` for documentation, with unit and meaning; `heading` of their names."""
-    rows = [
-        f"| `{one.path}` | {one.unit} | {one.description} |" for one in quantities if one.recorded and not one.derived
-    ]
+    rows = [f"| `{one.path}` | {one.unit} | {one.description} |" for one in quantities if one.in_record]
     return "\n".join([f"| {heading} | unit | meaning |", "| --- | --- | --- |", *rows])

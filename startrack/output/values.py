@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from startrack.camera import Camera
-from startrack.chain import Located, Measured, Oriented, Positioned
+from startrack.camera import Camera, lens_jacobian
+from startrack.catalog import catalog_rays
+from startrack.chain import Detected, Identified, Located, Measured, Oriented, Positioned
 from startrack.core.files import is_path
 from startrack.core.statistics import error_ellipse
 from startrack.core.types import MIDDLES_RAD, Array, Blocked, Fix
+from startrack.estimation.lens_correction import smooth_shifts
 from startrack.frames import R_from_rotvec, heading_pitch_roll_from_R_body_enu, latlon_from_enu
 from startrack.terrain import Terrain
 
@@ -21,6 +24,7 @@ ARCSEC_PER_RAD = 648_000 / np.pi
 SMALLEST_CHANCE = 1e-100  # smaller probabilities are beyond the models that they come from
 DOMINANT = 3.0  # times the circle that a stated fact gives: the line of the terminal names it
 ROTATION_STEP_RAD = 1e-5  # of the numerical derivative of heading, pitch and roll
+HALF_STEP_PX = 0.5  # of the numerical derivative of the sky by pixels
 _predicted_visible: WeakKeyDictionary[Located, int] = WeakKeyDictionary()
 At = Callable[[str], Any]  # from the path of a quantity to its value, None where it is not known
 
@@ -52,12 +56,16 @@ def boresight_rad(R_cam_icrs: Array) -> tuple[float, float, float]:
     Roll is the position angle of the image's top (-y of cam) at the boresight, from north through east. Near a
     celestial pole right ascension and roll are poorly determined; the quaternion is not.
     """
-    up, ahead = -R_cam_icrs[1], R_cam_icrs[2]
-    ra = turn_rad(ahead[1], ahead[0])
-    dec = np.arctan2(ahead[2], np.hypot(ahead[0], ahead[1]))
-    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
-    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
-    return ra, float(dec), turn_rad(up @ east, up @ north)
+    ra, dec, (east, north) = sky_axes(R_cam_icrs[2])
+    return ra, dec, turn_rad(-R_cam_icrs[1] @ east, -R_cam_icrs[1] @ north)
+
+
+def sky_axes(ray_icrs: Array) -> tuple[float, float, Array]:
+    """Right ascension in [0, 2 pi) and declination [rad] of a direction (3,), unit vectors (2, 3) east and north."""
+    ra, dec = turn_rad(ray_icrs[1], ray_icrs[0]), float(np.arctan2(ray_icrs[2], np.hypot(ray_icrs[0], ray_icrs[1])))
+    return ra, dec, np.array([
+        [-np.sin(ra), np.cos(ra), 0.0], [-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)],
+    ])  # fmt: skip
 
 
 def turn_rad(y: float, x: float) -> float:
@@ -145,11 +153,6 @@ def ellipse(at: At) -> tuple[float, float, float] | None:
     return float(major_m), float(minor_m), float(np.degrees(azimuth_rad))
 
 
-def finite_or_none(value: Any) -> Any:
-    """A number or an array as JSON values, None where it is infinite: not stated."""
-    return np.asarray(value).tolist() if np.isfinite(value).all() else None
-
-
 def lacking_circle(at: At) -> str | None:
     """A text where a position has no circle."""
     return "no circle" if at("position.east_m") is not None and at("position.radius95_m") is None else None
@@ -169,12 +172,8 @@ def sigma_m(at: At, axis: int) -> float | None:
 
 def modes_record(fix: Fix) -> list[dict[str, Any]]:
     """The modes of a `fix` as JSON values; a circle is null where none is stated."""
-    circles = ("radius95_m", "radius999_m")
-    return [
-        {"east_m": mode.east_m, "north_m": mode.north_m, "weight": mode.weight}
-        | {key: finite_or_none(getattr(mode, key)) for key in circles}
-        for mode in fix.modes
-    ]
+    keys = ("east_m", "north_m", "weight", "radius95_m", "radius999_m")
+    return [{key: at if np.isfinite(at := getattr(mode, key)) else None for key in keys} for mode in fix.modes]
 
 
 def mode_text(mode: dict[str, Any]) -> str:
@@ -233,3 +232,93 @@ def bodies_record(value: Oriented) -> list[dict[str, Any]]:
         for body, (x, y), is_inside in zip(value.bodies, xy_px.tolist(), inside, strict=True)
         if is_inside
     ]
+
+
+def matches_record(value: Identified) -> list[dict[str, Any]]:
+    """The identified stars of a `value`, each with the position measured for it."""
+    named = value.names.stars
+    columns = (value.stars.hip[named.star].tolist(), named.xy_px.tolist(), named.saturated.tolist())
+    return [
+        {"hip": hip or None, "x_px": x, "y_px": y, "saturated": saturated}
+        for hip, (x, y), saturated in zip(*columns, strict=True)
+    ]
+
+
+def sources_record(value: Detected) -> list[dict[str, float]]:
+    """The point sources of a `value`, brightest first; fluxes are in ADU where the gain is not known."""
+    found = value.detections
+    columns = zip(found.xy_px.tolist(), found.flux_e.tolist(), found.snr.tolist(), strict=True)
+    return [{"x_px": x, "y_px": y, "flux_e": flux, "snr": snr} for (x, y), flux, snr in columns]
+
+
+@dataclass(frozen=True)
+class Middle:
+    """Direction (ICRS, as in the catalogue: without aberration and refraction) at a picture's middle pixel."""
+
+    ra_rad: float  # in [0, 2 pi)
+    dec_rad: float
+    sigma_rad: float  # standard deviation per axis
+    scale_rad_per_px: float  # geometric mean of the two axes
+    rotation_rad: float  # position angle of image up, from north through east, in [0, 2 pi)
+
+
+def middle_px(value: Oriented) -> Array:
+    """The middle (2,) of a picture; pixel centres are at integers."""
+    return 0.5 * (np.array(value.camera.size_px) - 1.0)
+
+
+def has_middle(value: Any) -> bool:
+    """Whether a `value` of the pipeline has an attitude and a lens that shows the picture's middle."""
+    if not isinstance(value, Oriented):
+        return False
+    camera = value.camera
+    return bool(camera.angle_rad(middle_px(value)) < min(camera.max_angle_rad, camera.lens.max_invertible_rad))
+
+
+def sky_at_middle(value: Oriented) -> Middle:
+    """The sky at the middle of the picture of a `value` that has one.
+
+    The error is that of attitude and lens together, with their correlation: of a lens fitted to the picture's own stars
+    they nearly cancel.
+    """
+    camera, middle = value.camera, middle_px(value)
+    step = HALF_STEP_PX * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    rays_cam = camera.unproject(middle + step)
+    here, right, left, below, above = catalog_rays(
+        rays_cam @ value.attitude.R_cam_icrs, value.exposure.time_utc, value.site
+    )
+    ra, dec, axes = sky_axes(here)
+    by_px = axes @ np.stack([right - left, below - above], axis=1) / (2.0 * HALF_STEP_PX)
+    up = -by_px[:, 1]
+    covariance = by_px @ covariance_px2(value, rays_cam[0]) @ by_px.T
+    return Middle(
+        ra_rad=ra,
+        dec_rad=dec,
+        sigma_rad=float(np.sqrt(0.5 * np.trace(covariance))),
+        scale_rad_per_px=float(np.sqrt(abs(np.linalg.det(by_px)))),
+        rotation_rad=turn_rad(up[0], up[1]),
+    )
+
+
+def covariance_px2(value: Oriented, ray_cam: Array) -> Array:
+    """Covariance (2, 2) [px^2] of the pixel at which a `value`'s camera and attitude place a direction.
+
+    `ray_cam` (3,) is that direction.
+    """
+    camera, fit = value.camera, value.attitude_fit
+    by_turn = camera.jacobian_px_per_rad(ray_cam)
+    covariance = by_turn @ value.attitude.covariance_rad2 @ by_turn.T
+    if camera.covariance is not None:
+        by_lens = lens_jacobian(camera, ray_cam, camera.covariance_order)
+        mixed = by_turn @ fit.covariance_with_lens @ by_lens.T
+        covariance = covariance + by_lens @ camera.covariance @ by_lens.T + mixed + mixed.T
+        if fit.misfit is not None:  # what attitude and lens do not follow
+            here = smooth_shifts(camera, camera.project_unlimited(ray_cam[None]))[0] @ fit.misfit.displacement_px
+            follows = by_turn @ fit.misfit.turn_rad + by_lens @ fit.misfit.lens
+            covariance = covariance + here @ here.T - here @ follows.T - follows @ here.T
+    return np.asarray(covariance)
+
+
+def in_middle(part: str, per_unit: float) -> Callable[[Oriented], float]:
+    """The `part` of the sky at the middle, times `per_unit`, of a value that has one."""
+    return lambda value: float(getattr(sky_at_middle(value), part) * per_unit)

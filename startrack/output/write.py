@@ -18,7 +18,7 @@ from startrack.output.geo import GEO_FORMATS, geo_text
 from startrack.output.picture.annotate import annotated_png
 from startrack.output.picture.canvas import png_bytes
 from startrack.output.picture.panorama import located_picture
-from startrack.output.record import record_of
+from startrack.output.record import result_dict
 from startrack.output.tables import skyline_table_text, star_table_text
 from startrack.output.values import off_map
 from startrack.output.wcs import matches_bytes, wcs_bytes
@@ -28,7 +28,7 @@ SKYLINE_TABLE, SKYLINE_PICTURE = SKYLINE_FILES = (".skyline.ecsv", ".skyline.png
 PICTURES = (ANNOTATED, SKYLINE_PICTURE)
 STAR_FILES = (".stars.ecsv", ANNOTATED, ".wcs", ".corr")  # beside NAME.identification.json
 COMPANIONS = (*STAR_FILES, *SKYLINE_FILES)  # beside NAME.fix.json
-KINDS = {"fix": COMPANIONS, "identification": STAR_FILES, "detections": (ANNOTATED,)}  # most complete first
+COMPANIONS_OF = {"fix": COMPANIONS, "identification": STAR_FILES, "detections": (ANNOTATED,)}  # most complete first
 FilePath = str | os.PathLike[str]
 
 
@@ -39,14 +39,14 @@ def companion(record: Path, suffix: str) -> Path:
     the files of `locate` alone.
     """
     stem, kind = _stem_and_kind(record)
-    kinds = list(KINDS)
+    kinds = list(COMPANIONS_OF)
     taken = any(record.with_name(f"{stem}.{other}.json").exists() for other in kinds[: kinds.index(kind)])
     return record.with_name(f"{stem}.{kind}{suffix}" if taken else f"{stem}{suffix}")
 
 
 def remove_companions(record: Path) -> None:
     """Remove what an earlier run left beside a `record`: a refusal must not stand beside the picture of a success."""
-    for suffix in KINDS[_stem_and_kind(record)[1]]:
+    for suffix in COMPANIONS_OF[_stem_and_kind(record)[1]]:
         remove_file(companion(record, suffix))
 
 
@@ -91,7 +91,7 @@ def write_results(
     without a terrain holds the stars that were not identified too; `more`: keys that are added to the record. Raises
     BadInput where a file cannot be written; none of them is then left.
     """
-    record = record_of(outcome, _stem_and_kind(path)[1]) | (more or {})
+    record = result_dict(outcome, _stem_and_kind(path)[1]) | (more or {})
     try:
         _write_companions(outcome, path, plots=plots, catalog_table=catalog_table)
         if write_record:

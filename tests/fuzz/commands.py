@@ -171,7 +171,7 @@ def _run(command: tuple[str, ...], folder: Path) -> str | None:
     elif command[:2] not in WITHOUT_OUTPUT:
         words += ["-D", str(folder / "out")]
     out, err = io.StringIO(), io.StringIO()
-    in_process = patch("startrack.cli.batch.Runner", partial(Runner, in_process=True))  # under our limits
+    in_process = patch("startrack.cli.pictures.batch.Runner", partial(Runner, in_process=True))  # under our limits
     with in_process, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
             code = main(words)

@@ -19,7 +19,7 @@ from startrack.core.types import Array, Bools
 from startrack.localization import ROW_NATS
 from startrack.output.picture.annotate import layers_of, picture_in
 from startrack.output.picture.canvas import QUALITY, encoded_bytes
-from startrack.output.picture.relief import edge_cover, ground_cells, hill_shading
+from startrack.output.picture.maps import edge_cover, ground_cells, hill_shading
 from startrack.output.tables import half_range_rad
 from startrack.terrain import Terrain
 

@@ -43,7 +43,7 @@ from startrack.output.picture.maps import draw_overview, draw_zoom
 from startrack.output.picture.marks import draw_marks, overlay_of
 from startrack.output.record import image_name, stage_values
 from startrack.output.text import Rows, rows
-from startrack.output.values import mode_text, modes_record
+from startrack.output.values import mode_text
 
 PANEL_WIDTH, PANEL_HEIGHT = round(38.75 * TEXT_PX), round(72.5 * TEXT_PX)
 FACT_STEP_PX = 2 * TEXT_PX
@@ -221,12 +221,10 @@ def _has_circle(value: Inputs) -> bool:
 
 def _facts(value: Inputs) -> Rows:
     """Names and texts of the quantities that the panel shows."""
-    when = value.exposure.time_utc
+    when, at = value.exposure.time_utc, stage_values(value)
     found = [("Time", f"{when:%Y-%m-%d  %H:%M:%S} UTC" if when is not None else "not known")]
-    if isinstance(value, Located) and value.fix.ambiguous:
-        modes = modes_record(value.fix)[:MAX_MODES]
-        found += [(f"Position {k + 1}", mode_text(mode)) for k, mode in enumerate(modes)]
-    return found + rows("panel", stage_values(value))
+    modes = (at("modes.text") or [])[:MAX_MODES]
+    return [*found, *((f"Position {k}", mode_text(mode)) for k, mode in enumerate(modes, 1)), *rows("panel", at)]
 
 
 def _legend(value: Inputs, truth: bool, undrawn: int) -> Legend:

@@ -1,4 +1,4 @@
-"""Maps: the search area with the position, the position with its error, relief of a terrain."""
+"""Maps: the search area with the position, the position with its error, the relief of a terrain lit as maps are."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -13,22 +14,15 @@ from startrack.core.errors import length_text
 from startrack.core.types import Array, Bools, Fix
 from startrack.output.picture.axes import GAP_PX, NICE, multiples, nice_step
 from startrack.output.picture.canvas import TEXT_PX, Box, Canvas, Colour, Ink, box_around, mix_colours
-from startrack.output.picture.relief import (
-    Image,
-    edge_cover,
-    enlarge_image,
-    extrapolate_values,
-    ground_cells,
-    hill_shading,
-    inner_cells,
-)
 from startrack.terrain import Terrain
 
+Image = NDArray[np.float32]
 CIRCLE_RAD = np.linspace(0.0, 2 * np.pi, 181)
 SIDE_PX, MARGIN_PX, BELOW_PX = 860.0, 4 * TEXT_PX, 3 * TEXT_PX  # of a picture of one map, and beside it, for its scales
 SEARCH_MARGIN = 1.07  # of a map, in radii of the search area
 RELIEF_LIGHT = 3.0  # slopes that face the light, as a multiple of the floor's colour
 MAX_LEVELS = 12
+GENTLE_SLOPE = 0.02  # gentler ground looks flat
 
 
 @dataclass(frozen=True)
@@ -250,3 +244,57 @@ def ellipse_m(centre_m: tuple[float, float], covariance_m2: Array) -> Array:
     lengths, axes = np.linalg.eigh(covariance_m2)
     half_m = np.sqrt(np.maximum(lengths, 0.0))
     return np.asarray(centre_m) + (ring((0.0, 0.0), 1.0) * half_m) @ axes.T
+
+
+def ground_cells(
+    terrain: Terrain, half_m: ArrayLike, shape: tuple[int, int], centre_m: tuple[float, float] = (0.0, 0.0)
+) -> tuple[Image, Bools]:
+    """Heights [m] (H, W) within `half_m` east and north of the centre, north up, and where there is ground."""
+    points_m = cell_points(half_m, shape) + np.asarray(centre_m)
+    known = np.asarray(terrain.allowed(points_m.reshape(-1, 2)), dtype=bool).reshape(shape)
+    ground_m = np.zeros(shape, dtype=np.float32)
+    ground_m[known] = terrain.ground_m(points_m[known])
+    return ground_m, known
+
+
+def cell_points(half_m: ArrayLike, shape: tuple[int, int]) -> Array:
+    """Points (H, W, 2), east and north [m] of a map's centre, of its cells of `shape` (H, W), north up."""
+    x, y = (np.linspace(-half, half, n) for half, n in zip(np.asarray(half_m), shape[::-1], strict=True))
+    return np.stack(np.meshgrid(x, y[::-1]), axis=-1)
+
+
+def hill_shading(ground_m: Image, known: Bools, half_m: ArrayLike) -> Image:
+    """Light (H, W), 0 to 1, on cells lit from the north-west as maps are; carried some cells beyond the ground."""
+    east_m, north_m = (2 * half / (n - 1) for half, n in zip(np.asarray(half_m), known.shape[::-1], strict=True))
+    down, east = np.gradient(ground_m)
+    facing, inner = east / east_m + down / north_m, inner_cells(known)
+    steep = max(float(np.percentile(np.abs(facing[inner]), 95)) if inner.any() else 0.0, GENTLE_SLOPE)
+    light = np.maximum(0.5 + 0.5 * np.tanh(1.2 * facing / steep), 0.05)
+    return extrapolate_values(light.astype(np.float32), inner)
+
+
+def edge_cover(known: Bools, size: tuple[int, int]) -> Array:
+    """1 on known ground and 0 beside it, (H, W) of the given size (W, H), with a smooth edge."""
+    soft = enlarge_image(np.asarray(cv2.GaussianBlur(known.astype(np.float32), (0, 0), 1.5)), size)
+    return np.clip((soft - 0.5) * 4 + 0.5, 0, 1).astype(np.float64)
+
+
+def inner_cells(known: Bools) -> Bools:
+    """The mask without the cells at its edge, whose slopes would be those of a cliff that does not exist."""
+    return cv2.erode(known.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE) > 0
+
+
+def extrapolate_values(values: Image, known: Bools) -> Image:
+    """Known values, carried a few cells beyond their edge."""
+    filled, weight = np.where(known, values, 0).astype(np.float32), known.astype(np.float32)
+    for reach in (3, 7, 15):
+        near = cv2.blur(weight, (reach, reach))
+        carried = cv2.blur(filled, (reach, reach)) / np.maximum(near, 1e-6)
+        new = (weight == 0) & (near > 1e-6)
+        filled[new], weight[new] = carried[new], 1.0
+    return filled
+
+
+def enlarge_image(image: Image, size: tuple[int, int]) -> Image:
+    """The image, smooth, in a `size` (W, H)."""
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), dtype=np.float32)

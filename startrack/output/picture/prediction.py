@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +15,18 @@ from startrack.core.types import Array, Bools, Ints
 from startrack.frames import Site, latlon_from_enu
 from startrack.output.picture.axes import NICE, Axes
 from startrack.output.picture.canvas import LINE_PX, TEXT_PX, TITLE_PX, Canvas, Colour, Ink, rgb_colours
-from startrack.output.picture.maps import BELOW_PX, MARGIN_PX, SEARCH_MARGIN, SIDE_PX, Map, ring
-from startrack.output.picture.relief import cell_points, edge_cover, extrapolate_values, hill_shading
+from startrack.output.picture.maps import (
+    BELOW_PX,
+    MARGIN_PX,
+    SEARCH_MARGIN,
+    SIDE_PX,
+    Map,
+    cell_points,
+    edge_cover,
+    extrapolate_values,
+    hill_shading,
+    ring,
+)
 
 if TYPE_CHECKING:
     from startrack.terrain import Raster, Terrain
@@ -27,6 +37,7 @@ LEAST_SPREAD = 0.05  # of the radii, relative: less is one class
 COLOURS = rgb_colours("fde725 5ec962 21918c 3b528b 58286e")
 SHADE = 0.55  # of a colour in the darkest shadow of the relief
 CURVES = (Ink.BLUE, Ink.ORANGE, Ink.GREEN, Ink.PURPLE)
+RADIUS = "95 % radius [m]"
 LOCATED = 0.9  # share of the draws below which a point is marked
 
 
@@ -131,8 +142,8 @@ def path_picture(
     curves = {"each image alone": radius_m, **(more or {})}
     if (p_ok < LOCATED).any():
         lines = [*lines, "red circle: fewer than 9 of 10 images give a position; red cross: half of them or fewer"]
-    ends, across = (0.0, float(distance_m[-1])), "distance along the path [m]"
-    axes = _curve_axes(ends, (0.0, top_m), title, lines, across, zip(curves, CURVES, strict=False))
+    axes = _curve_axes(title, lines, (0.0, float(distance_m[-1])), (0.0, top_m))
+    axes.draw_scales(RADIUS, "distance along the path [m]", zip(curves, CURVES, strict=False))
     for colour, values_m in zip(CURVES, curves.values(), strict=False):
         axes.draw_curve(distance_m, values_m, colour)
     for distance, radius, share in zip(distance_m, radius_m, p_ok, strict=True):
@@ -159,7 +170,8 @@ def comparison_picture(variants: Sequence[dict[str, Any]], title: str) -> NDArra
     )
     colours = {camera: CURVES[k % len(CURVES)] for k, camera in enumerate(dict.fromkeys(row[0] for row in rows))}
     lines = ["median over the places"] if drawn else ["no position at half of the places"]
-    axes = _curve_axes(x, y, title, lines, "exposure [s]", colours.items(), "xy")
+    axes = _curve_axes(title, lines, x, y, "xy")
+    axes.draw_scales(RADIUS, "exposure [s]", colours.items())
     for camera, colour in colours.items():
         own = np.array(sorted(row[1:] for row in drawn if row[0] == camera)).reshape(-1, 2)
         axes.draw_curve(own[:, 0], own[:, 1], colour, TEXT_PX / 3)
@@ -170,15 +182,12 @@ def comparison_picture(variants: Sequence[dict[str, Any]], title: str) -> NDArra
 
 
 def _curve_axes(
-    x: tuple[float, float], y: tuple[float, float], title: str, lines: Sequence[str], across: str,
-    names: Iterable[tuple[str, Colour]], logarithmic: str = "",
-) -> Axes:  # fmt: skip
-    """Axes of radii with their scales and the `names` of their curves, on a canvas of their own."""
+    title: str, lines: Sequence[str], x: tuple[float, float], y: tuple[float, float], logarithmic: str = ""
+) -> Axes:
+    """Axes for curves of radii on a canvas of their own, with a `title` and `lines` above."""
     box = (MARGIN_PX, HEAD_PX + LINE_PX, MARGIN_PX + 1.2 * SIDE_PX, HEAD_PX + LINE_PX + SIDE_PX / 2)
     canvas = _headed_canvas(round(box[2] + BELOW_PX), round(box[3] + MARGIN_PX), title, lines)
-    axes = Axes(canvas, box, x, y, logarithmic)
-    axes.draw_scales("95 % radius [m]", across, names)
-    return axes
+    return Axes(canvas, box, x, y, logarithmic)
 
 
 def _headed_canvas(width: int, height: int, title: str, lines: Sequence[str]) -> Canvas:

@@ -3,8 +3,17 @@
 from __future__ import annotations
 
 from startrack.cli import flags
-from startrack.cli.flag_types import amount, field_of_view_rad, limit_type, number, positive_number
-from startrack.cli.flags import Command, Either, flag, function_at
+from startrack.cli.flags import (
+    Command,
+    Either,
+    amount,
+    field_of_view_rad,
+    flag,
+    function_at,
+    limit_type,
+    number,
+    positive_number,
+)
 
 CALIBRATE = """usage: startrack calibrate [ACTION] ... (startrack calibrate --help lists the flags of each action)
 
@@ -37,7 +46,7 @@ def state_flag(key: str) -> str:
 
 COMMANDS = (
     Command(
-        "calibrate", function_at("calibrate.run"), "a camera file from star exposures",
+        "calibrate", function_at("inputs.calibrate.run"), "a camera file from star exposures",
         "Fit the lens of a camera to the stars of one or more exposures of the open night sky, check the fit, and "
         "write the camera file with its covariance, a report and a JSON record. A fit that fails a check is refused, "
         "with the exposures that would help.",
@@ -60,14 +69,14 @@ COMMANDS = (
         start=CALIBRATE,
     ),
     Command(
-        "calibrate verify", function_at("calibrate.verify"), None,
+        "calibrate verify", function_at("inputs.calibrate.verify"), None,
         "Check whether a camera file still fits exposures of the stars. If the file was calibrated with --site, verify "
         "needs --site too.",
         {"input": flags.SKY, "more": (flags.JSON, *flags.MORE)},
         "startrack calibrate verify LATER.jpg -c camera.toml",
     ),
     Command(
-        "calibrate show", function_at("camera_files.show"), None, "Print the content of camera files.",
+        "calibrate show", function_at("inputs.camera_files.show"), None, "Print the content of camera files.",
         {
             "input": (flag("cameras CAMERA", "camera file, or the name of a shipped one", nargs="+"),),
             "more": (flags.JSON, *flags.MORE),
@@ -75,7 +84,7 @@ COMMANDS = (
         "startrack calibrate show fisheye-2048", memory_later=True,
     ),
     Command(
-        "calibrate convert", function_at("camera_files.convert"), None,
+        "calibrate convert", function_at("inputs.camera_files.convert"), None,
         "Convert a camera file to another program's format with --to, or from it.",
         {
             "input": (
@@ -107,7 +116,7 @@ COMMANDS = (
         "startrack calibrate convert camera.toml --to ros", memory_later=True,
     ),
     Command(
-        "calibrate board", function_at("calibrate.run_board"), None,
+        "calibrate board", function_at("inputs.calibrate.run_board"), None,
         "Fit the lens of a camera to pictures of a chessboard or a ChArUco board.",
         {
             "input": (
@@ -123,7 +132,7 @@ COMMANDS = (
         "startrack calibrate board BOARD.png... --pattern 9x6 -o camera.toml",
     ),
     Command(
-        "horizon", function_at("horizon.run"), "the horizon of a fixed camera from photographs of the night sky",
+        "horizon", function_at("inputs.horizon.run"), "the horizon of a fixed camera from photographs of the night sky",
         "Measure the skyline (obstruction profile) of a fixed camera on the Earth from one or several photographs of "
         "the night sky: from stars seen, stars missing, and the place where the sky's light stops. The suffix of -o "
         "chooses the format: .csv, .ecsv, .hrz (N.I.N.A.), .png (panorama), none (folder of a Stellarium landscape), "
@@ -152,7 +161,7 @@ COMMANDS = (
         start=TERRAIN,
         actions=(
             Command(
-                "show", function_at("terrain.show"),
+                "show", function_at("inputs.terrain.show"),
                 "properties, relief and, with --at, the horizon from a position", None,
                 {
                     "input": (
@@ -165,7 +174,8 @@ COMMANDS = (
                 "startrack terrain show shackleton --at 0 0", memory_later=True,
             ),
             Command(
-                "build", function_at("terrain.build"), "compute the horizons now; otherwise the first fix does", None,
+                "build", function_at("inputs.terrain.build"),
+                "compute the horizons now; otherwise the first fix does", None,
                 {
                     "input": (
                         flag("terrain TERRAIN", "terrain file, or the name of a shipped one", nargs="+"),
@@ -176,7 +186,7 @@ COMMANDS = (
                 "startrack terrain build shackleton",
             ),
             Command(
-                "import", function_at("terrain.import_map"),
+                "import", function_at("inputs.terrain.import_map"),
                 "a terrain file and GeoTIFF crops from elevation data", None,
                 {
                     "input": (
@@ -226,7 +236,7 @@ COMMANDS = (
                 "startrack terrain import MAP.tif -o own.toml --latitude -89.5 --longitude 130",
             ),
             Command(
-                "state", function_at("terrain.state"), "write into a terrain file the errors that it leaves out",
+                "state", function_at("inputs.terrain.state"), "write into a terrain file the errors that it leaves out",
                 "An error that the file states is trusted; for one that it leaves out a default counts, and that it "
                 "may be grossly wrong. Without flags the missing ones are asked for, or listed where there is no "
                 "terminal.",

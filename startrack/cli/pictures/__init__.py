@@ -5,15 +5,18 @@ from __future__ import annotations
 import argparse
 
 from startrack.cli import flags
-from startrack.cli.flag_types import (
+from startrack.cli.flags import (
+    Command,
+    Either,
     cluster_address,
     count,
     field_or_range_rad,
+    flag,
+    function_at,
     geo_formats,
     half_turn,
     seconds,
 )
-from startrack.cli.flags import Command, Either, flag, function_at
 from startrack.core import NARROWEST_DEG, REPORTED_IMAGES, WIDEST_DEG
 
 INPUT = (flags.IMAGES, flags.TOPIC, *flags.FACTS)
@@ -35,7 +38,7 @@ SKYLINE = (
 SHARED = {"output": flags.OUTPUT, "more": (flags.NO_SEED, *flags.MORE)}
 COMMANDS = (
     Command(
-        "locate", function_at("locate.locate"), "image to position and attitude",
+        "locate", function_at("pictures.locate.locate"), "image to position and attitude",
         "Locate the camera in each image: detect, identify, attitude, evidence, position. Camera, terrain and time "
         "come from flags, else from NAME.json beside the image, else from its header. Writes NAME.fix.json, "
         "NAME.stars.ecsv, NAME.skyline.ecsv, NAME.wcs, NAME.corr, NAME.annotated.png and NAME.skyline.png. With "
@@ -65,7 +68,7 @@ COMMANDS = (
         example="startrack locate sample_images/near-centre.png", memory_later=True,
     ),
     Command(
-        "identify", function_at("locate.identify"), "stars and attitude only",
+        "identify", function_at("pictures.locate.identify"), "stars and attitude only",
         "Name the stars of each image and give the attitude. Needs a camera file, or with --fov only the approximate "
         "field of view: the lens is then found with the stars. No terrain is needed; without a time the catalogue is "
         "taken at J2000.0 and 60 arcsec are added to the stated errors. Writes NAME.identification.json, "
@@ -91,14 +94,14 @@ COMMANDS = (
         example="startrack identify sky.png --fov 60", memory_later=True,
     ),
     Command(
-        "detect", function_at("locate.detect"), "centroids only",
+        "detect", function_at("pictures.locate.detect"), "centroids only",
         "Find the point sources of each image. With a camera file fluxes are in electrons, without one in ADU and the "
         "PSF is measured from the image. Writes NAME.detections.json and NAME.annotated.png.",
         {"input": INPUT, **SHARED},
         example="startrack detect sky.png -c camera.toml", memory_later=True,
     ),
     Command(
-        "batch", function_at("batch.run"), "every image of a folder",
+        "batch", function_at("pictures.batch.run"), "every image of a folder",
         "Locate the camera in every image of a tree, which OUT mirrors. A stopped run is resumed; images are repeated "
         "if they, their sidecar, camera or terrain file have changed. Adds results.ecsv, trajectory.tum, timings.ecsv, "
         "manifest.json and, with the extra parquet, results.parquet. Exit codes: 0 every image solved; 5 some not "
@@ -120,7 +123,7 @@ COMMANDS = (
         example="startrack batch NIGHT/ -c camera.toml -t shackleton -D results",
     ),
     Command(
-        "track", function_at("track.run"), "images of a drive or of a rover at rest to a trajectory",
+        "track", function_at("pictures.track.run"), "images of a drive or of a rover at rest to a trajectory",
         "Locate the images of one camera and estimate its trajectory from all of them, with the errors that they "
         "share. Writes track.tum (by all images), track.filtered.tum (by the images up to each), track.ecsv, "
         "track.geojson, track.json, track.png and track.html.",
@@ -146,7 +149,7 @@ COMMANDS = (
         "startrack track DRIVE/ --odometry odometry.tum -c camera.toml -t shackleton",
     ),
     Command(
-        "report", function_at("report.run"), "results as one page for a browser",
+        "report", function_at("pictures.report.run"), "results as one page for a browser",
         "Write OUT/report.html: every result of the folder OUT, in one file that needs no server and no network. Of a "
         "single NAME.fix.json it writes NAME.report.html beside it.",
         {
@@ -164,7 +167,7 @@ COMMANDS = (
         "startrack report startrack-out", memory_later=True,
     ),
     Command(
-        "demo", function_at("report.run_demo"), "make a picture, locate it and open the report",
+        "demo", function_at("pictures.report.run_demo"), "make a picture, locate it and open the report",
         "Render a fisheye picture from a crater floor, locate it, and open the report in a browser. Writes demo.png "
         "with the truth beside it, and the results of startrack locate.",
         {

@@ -1,4 +1,4 @@
-"""`startrack locate`, `identify` and `detect`: one image to its position, to its attitude, or to its centroids."""
+"""`startrack locate`, `identify` and `detect`: an image or a skyline to its position, attitude or centroids."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from threading import Thread
+from typing import Any
 
 import numpy as np
 
@@ -19,15 +20,18 @@ from startrack.applications.batch import result_stems
 from startrack.camera import Camera, load_camera
 from startrack.catalog import load_catalog
 from startrack.cli.console import Outcome, print_outcome, print_warnings, wait_lines, worst_code
-from startrack.cli.flags import check_localizer
+from startrack.cli.flags import attitude, check_localizer
 from startrack.cli.images import check_fov, flag_site, near_attitude_of, prepare, read, settings_of
-from startrack.cli.report import write_page_of_images
+from startrack.cli.pictures.report import write_page_of_images
 from startrack.core.errors import INTERNAL_ERROR, BadInput, BadOutput
 from startrack.core.files import make_folder, printable
 from startrack.core.limits import limited_time, refusing_shortage
-from startrack.core.types import Exposure
+from startrack.core.types import Exposure, PositionPrior
 from startrack.exposure import read_mask, split_bag_path
+from startrack.frames import parse_utc
 from startrack.identification import WIDE_FIELD_RAD, Identifier
+from startrack.localization import DEFAULT_LOCALIZER
+from startrack.terrain import load_terrain
 
 NEEDED_LATER = ("scipy.special", "scipy.spatial", "spiceypy", "PIL.ImageDraw")  # in this order; pictures need the last
 Solve = Callable[[Exposure, Camera | None], chain.Outcome]
@@ -41,9 +45,7 @@ def locate(args: argparse.Namespace) -> int:
             f"--fov {args.fov} IMAGE... -o CAMERA.toml, then startrack locate -c CAMERA.toml"
         )
     if args.skyline is not None:
-        from startrack.cli.skyline import locate_skyline
-
-        return locate_skyline(args)
+        return _locate_skyline(args)
     if not args.images:
         args.usage_error("give an image, or --skyline FILE")
     check_localizer(args)
@@ -92,7 +94,7 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve, limit_s: floa
             with refusing_shortage():
                 record, line = _solve_image(args, path, Path(args.dir) / f"{stem}.{kind}.json", solve, limit_s)
         except BadInput as cause:
-            record = output.refused_dict(path, cause.reason, str(cause), kind.removesuffix("s"))
+            record = output.refused_dict(path, cause.reason, str(cause), kind)
             if isinstance(cause, BadOutput):
                 record["advice"] = None  # it is about the picture, as is the reason, for lack of a better code
             line = output.refusal_line(path, cause.reason, str(cause))
@@ -100,7 +102,7 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve, limit_s: floa
             if args.verbose:
                 raise
             message = f"internal error: {type(cause).__name__}: {cause} (-v shows the traceback)"
-            record = output.refused_dict(path, INTERNAL_ERROR, message, kind.removesuffix("s"))
+            record = output.refused_dict(path, INTERNAL_ERROR, message, kind)
             line = f"{printable(name)}  {message}"
         print_warnings(args, name, record.get("warnings", ()))
         codes.add(print_outcome(args, record, line))
@@ -124,12 +126,7 @@ def _solve_image(args: argparse.Namespace, path: str, out: Path, solve: Solve, l
         camera, terrain = (None, chain.load_named(exposure)[1]) if is_located else (_camera_of(args, exposure), None)
         if isinstance(exposure.mask, str):
             read_mask(exposure.mask)  # as the others: an earlier result outlasts a file that cannot be read
-        try:
-            make_folder(out.parent)
-        except BadOutput as cause:
-            args.usage_error(str(cause))
-        remedy = "choose another -D, or replace it with -O"  # before anything is computed
-        output.prepare_folder(out, exposure.sha256, overwrite=args.overwrite, remedy=remedy)
+        _claim_record(args, out, exposure.sha256)
         read_s = time.perf_counter() - start
         if terrain is not None and exposure.terrain is not None and exposure.time_utc is not None:
             prepare(terrain, args)
@@ -137,12 +134,7 @@ def _solve_image(args: argparse.Namespace, path: str, out: Path, solve: Solve, l
         start = time.perf_counter()
         with wait_lines(args, f"{args.command} {printable(exposure.name)}"):
             result = chain.add_timing(solve(exposure, camera), read=1e3 * read_s)
-    more = {"explain": output.explain(result)} if is_located and args.explain else {}
-    record = output.write_results(
-        result, out, plots=not args.no_plots, catalog_table=getattr(args, "catalog_table", False), more=more
-    )
-    if is_located:
-        output.write_geo(out, result, args.format)
+    record = _write_files(args, result, out)
     line = output.summary_line(result, seconds=read_s + time.perf_counter() - start)
     if args.command == "identify" and camera is None and isinstance(result, chain.Oriented):
         fov = _found_fov_text(result.camera, args.fov)
@@ -154,6 +146,25 @@ def _solve_image(args: argparse.Namespace, path: str, out: Path, solve: Solve, l
         files = printable(out).removesuffix(".fix.json")
         line += f"\n  written to {files}.*" if is_located else ""
     return record, line
+
+
+def _claim_record(args: argparse.Namespace, out: Path, sha256: str) -> None:
+    """Make the folder of the record `out` before anything is computed; only -O replaces that of another image."""
+    try:
+        make_folder(out.parent)
+    except BadOutput as cause:
+        args.usage_error(str(cause))
+    output.prepare_folder(out, sha256, overwrite=args.overwrite, remedy="choose another -D, or replace it with -O")
+
+
+def _write_files(args: argparse.Namespace, result: chain.Outcome, out: Path) -> dict[str, Any]:
+    """Write the record `out` of a `result` and the files beside it; the record."""
+    more = {"explain": output.explain(result)} if getattr(args, "explain", False) else {}
+    catalog_table = getattr(args, "catalog_table", False)
+    record = output.write_results(result, out, plots=not args.no_plots, catalog_table=catalog_table, more=more)
+    if args.command == "locate":
+        output.write_geo(out, result, args.format)
+    return record
 
 
 def _camera_of(args: argparse.Namespace, exposure: Exposure) -> Camera | None:
@@ -175,3 +186,61 @@ def _found_fov_text(camera: Camera, fov_rad: float | tuple[float, float]) -> str
     width_rad = float(camera.angle_rad(np.array([[-0.5, middle], [right, middle]])).sum())
     found_rad = width_rad if width_rad < WIDE_FIELD_RAD else max(2 * camera.calibrated_angle_rad, WIDE_FIELD_RAD)
     return f"{math.degrees(found_rad):.4g}"
+
+
+def _locate_skyline(args: argparse.Namespace) -> int:
+    """Locate the camera by the skyline of --skyline; the exit code."""
+    check_localizer(args)
+    if args.images:
+        args.usage_error("--skyline stands in place of images: give one of them")
+    if args.localizer != DEFAULT_LOCALIZER:
+        args.usage_error(f"--skyline: only --localizer {DEFAULT_LOCALIZER} takes a measured skyline")
+    try:
+        with refusing_shortage():
+            record, line = _solve_skyline(args)
+    except BadInput as cause:
+        record = output.refused_dict(args.skyline, cause.reason, str(cause))
+        line = output.refusal_line(args.skyline, cause.reason, str(cause))
+    print_warnings(args, Path(args.skyline).name, record.get("warnings", ()))
+    return print_outcome(args, record, line)
+
+
+def _solve_skyline(args: argparse.Namespace) -> Outcome:
+    start = time.perf_counter()
+    if args.terrain is None:
+        raise BadInput("bad_terrain", "no terrain file is known: give -t FILE")
+    terrain = load_terrain(args.terrain)
+    when = None if args.time is None else parse_utc(args.time)
+    camera = None if args.camera is None else load_camera(args.camera)
+    near = None if args.near is None else PositionPrior(*args.near)
+    stated = _stated_attitude(args)
+    known = chain.StatedAttitude.of_input(stated, terrain.site, when)
+    points = chain.skyline_points(args.skyline, _errors_of(args, stated), camera, known, near)
+    exposure = chain.skyline_exposure(args.skyline, when, args.terrain)
+    out = Path(args.dir) / f"{Path(args.skyline).stem}.fix.json"
+    _claim_record(args, out, exposure.sha256)
+    prepare(terrain, args)
+    with wait_lines(args, f"locate {printable(exposure.name)}"):
+        result = chain.locate_skyline(exposure, points, terrain, args.time_limit)
+    record = _write_files(args, result, out)
+    line = output.summary_line(result, seconds=time.perf_counter() - start)
+    return record, line + ("\n" + output.verbose_text(result) if args.verbose else "")
+
+
+def _stated_attitude(args: argparse.Namespace) -> str | tuple[float, float, float] | None:
+    """Azimuth, pitch and roll [deg] of --attitude, or the path of a file."""
+    words = [] if args.attitude is None else args.attitude.split(",")
+    try:
+        return attitude(words) if len(words) == 3 else args.attitude
+    except argparse.ArgumentTypeError as cause:
+        args.usage_error(f"argument --attitude: {cause}")
+        raise  # the line above ends the program
+
+
+def _errors_of(args: argparse.Namespace, stated: str | tuple[float, ...] | None) -> chain.SkylineErrors:
+    """What flags state; the errors of a `stated` attitude in degrees must be, and those of a result count as none."""
+    if isinstance(stated, tuple) and None in (args.heading_sigma, args.tilt_sigma):
+        args.usage_error("--attitude AZ,PITCH,ROLL needs its errors: --heading-sigma DEG and --tilt-sigma DEG")
+    return chain.SkylineErrors.of_inputs(
+        heading_sigma=args.heading_sigma, tilt_sigma=args.tilt_sigma, correlation=args.correlation
+    )

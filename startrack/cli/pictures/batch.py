@@ -21,7 +21,7 @@ from startrack.applications.batch import Image, ImageDone, Task
 from startrack.cli.console import discard_stdout, print_warnings, progress
 from startrack.cli.flags import check_cluster, check_localizer
 from startrack.cli.images import absolute_facts, maps_left_out, prepare_reference, settings_of
-from startrack.cli.report import write_page_of
+from startrack.cli.pictures.report import write_page_of
 from startrack.core import errors
 from startrack.core.errors import INTERNAL_ERROR, BadInput
 from startrack.core.files import make_folder, printable

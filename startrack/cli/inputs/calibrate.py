@@ -8,7 +8,10 @@ import sys
 from startrack.applications import calibration
 from startrack.camera import REFRACTION_CONTAINED, REFRACTION_REMOVED, SENSOR, load_camera, save_camera
 from startrack.catalog import load_catalog
-from startrack.cli.camera_files import (
+from startrack.cli.console import named_steps, print_left_out, print_outcome, refusal
+from startrack.cli.flags import checked_flag
+from startrack.cli.images import approximate_camera, check_one_time, flag_site, read, read_each_once, site_of
+from startrack.cli.inputs.camera_files import (
     check_camera_output,
     check_name,
     remove_former,
@@ -16,9 +19,6 @@ from startrack.cli.camera_files import (
     write_camera,
     write_record,
 )
-from startrack.cli.console import named_steps, print_left_out, print_outcome, refusal
-from startrack.cli.flags import checked_flag
-from startrack.cli.images import approximate_camera, check_one_time, flag_site, read, read_each_once, site_of
 from startrack.core.errors import BadInput, NoSolution
 from startrack.core.files import printable, resolve_named, split_camera
 from startrack.core.limits import limited_time

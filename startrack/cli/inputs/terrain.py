@@ -14,9 +14,9 @@ import numpy as np
 
 from startrack import terrain as terrains
 from startrack.cli.console import duration_text
-from startrack.cli.flag_types import amount
+from startrack.cli.flags import amount
 from startrack.cli.images import prepare
-from startrack.cli.input_commands import STATED_ERRORS, state_flag
+from startrack.cli.inputs import STATED_ERRORS, state_flag
 from startrack.core import files
 from startrack.core.errors import BadInput, length_text, one_line
 from startrack.frames import Site, latlon_from_enu

@@ -1,4 +1,4 @@
-"""`startrack doctor`: versions, extras, data files, C library and a self-test; `schema`: JSON schemas of the files."""
+"""What is installed and kept: `startrack doctor` checks it, `schema` prints the formats, `cache` shows and removes."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ import json
 import platform
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from startrack.core import __version__
+from startrack.core.files import Locked, hold_lock, printable, remove_file
+from startrack.core.stored import cache_folder, limit_bytes
 
 REQUIRED = (
     "numpy", "scipy", "opencv-contrib-python-headless", "scikit-image", "astropy", "pillow", "tifffile",
@@ -29,6 +32,7 @@ OPTIONAL = {  # extra: its packages and what they are for
     "completion": (("argcomplete",), "completion in the shell"),
     "docs": (("sphinx",), "the documentation as a site"),
 }
+TABLES, KIND = "tables of horizons", "horizons"  # all that the cache holds
 SELF_TEST_SEED = 20080501
 SELF_TEST_LIMIT_M = 40.0
 
@@ -174,3 +178,52 @@ def run_schema(args: argparse.Namespace) -> int:
     else:
         args.usage_error(f"no schema is called {args.name!r}; there are: {', '.join(schemas)}")
     return 0
+
+
+def show_cache(args: argparse.Namespace) -> int:
+    """Print the folder of the cache with the number and size of its files, and the limit."""
+    files = _cached_files()
+    if args.json:
+        print(json.dumps({"limit_bytes": limit_bytes(), "folders": [_cache_record(files)]}))
+        return 0
+    size, limit = _megabytes(_bytes_of(files)), _megabytes(limit_bytes())
+    print(f"{TABLES}  {size:>9} in {len(files)} files, at most {limit}  {printable(cache_folder(KIND))}")
+    return 0
+
+
+def clear_cache(args: argparse.Namespace) -> int:
+    """Remove the files of the cache. Raises BadOutput for one that has to stay."""
+    files = _cached_files()
+    size, removed = _bytes_of(files), _cache_record(files)
+    for path in cache_folder(KIND).glob("*.lock"):
+        with suppress(Locked, OSError), hold_lock(path, wait=False):  # of a killed process: it goes with the block
+            pass
+    for path in files:
+        remove_file(path)
+    if args.json:
+        print(json.dumps({"removed_bytes": size, "folders": [removed]}))
+    elif not args.quiet:
+        print(f"removed {len(files)} files, {_megabytes(size)}")
+    return 0
+
+
+def _cached_files() -> list[Path]:
+    """All that is kept, but the locks of tables that are being made."""
+    return sorted(path for path in cache_folder(KIND).glob("*") if path.is_file() and path.suffix != ".lock")
+
+
+def _cache_record(files: list[Path]) -> dict[str, object]:
+    return {"kind": TABLES, "folder": str(cache_folder(KIND)), "files": len(files), "bytes": _bytes_of(files)}
+
+
+def _bytes_of(files: list[Path]) -> int:
+    """Bytes of the files that are still there."""
+    size = 0
+    for path in files:
+        with suppress(OSError):
+            size += path.stat().st_size
+    return size
+
+
+def _megabytes(size: float) -> str:
+    return f"{size / 1e6:.1f} MB"

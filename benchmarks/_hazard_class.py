@@ -156,7 +156,7 @@ def _sigmas(stated: Terrain) -> dict[str, tuple[float, float]]:
 def errors_as_stated(stated: Terrain, rng: Rng) -> Terrain:
     """The ground of a map whose posts and common horizon have the errors that the file states."""
     assert isinstance(stated, HeightMap)
-    bias = float(rng.normal(0.0, stated.common_sigma_rad))
+    bias = float(rng.normal(0.0, stated.errors.common_sigma_rad))
     return map_with(draw_ground(stated, stated.height_sigma_m, rng), {"bias_rad": bias})
 
 

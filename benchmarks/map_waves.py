@@ -19,13 +19,13 @@ from startrack.core.files import data_dir
 from startrack.core.types import Array
 from startrack.frames import enu_from_latlon
 from startrack.terrain import HeightMap, load_terrain, read_map
-from startrack.terrain.crest_errors import (
+from startrack.terrain.imports.comparison import compare_maps
+from startrack.terrain.imports.crest_errors import (
     Correlation,
     average_posts,
     correlate_with_coarser,
     map_of_rim,
 )
-from startrack.terrain.map_comparison import compare_maps
 from startrack.terrain.shape import WAVE_COUNT
 
 REFERENCE = Path(__file__).parents[1] / "tests" / "data" / "shackleton_floor_horizon.csv"

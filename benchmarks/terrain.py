@@ -48,7 +48,7 @@ def main() -> None:
     maps = {"the map as it is": (replace_sigma(true, 0.0, 0.0), 0.0), "the errors of its -rendered file": (true, 0.0)}
     if not args.no_degraded:
         degraded = degrade_map(true, args.seed)
-        low_m = BIAS_RAD * true.crest_distance_m  # the camera as much too high is the same
+        low_m = BIAS_RAD * true.errors.crest_distance_m  # the camera as much too high is the same
         lower = replace_settings(degraded, camera_height_m=true.camera_height_m + low_m)
         maps |= {"degraded, and known to be": (lower, 0.0), "degraded by one angle all around": (degraded, BIAS_RAD)}
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in maps}

@@ -14,7 +14,8 @@ costs nothing.
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.2.0"
+from startrack.core import __version__
+
 _MODULES = {  # public name to the module that has it
     "detect": "api.solve", "identify": "api.solve", "locate": "api.solve", "locate_skyline": "api.solve",
     "track": "api.solve",

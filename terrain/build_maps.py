@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from startrack.terrain import EQUIRECTANGULAR, STEREOGRAPHIC, Projection, Raster, read_map, write_map
-from startrack.terrain.plain_tiff import read_shipped
+from startrack.terrain.maps.reading import read_shipped
 
 HERE = Path(__file__).parent
 SUMS = {

@@ -12,7 +12,7 @@ from matplotlib import cbook
 
 from startrack.frames import Site
 from startrack.terrain import Raster
-from startrack.terrain.earth_projection import EarthProjection, project_earth
+from startrack.terrain.maps.projections import EarthProjection, project_earth
 
 PLACE_DEG = 36.59, -84.246  # in the middle of the map
 SITE = Site("earth", *map(float, np.radians(PLACE_DEG)), 300.0)

@@ -62,7 +62,7 @@ def slow_sums(points_m: Array, evidence: Evidence, terrain: Terrain) -> Array:
     """Sums (n, SECTORS) of the contributions of rows at positions (n, 2), each with its own horizon."""
     evidence = replace(evidence, llr=np.where(evidence.extended_nats > 0, evidence.llr, capped_llr(evidence)))
     horizon = terrain.horizon_rad(points_m[:, None], evidence.azimuth_rad)
-    sigma = np.hypot(evidence.edge_sigma_rad, terrain.horizon_sigma_rad(points_m[:, None], evidence.azimuth_rad))
+    sigma = np.hypot(evidence.edge_sigma_rad, terrain.errors.sigma_rad(points_m[:, None], evidence.azimuth_rad))
     value = slow_contributions(evidence, evidence.elevation_rad - horizon, sigma)
     key = np.arange(len(points_m))[:, None] * SECTORS + sector_of(evidence.azimuth_rad)
     sums = np.bincount(key.ravel(), weights=value.ravel(), minlength=len(points_m) * SECTORS)

@@ -16,7 +16,7 @@ from startrack.applications.batch import locate_image
 from startrack.chain import are_unchanged, input_hashes
 from startrack.cli.main import main
 from startrack.output import SCHEMAS
-from startrack.terrain import ForwardingTerrain, load_terrain
+from startrack.terrain import ForwardingTerrain, TerrainFile, load_terrain
 
 DEM = """
 body = "moon"
@@ -50,9 +50,9 @@ def test_a_refused_image_is_repeated_when_the_missing_height_map_exists(tmp_path
 
 def test_a_terrain_of_any_class_says_which_files_it_was_read_from(tmp_path, monkeypatch):
     class Tiles(ForwardingTerrain):
-        files = (tmp_path / "a.tile", tmp_path / "b.tile")
+        file = TerrainFile(paths=(tmp_path / "a.tile", tmp_path / "b.tile"))
 
-    for file in Tiles.files:
+    for file in Tiles.file.paths:
         file.write_bytes(b"heights")
     known = load_terrain("shackleton-thesis")
     monkeypatch.setattr("startrack.terrain.io.load_terrain", lambda path: Tiles(known))
@@ -60,7 +60,7 @@ def test_a_terrain_of_any_class_says_which_files_it_was_read_from(tmp_path, monk
     hashes = input_hashes(str(image), [], str(tmp_path / "tiles.toml"))
     assert set(hashes) == {"tiles.toml", "a.tile", "b.tile"}
     assert are_unchanged(str(image), hashes)
-    Tiles.files[1].write_bytes(b"others")
+    Tiles.file.paths[1].write_bytes(b"others")
     assert not are_unchanged(str(image), hashes)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from startrack.cli.main import main
-from startrack.core import cache
+from startrack.core import stored
 from startrack.core.files import hold_lock
 from startrack.core.types import BadInput
 
@@ -50,15 +50,15 @@ def without_home(monkeypatch, tmp_path):
     for name in ("HOME", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr("pwd.getpwuid", unknown)
-    monkeypatch.setattr(cache.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(stored.tempfile, "gettempdir", lambda: str(tmp_path))
     return tmp_path / f"startrack-{os.getuid()}"
 
 
 @needs_users
 def test_without_a_home_the_cache_lies_in_a_temporary_folder_of_the_user_alone(without_home):
-    assert cache.cache_folder("horizons") == without_home / "horizons"
+    assert stored.cache_folder("horizons") == without_home / "horizons"
     assert without_home.stat().st_mode & 0o777 == 0o700
-    assert cache.cache_folder("draws") == without_home / "draws"  # the same folder again
+    assert stored.cache_folder("draws") == without_home / "draws"  # the same folder again
 
 
 @needs_users
@@ -71,7 +71,7 @@ def test_a_temporary_folder_that_others_may_have_filled_is_not_used(without_home
         without_home.mkdir()
         without_home.chmod(0o777)
     with pytest.raises(OSError, match="Not a directory"):
-        cache.cache_folder("horizons").mkdir(parents=True)
+        stored.cache_folder("horizons").mkdir(parents=True)
 
 
 def run_unknown(tmp_path: Path, more: str, *words: object) -> subprocess.CompletedProcess[str]:
@@ -138,7 +138,7 @@ def test_cache_clear_removes_all_but_the_lock_in_use(full_cache, capsys):
 def test_the_tables_that_were_not_used_for_longest_leave_above_the_limit(full_cache, monkeypatch):
     for size_gb, left in (("3e-6", "abc"), ("2.5e-6", "ac"), ("1e-6", "a"), ("0", "a")):
         monkeypatch.setenv("STARTRACK_CACHE_GB", size_gb)
-        cache.remove_oldest(full_cache, "*.table", full_cache / "a.table")
+        stored.remove_oldest(full_cache, "*.table", full_cache / "a.table")
         assert sorted(path.stem for path in full_cache.glob("*.table")) == [*left], size_gb
 
 
@@ -146,4 +146,4 @@ def test_the_tables_that_were_not_used_for_longest_leave_above_the_limit(full_ca
 def test_a_limit_that_is_no_size_is_refused(monkeypatch, text):
     monkeypatch.setenv("STARTRACK_CACHE_GB", text)
     with pytest.raises(BadInput, match=f"STARTRACK_CACHE_GB={text}: is no size in GB"):
-        cache.limit_bytes()
+        stored.limit_bytes()

@@ -11,8 +11,7 @@ import pytest
 
 from startrack.core.types import TIME_SIGMA_S
 from startrack.localization.clock import GROSS_PROBABILITY, GROSS_SIGMA_S
-from startrack.terrain.refracted import STAR_REFRACTION
-from startrack.terrain.shape import CYLINDER_FACTS, MAP_FACTS
+from startrack.terrain.shape import CYLINDER_FACTS, MAP_FACTS, STAR_REFRACTION
 
 DOCS = Path(__file__).parents[1] / "docs"
 METHOD = (DOCS / "method.md").read_text(encoding="utf-8")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import convolve1d
 
-from startrack.core.smooth_image import SmoothImage
+from startrack.core.types import SmoothImage
 from startrack.detection import background, classify, damage, deblend, fit, frame, peaks, psf_width, streaks
 from startrack.psf import filter_kernel, pixel_profile
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import cKDTree
 from star_painter import cramer_rao, isolated_stars, plain_camera
 
-from startrack.core.smooth_image import SmoothImage
+from startrack.core.types import SmoothImage
 from startrack.detection import Detector
 from startrack.detection.classify import detection_threshold
 from startrack.detection.frame import Frame, SourceNoise, bin_frame, binning_factor

@@ -13,8 +13,7 @@ from scipy.special import expit
 from scipy.stats import norm
 from star_painter import cramer_rao, paint
 
-from startrack.core.smooth_image import SmoothImage
-from startrack.core.types import Body, Detections, Stars
+from startrack.core.types import Body, Detections, SmoothImage, Stars
 from startrack.detection.background import background_and_noise
 from startrack.evidence import FluxScale, StarEvidence, StarPhotometry, fit_flux_scale, flux_scale
 from startrack.evidence.photometry import Photometry, Sources, half_width, measure

@@ -13,13 +13,12 @@ from sky_helpers import EDGE_PX, GROUND_E, NOISE_E, level_horizon, paint_pixels
 
 from startrack.camera import load_camera
 from startrack.chain import Located, pipeline
-from startrack.core.smooth_image import SmoothImage
-from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Detections
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Detections, SmoothImage
 from startrack.evidence import Sources, measure
 from startrack.evidence.sky_levels import ANY_SIGMAS, BORDER_PROBABILITY, DRIFT, GROUND, SKY, patch_levels
 from startrack.evidence.sky_light import SkyLight, measure_sky_light, sectors_with_step
 from startrack.rendering import Series, render
-from startrack.terrain import GroundBrightness, load_terrain
+from startrack.terrain import GroundBrightness, TerrainFile, load_terrain
 
 SKY_E, RANDOM = 90.0, {"low": 0.3, "high": 3.0}
 
@@ -135,7 +134,8 @@ def test_a_frame_with_moonlit_snow_is_located() -> None:
     terrain = load_terrain("shackleton-thesis")
     snow = GroundBrightness.of({**RANDOM, "size_deg": 20.0, "seed": 3})
     series = Series(
-        camera=load_camera("fisheye-2048"), terrain=replace(terrain, ground_brightness=snow), catalog=catalog_to(8.0),
+        camera=load_camera("fisheye-2048"), terrain=replace(terrain, file=TerrainFile(ground_brightness=snow)),
+        catalog=catalog_to(8.0),
         seed=11, east_m=2500.0, north_m=-1200.0, faint_v_mag=None, sky_v_mag_arcsec2=20.0,
     )  # fmt: skip
     scene, rng = series.scene(0)

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from startrack.camera import Camera, Pinhole, load_camera
-from startrack.core.smooth_image import SmoothImage
-from startrack.core.types import MIDDLES_RAD, SECTORS, Detections
+from startrack.core.types import MIDDLES_RAD, SECTORS, Detections, SmoothImage
 from startrack.evidence import (
     Skyline,
     SkylineEstimate,

@@ -12,7 +12,7 @@ from astropy.time import Time
 
 from startrack.core.types import BadInput
 from startrack.exposure import read_exposure
-from startrack.exposure.header_times import middle_of_exposure
+from startrack.exposure.facts import middle_of_exposure
 from startrack.frames import format_utc
 
 FRAME = np.random.default_rng(5).integers(0, 65536, (31, 47)).astype(np.uint16)

@@ -46,13 +46,11 @@ class Sine(Lens):
 ''',
     "startrack.terrain.wall": '''
 from dataclasses import dataclass
-from pathlib import Path
-
 import numpy as np
 
 from startrack.core.declaration import Table, Text
 from startrack.frames import Site
-from startrack.terrain.protocol import Terrain
+from startrack.terrain.protocol import Terrain, TerrainFile
 
 TABLE = Table(keys={"file": Text(max_chars=100, required=True, description="height [m]")})
 
@@ -64,7 +62,7 @@ class Wall(Terrain):
     name: str
     site: Site
     height_m: float
-    files: tuple[Path, ...]
+    file: TerrainFile
     camera_height_m: float = 1.5
     search_radius_m: float = 300.0
 
@@ -85,9 +83,8 @@ class Wall(Terrain):
         return np.zeros(np.shape(points_m)[:-1])
 
 
-def make_wall(keys, name, site, folder):
-    file = folder / keys["wall"]["file"]
-    return Wall(name=name, site=site, height_m=float(file.read_text()), files=(file,))
+def make_wall(keys, folder, **shared):
+    return Wall(height_m=float((folder / keys["wall"]["file"]).read_text()), **shared)
 ''',
     "startrack.exposure.counts": '''
 import numpy as np
@@ -116,14 +113,13 @@ def run(args):
 COMMANDS = (Command("size", run, "sizes of images", "Print sizes.", {"input": (IMAGES, *FACTS), "more": MORE}),)
 ''',
 }
-ENTRIES = {  # of the module of each list: entries, each with the beginning of the line that follows it
+WALL = "__import__('startrack.terrain.wall', fromlist='*')"
+ENTRIES = {  # of the module of each list: the entry, with the beginning of the line that follows it
     "startrack.camera.lenses": [("    __import__('startrack.camera.sine', fromlist='*').Sine,", "    Pinhole,")],
     "startrack.terrain.io": [
-        ('        "wall": __import__("startrack.terrain.wall", fromlist="*").TABLE,', '        "cylinder": Table('),
-        ('    "wall": __import__("startrack.terrain.wall", fromlist="*").make_wall,', '    "cylinder": _make_cylinder'),
+        (f'    "wall": Kind({WALL}.TABLE, {WALL}.make_wall),', '    "cylinder": Kind('),
     ],
-    "startrack.exposure.decoding": [('    "COUNTS": (b"COUNTS",),', '    "PNG": (')],
-    "startrack.exposure.sidecar": [('PICTURE_SUFFIXES |= {".counts"}', "PACKING_SUFFIXES = ")],
+    "startrack.exposure.sidecar": [('    "COUNTS": Format((b"COUNTS",), (".counts",)),', '    "PNG": Format(')],
     "startrack.cli.main": [('    "size": "size",', '    "locate": "pictures"')],
 }
 SITECUSTOMIZE = """

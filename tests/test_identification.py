@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from startrack.camera import Camera, Pinhole, load_camera
 from startrack.catalog import load_catalog
-from startrack.core.smooth_image import SmoothImage
-from startrack.core.types import Detections, Identification, NotIdentified, Stars
+from startrack.core.types import Detections, Identification, NotIdentified, SmoothImage, Stars
 from startrack.estimation.false_alarm import coincidence_probability, density_per_sr, log_p_value
 from startrack.frames import angle_between_rad
 from startrack.identification import Identifier

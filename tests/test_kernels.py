@@ -264,7 +264,7 @@ def bytes_of_all_kernels():
 
 def photometry_of(rng):
     """Fluxes and variances of stars beside an edge of the background."""
-    from startrack.core.smooth_image import SmoothImage
+    from startrack.core.types import SmoothImage
     from startrack.evidence.photometry import Sources, measure
 
     image = rng.normal(100.0, 3.0, (96, 128)).astype(np.float32)
@@ -418,9 +418,9 @@ def horizons_of(rng):
     narrow = ground.horizon_bounds_rad(points, np.float64(5.0), azimuths, 1e-3)
     point = ground.horizon_bounds_rad(points[:, None], np.full((40, 1), 0.5), azimuths, 1e-3)
     wide = [ground.horizon_bounds_rad(points[:, None], half, MIDDLES_RAD, 0.02) for half in (5.0, 200.0)]
-    crests = ground.expected_crests(points[0], azimuths)
+    crests = ground.errors.expected_crests(points[0], azimuths)
     near = ground.near(points[0], 10.0, azimuths).horizon_rad(points[0] + rng.uniform(-9.0, 9.0, (5, 1, 2)), azimuths)
-    most = ground.max_horizon_sigma_rad(points, 3.0, azimuths, 0.05)
+    most = ground.errors.most_sigma_rad(points, 3.0, azimuths, 0.05)
     memory, results = horizon_table.BoxMemory(16, 2, 40), np.empty((2, 40, 40))
     for _ in range(2):
         memory.fill(points, *results, lambda missing: rng.random((2, np.count_nonzero(missing), 40)))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from startrack.core import circle
+from startrack.core import statistics
 from startrack.core.statistics import NORMAL_CDF
 from startrack.evidence import sky_levels, sky_light, sky_pixels
 from startrack.frames import wahba
@@ -23,14 +23,14 @@ def test_interpolation_around_the_circle(size):
     azimuth = np.concatenate([rng.uniform(-30.0, 30.0, 500), [0.0, -1e-17, 2 * np.pi, -2 * np.pi, 1e6]])
     around = np.append(values, values[0])
     expected = np.interp(azimuth % (2 * np.pi), np.linspace(0.0, 2 * np.pi, size + 1), around)
-    np.testing.assert_allclose(circle.interpolate_circle(values, azimuth), expected, atol=1e-8)
+    np.testing.assert_allclose(statistics.interpolate_circle(values, azimuth), expected, atol=1e-8)
 
 
 def test_interpolation_of_nothing_and_of_no_number():
-    assert circle.interpolate_circle(np.arange(4.0), np.zeros((0, 3))).shape == (0, 3)
-    found = circle.interpolate_circle(np.arange(4.0), np.array([np.nan, np.inf, -np.inf, 0.0]))
+    assert statistics.interpolate_circle(np.arange(4.0), np.zeros((0, 3))).shape == (0, 3)
+    found = statistics.interpolate_circle(np.arange(4.0), np.array([np.nan, np.inf, -np.inf, 0.0]))
     assert np.isnan(found[:3]).all() and found[3] == 0.0
-    assert np.isnan(circle.interpolate_circle(np.array([1.0, np.nan, 1.0]), np.array([2.0])))
+    assert np.isnan(statistics.interpolate_circle(np.array([1.0, np.nan, 1.0]), np.array([2.0])))
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -148,6 +148,11 @@ def test_packages_are_imported_by_their_faces():
     assert past == []
 
 
+def test_no_file_of_the_package_imports_a_name_of_the_top_face():
+    named = [(path, name.split(".")) for path, tree in sources().items() for name in imported_names(tree, ())]
+    assert [path for path, parts in named if parts[0] == "startrack" and not {*parts[1:2]} <= rooms()] == []
+
+
 def test_no_private_name_is_imported():
     names = [(path, name) for path, tree in sources().items() for name in imported_names(tree, ())]
     private = re.compile(r"startrack\..*\._[a-z]")

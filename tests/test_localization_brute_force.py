@@ -13,6 +13,7 @@ from scipy.stats import norm
 from startrack.core.types import Evidence, Fix, NotLocated
 from startrack.localization import ExactPosterior, Hull, PseudoGradient
 from startrack.localization.pseudo_gradient import descend
+from startrack.localization.rim_plane import points_of_rays
 from startrack.localization.skyline_profiles import ROW_NATS
 from startrack.terrain import Cylinder, load_terrain
 
@@ -160,7 +161,8 @@ def test_a_settled_descent_has_reproduced_the_list() -> None:
     settled = 0
     for k in range(60):
         evidence, at = thesis_list(np.random.default_rng([8, k]))
-        points, seen = -THESIS.visible_disks(evidence.azimuth_rad, evidence.elevation_rad)[0], evidence.llr > 0
+        points = points_of_rays(THESIS.wall_m, evidence.azimuth_rad, evidence.elevation_rad)
+        seen = evidence.llr > 0
         place, done = descend(points, seen, at + np.array([200.0, -300.0]), THESIS.radius_m, 1.0, 400)
         settled += done
         if done:

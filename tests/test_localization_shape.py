@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import fields, replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from startrack.localization import ExactPosterior
 from startrack.localization.importance_sampling import moments
 from startrack.localization.joint_posterior import sample_posterior
 from startrack.localization.shared_errors import SharedErrors
-from startrack.terrain import Cylinder, load_terrain
+from startrack.terrain import Cylinder, GroundErrors, load_terrain
 
 TRUE = load_terrain("shackleton-thesis")
 PLACES = [(3000.0, -2000.0), (-6500.0, 1000.0), (500.0, 400.0)]
@@ -83,7 +84,11 @@ def test_the_size_of_a_crater_is_not_estimated() -> None:
 class BiasedCylinder(Cylinder):
     """A cylinder whose horizon may be too low as a whole, too."""
 
-    common_sigma_rad = float(np.radians(0.03))
+    @property
+    def errors(self) -> GroundErrors:
+        errors = copy(super().errors)
+        errors.__dict__["common_sigma_rad"] = float(np.radians(0.03))
+        return errors
 
 
 def test_an_uncertain_shape_and_a_horizon_bias_are_estimated_together() -> None:
@@ -125,13 +130,15 @@ def test_an_error_of_the_width_scales_the_position_with_the_crater() -> None:
     silent = replace(TRUE, depth_sigma_m=1.0, diameter_sigma_m=1.0, ellipse_sigma_1=0.0, rim_tilt_sigma_rad=0.0)
     errors, azimuth, place = SharedErrors.of(silent, None), np.linspace(0.0, 6.0, 50), np.array([4000.0, -5000.0])
     level = silent.horizon_rad(place[None], azimuth).ravel()
-    by_name = dict(zip((one.name for one in silent.shape_errors), silent.shape_slopes_rad(place, azimuth), strict=True))
+    by_name = dict(
+        zip((one.name for one in silent.errors.shape), silent.errors.slopes_rad(place, azimuth), strict=True)
+    )
     slopes = errors.slopes_rad(silent, place, azimuth, level, by_name)
     for number, one in enumerate(errors.listed):
         values = 1e-3 * (np.arange(len(errors)) == number)
         (moved,) = errors.true_positions(place[None], values[None])
         named = {error.name: value for error, value in zip(errors.listed, values, strict=True)}
-        ground = silent.with_shape(np.array([named.get(error.name, 0.0) for error in silent.shape_errors]))
+        ground = silent.with_shape(np.array([named.get(error.name, 0.0) for error in silent.errors.shape]))
         rise = ground.horizon_rad(moved[None], azimuth).ravel() - level
         np.testing.assert_allclose(rise, 1e-3 * slopes[number], atol=2e-3 * np.abs(rise).max(), err_msg=one.name)
         assert np.allclose(moved, place * (1.001 if one.name == "diameter_1" else 1.0))

@@ -92,7 +92,7 @@ def rays_at(ground: Terrain, rng: np.random.Generator, count: int = 4000) -> Evi
 
 def drawn(stated: HeightMap, rng: np.random.Generator) -> Terrain:
     """The ground below AT_M: the map with waves as stated and no other error."""
-    values = np.array([rng.normal() * one.sigma if one.wave else 0.0 for one in stated.shape_errors])
+    values = np.array([rng.normal() * one.sigma if one.wave else 0.0 for one in stated.errors.shape])
     return stated.with_shape(values)
 
 
@@ -164,10 +164,10 @@ def halves(sigma_m: float | None) -> HeightMap:
 
 def test_slopes_of_an_offset_are_the_differences_of_the_horizon():
     terrain, azimuth = halves(1.0), np.linspace(0.1, 6.2, 40)
-    names = [one.name for one in terrain.shape_errors]
+    names = [one.name for one in terrain.errors.shape]
     at = names.index("map_2_offset_m")
     for place in AT_M, AT_M - 300.0:
-        slopes = terrain.shape_slopes_rad(place, azimuth)[at]
+        slopes = terrain.errors.slopes_rad(place, azimuth)[at]
         risen = terrain.with_shape(3.0 * (np.arange(len(names)) == at))
         change = (risen.horizon_rad(place, azimuth) - terrain.horizon_rad(place, azimuth)) / 3.0
         assert change == pytest.approx(slopes, abs=0.02 * np.abs(slopes).max())
@@ -176,7 +176,7 @@ def test_slopes_of_an_offset_are_the_differences_of_the_horizon():
 
 def test_an_offset_between_two_maps_of_a_file_is_found():
     silent, rng = halves(None), np.random.default_rng(5)
-    values = np.array([15.0 if one.name == "map_2_offset_m" else 0.0 for one in silent.shape_errors])
+    values = np.array([15.0 if one.name == "map_2_offset_m" else 0.0 for one in silent.errors.shape])
     rows = rays_at(silent.with_shape(values), rng)
     fix = ExactPosterior()(rows, silent)
     assert np.linalg.norm(fix.position_enu_m[:2] - AT_M) < fix.radius999_m
@@ -201,5 +201,5 @@ def test_waves_of_places_far_apart_are_independent():
         return float(np.sum(parts)) / float(np.square(list(of.values())).sum())
 
     assert common(0.0) == pytest.approx(1.0)
-    assert common(0.05 * terrain.crest_distance_m) > 0.9
-    assert common(20.0 * terrain.crest_distance_m) == 0.0
+    assert common(0.05 * terrain.errors.crest_distance_m) > 0.9
+    assert common(20.0 * terrain.errors.crest_distance_m) == 0.0

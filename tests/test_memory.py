@@ -15,7 +15,7 @@ import pytest
 
 from startrack.cli.main import main
 from startrack.cli.pictures import locate
-from startrack.core import memory
+from startrack.core import limits
 from startrack.core.types import BadInput
 from startrack.exposure import decoding
 from startrack.terrain import load_terrain
@@ -56,7 +56,7 @@ def test_commands_without_images_need_no_memory_for_them(words, tmp_path):
 
 
 def test_a_terrain_with_a_map_is_refused_before_it_is_read(monkeypatch):
-    monkeypatch.setattr(memory, "_limit_bytes", lambda: WITHOUT_IMAGES_BYTES)
+    monkeypatch.setattr(limits, "_limit_bytes", lambda: WITHOUT_IMAGES_BYTES)
     with pytest.raises(BadInput, match=r"haworth\.toml: the limit of address space") as caught:
         load_terrain("haworth")
     assert caught.value.reason == "out_of_memory"
@@ -72,7 +72,7 @@ def test_each_image_is_refused_by_an_object_of_its_own(picture):
 
 
 def test_a_picture_too_large_for_the_limit_is_refused_before_it_is_decoded(monkeypatch):
-    monkeypatch.setattr(memory, "_limit_bytes", lambda: int(1.2e9))
+    monkeypatch.setattr(limits, "_limit_bytes", lambda: int(1.2e9))
     decoding.check_size(2000, 2000)
     with pytest.raises(BadInput, match=r"is 1\.20 GB, .* 1\.28 GB with a picture of 16\.0 Mpx") as caught:
         decoding.check_size(4000, 4000)
@@ -103,7 +103,7 @@ def test_a_lack_of_memory_is_known_by_its_exception(cause, picture, monkeypatch,
     def fail(*_):
         raise cause
 
-    refusal = memory.memory_refusal(cause)
+    refusal = limits.memory_refusal(cause)
     assert refusal is not None and refusal.reason == "out_of_memory" and "memory is short" in str(refusal)
     monkeypatch.setattr(locate, "_solve_image", fail)
     assert main(["detect", str(picture), "--json"]) == 4
@@ -114,9 +114,9 @@ def test_a_lack_of_memory_is_known_by_its_exception(cause, picture, monkeypatch,
 
 def test_other_errors_are_a_lack_of_memory_where_no_library_can_be_loaded(monkeypatch):
     cause = RuntimeError("Could not locate or load CSPICE shared library")
-    assert memory.memory_refusal(cause) is None
-    monkeypatch.setattr(memory, "_has_room", lambda: False)
-    refusal = memory.memory_refusal(cause)
+    assert limits.memory_refusal(cause) is None
+    monkeypatch.setattr(limits, "has_room", lambda: False)
+    refusal = limits.memory_refusal(cause)
     assert refusal is not None and "CSPICE" in str(refusal)
 
 

@@ -20,7 +20,7 @@ from startrack.core.types import BadInput
 from startrack.evidence import add_obstacles
 from startrack.exposure import read_exposure
 from startrack.frames import azel_from_rays
-from startrack.terrain import load_terrain
+from startrack.terrain import TerrainFile, load_terrain
 
 ROOT = Path(__file__).parents[1]
 IMAGE = ROOT / "sample_images" / "near-wall.png"
@@ -46,7 +46,9 @@ def located():
 def hidden_exposure():
     """The sample with a dark obstacle before the sky, that hides the skyline."""
     exposure, result = read_exposure(str(IMAGE)), located().result
-    mask = add_obstacles(None, result.camera, result.R_cam_enu.T, replace(result.terrain, obstacles=wall()))
+    mask = add_obstacles(
+        None, result.camera, result.R_cam_enu.T, replace(result.terrain, file=TerrainFile(obstacles=wall()))
+    )
     pixels = exposure.pixels_adu.copy()
     pixels[mask.masked] = np.round(np.random.default_rng(1).normal(110.0, 6.0, np.count_nonzero(mask.masked)))
     return replace(exposure, pixels_adu=pixels)
@@ -94,7 +96,9 @@ def test_a_file_that_is_no_profile_is_refused_with_its_cause(tmp_path, text, cau
 
 def test_the_pixels_of_hidden_directions_do_not_count():
     result = located().result
-    mask = add_obstacles(None, result.camera, result.R_cam_enu.T, replace(result.terrain, obstacles=wall()))
+    mask = add_obstacles(
+        None, result.camera, result.R_cam_enu.T, replace(result.terrain, file=TerrainFile(obstacles=wall()))
+    )
     rng = np.random.default_rng(2)
     x, y = rng.integers(0, 2048, (2, 4000))
     azimuth, elevation = azel_from_rays(result.camera.unproject(np.stack([x, y], axis=1)) @ result.R_cam_enu)
@@ -127,7 +131,9 @@ def test_terrain_sidecar_and_camera_name_the_same_obstacles(tmp_path):
     text = (ROOT / "terrain" / "shackleton-thesis.toml").read_text()
     (tmp_path / "ground.toml").write_text('obstacles = "deck.csv"\n' + text)
     terrain = load_terrain(tmp_path / "ground.toml")
-    assert terrain.obstacles.hides(np.radians(100.0), np.radians(29.0)) and terrain.files == (tmp_path / "deck.csv",)
+    assert terrain.file.obstacles.hides(np.radians(100.0), np.radians(29.0)) and terrain.file.paths == (
+        tmp_path / "deck.csv",
+    )
     (tmp_path / "image.json").write_text(json.dumps({**sidecar, "obstacles": "deck.csv"}))
     exposure = read_exposure(str(tmp_path / "image.png"))
     assert exposure.obstacles == str(tmp_path / "deck.csv")

@@ -72,7 +72,8 @@ def test_what_terrain_show_prints_and_draws_has_the_mark(cropped, tmp_path, caps
     assert "off map      azimuths" in capsys.readouterr().out
     basin_file = load_terrain(cropped)
     assert isinstance(basin_file, HeightMap)
-    assert not replace(basin_file, highest_beyond_m=-np.inf, maps=basin().maps).ends_at(np.zeros(2), np.zeros(1)).any()
+    known = replace(basin_file, highest_beyond_m=-np.inf, maps=basin().maps)
+    assert known.unknown_below_rad(np.zeros(1)) < known.horizon_rad(np.zeros(2), np.zeros(1))
 
 
 def test_what_locate_writes_has_the_mark(cropped, tmp_path, capsys):

@@ -132,7 +132,7 @@ def test_two_workers_write_the_same_bytes(area, tmp_path):
 
 
 def test_without_rasterio_all_but_the_map_is_written(area, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("startrack.terrain.map_writing.find_spec", lambda name: None)
+    monkeypatch.setattr("startrack.terrain.maps.writing.find_spec", lambda name: None)
     out = tmp_path / "out"
     shutil.copytree(area, out)
     assert run(out, "--spacing", 9000, "--draws", 1) == 0

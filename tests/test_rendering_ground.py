@@ -24,7 +24,7 @@ FILE = {
 
 
 def ground(brightness: Any) -> GroundBrightness:
-    found = terrain_from_dict({**FILE, "ground": {"brightness": brightness}}).ground_brightness
+    found = terrain_from_dict({**FILE, "ground": {"brightness": brightness}}).file.ground_brightness
     assert found is not None
     return found
 

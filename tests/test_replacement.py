@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from startrack.core.files import write_atomically
-from startrack.core.replacement import PART_LIVES_S, _remove_parts
+from startrack.core.files import PART_LIVES_S, _remove_parts, write_atomically
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no lock shows there that a process lives")
 # Stops between write and rename, as a run that is killed there.

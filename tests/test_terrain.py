@@ -106,10 +106,10 @@ def test_methods_are_elementwise_and_broadcast(terrain: Terrain) -> None:
     assert np.shape(terrain.ground_m(places)) == (7,)
     assert np.shape(terrain.allowed(places.reshape(7, 1, 2))) == (7, 1)
     assert terrain.is_informative(azimuth, np.full(7, 1.0)).tolist() == 7 * [True]  # nothing stands so high
-    assert terrain.common_sigma_rad == pytest.approx(COMMON_SIGMA_RAD.get(terrain.name, 0.0), rel=0.05)
+    assert terrain.errors.common_sigma_rad == pytest.approx(COMMON_SIGMA_RAD.get(terrain.name, 0.0), rel=0.05)
     near = terrain.near(places[0], 1.0, azimuth)
     assert near.horizon_rad(places[0], azimuth) == pytest.approx(one_place, abs=1e-4)
-    sigma = terrain.horizon_sigma_rad(places, azimuth)
+    sigma = terrain.errors.sigma_rad(places, azimuth)
     assert sigma.shape == (7,)
     if terrain.name in COMMON_SIGMA_RAD:  # 5.4 m, 7 to 13 km away and 17 to 24 degrees high
         assert np.all((sigma > 2.7e-4) & (sigma < 7.6e-4))

@@ -14,8 +14,8 @@ from startrack.chain import terrain_input
 from startrack.core.types import Array, BadInput, Evidence
 from startrack.frames import Site
 from startrack.localization import ExactPosterior
-from startrack.terrain import Cylinder, ForwardingTerrain, Terrain, load_terrain
-from startrack.terrain.crater import DeformedCrater
+from startrack.terrain import Cylinder, ForwardingTerrain, GroundErrors, Terrain, load_terrain
+from startrack.terrain.cylinder import DeformedCrater
 from startrack.terrain.shape import EXACT_WAVES
 
 SITE = Site("moon", np.radians(-89.66), np.radians(129.78))
@@ -124,10 +124,8 @@ WITHOUT_DEFAULT = (
     "site",
     "air",
     "projection",
-    "rim_radius_m",
+    "rim",
     "table_path",
-    "obstacles",
-    "ground_brightness",
 )  # None of a terrain that has none
 
 
@@ -167,8 +165,8 @@ def test_all_methods_broadcast(name):
     assert np.all(low <= high)
     assert terrain.ground_m(points).shape == (4, 1)
     assert terrain.allowed(points).shape == (4, 1)
-    assert terrain.horizon_sigma_rad(points, AZIMUTHS).shape == (4, 12)
-    assert terrain.max_horizon_sigma_rad(points, 5.0, AZIMUTHS, 0.0).shape == (4, 12)
+    assert terrain.errors.sigma_rad(points, AZIMUTHS).shape == (4, 12)
+    assert terrain.errors.most_sigma_rad(points, 5.0, AZIMUTHS, 0.0).shape == (4, 12)
     assert terrain.is_informative(AZIMUTHS, np.full(12, 1.2)).shape == (12,)
     assert terrain.mask_reason(AZIMUTHS, np.full(12, 1.2)).tolist() == 12 * [""]
     assert terrain.horizon_rad(np.zeros((0, 2)), np.zeros(0)).shape == (0,)
@@ -183,13 +181,11 @@ def test_every_member_exists_and_describes_the_ground(name):
     assert terrain.search_radius_m == 300.0
     assert terrain.reach_m >= terrain.search_radius_m
     assert terrain.camera_height_m >= 0
-    assert terrain.hard_edges is True
-    assert 0 < terrain.finest_m < 1
-    assert terrain.common_sigma_rad == 0
+    assert terrain.errors.common_sigma_rad == 0
     assert isinstance(terrain.axisymmetric, bool)
-    assert all(error.sigma >= 0.0 and error.is_stated for error in terrain.shape_errors)
-    assert terrain.shape_slopes_rad(np.zeros((4, 1, 2)), AZIMUTHS).shape == (len(terrain.shape_errors), 4, 12)
-    assert isinstance(terrain.with_shape(np.zeros(len(terrain.shape_errors))), Terrain)
+    assert all(error.sigma >= 0.0 and error.is_stated for error in terrain.errors.shape)
+    assert terrain.errors.slopes_rad(np.zeros((4, 1, 2)), AZIMUTHS).shape == (len(terrain.errors.shape), 4, 12)
+    assert isinstance(terrain.with_shape(np.zeros(len(terrain.errors.shape))), Terrain)
     assert terrain.masked_sectors() == []
     assert isinstance(terrain.facts()["kind"], str)
     near = terrain.near(np.zeros(2), 20.0, AZIMUTHS)
@@ -207,7 +203,7 @@ def test_a_wrapper_returns_the_values_of_the_terrain(whole, wrapper):
     wrapped = wrapper(terrain)
     points, azimuths = rng.uniform(-200, 200, (20, 2)), rng.uniform(0, 2 * np.pi, 20)
     values = [name for name in MEMBERS if not callable(getattr(terrain, name))]
-    assert {"hard_edges", "finest_m", "reach_m", "site", "axisymmetric", "is_prepared"} <= set(values)
+    assert {"errors", "file", "reach_m", "site", "axisymmetric", "is_prepared"} <= set(values)
     for member in values:
         assert getattr(wrapped, member) == getattr(terrain, member), member
     assert np.array_equal(wrapped.horizon_rad(points, azimuths), terrain.horizon_rad(points, azimuths))
@@ -223,12 +219,12 @@ def test_a_forwarding_terrain_passes_every_member_on():
 
 
 @pytest.mark.parametrize("sigma_m", [0.0, 2.0])
-def test_height_maps_state_whether_their_horizon_is_exact(sigma_m):
+def test_the_posts_of_height_maps_make_the_horizon_err(sigma_m):
     terrain = replace(height_map(), height_sigma_m=sigma_m)
-    sigma = terrain.horizon_sigma_rad(np.zeros(2), AZIMUTHS)
-    assert terrain.hard_edges == (not sigma.any())
-    assert terrain.hard_edges == (sigma_m == 0.0)
-    assert terrain.max_horizon_sigma_rad(np.zeros(2), 50.0, AZIMUTHS, 0.01) == pytest.approx(sigma, rel=0.5)
+    sigma = terrain.errors.sigma_rad(np.zeros(2), AZIMUTHS)
+    assert sigma.any() == (sigma_m > 0.0)
+    assert terrain.errors.height_sigma_m == sigma_m
+    assert terrain.errors.most_sigma_rad(np.zeros(2), 50.0, AZIMUTHS, 0.01) == pytest.approx(sigma, rel=0.5)
 
 
 def evidence_from(terrain: Terrain, position_m: Array) -> Evidence:
@@ -287,7 +283,8 @@ class SwappedBounds(FacingWall):
 )
 def test_an_error_in_a_users_terrain_is_named_by_its_method(broken, fault, common_sigma_rad):
     terrain = broken()
-    terrain.common_sigma_rad = common_sigma_rad
+    terrain.errors = GroundErrors()
+    terrain.errors.common_sigma_rad = common_sigma_rad
     with pytest.raises(BadInput, match=fault) as caught:
         ExactPosterior()(evidence_from(FacingWall(), np.array([80.0, -120.0])), terrain)
     assert caught.value.reason == "bad_terrain"

@@ -11,7 +11,7 @@ from map_helpers import polar_stereographic
 from startrack.core.types import Array
 from startrack.frames import Site
 from startrack.terrain import HeightMap, Raster
-from startrack.terrain.crest_errors import (
+from startrack.terrain.imports.crest_errors import (
     CREST_AZIMUTHS,
     Correlation,
     CrestErrors,
@@ -94,7 +94,7 @@ def crater() -> HeightMap:
     )
     site = Site("moon", plane.latitude_rad, plane.longitude_rad)
     return HeightMap(
-        site=site, maps=(average_posts(ground, 4),), files=(), search_radius_m=5000.0, height_sigma_m=4.0,
+        site=site, maps=(average_posts(ground, 4),), search_radius_m=5000.0, height_sigma_m=4.0,
     )  # fmt: skip
 
 

@@ -33,7 +33,7 @@ def drawn() -> tuple[np.ndarray, np.ndarray]:
 def responses(ground: HeightMap, found: ExpectedCrests) -> np.ndarray:
     """Rise (n, posts) of the skyline by a metre of each post, with the ground below the camera."""
     response = np.zeros((len(AZIMUTHS), POSTS * POSTS))
-    for post, rad_per_m in ((found.post, found.rad_per_m), ground.ground_posts(CAMERA_M, AZIMUTHS)):
+    for post, rad_per_m in ((found.post, found.rad_per_m), ground.errors.ground_posts(CAMERA_M, AZIMUTHS)):
         ray = np.nonzero(post != NO_POST)[0]
         np.add.at(response, (ray, post[post != NO_POST]), rad_per_m[post != NO_POST])
     return response
@@ -42,7 +42,7 @@ def responses(ground: HeightMap, found: ExpectedCrests) -> np.ndarray:
 def test_moments_of_the_skyline_are_those_of_drawn_grounds(drawn):
     ground = basin()
     _, horizons = drawn
-    found = ground.expected_crests(CAMERA_M, AZIMUTHS)
+    found = ground.errors.expected_crests(CAMERA_M, AZIMUTHS)
     of_map, sigma = ground.horizon_rad(CAMERA_M[None], AZIMUTHS), horizons.std(axis=0)
     off = (horizons.mean(axis=0) - of_map - found.rise_rad) / sigma
     before = (horizons.mean(axis=0) - of_map) / sigma
@@ -57,11 +57,11 @@ def test_moments_of_the_skyline_are_those_of_drawn_grounds(drawn):
 
 def test_the_skyline_follows_a_post_as_in_drawn_grounds(drawn):
     errors, horizons = drawn
-    found = basin().expected_crests(CAMERA_M, AZIMUTHS)
+    found = basin().errors.expected_crests(CAMERA_M, AZIMUTHS)
     response = responses(basin(), found)
     for k in range(0, len(AZIMUTHS), 9):
         strongest = int(np.argmax(response[k]))
-        assert np.linalg.norm(basin().post_positions_m(np.array([strongest]))[0, :2] - CAMERA_M) > 3 * POST_M
+        assert np.linalg.norm(basin().errors.post_positions_m(np.array([strongest]))[0, :2] - CAMERA_M) > 3 * POST_M
         error = errors[:, strongest]
         slope = error @ (horizons[:, k] - horizons[:, k].mean()) / (error @ error)
         noise = horizons[:, k].std() / np.sqrt(GROUNDS) / SIGMA_M
@@ -70,23 +70,23 @@ def test_the_skyline_follows_a_post_as_in_drawn_grounds(drawn):
 
 def test_small_errors_leave_the_skyline_of_the_map():
     ground = basin(0.01)
-    found = ground.expected_crests(CAMERA_M, AZIMUTHS)
+    found = ground.errors.expected_crests(CAMERA_M, AZIMUTHS)
     assert np.abs(found.rise_rad).max() < 1e-4
     strongest = found.post[np.arange(len(AZIMUTHS)), found.rad_per_m.argmax(axis=1)]
     _, distance, _ = ground.horizons(CAMERA_M, AZIMUTHS)
-    away = np.linalg.norm(ground.post_positions_m(strongest)[:, :2] - CAMERA_M, axis=1)
+    away = np.linalg.norm(ground.errors.post_positions_m(strongest)[:, :2] - CAMERA_M, axis=1)
     assert away == pytest.approx(distance, abs=2 * POST_M)
     assert (found.post[found.rad_per_m > 0.0] != NO_POST).all()
 
 
 def test_exact_ground_has_no_such_moments():
-    assert basin(0.0).expected_crests(CAMERA_M, AZIMUTHS) is None
+    assert basin(0.0).errors.expected_crests(CAMERA_M, AZIMUTHS) is None
 
 
 def test_the_skyline_depends_on_nothing_that_was_computed_before():
     """Old memory that was read made positions on a map with errors of posts impossible, mostly at the first use."""
     ground = basin()
-    first = ground.expected_crests(CAMERA_M, AZIMUTHS)
-    basin(40.0).expected_crests(CAMERA_M + 90.0, AZIMUTHS + 0.4)
-    for one, other in zip(first, ground.expected_crests(CAMERA_M, AZIMUTHS), strict=True):
+    first = ground.errors.expected_crests(CAMERA_M, AZIMUTHS)
+    basin(40.0).errors.expected_crests(CAMERA_M + 90.0, AZIMUTHS + 0.4)
+    for one, other in zip(first, ground.errors.expected_crests(CAMERA_M, AZIMUTHS), strict=True):
         np.testing.assert_array_equal(one, other)

@@ -19,8 +19,8 @@ from startrack.core.types import BadInput
 from startrack.frames import Site, enu_from_latlon
 from startrack.terrain import HeightMap, Raster, Terrain, import_maps, load_terrain, read_map, write_map
 from startrack.terrain.derived_maps import DeformedMap
-from startrack.terrain.ellipsoid_fit import heights_above_sphere
 from startrack.terrain.height_map import OFF_MAP
+from startrack.terrain.maps.ellipsoid import heights_above_sphere
 
 pytest.importorskip("pyproj")
 pytest.importorskip("rasterio")
@@ -28,7 +28,7 @@ pytest.importorskip("matplotlib")
 import pyproj
 from earth_helpers import PLACE_DEG, SITE, in_projection, jacksboro, march
 
-from startrack.terrain.earth_projection import EarthProjection, project_earth
+from startrack.terrain.maps.projections import EarthProjection, project_earth
 
 DATA = Path(__file__).parent / "data"
 FINE_M = np.geomspace(1.0, 24_000.0, 5_000)
@@ -151,18 +151,18 @@ def test_bounds_hold_every_horizon_of_a_box_under_refraction():
 
 def test_the_error_of_refraction_is_the_change_of_the_horizon():
     terrain = on_earth(jacksboro(), terrestrial_refraction_sigma_1=None, height_sigma_m=0.0)
-    names = [error.name for error in terrain.shape_errors]
+    names = [error.name for error in terrain.errors.shape]
     assert "terrestrial_refraction_1" in names
     one = names.index("terrestrial_refraction_1")
-    assert terrain.shape_errors[one].sigma == 0.1
-    assert terrain.shape_errors[one].is_stated
+    assert terrain.errors.shape[one].sigma == 0.1
+    assert terrain.errors.shape[one].is_stated
     azimuths = np.linspace(0, 2 * np.pi, 90, endpoint=False)
     values = np.zeros(len(names))
     values[one] = 0.05
     other = terrain.with_shape(values).without_table()
     assert isinstance(other, DeformedMap)
     change = other.horizon_rad(np.zeros(2), azimuths) - terrain.without_table().horizon_rad(np.zeros(2), azimuths)
-    slope = terrain.shape_slopes_rad(np.zeros(2), azimuths)[one]
+    slope = terrain.errors.slopes_rad(np.zeros(2), azimuths)[one]
     assert slope.max() > 1e-4
     assert change == pytest.approx(0.05 * slope, abs=1e-6)
 
@@ -201,7 +201,7 @@ def test_a_usgs_dem_is_read_and_its_datum_and_ends_are_named(tmp_path):
     assert any("ground beyond could stand up to" in line for line in made.warnings)
     assert any("NAD27" in line and "WGS 84" in line for line in made.warnings)
     terrain = load_terrain(out)
-    assert any("NAD27" in line for line in terrain.error_warnings())
+    assert any("NAD27" in line for line in terrain.errors.warnings())
     horizon = np.degrees(terrain.horizon_rad(np.zeros(2), np.radians(np.arange(0.0, 360.0, 5.0))))
     assert horizon.max() > 25.0
     assert -8.0 < horizon[0] < 3.0  # the crater is open to the north
@@ -264,7 +264,7 @@ def test_import_writes_a_terrain_of_the_earth(tmp_path, capsys):
     terrain = load_terrain(out)
     assert terrain.site.height_m == pytest.approx(550.0, abs=15.0)
     assert terrain.terrestrial_refraction_1 == 0.13
-    shared = {error.name: error.sigma for error in terrain.shape_errors}
+    shared = {error.name: error.sigma for error in terrain.errors.shape}
     assert {name: sigma for name, sigma in shared.items() if name.startswith(("vertical", "terrestrial"))} == {
         "vertical_east_rad": pytest.approx(np.radians(0.003)), "vertical_north_rad": pytest.approx(np.radians(0.003)),
         "terrestrial_refraction_1": 0.1,
@@ -280,7 +280,7 @@ def test_import_writes_a_terrain_of_the_earth(tmp_path, capsys):
 
 def test_a_stated_geoid_tilts_the_ground():
     """The geoid rises by 20 arcsec to the east: the horizon there stands that much higher, in the west lower."""
-    from startrack.terrain.ellipsoid_fit import above_ellipsoid
+    from startrack.terrain.maps.ellipsoid import above_ellipsoid
 
     plain = on_earth(jacksboro())
     tilted = on_earth(above_ellipsoid(jacksboro(), SITE, -30.0, [20.0, 0.0]))

@@ -64,7 +64,7 @@ def test_where_no_post_makes_the_skyline_it_is_the_maps_with_the_error_of_a_post
     _, truth, _, _ = draw_scene(19)
     terrain, azimuth = replace(truth, height_sigma_m=0.5), (np.arange(240) + 0.5) * np.pi / 120
     place = np.array([0.5 * terrain.search_radius_m, 0.0])
-    crests = terrain.expected_crests(place, azimuth)
+    crests = terrain.errors.expected_crests(place, azimuth)
     assert crests is not None
     bare = crests.post[:, 0] == NO_POST
     assert 20 < np.count_nonzero(bare) < 200

@@ -35,8 +35,8 @@ from startrack.terrain import (
     terrain_from_dict,
     write_map,
 )
-from startrack.terrain.import_map import MEASURED_PER_ESTIMATE
-from startrack.terrain.projection import ORTHOGRAPHIC, projection_of
+from startrack.terrain.imports.import_map import MEASURED_PER_ESTIMATE
+from startrack.terrain.maps.projections import ORTHOGRAPHIC, projection_of
 
 ROOT = Path(__file__).parent.parent
 pytestmark = pytest.mark.usefixtures("own_cache")
@@ -88,7 +88,7 @@ def test_every_key_reaches_the_terrain(tmp_path):
     assert terrain.most_slope_rad == pytest.approx(np.radians(20))
     assert terrain.glare_rad == ((pytest.approx(np.radians(350)), pytest.approx(np.radians(10))),)
     own = np.hypot(np.radians(0.05), 0)
-    assert own < terrain.common_sigma_rad < 3 * own
+    assert own < terrain.errors.common_sigma_rad < 3 * own
     slopes = terrain.slope_rad(np.array([[0.0, 0.0], [0.0, 690.0]]))
     assert slopes[0] < 0.01
     assert terrain.allowed(np.array([[0.0, 0.0], [2000.0, 0.0]])).tolist() == [True, False]
@@ -98,12 +98,12 @@ def test_heights_whose_error_a_file_leaves_out_are_exact_with_a_warning(tmp_path
     cylinder = {key: HILL[key] for key in ("format", "body", "origin")} | {"name": "pit"}
     size = {"diameter_m": 9000.0, "depth_m": 1600.0}
     pit = terrain_from_dict(cylinder | {"cylinder": size | {"exact": True}})
-    assert all(error.is_stated and error.sigma == 0.0 for error in pit.shape_errors)
-    assert pit.error_warnings() == load_terrain("shackleton-thesis").error_warnings() == []
+    assert all(error.is_stated and error.sigma == 0.0 for error in pit.errors.shape)
+    assert pit.errors.warnings() == load_terrain("shackleton-thesis").errors.warnings() == []
     hill = load_terrain(terrain_file(tmp_path))
-    assert hill.error_warnings() == []
+    assert hill.errors.warnings() == []
     (tmp_path / "hill.toml").write_text(tomli_w.dumps({**HILL, "dem": {"file": "hill.tif"}}))
-    assert ["no height_sigma_m" in line for line in load_terrain(tmp_path / "hill.toml").error_warnings()] == [True]
+    assert ["no height_sigma_m" in line for line in load_terrain(tmp_path / "hill.toml").errors.warnings()] == [True]
 
 
 REFUSED = [

@@ -30,7 +30,7 @@ from startrack.terrain import table_cache as cache
 from startrack.terrain.derived_maps import DeformedMap, HorizonInterpolator
 from startrack.terrain.ground import ground_up_m
 from startrack.terrain.map_ends import facts_of_ends
-from startrack.terrain.projection import ORTHOGRAPHIC
+from startrack.terrain.maps.projections import ORTHOGRAPHIC
 from startrack.terrain.shape import EXACT_WAVES
 
 DATA = Path(__file__).parent / "data"
@@ -218,7 +218,7 @@ def test_a_raised_camera_sees_what_it_sees_without_the_table(shackleton):
     """A first sight line from the table of the camera before it was raised changes nothing but the time."""
     terrain, rng = replace(shackleton, search_radius_m=150.0, camera_height_sigma_m=0.1), np.random.default_rng(8)
     terrain.prepare()
-    raised = terrain.with_shape(np.where([one.name == "camera_height_m" for one in terrain.shape_errors], 0.7, 0.0))
+    raised = terrain.with_shape(np.where([one.name == "camera_height_m" for one in terrain.errors.shape], 0.7, 0.0))
     places, azimuths = rng.uniform(-100, 100, (2000, 2)), rng.uniform(0, 2 * np.pi, 2000)
     found = raised.horizon_rad(places, azimuths)
     assert found == pytest.approx(raised.without_table().horizon_rad(places, azimuths), abs=2e-6)
@@ -290,6 +290,7 @@ def tracer(monkeypatch):
         traced.cells.append({tuple(centre) for centre in centres})
 
     monkeypatch.setattr(cache, "fill_table", count)
+    monkeypatch.setattr(cache, "seconds_of_table", lambda ground: 1.0)  # which traces some
     monkeypatch.setattr(cache, "PART_CELLS", 2)
     monkeypatch.setattr(cache, "count_cores", lambda: 1)
     return traced
@@ -364,7 +365,7 @@ def test_a_common_error_is_estimated_with_the_position_and_widens_its_covariance
 
 
 def test_sigma_follows_from_posts_and_distance(shackleton):
-    sigma = replace(shackleton, height_sigma_m=5.0).horizon_sigma_rad(np.zeros((1, 2)), np.array([0.5]))
+    sigma = replace(shackleton, height_sigma_m=5.0).errors.sigma_rad(np.zeros((1, 2)), np.array([0.5]))
     horizon = shackleton.horizon_rad(np.zeros((1, 2)), np.array([0.5]))
     assert sigma[0] == pytest.approx(5.0 * np.cos(horizon[0]) ** 2 / 10_000, rel=0.1)  # the crest is some 10 km off
 

@@ -11,7 +11,7 @@ from scipy.ndimage import zoom
 
 from startrack.kernels.library import kernel
 from startrack.terrain import STEREOGRAPHIC, Cylinder, HeightMap, Projection, Raster
-from startrack.terrain.crater import distance_to_circle
+from startrack.terrain.cylinder import distance_to_circle
 from startrack.terrain.ground import ground_up_m, pack_maps, surfaces
 from startrack.terrain.horizon_table import (
     ANGLE_STEP_RAD,

@@ -16,9 +16,9 @@ from startrack.core.types import Array, Evidence
 from startrack.frames import enu_from_latlon
 from startrack.localization import ExactPosterior
 from startrack.terrain import STEREOGRAPHIC, HeightMap, Projection, Raster, load_terrain, read_map, write_map
-from startrack.terrain.crest_errors import measure_waves
-from startrack.terrain.map_comparison import MapComparison, compare_maps
-from startrack.terrain.projection import ORTHOGRAPHIC
+from startrack.terrain.imports.comparison import MapComparison, compare_maps
+from startrack.terrain.imports.crest_errors import measure_waves
+from startrack.terrain.maps.projections import ORTHOGRAPHIC
 
 DATA = Path(__file__).parent / "data"
 pytestmark = pytest.mark.usefixtures("own_cache")
@@ -63,7 +63,7 @@ def test_horizon_elevations_differ_by_the_stated_errors():
     sigma = terrain.height_sigma_m / ((1 + tan**2) * distance)
     assert 0.7 < np.std((higher - higher.mean()) / sigma) < 1.1
     coefficients_rad = np.fft.rfft(higher)[1:9] * 2 / len(higher)  # of the waves: two of each, 16 degrees of freedom
-    stated_rad = [error.sigma for error in terrain.shape_errors if error.name.startswith("wave_")][::2]
+    stated_rad = [error.sigma for error in terrain.errors.shape if error.name.startswith("wave_")][::2]
     assert 0.2 < np.mean(np.abs(coefficients_rad / stated_rad) ** 2) / 2 < 1.5
 
 

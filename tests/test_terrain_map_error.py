@@ -12,7 +12,7 @@ from scipy.ndimage import map_coordinates
 from startrack.cli.main import main
 from startrack.core.types import Array, BadInput
 from startrack.terrain import Raster, load_terrain, write_map
-from startrack.terrain.map_error import carried_spacing, error_between_posts_m
+from startrack.terrain.imports.roughness import carried_spacing, error_between_posts_m
 
 
 def grid(heights_m: Array, post_m: float = 100.0) -> Raster:

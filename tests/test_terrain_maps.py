@@ -27,15 +27,16 @@ from startrack.terrain import (
     read_map,
     write_map,
 )
-from startrack.terrain.height_units import SURVEY_FOOT_M, metres_of
-from startrack.terrain.map_heights import (
+from startrack.terrain.maps.heights import (
     FOOT_M,
     GROUNDS,
+    SURVEY_FOOT_M,
     Mark,
     find_marks,
     highest_step_m,
+    metres_of,
 )
-from startrack.terrain.map_reading import place_on
+from startrack.terrain.maps.reading import place_on
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 SPHERES = {"moon": "+proj=longlat +R=1737400 +no_defs", "earth": "EPSG:4326"}
@@ -475,7 +476,7 @@ def test_other_maps_need_the_extra_dem(tmp_path, monkeypatch):
     case = Case(tmp_path, POLAR, SOUTH, 60.0)
     path = case.write(case.heights_m.astype(np.float32))
     raster = read_map(path)
-    for module in ("map_reading", "map_writing"):
+    for module in ("maps.reading", "maps.writing"):
         monkeypatch.setattr(f"startrack.terrain.{module}.find_spec", lambda name: None)
     for use in (lambda: read_map(path), lambda: write_map(tmp_path / "b.tif", raster)):
         with pytest.raises(BadInput, match=r"pip install '\.\[dem\]'"):

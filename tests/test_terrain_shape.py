@@ -17,8 +17,16 @@ from startrack.frames import Site
 from startrack.localization.shared_errors import SharedErrors
 from startrack.simulation import draw_ground
 from startrack.simulation.ground_errors import ErringGround
-from startrack.terrain import Cylinder, ForwardingTerrain, HeightMap, Terrain, load_terrain, terrain_from_dict
-from startrack.terrain.crater import DeformedCrater
+from startrack.terrain import (
+    Cylinder,
+    ForwardingTerrain,
+    GroundErrors,
+    HeightMap,
+    Terrain,
+    load_terrain,
+    terrain_from_dict,
+)
+from startrack.terrain.cylinder import DeformedCrater
 from startrack.terrain.shape import WAVES
 
 CRATER = {
@@ -47,7 +55,7 @@ def uncertain() -> Cylinder:
 
 
 def test_a_silent_crater_has_defaults_and_gross_parts():
-    errors = {error.name: error for error in crater_file().shape_errors}
+    errors = {error.name: error for error in crater_file().errors.shape}
     assert tuple(errors) == NAMES[:-1]
     assert not any(error.is_stated for error in errors.values())
     found = {name: (e.fact, e.sigma, e.gross_probability, e.gross_sigma) for name, e in errors.items()}
@@ -62,12 +70,12 @@ def test_a_silent_crater_has_defaults_and_gross_parts():
 
 def test_stated_errors_of_a_crater_are_trusted():
     stated = crater_file(depth_sigma_m=3.2, diameter_sigma_m=0, ellipse_sigma_1=0.001, rim_tilt_sigma_deg=0.01)
-    errors = {error.name: error for error in stated.shape_errors}
+    errors = {error.name: error for error in stated.errors.shape}
     assert tuple(errors) == NAMES[:6]
     assert all(error.is_stated for error in errors.values())
     assert (errors["depth_1"].sigma, errors["diameter_1"].sigma) == (pytest.approx(0.002), 0.0)
     assert errors["rim_tilt_north_rad"].sigma == pytest.approx(np.radians(0.01))
-    partly = crater_file(depth_sigma_m=0.0, rover={"camera_height_sigma_m": 0.1}).shape_errors
+    partly = crater_file(depth_sigma_m=0.0, rover={"camera_height_sigma_m": 0.1}).errors.shape
     assert [error.name for error in partly] == list(NAMES)
     assert [error.is_stated for error in partly] == [True] + 5 * [False] + [True]
 
@@ -75,7 +83,7 @@ def test_stated_errors_of_a_crater_are_trusted():
 def test_exact_craters_have_no_errors():
     exact = (crater_file(exact=True), crater_file(exact=True, depth_sigma_m=0), Cylinder(diameter_m=9e3, depth_m=1.6e3))
     for one in exact:
-        assert all(error.sigma == 0.0 and error.is_stated for error in one.shape_errors)
+        assert all(error.sigma == 0.0 and error.is_stated for error in one.errors.shape)
         assert len(SharedErrors.of(one, None)) == 0
     assert len(SharedErrors.of(crater_file(exact=False), None)) == 6
     for key in ("depth_sigma_m", "diameter_sigma_m", "ellipse_sigma_1", "rim_tilt_sigma_deg"):
@@ -96,9 +104,9 @@ def test_unusable_errors_of_a_crater_are_refused(keys, named):
 @pytest.mark.parametrize("path", sorted(data_dir("terrain").glob("*.toml")), ids=lambda path: path.stem)
 def test_shipped_terrains_state_everything(path):
     terrain = load_terrain(path)
-    assert terrain.unstated_errors == ()
+    assert terrain.errors.unstated == ()
     if terrain.facts()["kind"] == "cylinder":
-        assert all(error.is_stated and error.sigma == 0.0 for error in terrain.shape_errors)
+        assert all(error.is_stated and error.sigma == 0.0 for error in terrain.errors.shape)
     else:
         sigmas = terrain.stretch_sigma_1, terrain.vertical_sigma_rad, terrain.camera_height_sigma_m
         assert None not in (*sigmas, terrain.horizon_sigma_common_rad)
@@ -107,8 +115,8 @@ def test_shipped_terrains_state_everything(path):
 
 def test_slopes_of_a_crater_are_the_differences_of_its_horizon():
     terrain = uncertain()
-    assert tuple(error.name for error in terrain.shape_errors) == NAMES
-    slopes = terrain.shape_slopes_rad(PLACES[:, None], AZIMUTHS)
+    assert tuple(error.name for error in terrain.errors.shape) == NAMES
+    slopes = terrain.errors.slopes_rad(PLACES[:, None], AZIMUTHS)
     assert slopes.shape == (7, 3, 40)
     for k, name in enumerate(NAMES):
         step = np.where(np.arange(7) == k, 0.01 if name == "camera_height_m" else 1e-6, 0.0)
@@ -118,7 +126,7 @@ def test_slopes_of_a_crater_are_the_differences_of_its_horizon():
 
 
 def test_slopes_vanish_inside_the_wall():
-    assert not uncertain().shape_slopes_rad(np.array([[9000.0, 0.0]]), AZIMUTHS).any()
+    assert not uncertain().errors.slopes_rad(np.array([[9000.0, 0.0]]), AZIMUTHS).any()
 
 
 def test_a_crater_without_deformation_is_the_cylinder():
@@ -131,7 +139,7 @@ def test_a_crater_without_deformation_is_the_cylinder():
     low, high = same.horizon_bounds_rad(PLACES[:, None], np.array(50.0), AZIMUTHS, 0.02)
     own = terrain.horizon_bounds_rad(PLACES[:, None], np.array(50.0), AZIMUTHS, 0.02)
     assert np.array_equal([low, high], own)
-    assert same.shape_errors == () and same.with_shape(np.zeros(0)) is same
+    assert same.errors.shape == () and same.with_shape(np.zeros(0)) is same
     for wrong in (np.zeros(6), np.zeros(8)):
         with pytest.raises(ValueError, match="zip"):
             terrain.with_shape(wrong)
@@ -186,7 +194,7 @@ def hill_terrain() -> HeightMap:
 
 def test_errors_of_a_map_by_file(tmp_path: Path):
     path = terrain_file(tmp_path, dem={"height_sigma_m": 0.0, "horizon_sigma_deg": 0.1})
-    errors = {error.name: error for error in load_terrain(path).shape_errors}
+    errors = {error.name: error for error in load_terrain(path).errors.shape}
     assert list(errors) == [
         "bias_rad",
         "stretch_1",
@@ -209,23 +217,23 @@ def test_errors_of_a_map_by_file(tmp_path: Path):
     stated = {"height_sigma_m": 0.0, "horizon_sigma_deg": 0.0, "stretch_sigma_1": 0.0, "vertical_sigma_deg": 0.01}
     stated["horizon_waves_sigma_deg"] = [0.01 * k for k in range(8)]
     path = terrain_file(tmp_path, dem=stated, rover={"camera_height_sigma_m": 0.0})
-    errors = load_terrain(path).shape_errors
+    errors = load_terrain(path).errors.shape
     waves = [0.01 * k for k in range(8) for _ in range(2)]
     assert [error.sigma for error in errors] == pytest.approx([0.0, 0.0, *np.radians([0.01, 0.01, *waves])])
     assert all(error.is_stated for error in errors)
     path = terrain_file(tmp_path, dem=stated | {"horizon_waves_sigma_deg": 0.02}, rover={"camera_height_sigma_m": 0.0})
-    assert np.degrees([error.sigma for error in load_terrain(path).shape_errors if error.wave == 4]) == pytest.approx(
+    assert np.degrees([error.sigma for error in load_terrain(path).errors.shape if error.wave == 4]) == pytest.approx(
         0.01
     )
 
 
 def test_slopes_of_a_map_are_the_differences_of_its_horizon():
     terrain, points = map_with(), np.array([[100.0, -200.0], [400.0, 350.0]])
-    slopes = terrain.shape_slopes_rad(points[:, None], AZIMUTHS)
+    slopes = terrain.errors.slopes_rad(points[:, None], AZIMUTHS)
     assert slopes.shape == (21, 2, 40)
     plain = terrain.horizon_rad(points[:, None], AZIMUTHS)
     steps = (1e-5, 1e-4, 1e-5, 1e-5, *np.full(16, 1e-5), 0.01)
-    for k, (error, step) in enumerate(zip(terrain.shape_errors, steps, strict=True)):
+    for k, (error, step) in enumerate(zip(terrain.errors.shape, steps, strict=True)):
         change = step * (np.arange(21) == k)
         found = terrain.with_shape(change).horizon_rad(points[:, None], AZIMUTHS)
         left_out = 0.3 if error.fact == "vertical_sigma_deg" else 2e-3  # tan H times the slope of the skyline
@@ -237,9 +245,9 @@ def test_slopes_of_a_map_are_the_differences_of_its_horizon():
 def test_crests_share_the_bias_as_a_height():
     """The crest at the distance d rises by cos^2 H / d, and the median one seen from the origin by one radian."""
     terrain, points = map_with(), np.array([[100.0, -200.0], [400.0, 350.0], [0.0, 0.0]])
-    names = [error.name for error in terrain.shape_errors]
+    names = [error.name for error in terrain.errors.shape]
     tan, distance_m, _ = terrain.horizons(points[:, None], MIDDLES_RAD)
-    slopes = terrain.shape_slopes_rad(points[:, None], MIDDLES_RAD)
+    slopes = terrain.errors.slopes_rad(points[:, None], MIDDLES_RAD)
     bias, wave = slopes[names.index("bias_rad")], slopes[names.index("wave_2_sin_rad")]
     far = distance_m > terrain.maps[0].post_m
     height = bias * distance_m * (1.0 + tan**2)
@@ -272,7 +280,7 @@ def test_bounds_of_a_deformed_map_hold():
         map_with().with_shape(np.array([1e-3, 0.01, 2e-3, -1e-3, *np.linspace(-1e-3, 1e-3, 16), 0.2])),
         np.random.default_rng(2),
     )
-    assert ground.camera_height_m == pytest.approx(1.7) and ground.shape_errors == ()
+    assert ground.camera_height_m == pytest.approx(1.7) and ground.errors.shape == ()
     centres, azimuths = rng.uniform(-400, 400, (20, 2)), rng.uniform(0, 2 * np.pi, 20)
     for half_m, turn_rad in ((5.0, 0.0), (100.0, 0.05)):
         low, high = ground.horizon_bounds_rad(centres, np.array(half_m), azimuths, turn_rad)
@@ -286,29 +294,29 @@ def test_an_interpolator_has_the_slopes_of_its_map():
     terrain = map_with()
     near = terrain.near(np.array([100.0, -200.0]), 30.0, AZIMUTHS)
     point = np.array([110.0, -190.0])
-    assert near.shape_errors == terrain.shape_errors
-    found, own = near.shape_slopes_rad(point, AZIMUTHS), terrain.shape_slopes_rad(point, AZIMUTHS)
+    assert near.errors.shape == terrain.errors.shape
+    found, own = near.errors.slopes_rad(point, AZIMUTHS), terrain.errors.slopes_rad(point, AZIMUTHS)
     scale = np.abs(own).max(axis=1, keepdims=True)
     assert np.abs(found - own).max(axis=1) == pytest.approx(np.zeros(21), abs=0.05 * scale.max())
-    assert np.abs(near.shape_slopes_rad(point, AZIMUTHS + 0.01) - terrain.shape_slopes_rad(point, AZIMUTHS + 0.01)
+    assert np.abs(near.errors.slopes_rad(point, AZIMUTHS + 0.01) - terrain.errors.slopes_rad(point, AZIMUTHS + 0.01)
                   ).max() == 0.0  # fmt: skip
 
 
 def test_a_wrapper_passes_the_errors_on():
     terrain = uncertain()
     wrapped = ForwardingTerrain(terrain)
-    assert wrapped.shape_errors == terrain.shape_errors
-    assert np.array_equal(wrapped.shape_slopes_rad(PLACES, 1.0), terrain.shape_slopes_rad(PLACES, 1.0))
+    assert wrapped.errors.shape == terrain.errors.shape
+    assert np.array_equal(wrapped.errors.slopes_rad(PLACES, 1.0), terrain.errors.slopes_rad(PLACES, 1.0))
     assert wrapped.with_shape(np.ones(7) * 1e-3) == terrain.with_shape(np.ones(7) * 1e-3)
 
     class Silent(ForwardingTerrain):
         name = "silent"
-        shape_errors = ()
+        errors = GroundErrors()
 
         def near(self, *_: Any) -> Terrain:
             return self
 
-    assert (Silent(terrain).name, Silent(terrain).shape_errors) == ("silent", ())
+    assert (Silent(terrain).name, Silent(terrain).errors.shape) == ("silent", ())
     assert isinstance(Silent(terrain).near(), Silent)
 
 
@@ -344,21 +352,21 @@ def on_earth(**air: float) -> Cylinder:
 
 
 def test_the_error_of_refraction_is_one_of_every_ground_below_air():
-    (error,) = (one for one in on_earth().shape_errors if one.sigma > 0.0)
+    (error,) = (one for one in on_earth().errors.shape if one.sigma > 0.0)
     assert (error.name, error.fact, error.sigma, error.is_stated) == ("refraction_1", "refraction_sigma_1", 0.035, True)
-    assert "refraction_1" not in [one.name for one in uncertain().shape_errors]
-    assert on_earth(pressure_hpa=840.0, temperature_c=3.0).shape_errors[-1].sigma == 0.005
-    assert on_earth(refraction_sigma_1=0.02).shape_errors[-1].sigma == 0.02
-    assert "refraction_1" not in [one.name for one in on_earth(pressure_hpa=0.0).shape_errors]
+    assert "refraction_1" not in [one.name for one in uncertain().errors.shape]
+    assert on_earth(pressure_hpa=840.0, temperature_c=3.0).errors.shape[-1].sigma == 0.005
+    assert on_earth(refraction_sigma_1=0.02).errors.shape[-1].sigma == 0.02
+    assert "refraction_1" not in [one.name for one in on_earth(pressure_hpa=0.0).errors.shape]
 
 
 def test_stars_that_are_raised_more_are_a_skyline_that_is_lower():
     crater = on_earth()
-    values = np.array([0.04 if one.name == "refraction_1" else 0.0 for one in crater.shape_errors])
+    values = np.array([0.04 if one.name == "refraction_1" else 0.0 for one in crater.errors.shape])
     ground, air = crater.with_shape(values), crater.air
     points = PLACES[:, None]
     horizon = crater.horizon_rad(points, AZIMUTHS)
-    slopes = crater.shape_slopes_rad(points, AZIMUTHS)[values > 0][0]
+    slopes = crater.errors.slopes_rad(points, AZIMUTHS)[values > 0][0]
     # 4 % more pressure raise the stars by 4 % more: a star at the skyline of the map is seen above it.
     denser = replace(air, pressure_hpa=1.04 * air.pressure_hpa)
     raised = denser.apparent_rad(air.true_rad(horizon)) - horizon
@@ -367,4 +375,4 @@ def test_stars_that_are_raised_more_are_a_skyline_that_is_lower():
     low, high = ground.horizon_bounds_rad(points, np.full((3, 1), 30.0), AZIMUTHS)
     assert np.all((low <= ground.horizon_rad(points, AZIMUTHS)) & (ground.horizon_rad(points, AZIMUTHS) <= high))
     assert ground.near(points[0, 0], 10.0, AZIMUTHS) is ground
-    assert ground.shape_errors == ()
+    assert ground.errors.shape == ()

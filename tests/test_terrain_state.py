@@ -79,7 +79,7 @@ def test_an_exact_crater(pit, capsys):
     assert state(pit, "--exact", "--json") == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown == {"format": "startrack.terrain/1", "file": str(pit), "stated": {"exact": True}, "unstated": []}
-    assert all(error.is_stated and error.sigma == 0.0 for error in load_terrain(pit).shape_errors)
+    assert all(error.is_stated and error.sigma == 0.0 for error in load_terrain(pit).errors.shape)
     assert state(pit) == 0
     assert "states every error" in capsys.readouterr().out
 

@@ -13,17 +13,17 @@ from startrack.catalog import load_catalog
 from startrack.chain import Located, Refused, Settings, identify_blind, locate_exposure
 from startrack.chain.stages import Measured
 from startrack.cli.main import main
-from startrack.core import time_limit
+from startrack.core import limits
 from startrack.core.errors import Reason
+from startrack.core.limits import TimeLimitReached, check_time, limited_time, stating_work, uncounted_time
 from startrack.core.runner import map_in_threads
-from startrack.core.time_limit import TimeLimitReached, check_time, limited_time, stating_work, uncounted_time
 from startrack.exposure import exposure_of, read_exposure
 
 SAMPLES = Path(__file__).parents[1] / "sample_images"
 LOWELL = str(SAMPLES / "lowell-2018-08-06.fits.bz2")
 
 
-class StepClock(time_limit._Clock):
+class StepClock(limits._Clock):
     """A clock that goes on by one second with every question, so that a limit counts questions."""
 
     now = 0.0
@@ -36,7 +36,7 @@ class StepClock(time_limit._Clock):
 @pytest.fixture
 def questions(monkeypatch: pytest.MonkeyPatch) -> StepClock:
     clock = StepClock()
-    monkeypatch.setattr(time_limit, "CLOCK", clock)
+    monkeypatch.setattr(limits, "CLOCK", clock)
     return clock
 
 

@@ -89,13 +89,16 @@ def test_a_steeper_crater_keeps_what_is_known_of_its_depth():
     steep = known.with_steepness(0.8)
     at, azimuth = np.array([[300.0, -500.0]]), np.linspace(0.0, 6.0, 7)
     np.testing.assert_allclose(np.tan(steep.horizon_rad(at, azimuth)), 0.8 * np.tan(known.horizon_rad(at, azimuth)))
-    assert known.unknown_steepness_1 == pytest.approx(np.hypot(0.3, 0.25)) and steep.unknown_steepness_1 == 0.0
-    depth = next(one for one in steep.shape_errors if one.name == "depth_1")
+    assert (
+        known.errors.unknown_steepness_1 == pytest.approx(np.hypot(0.3, 0.25))
+        and steep.errors.unknown_steepness_1 == 0.0
+    )
+    depth = next(one for one in steep.errors.shape if one.name == "depth_1")
     assert steep.depth_m * (1.0 + depth.mean) == pytest.approx(known.depth_m)
     assert steep.depth_m * depth.sigma == pytest.approx(known.depth_sigma_m)
     assert steep.with_steepness(1.0).depth_m == pytest.approx(known.depth_m)
     assert ForwardingTerrain(known).with_steepness(0.8).whole == steep
-    assert GROUND.unknown_steepness_1 == 0.0 and GROUND.with_steepness(1.0) is GROUND
+    assert GROUND.errors.unknown_steepness_1 == 0.0 and GROUND.with_steepness(1.0) is GROUND
     with pytest.raises(BadInput, match="half of it"):
         stated(depth_sigma_m=0.5 * DEPTH_M)
 
@@ -135,7 +138,7 @@ def test_a_drive_shows_depth_and_width():
         assert abs(size.size_m - true) < 3.5 * size.sigma_m
         assert 0.9 * ODOMETRY_SIGMA < size.sigma_m / true < 1.4 * ODOMETRY_SIGMA
         assert before * (1.0 + size.error_1) == pytest.approx(size.size_m)
-    assert track.terrain.rim_radius_m == pytest.approx(track.width.size_m / 2)
+    assert track.terrain.rim.radius_m == pytest.approx(track.width.size_m / 2)
     off = track.smoothed.position_enu_m[:, :2] - position
     assert np.linalg.norm(off, axis=1).max() < 2.0 * track.smoothed.radius95_m.max() < 120.0
     np.testing.assert_allclose(track.filtered.position_enu_m[-1], track.smoothed.position_enu_m[-1], atol=0.05)
@@ -249,7 +252,7 @@ def test_a_camera_at_rest_knows_the_size_as_stated():
         at = known.diameter_m / DIAMETER_M * (place + 3.0 * rng.normal(size=2))
         one = estimate_frame(rows, ground, errors, at, 25.0 * np.eye(2))
         seen = ObservedFrame(f"{k}", TIME + timedelta(hours=k), np.eye(3), (one,), rows)
-        frames.append(replace(seen, steepness_1=ground.steepness_1))
+        frames.append(replace(seen, steepness_1=ground.errors.steepness_1))
     track = estimate_track(frames, known, TrackErrors.of(known, None), at_rest=True)
     assert track.depth.size_m / track.width.size_m == pytest.approx(DEPTH_M / DIAMETER_M, rel=0.01)
     assert abs(np.log(track.width.size_m / DIAMETER_M)) < 3.5 * track.width.sigma_m / track.width.size_m

@@ -72,7 +72,7 @@ def raise_post(terrain: HeightMap, post: int, by_m: float) -> HeightMap:
 
 def test_the_horizon_sinks_with_the_posts_about_the_camera(ground):
     azimuth = np.radians([17.0, 140.0, 255.0])
-    post, rad_per_m = ground.ground_posts(PLACE_M, azimuth)
+    post, rad_per_m = ground.errors.ground_posts(PLACE_M, azimuth)
     raised_m = 20.0  # horizons are traced to some 1e-7 rad
     changed = raise_post(ground, int(post[0, 2]), raised_m).horizon_rad(PLACE_M[None], azimuth)
     np.testing.assert_allclose(
@@ -81,8 +81,8 @@ def test_the_horizon_sinks_with_the_posts_about_the_camera(ground):
 
 
 def test_posts_stand_where_the_map_has_them(ground):
-    post, _ = ground.ground_posts(PLACE_M, np.zeros(1))
-    points = ground.post_positions_m(post[0])
+    post, _ = ground.errors.ground_posts(PLACE_M, np.zeros(1))
+    points = ground.errors.post_positions_m(post[0])
     np.testing.assert_allclose(np.sort(np.ptp(points[:, :2], axis=0)), [240, 240], rtol=0.5)
     np.testing.assert_allclose(ground.ground_m(points[:, :2]), points[:, 2], atol=0.1)
     assert np.ptp(points[:, :2] - PLACE_M, axis=0).max() < 400
@@ -98,13 +98,13 @@ def test_the_observation_is_the_exact_posterior(ground):
     assert away @ np.linalg.solve(fix.covariance_m2, away) < 0.3
     alone = smooth([found], Steps.unknown(1))
     np.testing.assert_allclose(np.trace(alone.covariance_m2[0]), np.trace(fix.covariance_m2), rtol=0.5)
-    assert found.mean[2] * ground.common_sigma_rad == pytest.approx(HORIZON_ERROR_RAD, abs=np.radians(0.02))
+    assert found.mean[2] * ground.errors.common_sigma_rad == pytest.approx(HORIZON_ERROR_RAD, abs=np.radians(0.02))
 
 
 def test_the_response_to_the_bias_is_that_to_raised_rows(ground):
     evidence = rays_at(ground, PLACE_M, np.random.default_rng(2))
     here = estimate(evidence, ground)
-    raised = replace(evidence, elevation_rad=evidence.elevation_rad + 0.2 * ground.common_sigma_rad)
+    raised = replace(evidence, elevation_rad=evidence.elevation_rad + 0.2 * ground.errors.common_sigma_rad)
     there = estimate(raised, ground)
     np.testing.assert_allclose(
         there.mean - here.mean, 0.2 * here.response[:, 2], atol=0.1 * np.sqrt(here.covariance[0, 0])
@@ -162,8 +162,8 @@ def test_shared_errors_are_those_that_the_terrain_and_the_clock_state(ground):
     assert DEPTH in TrackErrors.of(crater(depth_sigma_m=5.0), None).names
     clock = Clock(turn_rad_s=np.array([0.0, 1e-7, 2.6e-6]), sigma_s=600.0)
     found = TrackErrors.of(ground, clock)
-    assert found.names == (*(one.name for one in ground.shape_errors if one.sigma > 0.0 and not one.wave), CLOCK)
-    assert found.sigma[[found.names.index(BIAS), -1]].tolist() == [ground.common_sigma_rad, 600.0]
+    assert found.names == (*(one.name for one in ground.errors.shape if one.sigma > 0.0 and not one.wave), CLOCK)
+    assert found.sigma[[found.names.index(BIAS), -1]].tolist() == [ground.errors.common_sigma_rad, 600.0]
 
 
 def test_a_gross_error_widens_its_fact_alone():

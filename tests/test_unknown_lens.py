@@ -18,8 +18,7 @@ from startrack.camera import Camera, Decentring, KannalaBrandt, Lens, Pinhole
 from startrack.catalog import is_below_horizon, load_catalog
 from startrack.chain import identify_blind as identify_picture
 from startrack.cli.main import main
-from startrack.core.smooth_image import SmoothImage
-from startrack.core.types import Detections, NotIdentified, Stars
+from startrack.core.types import Detections, NotIdentified, SmoothImage, Stars
 from startrack.estimation.attitude import solve_attitude
 from startrack.estimation.radial_fit import largest_angle_rad, radius_of
 from startrack.exposure import read_exposure

@@ -15,21 +15,19 @@ from startrack.camera.io import (
     REFRACTION_REMOVED,
     SENSOR,
     camera_from_dict,
+    camera_from_foreign_text,
     camera_keys,
     camera_text,
     camera_to_dict,
-    save_camera,
-)
-from startrack.camera.lens import Lens
-from startrack.camera.lenses import KannalaBrandt, Pinhole, default_lens, lens_kinds
-from startrack.camera.load import (
-    camera_from_foreign_text,
     decentring_rms_px,
     foreign_text,
     load_camera,
     read_camera,
     read_foreign_camera,
+    save_camera,
 )
+from startrack.camera.lens import Lens
+from startrack.camera.lenses import KannalaBrandt, Pinhole, default_lens, lens_kinds
 from startrack.camera.optics import MIN_THROUGHPUT_1, Decentring, Sensor
 from startrack.camera.platepar import Platepar, platepar_of
 from startrack.camera.virtualsky import VirtualSkyOverlay, virtualsky_of

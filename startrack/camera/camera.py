@@ -17,6 +17,7 @@ from startrack.frames import length_xy
 # Body x (forward) = image top = -cam y, body y (left) = +cam x, body z (up) = +cam z: it looks at the zenith.
 ZENITH_MOUNT_R_BODY_CAM = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
+REFRACTION_REMOVED, REFRACTION_CONTAINED = "taken out", "contained"  # of the Earth's air, in a lens
 CAP_POINTS = 400  # of a cap
 GOLDEN_ANGLE_RAD = np.pi * (3.0 - np.sqrt(5.0))
 SQUARE_PIXEL_SIGMA_1 = 1e-7  # relative sigma of fx / fy where they are fitted as one: just enough for an inverse

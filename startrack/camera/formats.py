@@ -5,6 +5,8 @@ Pixel (0, 0) is the centre of the first pixel, as here and in ROS (REP 104), Kal
 
 from __future__ import annotations
 
+import json
+import math
 import re
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -12,23 +14,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from startrack.camera.camera import Camera
-from startrack.camera.format_parts import (
-    Coefficients,
-    Part,
-    keys_of,
-    matrix_of,
-    read_distortion,
-    read_numbers,
-    read_xml,
-    read_yaml,
-    yaml_list,
-)
-from startrack.camera.lenses import MAX_COEFFICIENTS
-from startrack.camera.platepar_reading import plate_in, read_platepar
-from startrack.camera.ros import read_ros, split_ros, write_ros
+from startrack.camera.lenses import MAX_COEFFICIENTS, KannalaBrandt, Pinhole
+from startrack.camera.platepar import plate_in, read_platepar
 from startrack.core.types import BadInput
 from startrack.frames import ORTHONORMAL_1, quat_xyzw_from_R
 
+MAX_YAML_CHARS = 2**18  # the loader takes 3 s for 2^20
+Coefficients = tuple[float, ...] | None  # of a fisheye; None of a pinhole
+ROS_FILE_ARRAYS = {
+    "k": "camera_matrix", "d": "distortion_coefficients", "r": "rectification_matrix", "p": "projection_matrix",
+}  # fmt: skip
 CORNER_PX = 0.5  # COLMAP's origin is the corner of the first pixel
 COLMAP_HEAD = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
 COLMAP_LINE = re.compile(r"\d+\s+[A-Z_]+\s+\d+\s+\d+\s")  # CAMERA_ID, MODEL, WIDTH, HEIGHT
@@ -41,6 +36,163 @@ OPENCV_COUNTS = 4, 5, 8, 12, 14  # of distortion coefficients of OpenCV's models
 OPENCV_HEAD = re.compile(r"\A\s*%YAML[: ]1\.0|!!opencv-matrix")  # which YAML itself does not have
 MESSAGE_KEYS = {"k", "d", "distortion_model", "width", "height"}  # of sensor_msgs/CameraInfo
 SHOWN_PARTS = 6  # cameras named in a refusal
+
+
+class Part(NamedTuple):
+    """One camera of a file: its name there, the size of its pictures as text, and its content."""
+
+    name: str
+    size: str
+    content: Any
+
+
+def matrix_of(camera: Camera) -> list[float]:
+    """Camera matrix K (9,), row by row."""
+    (fx, fy), (cx, cy) = camera.focal_px, camera.centre_px
+    return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+
+
+def keys_of(
+    size_px: Sequence[Any], focal_px: tuple[float, float], centre_px: tuple[float, float], k: Coefficients
+) -> dict[str, Any]:
+    """The keys of a camera file."""
+    keys = {"size_px": tuple(map(int, size_px)), "focal_px": focal_px, "centre_px": centre_px}
+    if k is None:
+        return {**keys, "model": Pinhole.model}
+    return {**keys, "model": KannalaBrandt.model, **({"k": k} if any(k) else {})}
+
+
+def read_numbers(values: Any, count: int, key: str) -> list[float]:
+    """`count` finite numbers. Raises ValueError naming the key."""
+    if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != count:
+        raise ValueError(f"{key} must be {count} numbers")
+    numbers = [float(v) for v in values]
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{key} must be {count} finite numbers")
+    return numbers
+
+
+def read_distortion(
+    model: str, coefficients: Any, fisheyes: tuple[str, ...], pinholes: tuple[str, ...]
+) -> tuple[float, ...] | None:
+    """k1 to k4 of a fisheye `model`, None for a pinhole without distortion. Raises ValueError for any other."""
+    if model in fisheyes:
+        return tuple(read_numbers(coefficients, MAX_COEFFICIENTS, "distortion coefficients"))
+    if model not in pinholes:
+        raise ValueError(f"the distortion model {model!r} has no counterpart")
+    if any(float(c) for c in coefficients):
+        raise ValueError(f"distortion {model} with coefficients other than 0 has no counterpart; fisheye models have")
+    return None
+
+
+def read_yaml(text: str) -> list[dict[str, Any]]:
+    """The mappings of a YAML file, one of each document that is not empty. Raises ValueError if there is none."""
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):  # a few of them are a file of any size
+                raise yaml.YAMLError("aliases (*name) are not read")
+            return super().compose_node(parent, index)
+
+    if len(text) > MAX_YAML_CHARS:
+        raise ValueError(f"more than {MAX_YAML_CHARS // 2**10} KiB")
+    try:
+        found = [value for value in yaml.load_all(text, Loader) if value is not None]
+    except (yaml.YAMLError, RecursionError) as cause:
+        raise ValueError(str(cause)) from cause
+    if not found or not all(isinstance(value, dict) for value in found):
+        raise ValueError("no keys")
+    return found
+
+
+def yaml_list(values: Sequence[float]) -> str:
+    """A list in one line of YAML, numbers to the last digit."""
+    import yaml
+
+    return str(yaml.safe_dump([float(v) for v in values], default_flow_style=True, width=math.inf)).strip()
+
+
+def read_xml(text: str) -> dict[str, Any]:
+    """The entries of a FileStorage in XML: texts, and matrices as dictionaries. Raises ValueError."""
+    from xml.etree import ElementTree
+
+    try:
+        entries = ElementTree.fromstring(text)
+    except ElementTree.ParseError as cause:
+        raise ValueError(str(cause)) from cause
+    found: dict[str, Any] = {}
+    for entry in entries:
+        parts = {part.tag: (part.text or "").strip() for part in entry}
+        found[entry.tag] = {**parts, "data": parts.get("data", "").split()} if parts else (entry.text or "").strip()
+    return found
+
+
+def write_ros(camera: Camera, k: Coefficients) -> str:
+    """A camera_info file (camera_calibration_parsers): equidistant for fisheyes, plumb_bob for pinholes."""
+    model, coefficients = ("plumb_bob", (0.0,) * 5) if k is None else ("equidistant", k)
+    (fx, fy), (cx, cy) = camera.focal_px, camera.centre_px
+    name = json.dumps(camera.name, ensure_ascii=False)  # a JSON string is one of YAML
+    return (
+        f"image_width: {camera.size_px[0]}\nimage_height: {camera.size_px[1]}\ncamera_name: {name}\n"
+        f"camera_matrix:\n  rows: 3\n  cols: 3\n  data: {yaml_list(matrix_of(camera))}\n"
+        f"distortion_model: {model}\n"
+        f"distortion_coefficients:\n  rows: 1\n  cols: {len(coefficients)}\n  data: {yaml_list(coefficients)}\n"
+        "rectification_matrix:\n  rows: 3\n  cols: 3\n  data: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]\n"
+        "projection_matrix:\n  rows: 3\n  cols: 4\n"
+        f"  data: {yaml_list([fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0])}\n"
+    )
+
+
+def split_ros(text: str) -> list[Part]:
+    """The camera_info of a file, or those printed from a topic, whose keys ROS 1 writes in capitals.
+
+    Names are their numbers; the message's header does not count.
+    """
+    found = []
+    for number, document in enumerate(read_yaml(text), 1):
+        d = {str(key).lower(): value for key, value in document.items() if key != "header"}
+        if "camera_matrix" in d:
+            for key, name in ROS_FILE_ARRAYS.items():
+                if name in d:
+                    d[key] = d.pop(name)["data"]
+            d["width"], d["height"] = d.pop("image_width"), d.pop("image_height")
+        found.append(Part(str(number), f"{d['width']} x {d['height']}", d))
+    return found
+
+
+def read_ros(d: dict[str, Any], _angle_rad: float | None) -> dict[str, Any]:
+    """A camera_info. Width, height and matrix are of the whole sensor: region of interest, then binning, are applied.
+
+    A pixel of the picture covers pixels of the sensor: its centre is between theirs.
+    """
+    coefficients = read_distortion(
+        d["distortion_model"], d["d"], ("equidistant", "fisheye"), ("plumb_bob", "rational_polynomial")
+    )
+    fx, skew, cx, _, fy, cy, *_ = read_numbers(d["k"], 9, "camera matrix")
+    if skew:
+        raise ValueError("a skewed camera matrix has no counterpart")
+    size = np.array([int(d["width"]), int(d["height"])])
+    roi = d.get("roi") or {}
+    start, window = ([int(roi.get(key, 0)) for key in keys] for keys in (("x_offset", "y_offset"), ("width", "height")))
+    window = window if any(window) else size.tolist()  # 0: the whole sensor
+    by = [max(int(d.get(key, 0)), 1) for key in ("binning_x", "binning_y")]  # 0: none
+    if min(start) < 0 or min(window) < 1 or (np.add(start, window) > size).any():
+        raise ValueError(f"roi {window[0]} x {window[1]} at {start[0]}, {start[1]} is not within the sensor")
+    centre_px = (np.array([cx, cy]) - start + 0.5) / by - 0.5
+    picture = np.array(window) // by
+    notes = []
+    if max(by) > 1 or (picture != size).any():
+        notes.append(
+            f"binning {by[0]} x {by[1]} and region of interest {window[0]} x {window[1]} at {start[0]}, {start[1]} are "
+            f"applied: the camera is of pictures of {picture[0]} x {picture[1]} px"
+        )
+    r, p = read_numbers(d.get("r", np.eye(3).ravel().tolist()), 9, "r"), d.get("p")
+    shift = [] if p is None else read_numbers(p, 12, "p")[3::4]
+    if (any(r) and not np.array_equal(np.reshape(r, (3, 3)), np.eye(3))) or any(shift):
+        notes.append("the rectification of a stereo camera (r, p) is left out: the camera is of pictures as taken")
+    keys = keys_of(picture.tolist(), (fx / by[0], fy / by[1]), (float(centre_px[0]), float(centre_px[1])), coefficients)
+    return keys | {"name": str(d.get("camera_name") or ""), "notes": tuple(notes)}
 
 
 class Format(NamedTuple):

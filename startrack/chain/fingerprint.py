@@ -12,8 +12,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from startrack import __version__
 from startrack.catalog import has_deep_catalog
+from startrack.core import __version__
 from startrack.core.errors import BadInput
 from startrack.core.files import is_path, parse_toml, read_text, relative_path, split_camera
 from startrack.exposure import IMAGE_KEYS, RAW_SUFFIXES, BagImage, Sidecar, sidecar_of

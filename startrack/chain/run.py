@@ -11,7 +11,7 @@ from typing import Self, TypeVar
 
 from startrack.chain.stages import Inputs, Outcome, Refused
 from startrack.core.errors import Reason
-from startrack.core.time_limit import check_time, limited_time, stating_work
+from startrack.core.limits import check_time, limited_time, stating_work
 from startrack.core.types import BadInput, NoSolution
 
 HIDDEN_BY_DAMAGE = {  # reasons that damage of the image causes too

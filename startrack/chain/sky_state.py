@@ -9,7 +9,7 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.core.errors import Reason
-from startrack.core.time_limit import stating_work
+from startrack.core.limits import stating_work
 from startrack.core.types import Array, Centroids, Detections, Exposure, NotIdentified, TooFewStars
 from startrack.detection import MIN_BINNED_SIGMA_PX, ROUNDED, WIDTH_TOLERANCE, is_rounded, smallest_step
 

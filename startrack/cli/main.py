@@ -20,13 +20,12 @@ from typing import Any, NoReturn
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: a second thread waits for work, 0.2 s a start
 
-from startrack import __version__
 from startrack.cli.console import discard_stdout, open_closed_streams, print_advice
 from startrack.cli.flags import Command
-from startrack.core import errors
+from startrack.core import __version__, errors
 from startrack.core.errors import BadInput, BadOutput, NoSolution
 from startrack.core.files import FULL_DISK
-from startrack.core.memory import COMMAND_BYTES, START_BYTES, check_memory, refusing_shortage
+from startrack.core.limits import COMMAND_BYTES, START_BYTES, check_memory, refusing_shortage
 from startrack.kernels import LibraryMissing
 
 COMMANDS = {  # name to the module of startrack.cli that declares it

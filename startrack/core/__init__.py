@@ -1,5 +1,6 @@
 """What every package uses: values, errors with exit codes, files and locks, settings, processes."""
 
+__version__ = "0.2.0"  # of startrack
 MAX_EXPOSURE_S = 1e6  # of an image
 MAX_COUNT = 1_000_000  # of frames, cells or draws: more is a wrong unit
 REPORTED_IMAGES = 30  # on a page, with their pictures

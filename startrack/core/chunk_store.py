@@ -13,7 +13,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from startrack import __version__
+from startrack.core import __version__
 from startrack.core.files import PACKAGE, remove_file
 from startrack.core.runner import TASK_LIMIT_S, Died, Runner, RunStopped
 from startrack.core.stored import read_sealed, write_sealed

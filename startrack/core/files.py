@@ -6,15 +6,22 @@ import errno
 import os
 import re
 import tempfile
+import time
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 from startrack.core.declaration import similar_name
 from startrack.core.errors import MISSING, BadInput, BadOutput, Reason, one_line
-from startrack.core.replacement import replace_file
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 PACKAGE = Path(__file__).resolve().parents[1]
 MAX_TEXT_BYTES = 2**20  # camera and terrain files have a few kilobytes
@@ -30,6 +37,8 @@ KINDS = {  # of TOML files, by the reason of a faulty one: the flag that takes i
 LONG_KEY = re.compile(rf"(?<![\w.-])(?:{_KEY_PART}[ \t]*+\.[ \t]*+){{{MAX_KEY_PARTS}}}")
 FOREIGN_CAMERA_SUFFIXES = ".yaml", ".yml", ".xml", ".txt", ".cal"  # of other programs' camera files
 FilePath = str | os.PathLike[str]
+PART = re.compile(r"\.[0-9a-f]{32}\.part")  # name of a file that is being written
+PART_LIVES_S = 86_400.0  # since the last byte: longer than any writing, on file systems whose locks hold on one host
 
 
 class Locked(Exception):
@@ -282,3 +291,46 @@ def hold_lock(path: FilePath, *, wait: bool = True, on_wait: Callable[[], None] 
         with suppress(OSError):  # Windows keeps open files; a remaining file is not a lock
             file.unlink()
         lock.release()
+
+
+def replace_file(target: Path, data: bytes) -> None:
+    """Write the `data` to a part, which then takes the place of `target`; remove those of killed processes beside it.
+
+    Raises OSError, and ValueError for a name with a null character.
+    """
+    _remove_parts(target.parent.absolute())
+    # In the same folder, because a rename does not cross file systems; tempfile would make the file private.
+    part = target.parent / f".{uuid4().hex}.part"
+    try:
+        with part.open("xb") as file:
+            if fcntl is not None:
+                with suppress(OSError):  # a file system without locks: there no process removes parts
+                    fcntl.flock(file, fcntl.LOCK_EX)
+            file.write(data)
+            file.flush()
+            if fcntl is None:
+                file.close()  # Windows renames no open file
+            os.replace(part, target)
+    finally:
+        with suppress(OSError):  # renamed already; and a failed clean-up must not hide the cause
+            part.unlink()
+
+
+@lru_cache(maxsize=4096)
+def _remove_parts(folder: Path) -> None:
+    """Remove what killed processes left half-written in a `folder`, once a process: it is listed once.
+
+    A process holds the lock of its part up to the renaming, and writes once it has it: an empty part may be in use.
+    Another host may not see the lock, so that a part also has to be old.
+    On Windows, where no lock shows that a process lives, parts stay.
+    """
+    if fcntl is None:
+        return
+    with suppress(OSError):  # a folder that cannot be listed
+        for path in folder.iterdir():
+            if PART.fullmatch(path.name) and not path.is_symlink():
+                with suppress(OSError), path.open("r+b") as file:  # in use, or another user's
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    status = os.fstat(file.fileno())
+                    if status.st_size and time.time() - status.st_mtime > PART_LIVES_S:
+                        path.unlink()

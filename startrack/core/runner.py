@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import os
 import signal
@@ -26,7 +25,7 @@ from multiprocessing.process import BaseProcess
 from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar, cast
 
 from startrack.core.errors import BadInput
-from startrack.core.time_limit import check_time
+from startrack.core.limits import check_time
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -241,6 +240,8 @@ def _submit(pool: ProcessPoolExecutor, work: Callable[[Task], Result], task: Tas
 
 def _submit_to_cluster(client: Client, work: Callable[[Task], Result], task: Task) -> Future[Result]:
     """The future result, or the exception of the work, of its transfer or of a lost connection."""
+    import asyncio
+
     from distributed import Future as FarFuture
 
     async def fetched(far: FarFuture[Result]) -> Result:

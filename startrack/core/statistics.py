@@ -1,4 +1,4 @@
-"""Numbers from functions and samples: a robust estimate of spread, weights of log-likelihoods, a root."""
+"""Numbers from functions and samples: spread, weights of log-likelihoods, a root, and values around the horizon."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from startrack.core.values import Array
+from startrack.kernels.library import kernel
 
 NORMAL_BY_MEDIAN = 1.4826  # standard deviation of a normal variable over the median of its absolute value
 # The normal distribution function as the kernels interpolate it: by so many steps, of so many sigmas to either side; in
@@ -94,3 +95,13 @@ def error_ellipse(covariance: Array) -> tuple[Array, Array, Array]:
     squares, axes = np.linalg.eigh(covariance)
     minor, major = np.moveaxis(np.sqrt(np.maximum(squares, 0.0)), -1, 0)
     return major, minor, np.arctan2(axes[..., 0, 1], axes[..., 1, 1]) % np.pi
+
+
+def interpolate_circle(values: Array, azimuth_rad: Array) -> Array:
+    """Linear interpolation at `azimuth_rad` (...) [rad] of `values` (m,), which stand at even steps from azimuth 0."""
+    found = np.array(azimuth_rad, dtype=np.float64, order="C")
+    _interpolate(np.ascontiguousarray(values, dtype=np.float64), found.reshape(-1))
+    return found
+
+
+_interpolate = kernel("interpolate_circle", "values: float64[m]", "found: out float64[n]")

@@ -29,7 +29,6 @@ from startrack.core.fix import (
     UnstatedFact,
 )
 from startrack.core.obstacles import Obstacles
-from startrack.core.smooth_image import Image, SmoothImage
 from startrack.core.values import Array, Bools, Ints, Rows, Value, array, rotation, vector
 
 __all__ = [
@@ -39,6 +38,7 @@ __all__ = [
     "ShownError", "Stars", "TooFewStars", "UnstatedFact", "Value", "array", "rotation", "vector",
 ]  # fmt: skip
 
+Image = NDArray[np.float32]
 # Beyond the zenith: the search for an error of the horizon shifts the rows, by three sigma at most.
 MOST_ELEVATION_RAD = np.pi / 2 + 0.6
 SECTORS = 240  # of azimuth, 1.5 degrees each: an obstacle on no map hides what is in one together
@@ -125,6 +125,45 @@ class Exposure(Value):
     def recorded_adu(self) -> NDArray[np.float32]:
         """Counts (H, W) [ADU] before dark frame and flat field."""
         return self.pixels_adu if self.correction is None else self.correction.recorded_adu
+
+
+@dataclass(frozen=True)
+class SmoothImage:
+    """An image (H, W) that is linear between the middles of blocks of `side` rows; above and below them constant."""
+
+    rows: Image  # (n, W): the values in the middle of each block
+    side: int
+    height: int
+
+    @classmethod
+    def of(cls, image: Image) -> SmoothImage:
+        """Any image (H, W): each of its rows is kept."""
+        return cls(image, 1, len(image))
+
+    @classmethod
+    def from_blocks(cls, values: NDArray[Any], side: int, shape: tuple[int, ...]) -> SmoothImage:
+        """Linear interpolation, in x too, between the middles of square blocks (n, m) that cover an image (H, W)."""
+        import cv2
+
+        size = values.shape[1] * side, values.shape[0]
+        wide: Any = cv2.resize(values, size, interpolation=cv2.INTER_LINEAR)
+        return cls(np.ascontiguousarray(wide[:, : shape[1]]), side, shape[0])
+
+    def whole(self) -> Image:
+        """The image itself (H, W)."""
+        import cv2
+
+        size = self.rows.shape[1], len(self.rows) * self.side
+        full: Any = cv2.resize(self.rows, size, interpolation=cv2.INTER_LINEAR)
+        return full[: self.height]
+
+    def at(self, row: Any, column: Any) -> Image:
+        """Values at whole pixels; the indices are broadcast."""
+        above = np.clip((row + 0.5) / self.side - 0.5, 0.0, len(self.rows) - 1)
+        low = above.astype(np.int64)
+        part = (above - low).astype(np.float32)
+        high = np.minimum(low + 1, len(self.rows) - 1)
+        return np.asarray(self.rows[low, column] * (1 - part) + self.rows[high, column] * part)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ from functools import cache
 import cv2
 import numpy as np
 
-from startrack.core.smooth_image import Image, SmoothImage
+from startrack.core.types import Image, SmoothImage
 from startrack.kernels.library import kernel
 
 BAND_PIXELS = 2**18

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
-from startrack.core.smooth_image import Image
 from startrack.core.statistics import NORMAL_BY_MEDIAN
-from startrack.core.types import Array, Bools, Exposure, Ints, TooFewStars
+from startrack.core.types import Array, Bools, Exposure, Image, Ints, TooFewStars
 from startrack.detection.background import BLOCK_PX, CLIPPED_SIGMA, MIN_NOISE_STEPS, smallest_step
 from startrack.kernels.library import kernel
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.core.time_limit import check_time
+from startrack.core.limits import check_time
 from startrack.core.types import Array, Ints
 from startrack.detection.fit import (
     FIT_ROUNDS,

@@ -9,9 +9,8 @@ from math import ceil
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.core.smooth_image import Image, SmoothImage
-from startrack.core.time_limit import check_time
-from startrack.core.types import Array, Bools, Detections, Exposure, Mask, TooFewStars
+from startrack.core.limits import check_time
+from startrack.core.types import Array, Bools, Detections, Exposure, Image, Mask, SmoothImage, TooFewStars
 from startrack.detection.background import background_and_noise, block_side, smallest_step
 from startrack.detection.classify import (
     NOMINAL_HEIGHT,

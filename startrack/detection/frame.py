@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
-from startrack.core.smooth_image import Image, SmoothImage
-from startrack.core.types import Bools, Exposure, Ints
+from startrack.core.types import Bools, Exposure, Image, Ints, SmoothImage
 from startrack.kernels.library import kernel
 from startrack.psf import stamp_radius
 

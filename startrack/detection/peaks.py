@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.smooth_image import Image
-from startrack.core.types import Array, Ints
+from startrack.core.types import Array, Image, Ints
 from startrack.detection.background import BLOCK_PX, CLIPPED_SIGMA
 from startrack.detection.frame import LIGHT_AND_NOISE, Frame, lie_inside, radius_for
 from startrack.kernels.library import kernel

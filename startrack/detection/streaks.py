@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from startrack.core.time_limit import check_time
+from startrack.core.limits import check_time
 from startrack.core.types import Array, Bools, Ints
 from startrack.core.values import Rows, array
 from startrack.detection.background import CLIPPED_SIGMA

@@ -14,8 +14,8 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import numpy as np
 
 from startrack.camera import Camera, lens_jacobian, with_update
+from startrack.core.limits import check_time
 from startrack.core.statistics import root_between
-from startrack.core.time_limit import check_time
 from startrack.core.types import Array, NotIdentified
 from startrack.estimation.normal_equations import NormalEquations, Observations, Terms
 from startrack.frames import R_from_rotvec

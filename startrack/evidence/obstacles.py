@@ -28,7 +28,7 @@ def add_obstacles(
     """
     stated = (
         (camera.obstacles, R_COMPASS_BODY @ camera.R_body_cam, "bad_calibration"),
-        (terrain.obstacles, R_enu_cam, "bad_terrain"), (of_image, R_enu_cam, "bad_image"),
+        (terrain.file.obstacles, R_enu_cam, "bad_terrain"), (of_image, R_enu_cam, "bad_image"),
     )  # fmt: skip
     for given, R, reason in stated:
         if given is not None:

@@ -10,8 +10,7 @@ from math import ceil, sqrt
 
 import numpy as np
 
-from startrack.core.smooth_image import Image
-from startrack.core.types import Array, Bools, Detections, Ints
+from startrack.core.types import Array, Bools, Detections, Image, Ints
 from startrack.kernels import STAMP_LANES
 from startrack.kernels.library import kernel
 from startrack.psf import pixel_profile_table, stamp_radius

@@ -11,9 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.core.smooth_image import SmoothImage
 from startrack.core.statistics import median, robust_sigma
-from startrack.core.types import MIDDLES_RAD, Array, Detections, sector_of
+from startrack.core.types import MIDDLES_RAD, Array, Detections, SmoothImage, sector_of
 from startrack.evidence.photometry import SURE_SIGMAS
 from startrack.evidence.sky_levels import GROUND, SKY
 from startrack.evidence.sky_light import SkyLight

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.core.circle import interpolate_circle
+from startrack.core.statistics import interpolate_circle
 from startrack.core.types import MIDDLES_RAD, Array, Bools, Ints
 from startrack.frames import off_axis_rad, rays_from_azel
 from startrack.terrain import Terrain
@@ -68,7 +68,7 @@ class SkylineEstimate:
         variance_m2, axes = np.linalg.eigh(covariance_m2)
         axes = (axes * np.sqrt(np.maximum(variance_m2, 0.0))).T
         there = terrain.horizon_rad((position_m + np.vstack([np.zeros(2), axes, -axes]))[:, None], MIDDLES_RAD)
-        by_map = np.asarray(terrain.horizon_sigma_rad(np.asarray(position_m)[None], MIDDLES_RAD)).ravel()
+        by_map = np.asarray(terrain.errors.sigma_rad(np.asarray(position_m)[None], MIDDLES_RAD)).ravel()
         moved = (
             np.abs(there[1:] - there[0]).reshape(2, 2, -1).min(axis=0)
         )  # beyond a wall nearby the horizon is no measure

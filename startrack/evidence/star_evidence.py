@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
-from startrack.core.smooth_image import SmoothImage
-from startrack.core.types import Array, Body, Bools, Detections, Evidence, Ints, NoSolution, Stars
+from startrack.core.types import Array, Body, Bools, Detections, Evidence, Ints, NoSolution, SmoothImage, Stars
 from startrack.evidence.expected_stars import BAD_PIXELS, USABLE, ExpectedStars, expect_stars
 from startrack.evidence.flux_scale import FluxScale
 from startrack.evidence.photometry import Photometry, Sources, measure

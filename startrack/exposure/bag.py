@@ -17,9 +17,8 @@ import numpy as np
 
 from startrack.core.errors import BadInput, how_to_install
 from startrack.core.files import MAX_CAUSE_CHARS, MAX_TEXT_BYTES, FilePath, printable
-from startrack.core.memory import memory_refusal
+from startrack.core.limits import has_room, memory_refusal
 from startrack.core.types import Exposure
-from startrack.exposure.bounded_path import BoundedPath
 from startrack.exposure.decoding import Decoded, bad_image, check_size, decode_bytes, grey_float32, largest_value
 from startrack.exposure.facts import Facts
 from startrack.exposure.read import exposure_of_decoded
@@ -227,7 +226,8 @@ def _refusals(path: FilePath, reason: str) -> Iterator[None]:
     except Exception as error:  # rosbags raises many types for a damaged file
         cause = _escape(f"{type(error).__name__}: {error}")[:MAX_CAUSE_CHARS]
         damaged = BadInput(reason, f"{printable(path)}: damaged or unknown ROS bag ({cause})")
-        raise memory_refusal(error) or damaged from error
+        is_length = isinstance(error, MemoryError) and has_room()  # a length in the file that no file has
+        raise (None if is_length else memory_refusal(error)) or damaged from error
 
 
 def _escape(text: str) -> str:
@@ -253,7 +253,7 @@ def _open(path: Path, kinds: tuple[str, ...], topic: str | None, flag: str) -> I
     if path.is_dir() and metadata.stat().st_size > MAX_TEXT_BYTES:  # which rosbags would read for minutes
         raise _Fault(f"its metadata.yaml has more than {MAX_TEXT_BYTES // 2**20} MiB")
     # Files of older ROS 2 releases lack the definitions; those of the messages read here have never changed.
-    with AnyReader([BoundedPath(path)], default_typestore=get_typestore(Stores.LATEST)) as reader:
+    with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
         used = _choose_topic([(one.topic, one.msgtype) for one in reader.connections], kinds, topic, flag)
         connections = [one for one in reader.connections if one.topic == used and one.msgtype in kinds]
         yield reader, connections

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.files import MAX_CAUSE_CHARS, FilePath, missing_text, printable
-from startrack.core.memory import check_memory, memory_refusal
+from startrack.core.limits import check_memory, memory_refusal
 from startrack.core.types import MAX_PIXELS, BadInput
-from startrack.exposure.sidecar import RAW_SUFFIXES
+from startrack.exposure.sidecar import FORMATS, RAW_SUFFIXES
 
 MAX_FILE_BYTES = 8 * MAX_PIXELS + 2**24  # the largest image at the widest pixel type, and its headers
 EXACT_IN_FLOAT32 = 2 ** (np.finfo(np.float32).nmant + 1)
@@ -33,12 +33,6 @@ FRACTIONS_WARNING = (
 COLOUR_WARNING = "colour image: the plain mean of its three channels is used"
 Stamp = tuple[int, ...]  # of a file: inode, size, time of its last change
 T = TypeVar("T")
-STARTS = {  # of files, by their kind, whose module in lower case has the function `decode`
-    "PNG": (b"\x89PNG\r\n\x1a\n",),
-    "TIFF": (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"),
-    "JPEG": (b"\xff\xd8\xff",),
-    "FITS": (b"SIMPLE  =", b"\x1f\x8b", b"BZh"),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,7 +171,7 @@ def decode_bytes(raw: bytes, *, camera_raw: bool = False) -> Decoded:
 
     Raises BadInput bad_image; whatever else a decoder raises for damaged bytes is turned into it. Or out_of_memory.
     """
-    kind = next((kind for kind, starts in STARTS.items() if raw.startswith(starts)), None)
+    kind = next((kind for kind, one in FORMATS.items() if raw.startswith(one.starts)), None)
     if camera_raw:
         kind = "camera raw file"
     if kind is None:

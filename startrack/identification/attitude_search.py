@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.core.time_limit import check_time, stating_work
+from startrack.core.limits import check_time, stating_work
 from startrack.core.types import Array, Centroids, Ints
 from startrack.estimation.false_alarm import PATTERN_MATCHES, expected_false_alarms
 from startrack.frames import wahba

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.time_limit import check_time
+from startrack.core.limits import check_time
 from startrack.core.types import Array, Ints, Stars
 from startrack.identification.index import keep_last_few
 from startrack.identification.triangles import Triangles, number_runs, separate_bright_stars, triangles

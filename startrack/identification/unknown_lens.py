@@ -10,7 +10,7 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.core import FIELD_TOLERANCE_1, NARROWEST_DEG, WIDEST_DEG
-from startrack.core.time_limit import check_time, stating_work
+from startrack.core.limits import check_time, stating_work
 from startrack.core.types import Array, Centroids, Identification, ImageCircle, NotIdentified, Stars
 from startrack.estimation.false_alarm import probability
 from startrack.estimation.normal_equations import observations_of_image

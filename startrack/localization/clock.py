@@ -8,7 +8,7 @@ from math import hypot
 
 import numpy as np
 
-from startrack.core.time_limit import check_time
+from startrack.core.limits import check_time
 from startrack.core.types import Array, Clock, Evidence, Explored, NotLocated
 from startrack.frames import Air, R_from_rotvec, Site, sky_rotvec_rad, turn_sky, ut1_sigma_s
 from startrack.localization.places import FIT_M, BoxModel, Place, choose_apart

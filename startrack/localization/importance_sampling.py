@@ -15,8 +15,8 @@ from typing import Protocol
 
 import numpy as np
 
+from startrack.core.limits import check_time
 from startrack.core.statistics import shares
-from startrack.core.time_limit import check_time
 from startrack.core.types import Array
 
 DEGREES, FAR_DEGREES = 5.0, 3.0  # of freedom of the t distributions

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from startrack.core.circle import interpolate_circle
+from startrack.core.statistics import interpolate_circle
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, ImageErrors
 from startrack.localization.obstacle_chain import (
     LIT_MOVES,
@@ -74,8 +74,8 @@ class Neighbourhood:
     @cached_property
     def _shape_slopes_rad(self) -> dict[str, Array]:
         """Rise (SECTORS,) of the skyline by one unit of each error of the terrain's shape, by name."""
-        slopes = np.reshape(self.terrain.shape_slopes_rad(self.reference_m, MIDDLES_RAD), (-1, SECTORS))
-        return {one.name: slope for one, slope in zip(self.terrain.shape_errors, slopes, strict=True)}
+        slopes = np.reshape(self.terrain.errors.slopes_rad(self.reference_m, MIDDLES_RAD), (-1, SECTORS))
+        return {one.name: slope for one, slope in zip(self.terrain.errors.shape, slopes, strict=True)}
 
     @cached_property
     def skyline_rad(self) -> Array:
@@ -88,7 +88,7 @@ class Neighbourhood:
     @cached_property
     def crests(self) -> ExpectedCrests | None:
         """The skyline at the reference with all errors of posts; None of a ground without them."""
-        return self.terrain.expected_crests(self.reference_m, MIDDLES_RAD)
+        return self.terrain.errors.expected_crests(self.reference_m, MIDDLES_RAD)
 
     @cached_property
     def expected_rise_rad(self) -> Array:
@@ -103,9 +103,9 @@ class Neighbourhood:
         post is common to neighbours as the square of their correlation by posts; where the skyline follows none at all
         it is that azimuth's alone. Ground of which facts are not stated is rough by ROUGH_RAD besides.
         """
-        rough = 0.0 if all(one.is_stated for one in self.terrain.shape_errors) else ROUGH_RAD
+        rough = 0.0 if all(one.is_stated for one in self.terrain.errors.shape) else ROUGH_RAD
         if self.crests is None:
-            by_posts = np.asarray(self.terrain.horizon_sigma_rad(self.reference_m[None], MIDDLES_RAD)).ravel()
+            by_posts = np.asarray(self.terrain.errors.sigma_rad(self.reference_m[None], MIDDLES_RAD)).ravel()
             return np.hypot(by_posts, rough)
         of_posts, own = self._covariance_by_posts(self.crests), self.crests.own_sigma_rad
         likeness = correlation_of(of_posts)
@@ -123,7 +123,7 @@ class Neighbourhood:
         numbers, of = np.unique(crests.post[used], return_inverse=True)
         response = np.zeros((SECTORS, len(numbers)))
         np.add.at(response, (np.nonzero(used)[0], of), crests.rad_per_m[used])
-        return np.asarray(self.terrain.height_sigma_m**2 * response @ response.T)
+        return np.asarray(self.terrain.errors.height_sigma_m**2 * response @ response.T)
 
 
 def correlation_of(covariance: Array) -> Array:

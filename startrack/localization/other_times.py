@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from startrack.core.circle import interpolate_circle
+from startrack.core.statistics import interpolate_circle
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Clock
 from startrack.frames import R_from_rotvec, turn_sky
 from startrack.localization.clock import TIME_STEP_RAD, turned_model

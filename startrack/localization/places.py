@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from startrack.core.time_limit import check_time
+from startrack.core.limits import check_time
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, sector_of
 from startrack.localization.search_profiles import SearchProfiles, sum_contributions
 from startrack.localization.shared_errors import SharedErrors
@@ -100,7 +100,7 @@ class BoxModel:
         boxes = centres_m[:, None, :]
         low, high = self.terrain.horizon_bounds_rad(boxes, np.array(half_m), MIDDLES_RAD, WITHIN_RAD)
         require_bounds(self.terrain, low, high)
-        wider = MAP_SIGMAS * self.terrain.max_horizon_sigma_rad(boxes, half_m, MIDDLES_RAD, WITHIN_RAD)
+        wider = MAP_SIGMAS * self.terrain.errors.most_sigma_rad(boxes, half_m, MIDDLES_RAD, WITHIN_RAD)
         return self.profiles.bound(low + self.raised_rad - wider, high + self.raised_rad + wider)
 
     def score_place(self, point_m: Array) -> float:
@@ -126,8 +126,8 @@ class BoxModel:
         else:
             low, high = self.terrain.horizon_bounds_rad(boxes, np.array(half_m), azimuth, WITHIN_RAD)
             require_bounds(self.terrain, low, high)
-        if not self.terrain.hard_edges:
-            sigma = self.terrain.max_horizon_sigma_rad(boxes, half_m, azimuth, WITHIN_RAD)
+        if self.terrain.errors.height_sigma_m > 0.0:
+            sigma = self.terrain.errors.most_sigma_rad(boxes, half_m, azimuth, WITHIN_RAD)
             low, high = low - sigma, high + sigma
         raised = np.broadcast_to(self.raised_rad, SECTORS)[:: SECTORS // len(azimuth)]
         return self.profiles.average(low + raised - NARROWEST_RAD, high + raised + NARROWEST_RAD)

@@ -11,6 +11,7 @@ from startrack.localization.summary import camera_at, require_inside
 from startrack.terrain import Terrain, require_terrain
 
 DECISIVE_NATS = 5.0  # wrong for 1 star in 150; on a rendered 4 Mpx frame 3 nats double the pseudo-gradient's error
+FAR_M = 1e12
 
 
 @dataclass(frozen=True)
@@ -32,14 +33,25 @@ def stars_on_rim_plane(evidence: Evidence, terrain: Terrain) -> RimPlane:
     terrain = require_terrain(terrain)
     certainty = np.abs(evidence.llr)
     evidence = evidence.take(certainty >= min(DECISIVE_NATS, 0.5 * float(certainty.max(initial=0.0))))
-    disks = terrain.visible_disks(evidence.azimuth_rad, evidence.elevation_rad)
-    if disks is None:
+    if terrain.rim is None:
         raise BadInput("bad_terrain", f"{terrain.name}: this method needs a [cylinder]")
-    points, radius = -disks[0], disks[1]
+    radius, height = terrain.rim
+    points = points_of_rays(height, evidence.azimuth_rad, evidence.elevation_rad)
     rho = np.hypot(points[:, 0], points[:, 1])
     above = rho < 2 * radius
     wall = float(np.median(rho[above] * np.tan(evidence.elevation_rad[above]))) if above.any() else 0.0
     return RimPlane(points[above], evidence.llr[above] > 0, radius, wall)
+
+
+def points_of_rays(wall_m: float, azimuths_rad: Array, elevations_rad: Array) -> Array:
+    """Where rays (n,) pierce a plane `wall_m` above the camera: rho u (n, 2) [m], rho = wall / tan e, u horizontal.
+
+    A ray is visible from p exactly where |p + rho u| is below the radius of the rim in that plane; rays at or below
+    the horizontal pierce it infinitely far away.
+    """
+    tan = np.tan(elevations_rad)
+    rho = np.divide(wall_m, tan, out=np.full_like(tan, FAR_M), where=tan > 0)
+    return np.minimum(rho, FAR_M)[:, None] * np.stack([np.sin(azimuths_rad), np.cos(azimuths_rad)], axis=-1)
 
 
 def point_fix(position_m: Array, terrain: Terrain) -> Fix:

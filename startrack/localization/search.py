@@ -7,7 +7,7 @@ from math import ceil, log2
 
 import numpy as np
 
-from startrack.core.time_limit import check_time
+from startrack.core.limits import check_time
 from startrack.core.types import SECTORS, Array, Evidence, Explored, NotLocated
 from startrack.localization.places import (
     FINEST_M,

@@ -60,7 +60,7 @@ class SharedErrors:
     @staticmethod
     def doubtable(terrain: Terrain) -> tuple[str, ...]:
         """Stated facts of a `terrain` whose errors would be larger if the statement were wrong."""
-        known = terrain.shape_errors
+        known = terrain.errors.shape
         return tuple(
             dict.fromkeys(one.fact for one in known if one.gross_probability == 0.0 and one.gross_sigma > one.sigma)
         )
@@ -177,7 +177,7 @@ def _sigma(errors: Sequence[ShapeError], gross: str) -> Array:
 
 def _known_errors(terrain: Terrain, clock: Clock | None) -> list[ShapeError]:
     """The errors of a `terrain`, and of a `clock`, those that are stated as zero too."""
-    return [*terrain.shape_errors, *([] if clock is None else [_clock_error(clock, terrain)])]
+    return [*terrain.errors.shape, *([] if clock is None else [_clock_error(clock, terrain)])]
 
 
 def is_noticeable(clock: Clock, error_s: float, terrain: Terrain) -> bool:

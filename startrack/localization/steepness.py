@@ -24,7 +24,7 @@ def settle_steepness(evidence: Evidence, terrain: Terrain) -> Terrain:
 
     Raises NotLocated (outside_search_area, insufficient_geometry) where there is none, or more than one.
     """
-    sigma = terrain.unknown_steepness_1
+    sigma = terrain.errors.unknown_steepness_1
     if not sigma:
         return terrain
     steps = int(np.ceil(STEEPNESS_SIGMAS * sigma / STEEPNESS_STEP))

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from startrack.core.time_limit import check_time
+from startrack.core.limits import check_time
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Fix, Ints, NotLocated
 from startrack.localization.neighbourhood import Neighbourhood
 from startrack.localization.places import FINEST_M, Place, split_boxes

@@ -6,9 +6,9 @@ and a table of docs/formats.md are made from `QUANTITIES`. A new quantity is one
 
 from __future__ import annotations
 
-from startrack import __version__
 from startrack.camera import camera_keys, camera_to_dict
 from startrack.chain import Detected, Identified, Inputs, Located, Measured, Oriented, Positioned
+from startrack.core import __version__
 from startrack.core.ecsv import Column
 from startrack.frames import format_utc
 from startrack.kernels.library import LEVEL

@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from startrack import __version__
 from startrack.camera import camera_keys
 from startrack.chain import STAGES, Inputs, Outcome, last_value
+from startrack.core import __version__
 from startrack.core.errors import Reason
 from startrack.core.types import Exposure
 from startrack.exposure import SIDECAR as SIDECAR_KEYS
@@ -29,7 +29,7 @@ from startrack.output.quantity import (
     schema_of_kind,
 )
 from startrack.output.values import At
-from startrack.terrain import MAKERS, TERRAIN_KEYS
+from startrack.terrain import GROUNDS, TERRAIN_KEYS
 
 KINDS = {  # of the files NAME.KIND.json: what their records have of a result, in this order
     "fix": ("position", "modes", "search", "attitude", "middle", "explain", "stars", "bodies", "evidence", "sky",
@@ -139,7 +139,7 @@ def _has_type(value: Any, schema: Schema) -> bool:
     return isinstance(value, kinds[kind]) and isinstance(value, bool) == (kind == "boolean")
 
 
-TERRAIN_FILE: Schema = TERRAIN_KEYS.schema() | {"oneOf": [{"required": [ground]} for ground in MAKERS]}
+TERRAIN_FILE: Schema = TERRAIN_KEYS.schema() | {"oneOf": [{"required": [ground]} for ground in GROUNDS]}
 REFUSALS = [one.value for one in Reason if one is not Reason.AMBIGUOUS]
 SECTIONS = {
     name: schema_of(QUANTITIES, name, description)

@@ -131,7 +131,7 @@ def _needs_of(outcome: Outcome) -> Iterator[str]:
         yield from _longer_exposure(value)
         yield from _more_skyline(value)
         clock = ["time_sigma_s"] if value.clock.gross_probability > 0.0 else []
-        shape = [error.fact for error in value.terrain.shape_errors if not error.is_stated]
+        shape = [error.fact for error in value.terrain.errors.shape if not error.is_stated]
         silent = list(dict.fromkeys([*shape, *clock]))
         if silent:  # no position shows what each would gain
             yield f"facts: {', '.join(silent)} are not stated and count as uncertain ({_statement_of(silent[0])})"
@@ -192,7 +192,7 @@ def _finer_map(located: Located) -> Iterator[str]:
         f"a finer map: the smooth errors of this one make the 99.9 % circle {fix.radius999_m:.1f} m, not "
         f"{exact_m:.1f} m, and neither light nor more exposures help; crests "
         f"at azimuths {along:.0f} and {along + 180.0:.0f}, about "
-        f"{length_text(located.terrain.crest_distance_m)} away, count most"
+        f"{length_text(located.terrain.errors.crest_distance_m)} away, count most"
     )
 
 
@@ -250,7 +250,7 @@ def _doubtful_facts(measured: Measured) -> Iterator[str]:
     if measured.clock.gross_probability > 0.0:
         sigma = "nobody states its error"
     yield f"the right time: {measured.exposure.time_utc:%Y-%m-%dT%H:%M:%S} UTC, {sigma}; --time-sigma widens it"
-    stated = dict.fromkeys(error.fact for error in measured.terrain.shape_errors if error.is_stated)
+    stated = dict.fromkeys(error.fact for error in measured.terrain.errors.shape if error.is_stated)
     trusted = f" and trusted in {', '.join(stated)}" if stated else ""
     yield f"the right terrain: {measured.terrain.name} is compared with the image{trusted}"
     lens = "startrack calibrate verify compares it with an image of the stars"

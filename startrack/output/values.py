@@ -200,7 +200,8 @@ def off_map(value: Positioned) -> Blocked:
 
 def sectors_off_map(terrain: Terrain, position_m: Array) -> Blocked:
     """The azimuths in which ground off the maps could stand above the horizon of a `terrain` at `position_m` (2,)."""
-    return Blocked(np.where(terrain.ends_at(position_m, MIDDLES_RAD), 1.0, 0.0))
+    horizon_rad = np.ravel(terrain.horizon_rad(np.asarray(position_m)[None], MIDDLES_RAD))
+    return Blocked(np.where(terrain.unknown_below_rad(MIDDLES_RAD) > horizon_rad, 1.0, 0.0))
 
 
 def ranges_deg(sectors: Blocked | None) -> list[list[float]]:

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack import __version__
 from startrack.camera import Camera, Decentring
 from startrack.catalog import catalog_rays
 from startrack.chain import Oriented
+from startrack.core import __version__
 from startrack.core.types import Array
 from startrack.exposure import BLOCK_BYTES
 from startrack.frames import format_utc, wahba

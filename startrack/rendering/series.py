@@ -107,7 +107,7 @@ class Series:
     def ground_brightness(self) -> GroundBrightness:
         """Light of the ground over that of the sky, given, the terrain's or default."""
         stated = None if self.wall_reflectance is None else GroundBrightness.of(self.wall_reflectance)
-        return stated or self.terrain.ground_brightness or GroundBrightness.of(WALL_REFLECTANCE_1)
+        return stated or self.terrain.file.ground_brightness or GroundBrightness.of(WALL_REFLECTANCE_1)
 
     def scene(
         self, number: int, name: str = "", sky: tuple[Stars, Array] | None = None

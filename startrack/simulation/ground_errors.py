@@ -15,7 +15,7 @@ def draw_ground(terrain: Terrain, *, rng: np.random.Generator) -> Terrain:
 
     Errors of the shape are drawn from their stated or default sigmas, without the gross parts.
     """
-    errors, shared_sigma_rad, ground = terrain.shape_errors, terrain.common_sigma_rad, terrain
+    errors, shared_sigma_rad, ground = terrain.errors.shape, terrain.errors.common_sigma_rad, terrain
     if any(error.name == "bias_rad" and error.sigma > 0.0 for error in errors):
         shared_sigma_rad = 0.0  # it is drawn with the shape
     shape = np.array([error.sigma for error in errors])
@@ -26,7 +26,7 @@ def draw_ground(terrain: Terrain, *, rng: np.random.Generator) -> Terrain:
             drawn[far] = rng.standard_normal(np.count_nonzero(far))
         shape[errs] *= drawn
         ground = terrain.with_shape(shape)
-    if shared_sigma_rad > 0.0 or terrain.height_sigma_m > 0.0:
+    if shared_sigma_rad > 0.0 or terrain.errors.height_sigma_m > 0.0:
         return ErringGround(ground, rng, shared_sigma_rad)
     return ground
 
@@ -49,7 +49,7 @@ class ErringGround(ForwardingTerrain):
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:  # type: ignore[override]
         """Horizon elevation (..., n) [rad] seen from one point (1, 2) at azimuths (n,)."""
         found = np.asarray(self.whole.horizon_rad(points_m, azimuths_rad)) + self._shared_rad
-        crests = self.whole.expected_crests(np.reshape(points_m, 2), azimuths_rad)
+        crests = self.whole.errors.expected_crests(np.reshape(points_m, 2), azimuths_rad)
         if crests is None:
             return found
         return np.asarray(found + crests.rise_rad + np.sum(crests.rad_per_m * self._errors_m(crests.post), axis=1))
@@ -57,7 +57,7 @@ class ErringGround(ForwardingTerrain):
     def _errors_m(self, posts: Ints) -> Array:
         """Errors of the heights of posts (n, k) [m]: each is drawn when its post is first seen."""
         new = np.setdiff1d(posts, self._post)
-        drawn = self._rng.normal(0.0, self.whole.height_sigma_m, len(new))
+        drawn = self._rng.normal(0.0, self.whole.errors.height_sigma_m, len(new))
         drawn[new == NO_POST] = 0.0
         post = np.concatenate([self._post, new])
         order = np.argsort(post)

@@ -14,8 +14,7 @@ import numpy as np
 from startrack.camera import Camera, with_update
 from startrack.catalog import StarCatalog
 from startrack.chain import Identified, Measured, fit_orientation, identified_names
-from startrack.core.smooth_image import Image, SmoothImage
-from startrack.core.types import Array, Bools, Detections, Exposure, Identification, Ints
+from startrack.core.types import Array, Bools, Detections, Exposure, Identification, Image, Ints, SmoothImage
 from startrack.detection import Detector, electrons, source_variances
 from startrack.evidence import BAND_PX, half_width, leave_out_obstacles, skyline_band
 from startrack.psf import noise_area_px, pixel_profile

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from startrack.core.types import Array
 from startrack.frames import R_from_rotvec
 from startrack.kernels.library import kernel
+from startrack.terrain.horizon_table import rows_of_rays
+from startrack.terrain.map_errors import PostErrors
 from startrack.terrain.protocol import ForwardingTerrain, Terrain
-from startrack.terrain.rays import rows_of_rays
 from startrack.terrain.shape import wave_slopes_rad
 from startrack.terrain.table_cache import TABLES_IN_MEMORY
 from startrack.terrain.traced_map import TracedMap
+
+if TYPE_CHECKING:
+    from startrack.terrain.height_map import HeightMap
 
 TILT_ROUNDS = 2  # of the azimuth towards that of the turned skyline: each leaves a thousandth of the difference
 SETTLED_RAD = 1e-8  # of the azimuth: a change of 2 milliarcsec needs no further round
@@ -25,7 +28,7 @@ WIDER_RAD = 0.1  # by which azimuths are widened to find the highest skyline tha
 
 
 class DeformedMap(ForwardingTerrain):
-    """The ground of a height map with errors of its shape, given by the names of `shape_errors`.
+    """The ground of a height map with errors of its shape, given by their names.
 
     In this order: the camera stands higher, sight lines bend more, tan of the horizon is stretched, the horizon rises
     by the bias and by waves (by name), as crests of a wrong height do, and the skyline is turned about a horizontal
@@ -33,12 +36,11 @@ class DeformedMap(ForwardingTerrain):
     height and such lines; the horizon does without.
     """
 
-    whole: TracedMap
-    shape_errors, common_sigma_rad = (), 0.0
-    near, shape_slopes_rad, with_shape = Terrain.near, Terrain.shape_slopes_rad, Terrain.with_shape
+    whole: HeightMap
+    near, with_shape = Terrain.near, Terrain.with_shape
 
     def __init__(
-        self, whole: TracedMap, *, bias_rad: float = 0.0, stretch_1: float = 0.0, vertical_east_rad: float = 0.0,
+        self, whole: HeightMap, *, bias_rad: float = 0.0, stretch_1: float = 0.0, vertical_east_rad: float = 0.0,
         vertical_north_rad: float = 0.0, camera_height_m: float = 0.0, terrestrial_refraction_1: float = 0.0,
         **waves_rad: float,
     ) -> None:  # fmt: skip
@@ -50,6 +52,11 @@ class DeformedMap(ForwardingTerrain):
         self._most_risen_rad = float(risen_rad * whole.crest_share(np.zeros(1), np.zeros(1))[0]) if risen_rad else 0.0
         self._tilt_rad = float(np.hypot(vertical_east_rad, vertical_north_rad))
         self._R_turned_map = R_from_rotvec([vertical_north_rad, -vertical_east_rad, 0.0])
+
+    @cached_property
+    def errors(self) -> PostErrors:  # type: ignore[override]
+        """Those of the map's single posts."""
+        return PostErrors(self.whole)
 
     @property
     def camera_height_m(self) -> float:  # type: ignore[override]
@@ -69,9 +76,7 @@ class DeformedMap(ForwardingTerrain):
 
     def without_table(self) -> DeformedMap:
         """The same ground of the raised camera's map without its table; see `Terrain`."""
-        other = copy(self)
-        other.__dict__["_raised"] = self._raised.without_table()
-        return other
+        return self.changed(_raised=self._raised.without_table())
 
     def _level_rad(self, horizon_rad: Array) -> Array:
         """A horizon [rad] of the raised camera, stretched."""

@@ -19,8 +19,8 @@ from startrack.core.types import Array, Bools, Ints
 from startrack.frames import Site, enu_from_latlon, latlon_from_enu, sphere_radius_m
 from startrack.kernels.library import kernel
 from startrack.kernels.records import Record, declare_record
-from startrack.terrain.protocol import NO_POST
-from startrack.terrain.raster import Raster
+from startrack.terrain.maps.raster import Raster
+from startrack.terrain.shape import NO_POST
 
 SLOPE_STEPS = np.iinfo(np.int8).max  # a slope is kept as a whole number of 1/127 of the map's steepest, rounded up
 SURFACE_ROUNDS = 6  # of the height of the ground, each with the place of the last one's height

@@ -1,25 +1,31 @@
-"""Table of horizons, computed once per map and search area, and the errors of the horizon that follow from it.
+"""Table of horizons, computed once per map and search area, the errors of the horizon by it, and kernels on all cores.
 
 For each cell of the searched square and each degree of azimuth: bounds of the horizon, its distance, and a line above
-and a point below the ground that makes it.
+and a point below the ground that makes it. Rays go to the kernels one by one, or all azimuths of a point in a row.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
+from itertools import pairwise
 from threading import Lock
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.runner import count_cores
 from startrack.core.types import SECTORS, Array, Bools, Ints
 from startrack.kernels.library import kernel
 from startrack.kernels.records import Record, declare_record
 from startrack.terrain.ground import merge_blocks
-from startrack.terrain.rays import rows_of_rays
 
+MIN_RAYS_FOR_THREADS = 1500  # fewer take less time than starting threads
+MAX_THREADS = 8
 AZIMUTH_BINS = 360  # azimuths; the localizer's sectors are 1.5 degrees wide
 MIDDLES_RAD = (np.arange(AZIMUTH_BINS) + 0.5) * 2 * np.pi / AZIMUTH_BINS
 DISTANCE_STEP_M = 4.0
@@ -32,6 +38,50 @@ NEAREST_M = 50.0  # sigmas do not distinguish crests closer by
 SLOTS = 2**18  # boxes and azimuths that are kept: 15 MB; a draw on Shackleton's floor traces 20,000 to 110,000
 SECTOR_SLOTS = 2**14  # boxes whose bounds in all sectors are kept: 63 MB; a draw there looks 6000 up
 NEW = np.uint64(np.iinfo(np.uint64).max)  # a NaN, which no box has
+
+
+def flatten_rays(points_m: Array, azimuths_rad: Array) -> tuple[tuple[int, ...], Array, Array]:
+    """The shape of points (..., 2) broadcast with azimuths (...), and its n points (n, 2) and azimuths (n,)."""
+    shape = np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))
+    return shape, flatten(points_m, (*shape, 2)).reshape(-1, 2), flatten(azimuths_rad, shape).ravel()
+
+
+def rows_of_rays(points_m: Array, azimuths_rad: Array) -> tuple[tuple[int, ...], Array, Array]:
+    """The same shape, and its points (n, 2) and azimuths: (1, m) those of all points, else (n, 1)."""
+    if np.ndim(points_m) > 1 and np.shape(points_m)[-2] == 1 and np.ndim(azimuths_rad) == 1:
+        shape = (*np.shape(points_m)[:-2], len(azimuths_rad))
+        return shape, flatten(points_m, np.shape(points_m)).reshape(-1, 2), np.array(azimuths_rad, np.float64)[None]
+    shape, points, azimuths = flatten_rays(points_m, azimuths_rad)
+    return shape, points, azimuths[:, None]
+
+
+def flatten(a: Any, shape: tuple[int, ...]) -> Array:
+    """The values of `a`, broadcast to the shape, in one contiguous array of their own: kernels have one layout."""
+    return np.array(np.broadcast_to(np.asarray(a, dtype=np.float64), shape), order="C")
+
+
+def run_in_threads(function: Any, fixed: tuple[Any, ...], arrays: tuple[Array, ...]) -> None:
+    """Call the function with the fixed arguments and parts of the arrays, on all cores where rays are many."""
+    n, cores = len(arrays[-1]), min(count_cores(), MAX_THREADS)
+    if arrays[-1].size < MIN_RAYS_FOR_THREADS or cores == 1:
+        function(*fixed, *arrays)
+        return
+    ends = np.linspace(0, n, cores + 1).astype(int)
+    own, *others = [[a[i:j] for a in arrays] for i, j in pairwise(ends)]
+    running = [_thread_pool().submit(function, *fixed, *part) for part in others]
+    function(*fixed, *own)
+    for future in running:
+        future.result()
+
+
+@cache
+def _thread_pool() -> ThreadPoolExecutor:
+    """Threads beside the calling one, kept: each start takes as long as a thousand rays."""
+    return ThreadPoolExecutor(MAX_THREADS)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_thread_pool.cache_clear)  # threads are not copied
 
 
 @dataclass(frozen=True)

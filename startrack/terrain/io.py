@@ -1,31 +1,76 @@
-"""Terrain files (TOML): the declaration of their keys, and the terrain that they describe."""
+"""Terrain files (TOML): their keys, the terrain that they describe, and files with errors written in."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import replace
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from startrack.core.declaration import Choice, Either, Flag, List, Number, Table, Text
+from startrack.core.declaration import Choice, Either, List, Number, Table, Text
 from startrack.core.errors import Reason
 from startrack.core.files import parse_toml, printable, read_text, resolve_named
-from startrack.core.memory import check_memory
-from startrack.core.obstacles import Obstacles, read_obstacles
-from startrack.core.types import BadInput
+from startrack.core.obstacles import read_obstacles
+from startrack.core.types import Array, BadInput
 from startrack.frames import AIR_TABLE, Site
 from startrack.terrain import shape
-from startrack.terrain.cylinder import CYLINDER_KEYS, Cylinder
-from startrack.terrain.ground_brightness import GROUND_TABLE, GroundBrightness
-from startrack.terrain.protocol import Terrain
+from startrack.terrain.cylinder import CYLINDER_TABLE, make_cylinder
+from startrack.terrain.dem import DEM_TABLE, FILE, HEIGHT, make_height_map, paths_of
+from startrack.terrain.protocol import Terrain, TerrainFile
+from startrack.terrain.shape import (
+    BIAS,
+    CAMERA_ERROR,
+    CYLINDER_FACTS,
+    DEPTH,
+    DIAMETER,
+    OFFSETS,
+    REFRACTION,
+    STRETCH,
+    WAVE_PER_POST,
+    WAVES,
+    Fact,
+    vertical_fact,
+)
 
-FILE = Text(max_chars=4000, is_path=True)
-HEIGHT = Number(low=-shape.MAX_LENGTH_M, high=shape.MAX_LENGTH_M)
-SLOPES = List(each=Number(low=-600.0, high=600.0), count=2)
+BORDER_RAD = np.radians(0.2)  # over which one patch goes over to the next
+_LIGHT = Number(low=0.0, high=1000.0)
+_PATCHES = {
+    "low": Number(low=0.0, high=1000.0, required=True),
+    "high": Number(low=0.0, high=1000.0, required=True),
+    "size_deg": Number(low=1.0, high=360.0, required=True, description="of a patch in azimuth, about"),
+    "seed": Number(low=0, high=2**32 - 1, integer=True, default=0),
+}
+GROUND_TABLE = Table(
+    description="For pictures that are rendered.",
+    keys={
+        "brightness": Either(
+            kinds=(_LIGHT, Table(keys=_PATCHES, closed=True)),
+            description="light of the ground over that of the sky above it: a number, or patches of random brightness",
+        )
+    },
+)
+
+
+class Kind(NamedTuple):
+    """A kind of ground in terrain files: the table of its keys, and the function that makes the terrain.
+
+    `make` takes the checked keys of a file, the folder that its paths are relative to, and by name what all terrains
+    have: name, site, camera_height_m and file.
+    """
+
+    keys: Table
+    make: Callable[..., Terrain]
+
+
+GROUNDS = {  # by the name of their table
+    "cylinder": Kind(CYLINDER_TABLE, make_cylinder),
+    "dem": Kind(DEM_TABLE, make_height_map),
+}
 KEYS = Table(
     keys={
         "format": Choice(values=(1,), default=1),
@@ -40,38 +85,7 @@ KEYS = Table(
                 "height_m": replace(HEIGHT, default=0.0),
             },
         ),
-        "cylinder": Table(
-            description="Axis through the origin; floor at z = 0.",
-            keys=CYLINDER_KEYS,
-        ),
-        "dem": Table(
-            description="Height maps on the Moon's sphere or the Earth's ellipsoid; heights above it, posts at pixel "
-                        "centres, bilinear between.",
-            keys={
-                "file": Either(kinds=(FILE, List(each=FILE, least=1, most=100)), required=True,
-                               description="finest first"),
-                "height_sigma_m": replace(shape.AMOUNT, description="of single posts, independent of each other; if "
-                                          "absent 0, with a warning"),
-                **{fact.key: fact.limits for fact in (shape.BIAS, shape.STRETCH, shape.VERTICAL)},
-                shape.WAVES.key: shape.WAVES_LIMITS,
-                shape.OFFSETS.key: shape.OFFSETS.limits,
-                "scale": Number(low=-1e6, high=1e6, description="metres per unit, in place of what the files state"),
-                "offset_m": Number(low=-shape.MAX_LENGTH_M, high=shape.MAX_LENGTH_M,
-                                   description="height of value 0, in place of what the files state"),
-                "unusual_heights": Flag(description="the heights are right, though flatter, higher or lower than the "
-                                        "body's ground; no value is taken for a void that the file does not state"),
-                "cut_out_m": replace(shape.AMOUNT, description="voids up to so wide are roofs and trees that were cut "
-                                     "out of the maps: the ground there is interpolated between the posts around"),
-                "geoid_m": Either(kinds=(HEIGHT, List(each=HEIGHT, least=1, most=100)), description="height of the "
-                                  "geoid above the ellipsoid at the origin, if heights are above the geoid; a list: "
-                                  "of each map, 0 where they are above the ellipsoid; earth only"),
-                "geoid_slope_arcsec": Either(kinds=(SLOPES, List(each=SLOPES, least=1, most=100)), description="rise "
-                                             "of the geoid above the ellipsoid to the east and to the north; a list of "
-                                             "pairs: of each map; earth only"),
-                "highest_beyond_m": replace(HEIGHT, description="ground off the maps is no higher; if absent 8850 on "
-                                            "the earth, and on the moon the highest of the maps"),
-            },
-        ),
+        **{name: kind.keys for name, kind in GROUNDS.items()},
         "air": replace(
             AIR_TABLE,
             keys={
@@ -103,6 +117,54 @@ KEYS = Table(
         ),
     },
 )  # fmt: skip
+HEIGHT_KEY = "height_sigma_m"
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroundBrightness:
+    """Light of the ground over that of the sky above it: patches in azimuth, each with a random number.
+
+    The patches are equally wide, `size_rad` about, and begin at a random azimuth; the numbers are uniform between `low`
+    and `high`. The same `seed` gives the same patches.
+    """
+
+    low: float
+    high: float
+    size_rad: float = 2 * np.pi
+    seed: int = 0
+
+    @classmethod
+    def of(cls, stated: float | Mapping[str, Any]) -> Self:
+        """The brightness that is `stated` as a value of the key `ground.brightness`.
+
+        Raises BadInput bad_terrain for a `low` above `high`.
+        """
+        if not isinstance(stated, Mapping):
+            return cls(low=stated, high=stated)
+        low, high = stated["low"], stated["high"]
+        if low > high:
+            raise BadInput("bad_terrain", f"ground.brightness: low {low:g} is above high {high:g}")
+        return cls(low=low, high=high, size_rad=float(np.radians(stated["size_deg"])), seed=stated["seed"])
+
+    def __call__(self, azimuth_rad: Array) -> Array:
+        """Brightness (...) at azimuths `azimuth_rad` (...) in enu."""
+        at, patches_1 = self._knots
+        return np.interp(azimuth_rad, at, patches_1, period=2 * np.pi)
+
+    @property
+    def value(self) -> float | dict[str, float]:
+        """The value of the key that states it."""
+        if self.low == self.high:
+            return self.low
+        return {"low": self.low, "high": self.high, "size_deg": float(np.degrees(self.size_rad)), "seed": self.seed}
+
+    @cached_property
+    def _knots(self) -> tuple[Array, Array]:
+        """Azimuths (n,) of the ends of all patches, and the brightness there, linear between them."""
+        rng, count = np.random.default_rng(self.seed), max(round(2 * np.pi / self.size_rad), 1)
+        begins = rng.uniform(0, 2 * np.pi) + np.arange(count) * 2 * np.pi / count
+        ends = np.stack([begins + BORDER_RAD / 2, begins + 2 * np.pi / count - BORDER_RAD / 2], axis=1)
+        return ends.ravel(), np.repeat(rng.uniform(self.low, self.high, count), 2)
 
 
 def load_terrain(name_or_path: str | Path) -> Terrain:
@@ -122,7 +184,7 @@ def load_terrain(name_or_path: str | Path) -> Terrain:
 def files_of_terrain(path: str | Path) -> tuple[Path, ...]:
     """The files that the terrain of the file at `path` is read from, beside it; where it cannot be loaded, its maps."""
     try:
-        return load_terrain(path).files
+        return load_terrain(path).file.paths
     except BadInput:  # refused when it is used; a map that is missing may come
         with suppress(BadInput):
             return _files_of_maps(read_keys(read_text(path, "bad_terrain")), Path(path).parent)
@@ -163,8 +225,8 @@ def _load_cached(path: Path, text: str, stamps: tuple[Any, ...]) -> Terrain:
 
 def _map_files(keys: dict[str, Any], folder: Path) -> list[Path]:
     """Paths of the maps of the keys: those of its ground's key `file`, if it has one."""
-    files = next((keys[ground].get("file", ()) for ground in MAKERS if ground in keys), ())
-    return [folder / file for file in ((files,) if isinstance(files, str) else files)]
+    ground: dict[str, Any] = next((keys[name] for name in GROUNDS if name in keys), {})
+    return paths_of(ground.get("file", ()), folder)
 
 
 def _files_of_maps(keys: dict[str, Any], folder: Path) -> tuple[Path, ...]:
@@ -172,7 +234,7 @@ def _files_of_maps(keys: dict[str, Any], folder: Path) -> tuple[Path, ...]:
     maps = _map_files(keys, folder)
     if not maps:
         return ()
-    from startrack.terrain.map_reading import files_of_map
+    from startrack.terrain.maps.reading import files_of_map
 
     return tuple(dict.fromkeys(file for path in maps for file in files_of_map(path)))
 
@@ -197,114 +259,125 @@ def terrain_from_dict(values: dict[str, Any], default_name: str = "terrain", fol
     only_earth = [key for key in ("geoid_m", "geoid_slope_arcsec") if key in keys.get("dem", {})]
     if site.body != "earth" and only_earth:
         raise BadInput("bad_terrain", f"{only_earth[0]} is for the Earth, and the body is the {site.body.title()}")
-    makers = [make for ground, make in MAKERS.items() if ground in keys]
-    if len(makers) != 1:
-        what = "it has two grounds" if makers else "it has no ground"
+    kinds = [kind for ground, kind in GROUNDS.items() if ground in keys]
+    if len(kinds) != 1:
+        what = "it has two grounds" if kinds else "it has no ground"
         raise BadInput("bad_terrain", f"{what}: give a [cylinder] with diameter_m and depth_m, or a [dem] with file")
-    return makers[0](keys, keys.get("name", default_name), site, folder or Path())
+    shared = {
+        "name": keys.get("name", default_name), "site": site, "camera_height_m": keys["rover"]["camera_height_m"],
+        "file": _file_facts(keys, folder or Path()),
+    }  # fmt: skip
+    return kinds[0].make(keys, folder or Path(), **shared)
 
 
-def _obstacles(keys: dict[str, Any], folder: Path) -> tuple[Obstacles | None, tuple[Path, ...]]:
-    """The obstacles that a terrain file names, and their file."""
-    if "obstacles" not in keys:
-        return None, ()
-    return read_obstacles(folder / keys["obstacles"], "bad_terrain"), (folder / keys["obstacles"],)
+def _file_facts(keys: dict[str, Any], folder: Path) -> TerrainFile:
+    """What the `keys` of a terrain file in a `folder` state beside the ground. Raises BadInput bad_terrain."""
+    paths, obstacles, brightness = _files_of_maps(keys, folder), None, keys.get("ground", {}).get("brightness")
+    if "obstacles" in keys:
+        file = folder / keys["obstacles"]
+        paths, obstacles = (*paths, file), read_obstacles(file, "bad_terrain")
+    light = None if brightness is None else GroundBrightness.of(brightness)
+    return TerrainFile(paths=paths, obstacles=obstacles, ground_brightness=light)
 
 
-def _ground_brightness(keys: dict[str, Any]) -> GroundBrightness | None:
-    """What a terrain file states of the light of its ground. Raises BadInput bad_terrain."""
-    stated = keys.get("ground", {}).get("brightness")
-    return None if stated is None else GroundBrightness.of(stated)
+@dataclass(frozen=True)
+class StateableError:
+    """A key of a terrain file that states an error."""
+
+    table: str  # of the file
+    key: str
+    meaning: str
+    default: str  # what counts where the key is absent
+    is_missing: bool  # and matters
 
 
-def _make_cylinder(keys: dict[str, Any], name: str, site: Site, folder: Path) -> Cylinder:
-    obstacles, files = _obstacles(keys, folder)
-    cylinder, rover = keys["cylinder"], keys["rover"]
-    sigmas: dict[str, Any] = {fact.key: cylinder.get(fact.key) for fact in shape.CYLINDER_FACTS}
-    if cylinder.get("exact", False):
-        wrong = [key for key, sigma in sigmas.items() if sigma]
-        if wrong:
-            raise BadInput("bad_terrain", f"cylinder.exact is true, but {wrong[0]} is not 0: leave one of them out")
-        sigmas = dict.fromkeys(sigmas, 0.0)
-    return Cylinder(
-        name=name,
-        site=site,
-        camera_height_m=rover["camera_height_m"],
-        diameter_m=cylinder["diameter_m"],
-        depth_m=cylinder["depth_m"],
-        search_radius_m=keys["search"].get("radius_m", cylinder["diameter_m"] / 2),
-        camera_height_sigma_m=rover.get("camera_height_sigma_m", 0.0),
-        rim_tilt_sigma_rad=_radians(sigmas.pop("rim_tilt_sigma_deg")),
-        obstacles=obstacles,
-        ground_brightness=_ground_brightness(keys),
-        files=files,
-        **sigmas,
-    )
+def stateable_errors(text: str) -> list[StateableError]:
+    """The errors that a terrain file with this `text` states or could state. Raises BadInput bad_terrain."""
+    keys = read_keys(text)
+    vertical = vertical_fact(keys["body"])
+    dem, rover, cylinder = keys.get("dem", {}), keys.get("rover", {}), keys.get("cylinder")
+    if cylinder is not None:
+        sizes_m = {DEPTH.key: cylinder["depth_m"], DIAMETER.key: cylinder["diameter_m"]}
+        inexact = not cylinder.get("exact", False)
+        rows = [
+            ("cylinder", fact, _default_text(fact, sizes_m.get(fact.key)), inexact and fact.key not in cylinder)
+            for fact in CYLINDER_FACTS
+        ]
+        rows.append(("rover", CAMERA_ERROR, "0", False))
+    else:
+        rows = [
+            ("dem", BIAS, f"three times what {HEIGHT_KEY} makes of the horizon", BIAS.key not in dem),
+            *(("dem", fact, _default_text(fact), fact.key not in dem) for fact in (STRETCH, vertical)),
+            ("dem", WAVES, _waves_text(), WAVES.key not in dem),
+            ("dem", OFFSETS, _default_text(OFFSETS), OFFSETS.key not in dem and not isinstance(dem["file"], str)),
+            ("rover", CAMERA_ERROR, _default_text(CAMERA_ERROR), CAMERA_ERROR.key not in rover),
+        ]
+        if keys["body"] == "earth":
+            rows.append(("air", REFRACTION, _default_text(REFRACTION), REFRACTION.key not in keys.get("air", {})))
+    found = [
+        StateableError(table=table, key=fact.key, meaning=fact.meaning, default=default, is_missing=missing)
+        for table, fact, default, missing in rows
+    ]
+    if cylinder is not None:
+        return found
+    meaning, default = "error of single heights of the map [m]", "0, with a warning"
+    return [StateableError("dem", HEIGHT_KEY, meaning, default, is_missing=HEIGHT_KEY not in dem), *found]
 
 
-def _radians(degrees: float | None) -> float | None:
-    return None if degrees is None else float(np.radians(degrees))
+def _waves_text() -> str:
+    """What counts where a file leaves the waves out."""
+    gross = f"with probability {100 * WAVES.gross_probability:g} % a seam of {np.degrees(WAVES.gross_sigma):.4g}"
+    return f"{WAVE_PER_POST:g} of what {HEIGHT_KEY} makes of the horizon, and {gross}"
 
 
-def _waves(degrees: float | tuple[float, ...] | None) -> tuple[float, ...] | None:
-    """Sigmas [rad] of waves 1 to 8 of the horizon's error, from what a file states."""
-    if degrees is None:
+def _default_text(fact: Fact, size_m: float | None = None) -> str:
+    """The prior of a fact that a file leaves out, in the unit of its key; `size_m` is what a relative error is of."""
+    unit = 180.0 / np.pi if fact.key.endswith("_deg") else size_m or 1.0
+    text = f"{fact.sigma * unit:.4g}"
+    if fact.gross_probability:
+        text += f", and with probability {100 * fact.gross_probability:g} % {fact.gross_sigma * unit:.4g}"
+    return text
+
+
+def state_errors(text: str, values: Mapping[tuple[str, str], float | bool]) -> str:
+    """The `text` of a terrain file with `values` by table and key written in; all else is as before.
+
+    Raises BadInput bad_terrain where a key is there already, or the file's notation leaves no place for it.
+    """
+    for (table, key), value in values.items():
+        before = parse_toml(text, "bad_terrain")
+        if key in before.get(table, {}):
+            raise BadInput("bad_terrain", f"it states {table}.{key} already")
+        wanted = {**before, table: {**before.get(table, {}), key: value}}
+        line = f"{key} = {str(value).lower() if isinstance(value, bool) else repr(float(value))}"
+        fits = (changed for changed in _places(text, table, line) if _keys_of(changed) == wanted)
+        found = next(fits, None)
+        if found is None:
+            raise BadInput("bad_terrain", f"startrack finds no place for it: write `{line}` into [{table}] by hand")
+        text = found
+    return text
+
+
+def _keys_of(text: str) -> dict[str, Any] | None:
+    """The keys of a TOML text; None if it is none."""
+    try:
+        return parse_toml(text, "bad_terrain")
+    except BadInput:
         return None
-    return tuple(np.radians(shape.sigmas_of_waves(degrees) if isinstance(degrees, float) else degrees).tolist())
 
 
-def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) -> Terrain:
-    from startrack.terrain.height_map import HeightMap
-    from startrack.terrain.map_reading import read_map, require_origin
-
-    check_memory()  # its kernels come later: OpenBLAS ends the process before them
-    dem, rover, search = keys["dem"], keys["rover"], keys["search"]
-    near, files = (site.latitude_rad, site.longitude_rad), _map_files(keys, folder)
-    obstacles, more_files = _obstacles(keys, folder)
-    scaling = {key: dem[key] for key in ("scale", "offset_m", "unusual_heights") if key in dem}
-    maps = tuple(read_map(file, near=near, body=site.body, **scaling) for file in files)
-    require_origin(maps, *near)
-    if "cut_out_m" in dem:
-        from startrack.terrain.ground import fill_cut_out
-
-        maps = tuple(fill_cut_out(one, dem["cut_out_m"]) for one in maps)
-    on_earth = {}
-    if site.body == "earth":
-        from startrack.terrain.ellipsoid_fit import check_height, maps_above_ellipsoid
-
-        check_height(site, maps)
-        air = keys.get("air", {})
-        maps = maps_above_ellipsoid(maps, dem, site)
-        on_earth = {
-            "terrestrial_refraction_1": air.get("terrestrial_refraction", shape.REFRACTION_1),
-            "terrestrial_refraction_sigma_1": air.get(shape.REFRACTION.key),
-        }
-    default_highest = shape.EARTH_HIGHEST_M if site.body == "earth" else -np.inf
-    return HeightMap(
-        name=name,
-        site=site,
-        camera_height_m=rover["camera_height_m"],
-        maps=maps,
-        files=(*_files_of_maps(keys, folder), *more_files),
-        obstacles=obstacles,
-        ground_brightness=_ground_brightness(keys),
-        search_radius_m=search.get("radius_m", Terrain.search_radius_m),
-        height_sigma_m=dem.get("height_sigma_m", 0.0),
-        unstated_errors=() if "height_sigma_m" in dem else ("height_sigma_m",),
-        horizon_sigma_common_rad=_radians(dem.get("horizon_sigma_deg")),
-        stretch_sigma_1=dem.get("stretch_sigma_1"),
-        vertical_sigma_rad=_radians(dem.get("vertical_sigma_deg")),
-        waves_sigma_rad=_waves(dem.get(shape.WAVES.key)),
-        map_offset_sigma_m=dem.get(shape.OFFSETS.key),
-        camera_height_sigma_m=rover.get("camera_height_sigma_m"),
-        most_slope_rad=float(np.radians(search["max_slope_deg"])),
-        glare_rad=tuple((float(np.radians(a)), float(np.radians(b))) for a, b in search.get("glare_deg", ())),
-        highest_beyond_m=dem.get("highest_beyond_m", default_highest),
-        **on_earth,
-    )
-
-
-MAKERS: dict[str, Callable[[dict[str, Any], str, Site, Path], Terrain]] = {  # of each ground, by its table in KEYS
-    "cylinder": _make_cylinder,
-    "dem": _make_height_map,
-}
+def _places(text: str, table: str, line: str) -> Iterator[str]:
+    """Texts with the line after the last key of the table, after its header, or in a table of its own at the end."""
+    end = "\r\n" if "\r\n" in text else "\n"
+    lines = text.splitlines(keepends=True)
+    for at, one in enumerate(lines):
+        if re.match(rf"\s*\[\s*{table}\s*\]", one):
+            rest = at + 1
+            while rest < len(lines) and not re.match(r"\s*\[", lines[rest]):
+                rest += 1
+            while rest > at + 1 and re.match(r"\s*(#|$)", lines[rest - 1]):
+                rest -= 1
+            for place in (rest, at + 1):
+                head = "".join(lines[:place])
+                yield head + ("" if head.endswith("\n") else end) + line + end + "".join(lines[place:])
+    yield text + ("" if text.endswith("\n") else end) + f"{end}[{table}]{end}{line}{end}"

@@ -1,35 +1,44 @@
-"""The terrain protocol: elevation of the horizon at a position, and its bounds over a box of positions."""
+"""The terrain protocol: the ground, by its horizon; the errors of its map and what its file states are values of it."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from copy import copy
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.obstacles import Obstacles
-from startrack.core.types import Array, Bools, Ints
+from startrack.core.types import Array, BadInput, Bools
 from startrack.frames import Air, Site
-from startrack.terrain.earth_projection import EarthProjection
-from startrack.terrain.ground_brightness import GroundBrightness
-from startrack.terrain.projection import STEREOGRAPHIC, Projection
-from startrack.terrain.shape import ShapeError
+from startrack.terrain.maps.projections import STEREOGRAPHIC, EarthProjection, Projection
+from startrack.terrain.shape import GroundErrors
+
+if TYPE_CHECKING:
+    from startrack.terrain.io import GroundBrightness
 
 Progress = Callable[[int, int], None]  # parts done, of how many
-NO_POST = -1
+BOUNDS_ROUNDING_RAD = 1e-9  # by which a least horizon may exceed the greatest
 
 
-class ExpectedCrests(NamedTuple):
-    """The skyline at n azimuths of ground whose posts err, by the moments of its elevation."""
+@dataclass(frozen=True, kw_only=True)
+class TerrainFile:
+    """What a terrain file states beside its ground and the errors of that."""
 
-    rise_rad: Array  # (n,) mean, above the map's
-    own_sigma_rad: Array  # (n,) of the part that follows no post
-    post: Ints  # (n, k) in the numbering of a terrain; NO_POST where fewer count
-    rad_per_m: Array  # (n, k) mean rise with the height of each
+    paths: tuple[Path, ...] = ()  # files read beside it: what is made with the terrain depends on them
+    obstacles: Obstacles | None = None  # that hide its skyline, scanned from about where the camera stands
+    ground_brightness: GroundBrightness | None = None  # in pictures that are rendered; None: not stated
+
+
+class Rim(NamedTuple):
+    """A circular rim about the origin of a flat floor; of an uneven one the mean."""
+
+    radius_m: float
+    height_m: float  # above the camera
 
 
 class Terrain(ABC):
@@ -48,23 +57,13 @@ class Terrain(ABC):
     name: str = "terrain"
     site: Site | None = None  # where enu stands; needed to locate images, not to localize rays
     camera_height_m: float = 0.0  # of the camera above the ground
-    height_sigma_m: float = 0.0  # standard deviation of the height of a post, independent of the others
     search_radius_m: float = 10_000.0  # the camera is within this horizontal distance of the origin
-    common_sigma_rad: float = 0.0  # standard deviation of an error of the horizon that all azimuths and positions share
-    hard_edges: bool = True  # whether the horizon is exact: `horizon_sigma_rad` is zero everywhere
-    finest_m: float = 0.05  # half side of the smallest box of positions that the ground distinguishes
+    errors: GroundErrors = GroundErrors()  # of the map; the default: none
+    file: TerrainFile = TerrainFile()
     axisymmetric: bool = False  # whether a turn of the sky about the vertical only turns the position
     horizon_cost: float = 1.0  # of one horizon, beside one traced on a height map: the search has a budget of these
-    shape_errors: tuple[ShapeError, ...] = ()  # errors that all azimuths share, those that are stated as zero too
-    crest_distance_m: float = 10_000.0  # of the skyline from about the origin: over it waves of the map's error change
-    unknown_steepness_1: float = 0.0  # relative sigma of the horizon's tangent, where a search must find it; 0: known
-    steepness_1: float = 1.0  # the horizon's tangent that errors are counted from, over that of the stated shape
-    rim_radius_m: float | None = None  # of a circular rim about the origin, drawn on maps instead of the relief
+    rim: Rim | None = None  # of a crater, drawn on maps instead of the relief
     table_path: Path | None = None  # file of the table that `prepare` computes; None where it computes none
-    unstated_errors: tuple[str, ...] = ()  # keys of errors that the terrain file leaves out: they count as zero
-    obstacles: Obstacles | None = None  # that hide its skyline, scanned from about where the camera stands
-    ground_brightness: GroundBrightness | None = None  # in pictures that are rendered; None: not stated
-    files: tuple[Path, ...] = ()  # that it was read from, beside the terrain file: what is made with it depends on them
 
     @property
     def air(self) -> Air | None:
@@ -75,9 +74,13 @@ class Terrain(ABC):
         """The same ground under the air that is `stated`, see `Site.with_air`; None, or no site: itself."""
         if stated is None or self.site is None:
             return self
+        return self.changed(site=self.site.with_air(stated))
+
+    def changed(self, **values: Any) -> Self:
+        """A copy with other `values` of attributes, which keeps all that this one has computed but its errors."""
         other = copy(self)
-        other.__dict__["site"] = self.site.with_air(stated)
-        other.__dict__.pop("shape_errors", None)  # of a class that keeps them
+        other.__dict__.pop("errors", None)  # of a class that keeps them
+        other.__dict__.update(values)
         return other
 
     @property
@@ -116,16 +119,6 @@ class Terrain(ABC):
     def ground_m(self, points_m: Array) -> Array:
         """Height (...) of the ground in enu [m] at the points (..., 2)."""
 
-    def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
-        """Standard deviation (...) of the horizon [rad] from the errors of the map; independent between azimuths."""
-        return np.zeros(np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad)))
-
-    def max_horizon_sigma_rad(
-        self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float
-    ) -> Array:
-        """The largest `horizon_sigma_rad` (...) over boxes and azimuths, as in `horizon_bounds_rad`."""
-        return np.zeros(np.broadcast_shapes(np.shape(centres_m)[:-1], np.shape(azimuths_rad)))
-
     def horizon_spread_rad(self, points_m: Array, half_m: float, azimuths_rad: Array) -> tuple[Array, Array]:
         """Middle and half width (...), (...) [rad] of the horizon over boxes: an estimate, where bounds are wide."""
         low, high = self.horizon_bounds_rad(points_m, np.array(half_m), azimuths_rad)
@@ -143,11 +136,6 @@ class Terrain(ABC):
         """Elevations (...) below which ground off the maps could stand at the azimuths (...), or -pi/2."""
         return np.full(np.shape(azimuths_rad), -np.pi / 2)
 
-    def ends_at(self, point_m: Array, azimuths_rad: Array) -> Bools:
-        """Whether ground off the maps could stand above the horizon seen from `point_m` (2,) at the azimuths (n,)."""
-        horizon = np.ravel(self.horizon_rad(np.asarray(point_m)[None], azimuths_rad))
-        return np.asarray(self.unknown_below_rad(azimuths_rad) > horizon)
-
     def mask_reason(self, azimuths_rad: Array, elevations_rad: Array) -> NDArray[np.str_]:
         """Why rays (n,) are not informative; empty where they are."""
         return np.where(self.is_informative(azimuths_rad, elevations_rad), "", "ground off the map")
@@ -156,32 +144,9 @@ class Terrain(ABC):
         """One line of text per range of azimuths that is not informative."""
         return []
 
-    def error_warnings(self) -> list[str]:
-        """One line of text if the terrain file leaves out errors: the ground then counts as exact."""
-        return []
-
     def warnings(self) -> list[str]:
         """What the ground does not cover, and what its file does not state: the same for every image."""
-        return [*self.masked_sectors(), *self.error_warnings()]
-
-    def expected_crests(self, point_m: Array, azimuths_rad: Array) -> ExpectedCrests | None:
-        """The skyline seen from `point_m` (2,) at the azimuths (n,), with all errors of posts; None without such."""
-        return None
-
-    def crest_posts(self, point_m: Array, azimuths_rad: Array) -> Ints:
-        """The posts (n,) nearest to the map's crests seen from `point_m` (2,) at the azimuths (n,); NO_POST of none."""
-        return np.full(len(azimuths_rad), NO_POST)
-
-    def ground_posts(self, point_m: Array, azimuths_rad: Array) -> tuple[Ints, Array]:
-        """The posts (n, k) of the ground below a camera at `point_m` (2,), and by how much each lowers the horizon.
-
-        The latter is (n, k), negative, at the azimuths (n,) [rad/m].
-        """
-        return np.zeros((len(azimuths_rad), 0), dtype=np.int64), np.zeros((len(azimuths_rad), 0))
-
-    def post_positions_m(self, posts: Ints) -> Array:
-        """East, north and up (n, 3) in enu of the posts with these numbers (n,)."""
-        return np.zeros((len(posts), 3))
+        return [*self.masked_sectors(), *self.errors.warnings()]
 
     def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = 3) -> Terrain:
         """The same ground, prepared for positions within `half_m` of a centre (2,), at the azimuths (n,).
@@ -190,22 +155,15 @@ class Terrain(ABC):
         """
         return self
 
-    def shape_slopes_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
-        """Change (k, ...) [rad] of the horizon by one unit of each of the k `shape_errors`, to first order.
-
-        Seen from the points (..., 2) [m] at the azimuths (...) [rad].
-        """
-        return np.zeros((0, *np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))))
-
     def with_steepness(self, steepness_1: float) -> Terrain:
         """The same knowledge of a ground, its errors counted from one of this `steepness_1`.
 
-        For grounds whose `unknown_steepness_1` may differ from 0.
+        For grounds whose `errors.unknown_steepness_1` may differ from 0.
         """
         return self
 
     def with_shape(self, values: Array) -> Terrain:
-        """The ground that has the errors `values` (k,), in the units of the k `shape_errors`, exactly.
+        """The ground that has the errors `values` (k,), in the units of the k errors of its shape, exactly.
 
         For simulation: its horizon may cost much, and its bounds may be wide. Raises ValueError for another number of
         values.
@@ -213,13 +171,6 @@ class Terrain(ABC):
         if np.size(values):
             raise ValueError(f"with_shape: {np.size(values)} values for a terrain without errors of its shape")
         return self
-
-    def visible_disks(self, azimuths_rad: Array, elevations_rad: Array) -> tuple[Array, float] | None:
-        """Centres (n, 2) and radius [m] of the disks of ground from which the rays (n,) are visible.
-
-        None where the visible ground of a ray is not a disk of one radius for all rays.
-        """
-        return None
 
     @property
     def is_prepared(self) -> bool:
@@ -254,6 +205,8 @@ class Terrain(ABC):
 class ForwardingTerrain(Terrain):
     """A terrain with every attribute and method of another one, `whole`; subclasses replace some of them."""
 
+    changed = Terrain.changed
+
     def __init__(self, whole: Terrain) -> None:
         self.whole = whole
 
@@ -273,20 +226,15 @@ class ForwardingTerrain(Terrain):
 
     def without_table(self) -> Terrain:
         """A copy of this one, about `whole` without its table."""
-        return self._about(self.whole.without_table())
+        return self.changed(whole=self.whole.without_table())
 
     def with_air(self, stated: Mapping[str, Any] | None) -> Self:
         """A copy of this one, about `whole` under the air that is `stated`."""
-        return self._about(self.whole.with_air(stated))
+        return self.changed(whole=self.whole.with_air(stated))
 
     def with_steepness(self, steepness_1: float) -> Terrain:
         """A copy of this one, about `whole` of this `steepness_1`."""
-        return self._about(self.whole.with_steepness(steepness_1))
-
-    def _about(self, whole: Terrain) -> Self:
-        other = copy(self)
-        other.__dict__["whole"] = whole
-        return other
+        return self.changed(whole=self.whole.with_steepness(steepness_1))
 
 
 def _forward(name: str) -> Any:
@@ -296,3 +244,120 @@ def _forward(name: str) -> Any:
 for _name in set(vars(Terrain)) - set(vars(ForwardingTerrain)):
     if not _name.startswith("_"):
         setattr(ForwardingTerrain, _name, _forward(_name))
+
+
+def with_refraction_error(ground: Terrain, error_1: float) -> Terrain:
+    """The `ground` below stars whose refraction is larger than that of its air, relatively by `error_1`."""
+    return ground if error_1 == 0.0 or ground.air is None else MisrefractedGround(ground, ground.air, error_1)
+
+
+class MisrefractedGround(ForwardingTerrain):
+    """The terrain `whole`, without errors of its shape, in directions of stars that its `air` alone refracts."""
+
+    near, with_shape = Terrain.near, Terrain.with_shape
+
+    def __init__(self, whole: Terrain, air: Air, error_1: float) -> None:
+        super().__init__(whole)
+        self._air, self._error_1 = air, error_1
+
+    def _lowered_rad(self, horizon_rad: Array) -> Array:
+        """Elevations (...) [rad], in the order of the `horizon_rad` (...)."""
+        return np.asarray(horizon_rad - self._error_1 * self._air.lift_rad(horizon_rad))
+
+    def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """Horizon elevation [rad]; see `Terrain`."""
+        return self._lowered_rad(self.whole.horizon_rad(points_m, azimuths_rad))
+
+    def horizon_bounds_rad(
+        self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
+    ) -> tuple[Array, Array]:
+        """Bounds [rad] from those of the whole; see `Terrain`."""
+        low, high = self.whole.horizon_bounds_rad(centres_m, half_m, azimuths_rad, azimuth_half_rad)
+        return self._lowered_rad(low), self._lowered_rad(high)
+
+    def horizon_spread_rad(self, points_m: Array, half_m: float, azimuths_rad: Array) -> tuple[Array, Array]:
+        """As of the whole, about the horizon of this ground; see `Terrain`."""
+        middle, half = self.whole.horizon_spread_rad(points_m, half_m, azimuths_rad)
+        return self._lowered_rad(middle), half
+
+
+def require_terrain(given: Any) -> Terrain:
+    """`given`, if it is a terrain: of a class derived from Terrain, or with every member of one.
+
+    The one check of the members of a user's object; `require_bounds` and `require_horizons` check the values. All other
+    code relies on the protocol. Raises BadInput (bad_terrain) that names the required methods which are missing.
+    """
+    members = [name for name in dir(Terrain) if not name.startswith("_")]
+    if all(hasattr(type(given), name) or hasattr(given, name) for name in members):
+        return given  # type: ignore[no-any-return]
+    if isinstance(given, str):
+        raise BadInput("bad_terrain", f"{given!r} is a text, no terrain: give startrack.load_terrain({given!r})")
+    missing = [name for name in sorted(Terrain.__abstractmethods__) if not hasattr(given, name)]
+    lacks = f" (it has no {', '.join(missing)})" if missing else ""
+    raise BadInput(
+        "bad_terrain",
+        f"{type(given).__name__} is no terrain{lacks}: give a file, a name, or an object of a class derived from "
+        "startrack.Terrain",
+    )
+
+
+def require_site(terrain: Terrain) -> Site:
+    """The site of a `terrain`. Raises BadInput (bad_terrain) where it has none."""
+    if terrain.site is None:
+        raise BadInput("bad_terrain", f"terrain {terrain.name} has no site: its sky is not known")
+    return terrain.site
+
+
+def require_place(terrain: Terrain, east_m: float, north_m: float) -> None:
+    """Raise BadInput (bad_terrain), with the range allowed, where no camera can stand on a `terrain`.
+
+    The place is `east_m` and `north_m` of the origin [m].
+    """
+    if terrain.allowed(np.array([[east_m, north_m]]))[0]:
+        return
+    away_m, radius_m = float(np.hypot(east_m, north_m)), min(terrain.search_radius_m, terrain.reach_m)
+    place = f"E {east_m:g} m, N {north_m:g} m"
+    if away_m > radius_m:
+        raise BadInput(
+            "bad_terrain",
+            f"{place} is {away_m:.0f} m from the origin of {terrain.name}: give a place within its search area, "
+            f"{radius_m:g} m about the origin",
+        )
+    raise BadInput(
+        "bad_terrain", f"{terrain.name}: no camera can stand at {place} (a steep slope, or the wall): give another"
+    )
+
+
+def require_bounds(terrain: Terrain, low_rad: Array, high_rad: Array) -> None:
+    """Raise BadInput (bad_terrain) unless what `horizon_bounds_rad` of a `terrain` gave are bounds.
+
+    `low_rad` and `high_rad` (...): the least and greatest horizons. The search asks for those of the whole search area
+    first, so that an error in a user's terrain is named before it misleads the search.
+    """
+    wrong, fault = ~(low_rad <= high_rad + BOUNDS_ROUNDING_RAD), "least horizons above the greatest"
+    if not wrong.any():
+        return
+    nan = np.isnan(low_rad) | np.isnan(high_rad)
+    if nan.any():
+        wrong, fault = nan, "NaN"
+    _refuse(terrain, "horizon_bounds_rad", fault, wrong, "sectors of boxes")
+
+
+def require_horizons(terrain: Terrain, points_m: Array, horizon_rad: Array) -> None:
+    """Raise BadInput (bad_terrain) unless a `terrain` gave finite horizons wherever a camera can stand.
+
+    `points_m` (..., 2) are the positions, `horizon_rad` (...) what `horizon_rad` gave there.
+    """
+    if not np.isfinite(horizon_rad).all():
+        wrong = ~np.isfinite(horizon_rad) & np.asarray(terrain.allowed(points_m))
+        _refuse(terrain, "horizon_rad", "NaN or infinity", wrong, "rays from ground on which a camera can stand")
+
+
+def _refuse(terrain: Terrain, method: str, fault: str, wrong: Bools, what: str) -> None:
+    """Raise BadInput (bad_terrain) if any value of a method is wrong."""
+    if wrong.any():
+        raise BadInput(
+            "bad_terrain",
+            f"terrain {terrain.name!r} ({type(terrain).__name__}): {method} gives {fault} for "
+            f"{np.count_nonzero(wrong)} of {wrong.size} {what}",
+        )

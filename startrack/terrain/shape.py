@@ -1,15 +1,18 @@
-"""Errors of a terrain's shape: what a file states about them, and what counts where it is silent."""
+"""Errors of a ground's map: those of its shape, what a file states about them, and what counts where it is silent."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from startrack.core.declaration import Either, List, Number
-from startrack.core.types import Array
+from startrack.core.types import Array, Ints
+from startrack.frames import AIR_KEYS, USUAL_SIGMA_1, Air
 
+NO_POST = -1
 EXACT = 0.0  # sigma of a ground without the error
 MAX_LENGTH_M = 1e7  # five times the Moon's radius
 LENGTH = Number(low=0.0, high=MAX_LENGTH_M, above=True)
@@ -56,7 +59,7 @@ class Fact(Prior):
     meaning: str  # for those who are asked for it
     limits: Number  # of the value in the file
 
-    def shape_errors(self, stated: float | None, beside: float = 0.0) -> list[ShapeError]:
+    def errors_of_shape(self, stated: float | None, beside: float = 0.0) -> list[ShapeError]:
         """Those of the errors that count; `stated` is the sigma in the unit of the errors, None where it is not.
 
         `beside` is the sigma of an independent error with the same effect.
@@ -161,6 +164,17 @@ CYLINDER_FACTS = (DEPTH, DIAMETER, ELLIPSE, RIM_TILT)
 MAP_FACTS = (BIAS, STRETCH, VERTICAL, WAVES, OFFSETS, CAMERA_ERROR)
 
 
+STAR_REFRACTION = Fact(
+    key="refraction_sigma_1", errors=("refraction_1",), sigma=USUAL_SIGMA_1,
+    meaning="error of the refraction of the stars, relative", limits=AIR_KEYS["refraction_sigma_1"],
+)  # fmt: skip
+
+
+def radians(degrees: float | None) -> float | None:
+    """The angle [rad] of one in `degrees`; None of None."""
+    return None if degrees is None else float(np.radians(degrees))
+
+
 def vertical_fact(body: str) -> Fact:
     """The fact of a tilt of the whole map, on the Moon or the Earth."""
     return VERTICAL_EARTH if body == "earth" else VERTICAL
@@ -174,6 +188,16 @@ def offset_names(maps: int) -> tuple[str, ...]:
 def sigmas_of_waves(sigma: float) -> tuple[float, ...]:
     """Those of waves 1 to WAVE_COUNT where one number, of wave 1, states them."""
     return tuple(sigma * m**WAVE_FALL for m in range(1, WAVE_COUNT + 1))
+
+
+def refraction_errors(air: Air | None) -> list[ShapeError]:
+    """The error of the refraction in an `air`; none without."""
+    return [] if air is None else STAR_REFRACTION.errors_of_shape(air.refraction_sigma_1)
+
+
+def refraction_slopes_rad(air: Air | None, horizon_rad: Array) -> dict[str, Array]:
+    """Change (...) [rad] of a skyline at the elevations `horizon_rad` (...) by one unit of each error, by its name."""
+    return {} if air is None else {"refraction_1": -air.lift_rad(horizon_rad)}
 
 
 def wave_errors(stated: tuple[float, ...] | None, post_rad: float) -> list[ShapeError]:
@@ -212,3 +236,61 @@ def select_slopes(errors: Sequence[ShapeError], slopes_rad: dict[str, Array], sh
 def errors_by_name(errors: Sequence[ShapeError], values: Array) -> dict[str, float]:
     """The `values` (k,) of the errors by name. Raises ValueError where there are not as many."""
     return {error.name: float(value) for error, value in zip(errors, values, strict=True)}
+
+
+class ExpectedCrests(NamedTuple):
+    """The skyline at n azimuths of ground whose posts err, by the moments of its elevation."""
+
+    rise_rad: Array  # (n,) mean, above the map's
+    own_sigma_rad: Array  # (n,) of the part that follows no post
+    post: Ints  # (n, k) in the numbering of a terrain; NO_POST where fewer count
+    rad_per_m: Array  # (n, k) mean rise with the height of each
+
+
+class GroundErrors:
+    """Errors of the map of a ground: of single posts, and of its shape, which all azimuths share.
+
+    The defaults are those of exact ground. Positions and directions are as in `Terrain`.
+    """
+
+    height_sigma_m: float = 0.0  # standard deviation of the height of a post, independent of the others
+    common_sigma_rad: float = 0.0  # standard deviation of an error of the horizon that all azimuths and positions share
+    shape: tuple[ShapeError, ...] = ()  # errors that all azimuths share, those that are stated as zero too
+    unstated: tuple[str, ...] = ()  # keys of errors that the terrain file leaves out: they count as zero
+    crest_distance_m: float = 10_000.0  # of the skyline from about the origin: over it waves of the map's error change
+    unknown_steepness_1: float = 0.0  # relative sigma of the horizon's tangent, where a search must find it; 0: known
+    steepness_1: float = 1.0  # the horizon's tangent that errors are counted from, over that of the stated shape
+
+    def slopes_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """Change (k, ...) [rad] of the horizon by one unit of each of the k errors of the shape, to first order.
+
+        Seen from the points (..., 2) [m] at the azimuths (...) [rad].
+        """
+        return np.zeros((0, *np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))))
+
+    def sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """Standard deviation (...) of the horizon [rad] by single posts; independent between azimuths."""
+        return np.zeros(np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad)))
+
+    def most_sigma_rad(self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float) -> Array:
+        """The largest `sigma_rad` (...) over boxes and azimuths, as in `Terrain.horizon_bounds_rad`."""
+        return np.zeros(np.broadcast_shapes(np.shape(centres_m)[:-1], np.shape(azimuths_rad)))
+
+    def expected_crests(self, point_m: Array, azimuths_rad: Array) -> ExpectedCrests | None:
+        """The skyline seen from `point_m` (2,) at the azimuths (n,), with all errors of posts; None without such."""
+        return None
+
+    def ground_posts(self, point_m: Array, azimuths_rad: Array) -> tuple[Ints, Array]:
+        """The posts (n, k) of the ground below a camera at `point_m` (2,), and by how much each lowers the horizon.
+
+        The latter is (n, k), negative, at the azimuths (n,) [rad/m].
+        """
+        return np.zeros((len(azimuths_rad), 0), dtype=np.int64), np.zeros((len(azimuths_rad), 0))
+
+    def post_positions_m(self, posts: Ints) -> Array:
+        """East, north and up (n, 3) in enu of the posts with these numbers (n,)."""
+        return np.zeros((len(posts), 3))
+
+    def warnings(self) -> list[str]:
+        """One line of text for each error that the terrain file leaves out: the ground then counts as exact."""
+        return []

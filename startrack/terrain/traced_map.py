@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,28 +9,28 @@ from typing import Any, Self
 
 import numpy as np
 
-from startrack.core.obstacles import Obstacles
 from startrack.core.types import SECTORS, Array, BadInput, Bools
 from startrack.frames import Site
-from startrack.terrain.earth_projection import EarthProjection
 from startrack.terrain.ground import Ground, ground_up_m, pack_maps, surfaces
-from startrack.terrain.ground_brightness import GroundBrightness
 from startrack.terrain.horizon_table import (
     AZIMUTH_BINS,
     NO_TABLE,
     HorizonTable,
     Square,
     box_bounds,
+    flatten,
+    flatten_rays,
+    rows_of_rays,
+    run_in_threads,
     sector_bounds,
     trace_horizons,
 )
-from startrack.terrain.map_cost import costs_of
-from startrack.terrain.projection import Projection
-from startrack.terrain.protocol import Progress, Terrain
-from startrack.terrain.raster import Raster
-from startrack.terrain.rays import flatten, flatten_rays, rows_of_rays, run_in_threads
+from startrack.terrain.maps.projections import EarthProjection, Projection
+from startrack.terrain.maps.raster import Raster
+from startrack.terrain.protocol import Progress, Terrain, TerrainFile
 from startrack.terrain.table_cache import (
     TABLES_IN_MEMORY,
+    costs_of,
     discard_table,
     key_of_table,
     load_or_build_table,
@@ -60,14 +59,11 @@ class TracedMap(Terrain):
     name: str = "height map"
     site: Site
     maps: tuple[Raster, ...]  # finest first
-    files: tuple[Path, ...] = ()  # of them, and of obstacles
-    obstacles: Obstacles | None = None
-    ground_brightness: GroundBrightness | None = None
+    file: TerrainFile = Terrain.file
     camera_height_m: float = 1.5
     search_radius_m: float = Terrain.search_radius_m
     terrestrial_refraction_1: float = 0.0  # curvature of a level sight line in air, relative to the body's
     highest_beyond_m: float = -np.inf  # ground off the maps is no higher, nor than their highest post; as their heights
-    finest_m = 0.45  # no height map is more accurate
     _uses_table = True  # traces begin at the horizon's distance of a table in memory
     _similar_table: HorizonTable | None = None  # of a map much like this one: it tells about where horizons stand
 
@@ -106,10 +102,8 @@ class TracedMap(Terrain):
 
     def with_voids(self) -> Self:
         """The same map whose `horizons` end at its voids, without its table."""
-        other = self.without_table()
-        if any(np.isnan(one.heights_m).any() for one in self.maps):
-            other.__dict__["ground"] = self._pack(keep_voids=True)
-        return other
+        has_voids = any(np.isnan(one.heights_m).any() for one in self.maps)
+        return self.without_table().changed(**({"ground": self._pack(keep_voids=True)} if has_voids else {}))
 
     def _pack(self, keep_voids: bool) -> Ground:
         packed = pack_maps(self.site, self.maps, keep_voids=keep_voids)
@@ -187,8 +181,7 @@ class TracedMap(Terrain):
 
     def without_table(self) -> Self:
         """The same map whose traces begin at the camera; see `Terrain`."""
-        (other := copy(self)).__dict__["_uses_table"] = False
-        return other
+        return self.changed(_uses_table=False)
 
     def horizons(self, points_m: Array, azimuths_rad: Array) -> tuple[Array, Array, Array]:
         """tan, distance, and distance of the maps' end, (...) each, of the points (..., 2) at the azimuths (...).

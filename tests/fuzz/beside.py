@@ -76,7 +76,7 @@ def _read_bag(data: bytes, number: int, folder: Path) -> None:
 
 def _read_grid(data: bytes, number: int, folder: Path) -> None:
     from startrack.terrain import Grid, map_of_array, read_map
-    from startrack.terrain.array_map import SUFFIX, read_array
+    from startrack.terrain.maps.reading import SUFFIX, read_array
 
     path = folder / GRIDS[number]
     path.write_bytes(data)
@@ -87,7 +87,7 @@ def _read_grid(data: bytes, number: int, folder: Path) -> None:
 
 
 def _read_label(data: bytes, number: int, folder: Path) -> None:
-    from startrack.terrain.map_reading import read_map
+    from startrack.terrain.maps.reading import read_map
 
     (folder / "HILL.IMG").write_bytes((61 * np.arange(61 * 61) % 997).astype("<i2").tobytes())
     path = folder / "HILL.LBL"

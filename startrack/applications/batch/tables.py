@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from startrack import __version__
 from startrack.applications.batch import task as results
 from startrack.applications.batch.find import Image, record_path, unique_names
 from startrack.applications.batch.task import INPUTS, JOB, SOLVED, Record, Task, is_solved, stored_record, text_of_name
 from startrack.chain import STAGES, content_sha256
+from startrack.core import __version__
 from startrack.core.files import write_atomically
 from startrack.core.stored import read_json_object
 from startrack.frames import R_from_quat_xyzw, tum_line

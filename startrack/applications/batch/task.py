@@ -15,7 +15,7 @@ from startrack import chain, output
 from startrack.chain import Outcome, content_sha256
 from startrack.core.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput, Reason, one_line
 from startrack.core.files import FULL_DISK, printable, remove_file
-from startrack.core.memory import refusing_shortage
+from startrack.core.limits import refusing_shortage
 from startrack.core.runner import Died, Runner, RunStopped
 from startrack.core.stored import read_json_object
 from startrack.core.types import Exposure

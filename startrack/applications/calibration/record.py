@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from startrack import __version__
 from startrack.applications.calibration.acceptance import CheckedCamera, star_coverage
 from startrack.applications.calibration.board import BoardCalibration
 from startrack.applications.calibration.photometry import photometry_dict
 from startrack.applications.calibration.run import Calibration
 from startrack.camera import REFRACTION_REMOVED, Camera, camera_to_dict
+from startrack.core import __version__
 from startrack.core.errors import Reason
 from startrack.core.types import Array
 from startrack.estimation.lens_fit import LensFit

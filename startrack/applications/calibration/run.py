@@ -23,8 +23,8 @@ from startrack.applications.calibration.static_parts import find_obstructions, r
 from startrack.camera import REFRACTION_CONTAINED, REFRACTION_REMOVED, Camera
 from startrack.catalog import StarCatalog
 from startrack.chain import stating_sky
+from startrack.core.limits import stating_work
 from startrack.core.runner import map_in_threads
-from startrack.core.time_limit import stating_work
 from startrack.core.types import Array, BadInput, Bools, Exposure, Identification, NotIdentified, TooFewStars
 from startrack.detection import Detector
 from startrack.estimation.fixed_camera import find_disagreeing

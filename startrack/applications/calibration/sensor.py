@@ -15,9 +15,8 @@ from startrack.applications.calibration.acceptance import IMAGE_RINGS
 from startrack.applications.calibration.static_parts import find_hot_pixels, turn_rad
 from startrack.camera import Camera
 from startrack.core.runner import map_in_threads
-from startrack.core.smooth_image import Image
 from startrack.core.statistics import median, robust_sigma
-from startrack.core.types import Array, Exposure
+from startrack.core.types import Array, Exposure, Image
 from startrack.estimation.joint_fit import JointFit
 from startrack.psf import pixel_profile, stamp_radius
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.camera import MIN_THROUGHPUT_1, Sensor
+from startrack.core.limits import check_time
 from startrack.core.statistics import robust_sigma
-from startrack.core.time_limit import check_time
 from startrack.core.types import Array, Ints, Rows, array
 from startrack.estimation.joint_fit import JointFit
 from startrack.frames import airmass

@@ -18,8 +18,8 @@ from startrack.catalog import (
 )
 from startrack.chain import NearAttitude, Oriented, Refused, Settings, identify, identify_blind
 from startrack.core.errors import BadInput, Reason
+from startrack.core.limits import TimeLimitReached
 from startrack.core.runner import map_in_threads
-from startrack.core.time_limit import TimeLimitReached
 from startrack.core.types import Array, Body, Detections, Exposure, Ints
 from startrack.detection import Damage, find_damage
 from startrack.estimation.false_alarm import log_p_value_poisson

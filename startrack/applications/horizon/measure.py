@@ -34,8 +34,8 @@ from startrack.applications.horizon.starlight import StarLight, measure_stars
 from startrack.camera import Camera
 from startrack.catalog import StarCatalog
 from startrack.core.errors import NoSolution
+from startrack.core.limits import check_time
 from startrack.core.runner import map_in_threads
-from startrack.core.time_limit import check_time
 from startrack.core.types import Array, Bools, Exposure, Ints, MeasuredSkyline
 from startrack.frames import Site, off_axis_rad, rays_from_azel
 

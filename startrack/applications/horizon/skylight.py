@@ -26,8 +26,8 @@ from startrack.applications.horizon.columns import (
 )
 from startrack.applications.horizon.frames import SkyFrame
 from startrack.applications.horizon.starlight import StarLight
+from startrack.core.limits import check_time
 from startrack.core.statistics import NORMAL_BY_MEDIAN
-from startrack.core.time_limit import check_time
 from startrack.core.types import Array, Bools, Ints
 
 BEYOND_CIRCLE_RAD = np.radians(4.5)  # the edge of the image circle is stated to some degrees; light is followed so far

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from startrack import __version__, output
+from startrack import output
 from startrack.applications.prediction.draws import Conditions, predictor_of
 from startrack.applications.prediction.places import AreaCells, PathPoints
 from startrack.applications.prediction.quantities import (
@@ -27,6 +27,7 @@ from startrack.applications.prediction.quantities import (
     summarize_cells,
 )
 from startrack.applications.prediction.run import add_odometry
+from startrack.core import __version__
 from startrack.core.errors import BadOutput, length_text
 from startrack.core.files import check_regular, remove_file, write_atomically
 from startrack.core.stored import read_json_object

@@ -30,7 +30,7 @@ COMPARED_SOURCES = (  # of the chunks of all methods too
     "applications/reproduction/comparison.py", "applications/reproduction/scene.py",
     "applications/reproduction/published/*.py", "applications/reproduction/series.py",
     "applications/reproduction/valley.py", "applications/tracking/*.py", "chain/*.py", "detection/*.py",
-    "estimation/*.py", "evidence/*.py", "identification/*.py", "rendering/*.py", "simulation/*.py", "terrain/*.py",
+    "estimation/*.py", "evidence/*.py", "identification/*.py", "rendering/*.py", "simulation/*.py", "terrain/**/*.py",
 )  # fmt: skip
 KUA, OURS, BOUND = "kua", "ours", "bound"  # the thesis's two steps; ours; the limit for a perfect list
 ALL_METHODS = "all"  # that the thesis names, with `compare_places`

@@ -11,11 +11,12 @@ import numpy as np
 from startrack.applications.reproduction import simulator
 from startrack.applications.reproduction.artefact import Artefact, Context, markdown_table
 from startrack.applications.reproduction.methods import error_statistics
+from startrack.applications.reproduction.published.skylines import crest_posts_m
 from startrack.applications.reproduction.scene import Scene, terrain_of
-from startrack.core.types import MIDDLES_RAD, Array, Bools, NotLocated
+from startrack.core.types import Array, Bools, NotLocated
 from startrack.localization import ExactPosterior, PseudoGradient, descend, hull_position
 from startrack.output import Column
-from startrack.terrain import NO_POST, Terrain
+from startrack.terrain import Terrain
 
 WANDERING_PER_SKY = 2000  # positions, of which one in a hundred wanders; fewer in a quick run
 SEARCHED_M, SEARCH_STEP_M = 100.0, 5.0  # half side of the grid about the end of a descent that wanders, and its step
@@ -180,8 +181,8 @@ def _real_floor(context: Context) -> Iterator[Row]:
 
 def simplify_crater(terrain: Terrain) -> tuple[Array, float, float]:
     """Centre (2,), radius and height of the circle [m] through the crests of a `terrain` that its origin sees."""
-    crest = terrain.crest_posts(np.zeros(2), MIDDLES_RAD)
-    points = terrain.post_positions_m(crest[crest != NO_POST])
+    points = crest_posts_m(terrain, np.zeros(2))
+    points = points[np.isfinite(points[:, 0])]
     a = np.column_stack([2 * points[:, :2], np.ones(len(points))])
     (east, north, rest), *_ = np.linalg.lstsq(a, np.square(points[:, :2]).sum(axis=1), rcond=None)
     return np.array([east, north]), float(np.sqrt(rest + east**2 + north**2)), float(points[:, 2].mean())

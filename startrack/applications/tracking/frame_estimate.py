@@ -270,7 +270,7 @@ def _posts(model: FrameModel, by_horizon: Array, covariance: Array) -> tuple[Int
     if around.crests is None:
         return np.zeros(0, dtype=np.int64), np.zeros((len(by_horizon), 0))
     crests = around.crests.post, around.crests.rad_per_m
-    parts = [crests, terrain.ground_posts(around.reference_m, MIDDLES_RAD)]
+    parts = [crests, terrain.errors.ground_posts(around.reference_m, MIDDLES_RAD)]
     every = np.concatenate([posts.ravel() for posts, _ in parts])
     # Ground higher than the map acts on the evidence as a map lower than the ground.
     response = np.concatenate(
@@ -279,7 +279,7 @@ def _posts(model: FrameModel, by_horizon: Array, covariance: Array) -> tuple[Int
     known = every != NO_POST
     post, of = np.unique(every[known], return_inverse=True)
     by_post: Array = np.stack([np.bincount(of, weights=row[known], minlength=len(post)) for row in response])
-    by_post *= terrain.height_sigma_m
+    by_post *= terrain.errors.height_sigma_m
     effect = np.square(by_post / np.sqrt(np.diag(covariance))[:, None]).max(axis=0, initial=0.0)
     order = np.argsort(effect)
     kept = np.sort(order[np.cumsum(effect[order]) > NEGLIGIBLE_POST])
@@ -292,7 +292,7 @@ def waves_at(position_m: Array, terrain: Terrain, linear: LinearErrors) -> tuple
     A wave changes with the place, since the crests stand in other directions there: its error is that of the four
     nodes about the position (2,) of a square grid, independent of each other, in parts whose squares add up to 1.
     """
-    spacing_m = NODE_SPACING * terrain.crest_distance_m / (1 + np.arange(linear.waves) // 2)
+    spacing_m = NODE_SPACING * terrain.errors.crest_distance_m / (1 + np.arange(linear.waves) // 2)
     at = position_m / spacing_m[:, None]
     low, corner = np.floor(at), np.array([[0, 0], [1, 0], [0, 1], [1, 1]])[:, None]
     part = np.sqrt(np.prod(1.0 - np.abs(at - low - corner), axis=-1))

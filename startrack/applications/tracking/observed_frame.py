@@ -91,8 +91,9 @@ def observe_frame(outcome: Outcome, errors: TrackErrors | None = None, terrain: 
     fixes = image_fixes(value.fix, terrain)
     rows = _informative_rows(value, terrain, fixes[0].at_time_m)
     frame = ObservedFrame(
-        name, when, R, (), rows, fixes, value.fix.shown, steepness_1=value.terrain.steepness_1, search=value.fix.search
-    )
+        name, when, R, (), rows, fixes, value.fix.shown, steepness_1=value.terrain.errors.steepness_1,
+        search=value.fix.search,
+    )  # fmt: skip
     return observe_again(frame, errors, terrain)
 
 

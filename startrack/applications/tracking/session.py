@@ -83,7 +83,9 @@ class TrackSession:
         frame = self.store.read(key) if self.store and key else None
         if frame is None:
             outcome = locate(exposure, camera, terrain, load_catalog(), self.settings)
-            ground = self._count_from(terrain, outcome.terrain.steepness_1) if isinstance(outcome, Located) else terrain
+            ground = terrain
+            if isinstance(outcome, Located):
+                ground = self._count_from(terrain, outcome.terrain.errors.steepness_1)
             frame = observe_frame(outcome, replace(shared, gross=facts_of(outcome, shared)), ground)
             if self.store and key:
                 self.store.write(key, frame)

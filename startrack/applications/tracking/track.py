@@ -221,7 +221,7 @@ def _trajectory(
 def _shape_values(found: Smoothed, shared: TrackErrors, terrain: Terrain) -> Array:
     """(n,) of all errors of the terrain's shape, as estimated."""
     known = dict(zip(shared.names, shared.values(found.shared).tolist(), strict=True))
-    return np.array([known.get(one.name, one.mean) for one in terrain.shape_errors])
+    return np.array([known.get(one.name, one.mean) for one in terrain.errors.shape])
 
 
 def _size_error(found: Smoothed, shared: TrackErrors, name: str, size_m: float) -> SizeError | None:

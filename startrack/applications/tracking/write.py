@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from startrack import __version__, output
+from startrack import output
 from startrack.applications.tracking.legs import SlippedLeg
 from startrack.applications.tracking.quantities import FORMAT, FRAME_QUANTITIES, STATUSES, frame_records
 from startrack.applications.tracking.track import SizeError, Track, Trajectory
 from startrack.applications.tracking.track_map import known_points, track_extent
+from startrack.core import __version__
 from startrack.core.files import write_atomically
 from startrack.core.types import Array
 from startrack.frames import R_from_quat_xyzw, tum_line

@@ -21,7 +21,7 @@ from startrack.cli.inputs.camera_files import (
 )
 from startrack.core.errors import BadInput, NoSolution
 from startrack.core.files import printable, resolve_named, split_camera
-from startrack.core.time_limit import limited_time
+from startrack.core.limits import limited_time
 
 MIN_SIDE, MAX_SIDE = 3, 100  # corners or squares of a board
 SENSOR_FLAGS = {"gain_e_per_adu": "gain", "read_noise_e": "read_noise", "bias_adu": "bias"}  # by keys of camera files

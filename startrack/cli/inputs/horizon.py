@@ -15,7 +15,7 @@ from startrack.catalog import load_catalog
 from startrack.cli.console import Outcome, named_steps, print_left_out, print_outcome, refusal
 from startrack.cli.images import approximate_camera, check_fov, check_one_time, read_each_once, site_of
 from startrack.core.errors import BadInput, BadOutput, NoSolution, Reason, one_line
-from startrack.core.time_limit import limited_time, stating_work
+from startrack.core.limits import limited_time, stating_work
 
 FORMAT = "startrack.horizon/1"
 UNTESTED = "time and site are not tested by one image: an hour turns the skyline by 15 degrees"

@@ -25,8 +25,7 @@ from startrack.cli.images import check_fov, flag_site, near_attitude_of, prepare
 from startrack.cli.pictures.report import write_page_of_images
 from startrack.core.errors import INTERNAL_ERROR, BadInput, BadOutput
 from startrack.core.files import make_folder, printable
-from startrack.core.memory import refusing_shortage
-from startrack.core.time_limit import limited_time
+from startrack.core.limits import limited_time, refusing_shortage
 from startrack.core.types import Exposure, PositionPrior
 from startrack.exposure import read_mask, split_bag_path
 from startrack.frames import parse_utc

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from startrack.applications import tracking
-from startrack.applications.batch import image_tree, images_under
+from startrack.applications.batch import images_under, names_under
 from startrack.applications.tracking import FrameStore, ObservedFrame, Odometry, OdometryFile, Track, TrackSession
 from startrack.catalog import load_catalog
 from startrack.chain import Settings
@@ -130,7 +130,6 @@ class TrackRun:
     def follow(self) -> None:
         """Take images as they come; Ctrl-C and SIGTERM end it, before the first image with the code of a stop."""
         folder = self.args.frames[0]
-        tree = image_tree(folder, self.args.dir)
         load_catalog()  # before the first image comes
         prepare_reference(self.args.terrain, self.args)
         former = signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -147,7 +146,7 @@ class TrackRun:
 
         try:
             for path in tracking.follow_images(
-                lambda: [os.path.join(folder, name) for name in tree.changes()],
+                lambda: [os.path.join(folder, name) for name in names_under(folder, self.args.dir)],
                 take,
                 lambda path, cause: self._refuse(forget(path), cause),
                 until_idle_s=self.args.until_idle,

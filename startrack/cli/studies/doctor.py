@@ -13,9 +13,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from startrack import __version__
-from startrack.core.cache import cache_folder, limit_bytes
+from startrack.core import __version__
 from startrack.core.files import Locked, hold_lock, printable, remove_file
+from startrack.core.stored import cache_folder, limit_bytes
 
 REQUIRED = (
     "numpy", "scipy", "opencv-contrib-python-headless", "scikit-image", "astropy", "pillow", "tifffile",

@@ -219,8 +219,8 @@ def ground_map(
         "search_m": terrain.search_radius_m,
         "site": terrain.site.body if terrain.site is not None else None,
     }
-    if terrain.rim_radius_m is not None:
-        return {**shape, "rim_m": terrain.rim_radius_m}
+    if terrain.rim is not None:
+        return {**shape, "rim_m": terrain.rim.radius_m}
     half_m = MAP_MARGIN * terrain.reach_m if half_m is None else half_m
     cells = RELIEF_CELLS, RELIEF_CELLS
     ground_m, known = ground_cells(terrain, (half_m, half_m), cells, centre_m)

@@ -67,7 +67,7 @@ class Map:
 
     def draw_ground(self, terrain: Terrain) -> None:
         """The shape of the ground of a `terrain`, or the rim of a cylinder; the search area (dashed) and a grid."""
-        rim, origin = terrain.rim_radius_m or 0.0, self.canvas_px((0.0, 0.0))
+        rim, origin = terrain.rim.radius_m if terrain.rim else 0.0, self.canvas_px((0.0, 0.0))
         self.window.rectangle(self.box, Ink.PAPER)
         if not rim:
             self.draw_relief(*self.ground(terrain))
@@ -90,7 +90,7 @@ class Map:
 
     def draw_heights(self, terrain: Terrain) -> str:
         """Contours of a `terrain` with their heights; words about them, empty of flat ground and of a cylinder."""
-        if terrain.rim_radius_m is not None:
+        if terrain.rim is not None:
             return ""
         ground_m, known = self.ground(terrain)
         heights_m = ground_m[inner_cells(known)]
@@ -174,7 +174,7 @@ def draw_overview(
 
     All positions of the fix are drawn if it is ambiguous. `truth` (2,) is the true one, east and north [m].
     """
-    reach = max(min(terrain.search_radius_m, terrain.reach_m), terrain.rim_radius_m or 0.0)
+    reach = max(min(terrain.search_radius_m, terrain.reach_m), terrain.rim.radius_m if terrain.rim else 0.0)
     drawn = Map.of_extent(canvas, box, (0.0, 0.0), SEARCH_MARGIN * reach)
     drawn.draw_ground(terrain)
     if truth is not None:

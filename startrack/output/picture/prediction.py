@@ -51,7 +51,7 @@ def prediction_picture(
     """
     box = (MARGIN_PX, HEAD_PX, MARGIN_PX + SIDE_PX, HEAD_PX + SIDE_PX)
     canvas = _headed_canvas(round(box[2] + KEY_PX), round(box[3] + BELOW_PX), title, lines)
-    half_m = SEARCH_MARGIN * max(terrain.search_radius_m, terrain.rim_radius_m or 0.0)
+    half_m = SEARCH_MARGIN * max(terrain.search_radius_m, terrain.rim.radius_m if terrain.rim else 0.0)
     drawn, classes = Map.of_extent(canvas, box, (0.0, 0.0), half_m), radius_classes(radius95_m.heights_m)
     bounds_m = [bound for bound, _, _ in classes[:-1]]
     colours = [*([colour for _, _, colour in classes] or COLOURS[:1]), Ink.VERMILLION]  # the last: no position

@@ -16,11 +16,12 @@ import numpy as np
 from startrack.applications.reproduction.published.skylines import (
     LIT_SIGMA_RAD,
     close_gaps,
+    crest_posts_m,
     grid_points,
     require_bearings,
 )
 from startrack.core.types import MIDDLES_RAD, Array, Ints, MeasuredSkyline, NotLocated
-from startrack.terrain import NO_POST, Terrain
+from startrack.terrain import Terrain
 
 CORRESPONDENCES = 3  # for a pose: two coordinates and the heading, with an angle and elevations to check them
 FEATURE_REACH, FEATURE_MEAN = 8, 5  # sectors to either side that a feature stands out of, and of a mean
@@ -50,9 +51,8 @@ class MapFeatures:
         """
         found = [np.zeros((0, 3))]
         for view in grid_points(terrain, VIEWS_STEP_M):
-            crest = terrain.crest_posts(view, MIDDLES_RAD)
-            seen = find_features(terrain.horizon_rad(view[None], MIDDLES_RAD))
-            found.append(terrain.post_positions_m(crest[seen[crest[seen] != NO_POST]]))
+            crest_m = crest_posts_m(terrain, view)[find_features(terrain.horizon_rad(view[None], MIDDLES_RAD))]
+            found.append(crest_m[np.isfinite(crest_m[:, 0])])
         points = np.concatenate(found)
         _, cell, count = np.unique(
             np.floor(points[:, :2] / FEATURE_CELL_M), axis=0, return_inverse=True, return_counts=True

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import cast
 
 import numpy as np
 
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, MeasuredSkyline, NotLocated
-from startrack.terrain import Terrain
+from startrack.terrain import NO_POST, HeightMap, Terrain, cell_posts, require_site
 
 LIT_SIGMA_RAD = 1.0 / 652.0  # one pixel of a 180-degree fisheye of 2048 pixels: the noise that the papers assume
 MAP_STEP_M = 75.0  # between positions of a grid: that of Stein and Medioni (Kua 2008, section 2.2), the only one given
@@ -66,6 +67,24 @@ def grid_points(terrain: Terrain, step_m: float = MAP_STEP_M) -> Array:
     line = step_m * np.arange(-count, count + 1)
     points = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
     return points[terrain.allowed(points) & (np.hypot(*points.T) <= terrain.search_radius_m)]
+
+
+def crest_posts_m(terrain: Terrain, view_m: Array) -> Array:
+    """East, north and up (SECTORS, 3) [m] of the posts nearest to the crests of a map seen from `view_m` (2,).
+
+    nan of ground without posts, and where a crest is on no map.
+    """
+    found = np.full((SECTORS, 3), np.nan)
+    if terrain.rim is not None:
+        return found
+    ground = cast(HeightMap, terrain)
+    tan, distance_m, _ = ground.horizons(view_m, MIDDLES_RAD)
+    away_m = distance_m[:, None] * np.stack([np.sin(MIDDLES_RAD), np.cos(MIDDLES_RAD)], axis=1)
+    up_m = float(ground.ground_m(view_m)) + ground.camera_height_m + tan * distance_m
+    post, weight = cell_posts(require_site(ground), ground.maps, np.column_stack([view_m + away_m, up_m]))
+    nearest = post[np.arange(len(post)), np.argmax(weight, axis=1)]
+    found[nearest != NO_POST] = ground.errors.post_positions_m(nearest[nearest != NO_POST])
+    return found
 
 
 traced_grid = lru_cache(maxsize=1)(MapGrid.trace)  # once a process: minutes on a height map

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from startrack.core.errors import how_to_install
 from startrack.core.files import write_atomically
 from startrack.core.types import BadInput
-from startrack.terrain.earth_projection import WGS84_CODE, EarthProjection
-from startrack.terrain.raster import Raster
+from startrack.terrain.maps.projections import WGS84_CODE, EarthProjection
+from startrack.terrain.maps.raster import Raster
 
 MIN_STEP_M = 0.01  # of the heights in files that are written
 NO_HEIGHT = np.iinfo(np.uint16).max

@@ -1,11 +1,15 @@
-"""Shortage of memory as a refusal: before libraries begin that end the process without it, and by exceptions."""
+"""Limits of memory and of processor time, as refusals."""
 
 from __future__ import annotations
 
 import errno
 import mmap
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from threading import Lock
 
 from startrack.core.errors import BadInput, NoSolution, Reason
 from startrack.core.files import MAX_CAUSE_CHARS
@@ -52,7 +56,7 @@ def memory_refusal(cause: BaseException) -> BadInput | None:
         chain.append(one)
         one = one.__cause__ or one.__context__
     lacking = next((one for one in chain if _states_shortage(one)), None)
-    if lacking is None and _has_room():
+    if lacking is None and has_room():
         return None
     lacking = lacking or cause
     limit_bytes = _limit_bytes()
@@ -70,7 +74,7 @@ def _states_shortage(cause: BaseException) -> bool:
     )
 
 
-def _has_room() -> bool:
+def has_room() -> bool:
     """Whether a library could still be loaded: libraries and threads fail with exceptions of any class without it."""
     with suppress(OSError, ValueError):
         mmap.mmap(-1, LIBRARY_BYTES).close()
@@ -86,3 +90,89 @@ def _limit_bytes() -> int | None:
         return None
     soft = resource.getrlimit(resource.RLIMIT_AS)[0]
     return None if soft == resource.RLIM_INFINITY else soft
+
+
+class TimeLimitReached(NoSolution):
+    """The limit of the processor time came before an answer."""
+
+    reason = Reason.TIME_LIMIT
+
+
+@dataclass
+class _Clock:
+    """Processor time [s] without that of blocks that are not counted, which may overlap in several threads."""
+
+    left_out_s: float = 0.0
+    depth: int = 0
+    begun_s: float = 0.0
+    lock: Lock = field(default_factory=Lock)
+
+    def now_s(self) -> float:
+        with self.lock:
+            return (self.begun_s if self.depth else time.process_time()) - self.left_out_s
+
+    def pause(self) -> None:
+        with self.lock:
+            if not self.depth:
+                self.begun_s = time.process_time()
+            self.depth += 1
+
+    def resume(self) -> None:
+        with self.lock:
+            self.depth -= 1
+            if not self.depth:
+                self.left_out_s += time.process_time() - self.begun_s
+
+
+@dataclass(frozen=True)
+class _Limit:
+    seconds: float
+    end_s: float  # of CLOCK
+
+
+CLOCK = _Clock()
+_LIMIT: ContextVar[_Limit | None] = ContextVar("time limit", default=None)
+
+
+@contextmanager
+def limited_time(seconds: float | None) -> Iterator[None]:
+    """In the block `check_time` raises once so much processor time [s] was used; None: as outside of the block.
+
+    Raises ValueError for a limit that is not above 0.
+    """
+    if seconds is not None and not seconds > 0:
+        raise ValueError(f"the time limit is {seconds} s: give seconds of processor time, above 0")
+    if seconds is None:
+        yield
+        return
+    token = _LIMIT.set(_Limit(seconds, CLOCK.now_s() + seconds))
+    try:
+        yield
+    finally:
+        _LIMIT.reset(token)
+
+
+@contextmanager
+def uncounted_time() -> Iterator[None]:
+    """In the block no processor time counts: what it makes is kept, and a second run does not need it."""
+    CLOCK.pause()
+    try:
+        yield
+    finally:
+        CLOCK.resume()
+
+
+def check_time() -> None:
+    """Raises TimeLimitReached where the limit of the block has come."""
+    limit = _LIMIT.get()
+    if limit is not None and CLOCK.now_s() > limit.end_s:
+        raise TimeLimitReached(f"the limit of {limit.seconds:g} s of processor time came before an answer")
+
+
+@contextmanager
+def stating_work(text: Callable[[], str]) -> Iterator[None]:
+    """In the block TimeLimitReached becomes another one, which also states the `text`: what was done by then."""
+    try:
+        yield
+    except TimeLimitReached as cause:
+        raise TimeLimitReached(f"{cause}; {text()}") from cause

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.core.types import Array, BadInput
-from startrack.terrain.raster import Raster
+from startrack.terrain.maps.raster import Raster
 
 MIN_ERROR_M = 0.1
 MIN_RATIO_ROUGH = 0.5  # natural ground is no smoother: errors fall with the distance of the posts, not with its square

@@ -1,4 +1,4 @@
-"""Maps of the Earth as the kernels trace them: on a sphere about the origin, with polynomials for the map's projection.
+"""Maps of the Earth as the kernels trace them, on a sphere about the origin; and heights that count from the geoid.
 
 The sphere goes through the origin of enu, as curved as the ellipsoid is there; its centre is on the origin's vertical.
 The exact place of a post in enu gives its direction from that centre and its height above that sphere. The column and
@@ -10,15 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from importlib.util import find_spec
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.errors import how_to_install
 from startrack.core.types import Array, BadInput
 from startrack.frames import Site, enu_from_latlon, latlon_from_enu, sphere_radius_m
-from startrack.terrain.earth_projection import FOOT_M
-from startrack.terrain.raster import Raster
+from startrack.terrain.maps.projections import FOOT_M
+from startrack.terrain.maps.raster import Raster
 
 MOST_DEGREE = 12
 FIT_NODES, CHECK_NODES = 28, 41  # along each side, for the fit and for its check
@@ -28,6 +30,8 @@ MARGIN_POSTS, MARGIN_1 = 6.0, 0.02  # beyond the map's posts, where steps of a r
 TOLERANCE_POSTS, TOLERANCE_M, TOLERANCE_RAD = 0.01, 0.1, 2e-6
 FOOT_TOLERANCE_1, LOW_M = 0.03, 100.0  # stated heights that low do not show the unit
 HEIGHT_NODES = 65  # along each side of a map, between which the sphere's height is interpolated: it bends by 1e-9 / m
+ELLIPSOID = "ellipsoid"  # in place of a grid of the geoid: heights are above the ellipsoid
+BASE_M = 10_000.0  # from the site to the points that give the slope: the grids have posts every 2 to 30 km
 
 
 def fit_cells(raster: Raster, site: Site) -> Array:
@@ -70,6 +74,37 @@ def heights_above_sphere(raster: Raster, site: Site) -> NDArray[np.float32]:
     centre = np.array([0.0, 0.0, -radius])
     above = _smooth_over_posts(raster, site, lambda points: np.linalg.norm(points - centre, axis=-1) - radius - height)
     return np.asarray(raster.heights_m + above, dtype=np.float32)
+
+
+class Geoid(NamedTuple):
+    """The geoid above the ellipsoid: its height at a site, and how it rises there to the east and to the north."""
+
+    height_m: float
+    slope_arcsec: tuple[float, float]
+
+
+def geoid_at(grid: str, site: Site) -> Geoid:
+    """The geoid at a `site` on the Earth by a `grid`: a name that PROJ finds, or the path of a GTX or GeoTIFF grid.
+
+    Raises BadInput (bad_terrain) where PROJ has no such grid, or it does not reach the site.
+    """
+    if find_spec("pyproj") is None:
+        raise BadInput("bad_terrain", f"grids of the geoid need pyproj: {how_to_install('dem')}")
+    from pyproj import Transformer
+    from pyproj.exceptions import ProjError
+
+    try:
+        shift = Transformer.from_pipeline(f"+proj=vgridshift +grids={grid} +multiplier=1")
+    except ProjError as cause:
+        advice = f"projsync --file {grid} fetches those of PROJ"
+        raise BadInput("bad_terrain", f"{grid}: PROJ finds no such grid of the geoid: {advice}") from cause
+    east_m, north_m = BASE_M * np.array([[0, -1, 1, 0, 0], [0, 0, 0, -1, 1]])
+    latitude, longitude = latlon_from_enu(site, east_m, north_m, np.zeros(5))
+    here, west, east, south, north = shift.transform(longitude, latitude, np.zeros(5), radians=True)[2]
+    if not np.isfinite([here, west, east, south, north]).all():
+        raise BadInput("bad_terrain", f"{grid}: this grid of the geoid does not reach the origin")
+    slope = np.degrees(np.arctan([(east - west) / (2 * BASE_M), (north - south) / (2 * BASE_M)])) * 3600.0
+    return Geoid(float(here), (float(slope[0]), float(slope[1])))
 
 
 def above_ellipsoid(raster: Raster, site: Site, geoid_m: float, slope_arcsec: Sequence[float]) -> Raster:

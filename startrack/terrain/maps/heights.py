@@ -1,9 +1,10 @@
-"""Heights from the values of a map file: their unit, the posts without a height, and whether they can be of a body."""
+"""Heights from the values of a map file: their unit, as files spell it, voids, and whether a body has such ground."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -11,10 +12,8 @@ from numpy.typing import NDArray
 
 from startrack.core.types import Array, BadInput, Bools
 from startrack.frames import MOON_RADIUS_M
-from startrack.terrain.earth_projection import FOOT_M
-from startrack.terrain.height_units import metres_of
-from startrack.terrain.projection import MAX_NUMBER
-from startrack.terrain.raster import Raster
+from startrack.terrain.maps.projections import FOOT_M, MAX_NUMBER
+from startrack.terrain.maps.raster import Raster
 from startrack.terrain.shape import MAX_LENGTH_M
 
 MARKS = -9999.0, -99_999.0, -32_768.0, -32_767.0, 32_767.0, 9999.0, 99_999.0, -(2.0**31)  # usual values for voids
@@ -27,6 +26,13 @@ CLIFF_M, CLIFF_SLOPE = 1_500.0, 2.0  # between neighbours: the highest wall (Mou
 UNSTATED = "", "none", "unknown", "unspecified"  # units as decoders fill them in
 UNITS_TO_TRY = {"feet": FOOT_M, "decimetres": 0.1, "centimetres": 0.01, "millimetres": 0.001}
 AS_THEY_ARE = "if they are right, give --unusual-heights, or unusual_heights = true in [dem]"
+SURVEY_FOOT_M = 1200 / 3937
+PREFIXES = {"": 1.0, "k": 1e3, "d": 0.1, "c": 0.01, "m": 1e-3, "kilo": 1e3, "deci": 0.1, "centi": 0.01, "milli": 1e-3}
+METRES = {"": ("m",), "long": ("metre", "meter")}  # after a short and after a long prefix
+FEET = "ft", "foot", "feet"
+SURVEY_WORDS = "us survey {}", "survey {}", "us {}", "{} us", "{}us", "us{}", "{} us survey", "u.s. survey {}"
+INTERNATIONAL_WORDS = "{}", "international {}", "intl {}", "{} international", "{} i"
+SURVEY_FOOT_WORD = "sft"  # of BT files
 
 
 class Ground(NamedTuple):
@@ -294,3 +300,24 @@ def note_bands(count: int, alphas: Sequence[int], descriptions: Sequence[str | N
         return ()
     named = [f"{k + 1} ({descriptions[k]})" if descriptions[k] else f"{k + 1}" for k in others[:5]]
     return (f"the first of its {count} bands is taken as the heights; not read: {', '.join(named)}",)
+
+
+def metres_of(unit: str) -> float | None:
+    """The length [m] of a `unit` as map files spell it; None for one that is not known."""
+    word = " ".join(unit.lower().strip(" \t\n\0'\"<>[]").replace("_", " ").replace("-", " ").split())
+    word = word.replace("(", "").replace(")", "")
+    return _units_m().get(word)
+
+
+@cache
+def _units_m() -> dict[str, float]:
+    """Lengths [m] by their lower-case names: those of PROJ, and common spellings."""
+    from pyproj.database import get_units_map
+
+    found = {name.lower(): float(unit.conv_factor) for name, unit in get_units_map(category="linear").items()}
+    for prefix, factor in PREFIXES.items():
+        names = METRES["" if len(prefix) == 1 else "long"] + (METRES[""] if not prefix else ())
+        found |= {f"{prefix}{name}{plural}": factor for name in names for plural in ("", "s") if name + plural != "ms"}
+    found |= {form.format(foot): SURVEY_FOOT_M for form in SURVEY_WORDS for foot in FEET}
+    found |= {form.format(foot): FOOT_M for form in INTERNATIONAL_WORDS for foot in FEET}
+    return found | {SURVEY_FOOT_WORD: SURVEY_FOOT_M}

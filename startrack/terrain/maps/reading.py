@@ -1,28 +1,38 @@
-"""Height maps from files, by rasterio; the shipped ones without it."""
+"""Height maps from files, by rasterio, the shipped ones without it; and from arrays, which state no place."""
 
 from __future__ import annotations
 
 import json
+import logging
 import math
 import os
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from startrack.core.errors import how_to_install
-from startrack.core.files import data_dir
+from startrack.core.files import MAX_CAUSE_CHARS, data_dir
+from startrack.core.limits import memory_refusal
 from startrack.core.types import MAX_PIXELS, BadInput
-from startrack.terrain.earth_projection import EarthProjection, is_earth, project_earth
-from startrack.terrain.map_heights import Stored, heights_of, note_bands
-from startrack.terrain.plain_tiff import one_line_refusal, read_shipped
-from startrack.terrain.projection import EQUIRECTANGULAR, Projection, projection_of
-from startrack.terrain.raster import Raster
+from startrack.terrain.maps.heights import Stored, heights_of, note_bands
+from startrack.terrain.maps.projections import (
+    EQUIRECTANGULAR,
+    STEREOGRAPHIC,
+    EarthProjection,
+    Projection,
+    is_earth,
+    project_earth,
+    projection_of,
+)
+from startrack.terrain.maps.raster import Raster
 
 # Half the side of what is read about the origin. On the Moon 10 km mountains are below the horizontal farther away. On
 # the Earth the highest stand 2.8 degrees high at most farther away, where the air leaves few stars.
@@ -50,6 +60,9 @@ NO_MAPS = {  # by suffix
     ".zip": "an archive: give the map in it",
 }
 HEIGHT_NAMES = "altitude", "dem", "elevation", "height", "topo", "z"  # of the grid of heights among others of a file
+GEOGRAPHIC = 2  # of GTModelTypeGeoKey
+PROJECTIONS = {14: "stere", 15: "stere", 21: "ortho"}  # PROJ's names, by GeoTIFF's numbers (15: about a pole)
+SUFFIX = ".npy"
 
 
 def read_map(
@@ -281,3 +294,127 @@ def _label_units(label: dict[str, Any]) -> Iterator[str]:
             if name.endswith("IMAGE") and "UNIT" in entry:
                 yield str(entry["UNIT"])
             yield from _label_units(entry)
+
+
+@contextmanager
+def one_line_refusal(what: str) -> Iterator[None]:
+    """Errors of a decoder as BadInput bad_terrain: damaged files make decoders raise errors of nearly any class."""
+    log = logging.getLogger("tifffile")
+    log.disabled = True  # the exception has the cause
+    try:
+        yield
+    except BadInput:
+        raise
+    except Exception as cause:
+        text = " ".join(str(cause).split())[:MAX_CAUSE_CHARS] or type(cause).__name__
+        raise memory_refusal(cause) or BadInput("bad_terrain", f"{what}: {text}") from cause
+    finally:
+        log.disabled = False
+
+
+def is_geotiff(path: Path) -> bool:
+    """Whether the file `path` is a TIFF whose first directory has the tag of a map's keys (34735)."""
+    import tifffile
+
+    with suppress(BadInput), one_line_refusal(str(path)), tifffile.TiffFile(path) as file:
+        return bool(file.pages.first.is_geotiff)
+    return False
+
+
+def read_shipped(path: Path) -> Raster:
+    """A map that `terrain/build_maps.py` wrote: whole steps with scale and offset [m], every post with a height.
+
+    Raises BadInput bad_terrain for another or a damaged file.
+    """
+    import tifffile
+
+    with one_line_refusal(f"{path}: not a map as startrack ships it"), tifffile.TiffFile(path) as file:
+        page, keys = file.pages.first, file.geotiff_metadata or {}
+        items = ElementTree.fromstring(page.tags.valueof("GDAL_METADATA")).iter("Item")
+        step = {item.get("name"): float(item.text or "") for item in items if item.get("name") in ("SCALE", "OFFSET")}
+        west, north = keys["ModelTiepoint"][3:5]
+        dx, dy = keys["ModelPixelScale"][0], -keys["ModelPixelScale"][1]
+        return Raster(
+            heights_m=(page.asarray() * step["SCALE"] + step["OFFSET"]).astype(np.float32),
+            projection=_projection_of(keys), x0_m=west + 0.5 * dx, y0_m=north + 0.5 * dy, dx_m=dx, dy_m=dy,
+        )  # fmt: skip
+
+
+def _projection_of(keys: dict[str, float]) -> Projection:
+    """The projection of the keys of a shipped map."""
+    if keys["GTModelTypeGeoKey"] == GEOGRAPHIC:
+        return projection_of({"proj": "longlat", "R": keys["GeogSemiMajorAxisGeoKey"]})
+    longitude = keys.get("ProjStraightVertPoleLongGeoKey", keys.get("ProjCenterLongGeoKey"))
+    return projection_of({
+        "proj": PROJECTIONS[int(keys["ProjCoordTransGeoKey"])], "R": keys["GeogSemiMajorAxisGeoKey"],
+        "lat_0": keys.get("ProjNatOriginLatGeoKey", keys.get("ProjCenterLatGeoKey")), "lon_0": longitude,
+        "k_0": keys.get("ProjScaleAtNatOriginGeoKey", 1.0), "x_0": keys["ProjFalseEastingGeoKey"],
+        "y_0": keys["ProjFalseNorthingGeoKey"],
+    })  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grid:
+    """Where the posts of an array stand: the first row is the northern one, columns go to the east.
+
+    post: distance between posts. crs: reference system as PROJ reads it; "" is the stereographic plane of the Moon
+    about the origin. corner: x, y of the first post; None where the array's middle stands at the origin. Lengths are in
+    the units of `crs`, metres without it.
+    """
+
+    post: float
+    crs: str = ""
+    corner: tuple[float, float] | None = None
+
+    def place(self, heights_m: np.ndarray, near: tuple[float, float]) -> Raster:
+        """The array `heights_m` (rows, columns) in its place, `near` the latitude and longitude [rad] of the origin.
+
+        Raises BadInput bad_terrain for a reference system that is not known.
+        """
+        rows, columns = heights_m.shape
+        half = 0.5 * self.post * np.array([columns - 1, 1 - rows])
+        if not self.crs:
+            projection = Projection(kind=STEREOGRAPHIC, latitude_rad=near[0], longitude_rad=near[1])
+            x0, y0 = -half if self.corner is None else self.corner
+            return Raster(
+                heights_m=heights_m, projection=projection, x0_m=float(x0), y0_m=float(y0), dx_m=self.post,
+                dy_m=-self.post,
+            )  # fmt: skip
+        require_extra(f"--crs {self.crs}")
+        import pyproj
+
+        with one_line_refusal(f"{self.crs}: PROJ knows no such reference system"):
+            crs = pyproj.CRS.from_user_input(self.crs)
+        if self.corner is None:
+            whole = place_on(crs, heights_m, (0.0, 0.0), (self.post, -self.post), near)
+            x, y = whole.projection.xy_from_latlon(*near)
+            metres = whole.dx_m / self.post
+            x0, y0 = np.array([float(x), float(y)]) / metres - half
+        else:
+            x0, y0 = self.corner
+        return place_on(crs, heights_m, (float(x0), float(y0)), (self.post, -self.post), near)
+
+
+def map_of_array(
+    heights: ArrayLike, grid: Grid, *, latitude_rad: float, longitude_rad: float, scale: float | None = None,
+    offset_m: float | None = None, unusual_heights: bool = False, source: str = "array",
+) -> Raster:  # fmt: skip
+    """The height map of an array (rows, columns) of heights on a `grid`; NaN is a void.
+
+    latitude_rad, longitude_rad: the origin. scale, offset_m: height [m] = offset + scale x value; whole numbers need a
+    scale. unusual_heights: see `read_map`. source: its name in messages. Raises BadInput bad_terrain.
+    """
+    values = np.asarray(heights)
+    if values.ndim != 2 or values.size > MAX_PIXELS:
+        raise BadInput("bad_terrain", f"{source}: an array of shape {values.shape}: give rows and columns of heights")
+    values = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("="))
+    placed = grid.place(values, (latitude_rad, longitude_rad))
+    stored = Stored(values=placed, missing=np.zeros(values.shape, dtype=bool))
+    found = heights_of(stored, source, scale, offset_m, unusual_heights)
+    return replace(found, source=source)
+
+
+def read_array(path: str | Path) -> np.ndarray:
+    """The array of a `.npy` file, as it lies on the disk. Raises BadInput bad_terrain."""
+    with one_line_refusal(f"{path}: not an array that numpy reads"):
+        return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))

@@ -15,8 +15,8 @@ from startrack.core.errors import length_text
 from startrack.core.types import Array, BadInput, Bools
 from startrack.terrain.ground import ground_up_m
 from startrack.terrain.height_map import HeightMap
-from startrack.terrain.map_error import carried_spacing
-from startrack.terrain.raster import Raster
+from startrack.terrain.imports.roughness import carried_spacing
+from startrack.terrain.maps.raster import Raster
 from startrack.terrain.shape import WAVE_COUNT, sigmas_of_waves
 
 RIM_RADII = 1.5  # of the search area: most of the rim is nearer

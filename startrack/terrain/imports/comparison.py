@@ -12,7 +12,8 @@ import numpy as np
 from startrack.core.errors import length_text
 from startrack.core.types import Array, BadInput
 from startrack.frames import Site
-from startrack.terrain.crest_errors import (
+from startrack.terrain.height_map import HeightMap
+from startrack.terrain.imports.crest_errors import (
     CREST_POSTS,
     MIN_CRESTS,
     Correlation,
@@ -21,8 +22,8 @@ from startrack.terrain.crest_errors import (
     measure_crest_errors,
     spread_positions,
 )
-from startrack.terrain.height_map import COMMON_PER_POST, HeightMap
-from startrack.terrain.raster import Raster
+from startrack.terrain.map_errors import COMMON_PER_POST
+from startrack.terrain.maps.raster import Raster
 
 FINER = 2.0  # a finer map has at least so many posts to one of the map
 MIN_POSTS_ACROSS = 20.0  # of the map, in the overlap

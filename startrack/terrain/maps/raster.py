@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from startrack.core.types import Array
 from startrack.frames import R_enu_fixed, Site, enu_from_latlon, latlon_from_enu
-from startrack.terrain.earth_projection import EarthProjection
-from startrack.terrain.projection import EQUIRECTANGULAR, STEREOGRAPHIC, Projection
+from startrack.terrain.maps.projections import EQUIRECTANGULAR, STEREOGRAPHIC, EarthProjection, Projection
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -88,11 +87,11 @@ class Raster:
         """Projection of a vector from the sphere's centre in the site's enu axes to (column, row), as 16 numbers.
 
         kind, R_projection_enu (9), size along x and y [m], column = (x - n12) n13, row = (y - n14) n15. On the Earth
-        (n, 2) numbers, see `ellipsoid_fit.fit_cells`.
+        (n, 2) numbers, see `ellipsoid.fit_cells`.
         """
         p = self.projection
         if isinstance(p, EarthProjection):
-            from startrack.terrain.ellipsoid_fit import fit_cells
+            from startrack.terrain.maps.ellipsoid import fit_cells
 
             return fit_cells(self, site)
         R_projection_enu = p.R_projection_fixed @ R_enu_fixed(site).T
@@ -105,7 +104,7 @@ class Raster:
     def heights_above_origin_m(self, site: Site) -> NDArray[np.float32]:
         """Heights [m] above the sphere through the site, see `frames.sphere_radius_m`."""
         if isinstance(self.projection, EarthProjection):
-            from startrack.terrain.ellipsoid_fit import heights_above_sphere
+            from startrack.terrain.maps.ellipsoid import heights_above_sphere
 
             return heights_above_sphere(self, site)
         return self.heights_m - np.float32(site.height_m) if site.height_m else self.heights_m

@@ -15,19 +15,17 @@ from startrack.core.errors import BadOutput, length_text
 from startrack.core.files import check_output, data_dir, printable, write_atomically
 from startrack.core.types import BadInput
 from startrack.frames import Site
-from startrack.terrain.array_map import SUFFIX, Grid, map_of_array, read_array
-from startrack.terrain.crest_errors import Correlation, map_of_rim, measure_waves
-from startrack.terrain.earth_projection import ELLIPSOID, Geoid, geoid_at
-from startrack.terrain.ellipsoid_fit import maps_above_ellipsoid
 from startrack.terrain.ground import fill_cut_out
 from startrack.terrain.height_map import HeightMap
 from startrack.terrain.horizon_table import AZIMUTH_BINS
+from startrack.terrain.imports.comparison import compare_with_finest, offsets_of_maps_m
+from startrack.terrain.imports.crest_errors import Correlation, map_of_rim, measure_waves
+from startrack.terrain.imports.roughness import carried_spacing, error_between_posts_m, find_product
 from startrack.terrain.io import site_of_keys, terrain_from_dict
-from startrack.terrain.map_comparison import compare_with_finest, offsets_of_maps_m
-from startrack.terrain.map_error import carried_spacing, error_between_posts_m, find_product
-from startrack.terrain.map_reading import read_map, require_origin
-from startrack.terrain.map_writing import write_map
-from startrack.terrain.raster import Raster
+from startrack.terrain.maps.ellipsoid import ELLIPSOID, Geoid, geoid_at, maps_above_ellipsoid
+from startrack.terrain.maps.raster import Raster
+from startrack.terrain.maps.reading import SUFFIX, Grid, map_of_array, read_array, read_map, require_origin
+from startrack.terrain.maps.writing import write_map
 from startrack.terrain.shape import CAMERA_ERROR, OFFSETS, REFRACTION, REFRACTION_1, STRETCH, WAVES, vertical_fact
 
 MAX_POST_RADII = 0.2  # of the search area: with posts further apart its shape is not resolved

@@ -1,0 +1,1 @@
+"""Import of elevation data as terrain files, with the errors of the maps."""

@@ -101,6 +101,15 @@ def link_figures(app: Sphinx, doctree: nodes.document, docname: str) -> None:
             code["classes"].append("unbroken")
 
 
+def complete_landmarks(app: Sphinx, page: str, template: str, context: dict[str, Any], doctree: Any) -> None:
+    """Give the captions of the contents a level as headings, and let keys scroll blocks of code."""
+    contents, body = context.get("furo_navigation_tree"), context.get("body")
+    if contents:
+        context["furo_navigation_tree"] = contents.replace('role="heading"', 'role="heading" aria-level="2"')
+    if body:
+        context["body"] = body.replace("<pre>", '<pre tabindex="0">')
+
+
 def source_with_field_comments(module: str) -> tuple[str | None, str | None]:
     """File and source of a module for autodoc, where the comment after a field of a dataclass documents the field."""
     path, source = module_source(module)
@@ -121,5 +130,6 @@ def setup(app: Sphinx) -> None:
     app.connect("source-read", link_to_pages)
     app.connect("include-read", link_in_included)
     app.connect("doctree-resolved", link_figures)
+    app.connect("html-page-context", complete_landmarks, priority=900)  # after the theme
     app.connect("autodoc-process-docstring", keep_attribute, priority=400)  # Napoleon has 500
     app.connect("autodoc-process-docstring", restore_attribute, priority=600)

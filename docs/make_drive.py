@@ -34,7 +34,7 @@ DRIVE = ["--speed", "0.05", "--every", "120", "--seed", "11", "--time", "2030-06
 PICTURE_PX = 420
 STEP_MS, LAST_MS = 450, 3000
 MAX_BYTES = 1_500_000
-HALF_M = 20.0  # of the map, which follows the rover
+ROOM_M = 12.0  # of the map, beyond the way
 TRUE, DRAWN = "#cc79a7", "#f07a2b"
 
 
@@ -73,13 +73,18 @@ def draw_step(table: Table, true_m: Any, k: int) -> Image.Image:
         left.plot(*true_m.T, color=TRUE, lw=1.2, ls="--", label="true path")
         way = np.stack([table["filtered_east_m"], table["filtered_north_m"]], axis=-1)[: k + 1]
         left.plot(*way.T, "-o", color=DRAWN, ms=3, lw=1.5, label="position by startrack")
-        radius_m = float(table["filtered_radius95_m"][k])
+        radii_m = np.asarray(table["filtered_radius95_m"], dtype=float)
+        for place, former_m in zip(way[:-1], radii_m, strict=False):
+            left.add_patch(Circle(tuple(place), former_m, fill=False, color=DRAWN, lw=0.8, alpha=0.35))
+        radius_m = float(radii_m[k])
         left.add_patch(Circle(tuple(way[-1]), radius_m, fill=False, color=DRAWN, lw=2))
         left.plot([], [], "o", color=DRAWN, mfc="none", ms=9, mew=2, label="95 % circle")
-        left.set(xlim=way[-1, 0] + HALF_M * np.array([-1, 1]), ylim=way[-1, 1] + HALF_M * np.array([-1, 1]))
+        middle_m, half_m = 0.5 * (true_m.max(axis=0) + true_m.min(axis=0)), 0.5 * np.ptp(true_m, axis=0).max() + ROOM_M
+        left.set(xlim=middle_m[0] + half_m * np.array([-1, 1]), ylim=middle_m[1] + half_m * np.array([-1, 1]))
         left.set(xlabel="east, m", ylabel="north, m", aspect="equal")
         left.legend(loc="upper left", frameon=False)
-        left.text(0.97, 0.04, f"image {k + 1}\n±{radius_m:.1f} m", transform=left.transAxes, ha="right", fontsize=13)
+        left.text(0.97, 0.05, f"±{radius_m:.1f} m", transform=left.transAxes, ha="right", fontsize=30, weight="bold")
+        left.text(0.97, 0.18, f"image {k + 1}", transform=left.transAxes, ha="right", fontsize=12)
         left.grid(color="#252c3a", lw=0.6)
         right.imshow(sky_of(f"{table['image'][k]}.png"))
         right.set_axis_off()

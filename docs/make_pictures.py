@@ -202,6 +202,7 @@ PICTURES = {
 }  # fmt: skip
 TUTORIALS = {  # name: page, and the file that its commands write
     "crater": ("own-terrain", "startrack-out/crater.horizon.png"),
+    "ridge": ("place-from-a-photograph", "startrack-out/ridge.skyline.png"),
     "valley": ("earth-valley", "startrack-out/night.annotated.png"),
     "lens": ("calibrate-your-camera", "my-camera.report.png"),
 }

@@ -46,6 +46,13 @@ def chromium() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="session")
+def axe() -> str:
+    """The rules of axe-core, as a script."""
+    package = pytest.importorskip("axe_playwright_python", reason="axe-core is not installed")
+    return (Path(package.__file__).parent / "axe.min.js").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="session")
 def zig_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the package ziglang, a compiler for all systems. Skips without an index of packages."""
     folder = tmp_path_factory.mktemp("zig")

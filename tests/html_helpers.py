@@ -59,6 +59,13 @@ class Window:
         self.context.close()
         assert said == []
 
+    def violations(self, axe: str) -> list[tuple[str, list[str]]]:
+        """What the rules of `axe` find, with the elements."""
+        self.page.evaluate(axe)
+        found = self.page.evaluate("axe.run()")
+        assert len(found["passes"]) > 20  # the rules have run
+        return [(one["id"], [node["html"] for node in one["nodes"]]) for one in found["violations"]]
+
     def wait_for(self, condition: str) -> None:
         """Wait for a condition in JavaScript. (Playwright's own way polls by eval, which the page's rules forbid.)"""
         for _ in range(600):

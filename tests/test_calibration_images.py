@@ -16,13 +16,14 @@ import pytest
 from astropy.io import fits
 from horizon_helpers import CAMERA, TIME, painted_frame
 from horizon_helpers import SITE as HIGH_SITE
+from html_helpers import DESKTOP, SMALL, Window
 from jsonschema import ValidationError
 from schema_helpers import check_printed_schema
 from scipy.spatial import cKDTree
 
 from startrack.applications.calibration import calibrate
 from startrack.applications.calibration.acceptance import joint_log_p_value
-from startrack.applications.calibration.report import write_report
+from startrack.applications.calibration.report import _report_html, write_report
 from startrack.applications.calibration.static_parts import find_obstructions
 from startrack.applications.calibration.verify import Verification, verify, verify_dict, verify_line
 from startrack.camera import load_camera, save_camera
@@ -237,8 +238,30 @@ def test_the_command_writes_camera_record_and_report(written_files):
     assert all(gate["passed"] for gate in record["gates"])
     page = (written_files / "new.report.html").read_text()
     assert "accepted" in page
-    assert not re.search(r'(src|href)="(?!data:)', page)  # nothing is fetched
+    assert not re.search(r'(src|href)="(?!data:|#main)', page)  # nothing is fetched
     assert (written_files / "new.report.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [DESKTOP, SMALL])
+def test_axe_finds_nothing_in_the_report(chromium, axe, cold_calibration, tmp_path, size, scheme):
+    write_report(tmp_path / "a.toml", cold_calibration)
+    w = Window(chromium, tmp_path / "a.report.html", size, scheme)
+    assert w.violations(axe) == []
+    assert w.has_no_overflow()
+    words = w.page.locator("main").inner_text()
+    assert "below 1e-300" in words and "log10" not in words and "Dark theme" not in words
+    w.close()
+
+
+def test_the_report_says_what_to_do_where_a_check_failed(cold_calibration):
+    check = replace(cold_calibration.checks[0], passed=False, advice="take <more> pictures")
+    failed = replace(cold_calibration, checks=(check, *cold_calibration.checks[1:]))
+    for found, is_told in ((failed, True), (cold_calibration, False)):
+        text = _report_html(found, b"")
+        assert ("take &lt;more&gt; pictures" in text) == ("what to do" in text) == is_told
+        assert len(re.findall("<td", text.partition("<tbody>")[2].partition("</tr>")[0])) == (4 if is_told else 3)
 
 
 def test_the_report_without_matplotlib_names_the_extra(cold_calibration, tmp_path, monkeypatch):

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import cv2
@@ -222,8 +223,8 @@ def test_a_closed_output_is_a_closed_pipe(folder, words):
 def test_without_json_there_is_one_line_for_each_image(folder, capsys):
     code, lines, err = run(capsys, "detect", stars(), black_image(), "missing.png", "--no-plots")
     assert code == BAD_INPUT
-    next_step, files = err.splitlines()  # no_stars: its message contains the advice
-    assert next_step.startswith("  next: ") and files == "files in startrack-out"
+    assert err == "files in startrack-out\n"
+    assert ["  next: " in line for line in lines] == [False, False, True]  # no_stars: its message contains the advice
     starts = [["stars.png", "ok"], ["black.png", "refused"], ["missing.png", "refused"]]
     assert [line.split()[:2] for line in lines] == starts
     code, lines, err = run(capsys, "detect", "stars.png", "black.png", "--no-plots", "--quiet")
@@ -382,9 +383,9 @@ def test_no_refusal_shows_a_traceback(folder):
     done = shell("locate", *images, "--no-plots", cwd=folder)
     assert done.returncode == BAD_INPUT
     assert len(done.stdout.splitlines()) == len(images)
-    *advice, files = done.stderr.splitlines()
-    assert files == "files in startrack-out"
-    assert all(line.startswith("  next: ") for line in advice) and len(advice) == len(set(advice))
+    assert done.stderr == "files in startrack-out\n"
+    advice = [line.partition("  next: ")[2] for line in done.stdout.splitlines() if "  next: " in line]
+    assert advice and len(advice) == len(set(advice))
 
 
 def test_unwritable_output_is_reported_in_one_line(folder):
@@ -440,7 +441,7 @@ def test_each_action_of_calibrate_has_its_own_help(capsys, action):
 def test_calibrate_takes_images_without_an_action(capsys):
     with pytest.raises(SystemExit, match="0"):
         main(["calibrate", "--help"])
-    assert "usage: startrack calibrate [-h]" in capsys.readouterr().out
+    assert "usage: startrack calibrate [options] IMAGE..." in capsys.readouterr().out
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
@@ -464,8 +465,8 @@ def test_a_full_disk_behind_stdout_is_named(folder):
         (
             {"_ARGCOMPLETE_SHELL": "fish", "_ARGCOMPLETE_DFS": "\t", "_ARGCOMPLETE_SUPPRESS_SPACE": "1"},
             {
-                "loc": "locate\timage to position and attitude",
-                "locate --ima": "--image-topic\tof a ROS bag with several",
+                "loc": "locate\tpicture to position and attitude",
+                "locate --ima": "--image-topic\ttopic of the images in a ROS bag that has several",
             },
         ),
     ],
@@ -482,6 +483,53 @@ def test_shell_completion_knows_the_commands(folder, tmp_path, shell, answers):
         env = {**os.environ, **asked, **shell, "PYTHONPATH": str(ROOT)}
         subprocess.run(["bash", "-c", command], cwd=folder, check=False, env=env)
         assert answer.read_text().strip() == expected
+
+
+def test_the_help_shows_the_doors_and_every_command_once(capsys):
+    from startrack.cli.main import COMMANDS, DOORS, GROUPS
+
+    assert sorted(name for names in GROUPS.values() for name in names) == sorted(COMMANDS)
+    with pytest.raises(SystemExit, match="0"):
+        main(["--help"])
+    text = capsys.readouterr().out
+    assert DOORS in text and text.index("  demo ") < text.index("  locate ")
+    for name in COMMANDS:
+        assert len(re.findall(rf"^  {name} +\S.*$", text, flags=re.MULTILINE)) == 1
+    assert "star exposure" not in text
+
+
+@pytest.mark.parametrize(
+    ("command", "usage", "example"),
+    [
+        ("locate", "startrack locate [options] [IMAGE...]", "startrack locate sample_images/near-centre.png"),
+        ("horizon", "startrack horizon [options] IMAGE... -o FILE", "startrack horizon NIGHT.jpg... --fov 180"),
+        ("predict", "startrack predict [options] -t FILE -c FILE --time UTC", "startrack predict -t shackleton"),
+    ],
+)
+def test_the_help_of_a_command_begins_with_what_it_needs_and_an_example(capsys, command, usage, example):
+    with pytest.raises(SystemExit, match="0"):
+        main([command, "--help"])
+    head, _, _ = capsys.readouterr().out.partition("options:\n")
+    assert head.startswith(f"usage: {usage}\n") and f"\nexample:\n  {example}" in head
+
+
+def test_doctor_prints_one_line_for_each_extra(capsys, monkeypatch):
+    from startrack.cli.studies.doctor import OPTIONAL, extra_lines, print_check
+
+    def version(name):
+        if name == "rosbags":
+            raise metadata.PackageNotFoundError(name)
+        return "1.0"
+
+    monkeypatch.setattr(doctor.metadata, "version", version)
+    lines = extra_lines()
+    assert [line.split()[1] for line in lines] == [*OPTIONAL]
+    (missing,) = [line for line in lines if line.split()[0] == "-"]
+    assert missing.split()[1] == "ros" and "pip install '.[ros]'" in missing
+    print_check({"name": "packages", "ok": True, "message": ", ".join(f"package-{k} 1.0" for k in range(20))})
+    shown = capsys.readouterr().out.splitlines()
+    assert len(shown) > 1 and max(map(len, shown)) <= 100
+    assert all(line.startswith(20 * " ") for line in shown[1:])
 
 
 def test_doctor_knows_the_packages_and_extras_of_the_project():

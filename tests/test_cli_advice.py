@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from startrack.chain import detect, stating_sky
-from startrack.cli.console import print_outcome, print_warnings
+from startrack.cli.console import Columns, print_outcome, print_warnings
 from startrack.cli.main import main
 from startrack.core.errors import NotIdentified, Reason, next_step
 from startrack.exposure import read_exposure
@@ -68,7 +69,9 @@ def test_a_refusal_ends_with_what_to_do(tmp_path: Path, capsys: pytest.CaptureFi
     (tmp_path / "no.png").write_bytes(b"no picture")
     words = ["locate", str(tmp_path / "no.png"), "-D", str(tmp_path / "out")]
     assert main(words) == 4
-    assert capsys.readouterr().err == f"  next: {Reason.BAD_IMAGE.advice}\n"
+    out, err = capsys.readouterr()
+    assert out.startswith("no.png  refused  bad_image: ") and out.endswith(f"  next: {Reason.BAD_IMAGE.advice}\n")
+    assert err == ""  # no picture, no result, no files
     assert main([*words, "-q"]) == 4
     assert "next:" not in capsys.readouterr().err
     assert main([*words, "--json"]) == 4
@@ -83,7 +86,7 @@ def test_of_a_missing_file_a_similar_name_is_the_advice(tmp_path: Path, capsys: 
     out = ["-D", str(tmp_path / "out")]
     assert main(["locate", str(tmp_path / "other.png"), *out]) == 4
     advice = "  next: Check the name and the folder of the file.\n"
-    assert capsys.readouterr() == ("other.png  refused  bad_image: No such file\n", advice)
+    assert capsys.readouterr() == (f"other.png  refused  bad_image: No such file{advice}", "")
     assert main(["locate", str(tmp_path / "nigth-12.png"), *out]) == 4
     heard = capsys.readouterr()
     assert heard == ("nigth-12.png  refused  bad_image: No such file: is night-12.png meant?\n", "")
@@ -91,7 +94,7 @@ def test_of_a_missing_file_a_similar_name_is_the_advice(tmp_path: Path, capsys: 
     assert capsys.readouterr().err.endswith("cratr.toml: No such file: is crater.toml meant?\n")
     (tmp_path / "link.png").symlink_to(tmp_path / "nowhere")
     assert main(["locate", str(tmp_path / "link.png"), *out]) == 4
-    assert "No such file\n" in capsys.readouterr().out
+    assert "No such file  next: " in capsys.readouterr().out
 
 
 def test_a_solution_has_no_advice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -147,7 +150,48 @@ def test_the_advice_of_a_command_comes_before_that_of_the_reason(capsys: pytest.
     for own, shown in (("Check the site.", "Check the site."), (reason.advice, reason.advice)):
         record = {"status": "refused", "reason": str(reason), "message": "they differ", "advice": own}
         assert print_outcome(argparse.Namespace(json=False, quiet=False), record, "a  refused") == 3
-        assert capsys.readouterr() == ("a  refused\n", f"  next: {shown}\n")
+        assert capsys.readouterr() == (f"a  refused  next: {shown}\n", "")
+
+
+REFUSAL = re.compile(
+    r"(?P<name>\S.*?)  refused  (?P<reason>[a-z_]+): (?P<message>.*?)(?:  next: (?P<advice>[A-Z].*\.))?"
+)
+
+
+def test_eight_refusals_have_one_shape(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Name, reason, message, and the advice in the same line of the same stream unless the message contains it."""
+    (tmp_path / "no.png").write_bytes(b"no picture")
+    (tmp_path / "empty").mkdir()
+    no, out = str(tmp_path / "no.png"), ["-D", str(tmp_path / "out")]
+    refused = [
+        (["locate", no, *out], "no.png", "bad_image", False),
+        (["identify", str(tmp_path / "gone.png"), *out], "gone.png", "bad_image", False),
+        (["locate", LOWELL, "-t", "nowhere", *out], Path(LOWELL).name, "bad_terrain", False),
+        (["horizon", no, "-o", str(tmp_path / "h.csv")], "h.csv", "bad_image", False),
+        (["calibrate", LOWELL, "--fov", "90", "--no-plots", "-o", str(tmp_path / "c.toml")],
+         str(tmp_path / "c.toml"), "not_identified", False),
+        (["batch", str(tmp_path / "empty"), *out], "startrack batch", "bad_image", True),
+        (["report", str(tmp_path / "nothing")], "startrack report", "bad_image", True),
+        (["track", no, *out], "no.png", "bad_image", True),
+    ]  # fmt: skip
+    for words, name, reason, is_error in refused:
+        assert main(words) in (3, 4), words
+        heard = capsys.readouterr()
+        line = (heard.err if is_error else heard.out).splitlines()[0]
+        shape = REFUSAL.fullmatch(line)
+        assert shape is not None, line
+        assert (shape["name"], shape["reason"]) == (name, reason)
+        assert shape["advice"] or next_step(shape["reason"], shape["message"]) == "", line
+        if name in ("startrack batch", "startrack report"):  # no picture is at fault
+            assert "folder" in shape["advice"] and "in every pixel" not in shape["advice"]
+
+
+def test_a_picture_of_the_earth_without_a_terrain_leads_to_the_commands_that_need_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["locate", LOWELL, "-D", str(tmp_path)]) == 4
+    advice = capsys.readouterr().out.partition("  next: ")[2]
+    assert "startrack identify" in advice and "startrack horizon" in advice
 
 
 @pytest.mark.parametrize(
@@ -190,3 +234,14 @@ def test_fields_that_were_tried_are_not_advised(low: float, high: float, text: s
     assert text in advice and ("--fov" in advice) == bool(text)
     assert "near_sky" not in advice
     assert "leave out near_sky" in advise_on_fields(0.1, 0.4, NearSky.from_degrees([10.0, 20.0, 5.0]))
+
+
+def test_lines_of_several_images_have_steady_columns() -> None:
+    columns = Columns(["near-centre.png", "a.png"])
+    first = "near-centre.png  ok  E 425.3 m  N -310.5 m  ±8.9 m (95 %)  heading 32.0°  2248 stars  1.2 s with files"
+    second = "a.png  ok  E -6899.5 m  N 4700.6 m  ±13.0 m (95 %)  heading 205.0°  835 stars  11.2 s with files"
+    lines = [columns.aligned(line) for line in (first, second)]
+    places = [[line.index(word) for word in (" ok ", " m  N", " m  ±", " m (95", "°", " stars")] for line in lines]
+    assert places[0] == places[1]
+    assert [re.sub(r" +", "", line) for line in lines] == [re.sub(r" +", "", line) for line in (first, second)]
+    assert columns.aligned("a.png  ok  1979 point sources\n  more  1 s").endswith("\n  more  1 s")

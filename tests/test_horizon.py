@@ -240,6 +240,7 @@ def test_the_command_writes_files_of_one_computation_and_the_record(tmp_path, ca
     Draft202012Validator(SCHEMAS["horizon"]).validate(record)
     assert set(record) <= set(SCHEMAS["horizon"]["properties"])
     files = {tmp_path / name for name in ("a.hrz", "a.csv", "garden/landscape.ini", "garden/horizon.txt")}
+    files.add(tmp_path / "a.skyline.png")
     assert {*map(Path, record["files"])} == files == {path for path in tmp_path.rglob("*") if path.is_file()}
     measured = np.genfromtxt(tmp_path / "a.csv", delimiter=",", skip_header=1)[:, 1]
     known = np.isfinite(measured)
@@ -249,13 +250,24 @@ def test_the_command_writes_files_of_one_computation_and_the_record(tmp_path, ca
     assert len(fitted) == 1 and not (tmp_path / "b.csv").exists()
 
 
+def test_the_folder_of_results_and_no_plots_hold(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["horizon", str(PHOTO), "-o", "a.csv", "-D", "out", LOWELL_FLAG, "-c", "lowell-ldt"]
+    assert main([*words, "--no-plots"]) == 0
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.csv"]
+    assert main([*words, "-O"]) == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"a.csv", "a.skyline.png"}
+    assert capsys.readouterr().err.splitlines()[-1] == "files out/a.csv, out/a.skyline.png"
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
 def test_the_advice_of_a_wrong_site_is_about_the_site(tmp_path, capsys):
     words = ["-o", str(tmp_path / "a.hrz"), "--site=-34.7443,-111.4223", "-c", "lowell-ldt"]
     assert main(["horizon", str(PHOTO), *words, "--json"]) == 3
     advice = json.loads(capsys.readouterr().out)["advice"]
     assert "site" in advice and "terrain" not in advice and "boulder" not in advice
     assert main(["horizon", str(PHOTO), *words]) == 3
-    assert "terrain" not in capsys.readouterr().err
+    assert "terrain" not in capsys.readouterr().out
 
 
 def test_without_site_or_time_it_is_bad_input(tmp_path, capsys):

@@ -87,6 +87,16 @@ def test_azimuths_that_differ_are_crossed_in_the_panorama():
     assert np.ptp(many[:, 1]) == pytest.approx(2 * np.ptp(some[:, 1]), rel=0.1)
 
 
+def test_azimuths_that_are_not_seen_are_hatched_and_named():
+    seen = small_skyline()
+    gap = (np.arange(360) > 99) & (np.arange(360) < 161)
+    hole = replace(seen, elevation_rad=np.where(gap, np.nan, seen.elevation_rad))
+    changed = np.flatnonzero((skyline_picture(seen) != skyline_picture(hole)).any(axis=(0, 2)))
+    left, right = 64 + np.array([99, 161]) / 360 * (1440 - 64 - 16)  # the plot of this picture
+    assert changed.min() >= left - 8 and changed.max() <= right + 8
+    assert len(changed) > 0.9 * (right - left)
+
+
 def crosses_in(picture: np.ndarray) -> np.ndarray:
     """Rows and columns (n, 2) of the pixels in the ink of the crosses."""
     return np.argwhere(np.abs(picture.astype(int) - Ink.HIDDEN).sum(axis=-1) < 60)

@@ -101,6 +101,18 @@ def test_the_ground_is_that_of_the_photograph_in_its_place(files, texture):
     assert (beyond == [38, 51, 38]).all()  # what no photograph shows
 
 
+def test_the_picture_of_a_skyline_shows_the_photograph_behind_it(photographed, tmp_path):
+    """The lamp is light grey there; without photographs nothing is."""
+    paths = [tmp_path / "with.png", tmp_path / "without.png"]
+    for path, frames in zip(paths, (photographed.frames, ()), strict=True):
+        write_skyline(photographed.skyline, SITE, frames, str(path), overwrite=False)
+    pictures = [cv2.imread(str(path))[32:-40] for path in paths]
+    column = round(64 + LAMP_DEG[0] / 360 * (pictures[0].shape[1] - 64 - 16))
+    lit, plain = (np.argwhere((np.ptp(one, axis=2) == 0) & (one[:, :, 0] > 180))[:, 1] for one in pictures)
+    assert (np.abs(lit - column) < 8).sum() > 3 and len(plain) == 0
+    assert np.mean(pictures[0] != pictures[1]) > 0.5
+
+
 def test_unknown_azimuths_are_half_transparent_and_marked(files, photographed):
     skyline = photographed.skyline
     unknown = (skyline.azimuth_rad > np.radians(29.5)) & (skyline.azimuth_rad < np.radians(40.5))

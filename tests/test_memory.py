@@ -45,7 +45,9 @@ def run_within(limit_bytes, *words, folder):
 def test_a_small_limit_ends_in_words(picture):
     done = run_within(TOO_LITTLE_BYTES, "detect", str(picture), folder=picture.parent)
     assert (done.returncode, done.stdout) == (4, "")
-    assert done.stderr.startswith("startrack: out_of_memory: the limit of address space (ulimit -v) is 0.39 GB")
+    assert done.stderr.startswith(
+        "startrack detect  refused  out_of_memory: the limit of address space (ulimit -v) is 0.39 GB"
+    )
     assert "Traceback" not in done.stderr and "report" not in done.stderr
 
 

@@ -135,7 +135,8 @@ def test_a_position_without_a_circle_has_an_error_only(located, tmp_path):
     assert [row[key] for key in ("radius95_m", "radius999_m", "cov_ee", "nees")] == [None] * 4
     assert row["error_m"] == pytest.approx(np.linalg.norm(located_at - [6010.0, -2507.0]), abs=0.01)
     assert head["errors"]["inside95"] is head["errors"]["mean_nees"] is None
-    facts = dict(dict(facts_of(record_values(result_dict(point))))["Position"])
+    rows = dict(facts_of(record_values(result_dict(point))))["Position"]
+    facts = {name: text for name, text, _ in rows}
     assert facts["95 % within"] == "no circle" and facts["Search"] == "approximate"
     assert not {"Sigma", "99.9 % within"} & set(facts)
 
@@ -401,3 +402,20 @@ def test_locate_and_batch_add_the_page(tmp_path, capsys):
     assert data_of((one / "flat.report.html").read_text(encoding="utf-8"), "results")["rows"][0][3] == "no_stars"
     assert main(["batch", str(images), "-D", str(many), "--report", "-q", "--no-plots", "-j", "1"]) == 5
     assert data_of((many / "report.html").read_text(encoding="utf-8"), "results")["single"] is False
+
+
+def test_rows_say_what_they_mean(located):
+    groups = dict(facts_of(record_values(result_dict(located.result))))
+    helps = {name: meaning for rows in groups.values() for name, _, meaning in rows}
+    assert "holds 95 %" in helps["95 % within"] and helps["95 % within"].endswith("[m]")
+    assert all(helps.values()) and not any("`" in text for text in helps.values())
+
+
+def test_a_refused_picture_of_the_earth_is_advised_by_its_message(located, tmp_path):
+    write_results(located.result, tmp_path / "a.fix.json")
+    (found,), _ = results_under(tmp_path)
+    message = "no terrain file is known: give -t FILE or a sidecar with terrain"
+    record = {**found.record, "status": "refused", "reason": "bad_terrain", "message": message, "position": None}
+    text = page_text([replace(found, record=record)])
+    assert "startrack horizon" in data_of(text, "detail-0")["advice"]
+    assert data_of(page_text([found]), "detail-0")["advice"] is None

@@ -252,7 +252,7 @@ def test_the_skyline_of_the_image_is_shown_twice(window, size):
 def test_a_file_is_shown_by_its_name_and_found_by_its_path(window):
     w = window()
     w.open("small.png")
-    camera = w.page.locator(".facts .tipped")
+    camera = w.page.locator(".facts dd .tipped")
     assert camera.inner_text() == "small-fisheye"
     assert camera.get_attribute("title") == "/somewhere/else/cameras/small-fisheye.toml"
     assert "The first image of a run" in w.page.locator("#detail").inner_text()
@@ -330,3 +330,20 @@ def test_ten_thousand_rows_scroll(window):
     w.page.get_by_role("searchbox").fill("00042")
     assert w.page.locator("tbody th[scope=row]").all_inner_texts() == ["n/00042.png"]
     assert "2,500 with a known position" in w.page.locator("#overview").inner_text()
+
+
+def test_the_headline_says_when_where_how_sure_and_whither(window):
+    w = window()
+    w.open("small.png")
+    lead = w.page.locator("#detail .lead").inner_text().replace("\u00a0", " ")
+    record = w.page.evaluate("detailOf(page.rows.findIndex((row) => row[column.image] === 'small.png')).record")
+    position = record["position"]
+    assert lead.startswith(record["provenance"]["time_utc"][:19].replace("T", " ") + " UTC: east ")
+    assert f"within {position['radius95_m']:,.1f} m (95 %)" in lead
+    assert f"heading {record['attitude']['heading_deg']:.1f}°" in lead
+    assert f"{len(record['warnings']) or 'no'} warning" in lead
+    level = position["protection_level_m"]
+    assert ("protection level" in lead) == (level is not None)
+    assert ("(99.9 %)" in lead) == (position["radius999_m"] > 5 * position["radius95_m"])
+    term = w.page.locator("#detail .facts dt", has_text="95 % within").first
+    assert "holds 95 %" in term.get_attribute("title")

@@ -41,13 +41,6 @@ def window(chromium, folder) -> Iterator[Any]:
         one.close(ignored=READ_TWICE)
 
 
-@pytest.fixture(scope="module")
-def axe() -> str:
-    """The rules of axe-core, as a script."""
-    package = pytest.importorskip("axe_playwright_python", reason="axe-core is not installed")
-    return (Path(package.__file__).parent / "axe.min.js").read_text(encoding="utf-8")
-
-
 def painted(w: Window) -> None:
     """Wait until the picture is drawn as it is set."""
     w.wait_for(f"!{VIEW}.waiting && {VIEW}.box !== undefined")

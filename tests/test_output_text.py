@@ -113,3 +113,12 @@ def test_verbose_gives_more_lines(located):
 def test_probabilities_too_small_for_a_float():
     assert chance_text(2.17e-12) == "2e-12"
     assert chance_text(1e-300) == chance_text(0.0) == "below 1e-100"  # smaller values are beyond the model
+
+
+def test_a_wide_circle_of_999_of_1000_stands_in_the_line(located):
+    """Where it is five times that of 95 %: a gross error is then possible that the smaller circle does not tell."""
+    fix = located.result.fix
+    for factor, is_told in ((4.9, False), (5.1, True)):
+        wide = replace(located.result, fix=replace(fix, radius999_m=factor * fix.radius95_m))
+        told = f", {factor * fix.radius95_m:.1f} m (99.9 %)"
+        assert (told in summary_line(wide)) == is_told == ("(99.9 %)" in summary_line(wide))

@@ -6,6 +6,7 @@ import json
 import shutil
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -29,6 +30,7 @@ from startrack.applications.prediction import (
     summarize_cells,
     times_between,
 )
+from startrack.applications.prediction import report as prediction_report
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.chain import locate
@@ -461,3 +463,34 @@ def test_along_a_path_there_is_a_table_with_distances_and_no_map(waypoints, tmp_
     assert record["variants"][0]["limiting_v_mag"] < record["variants"][1]["limiting_v_mag"]
     Draft202012Validator(PREDICTION).validate(record)
     assert (out / "predict-compare.png").exists()
+
+
+def test_the_colours_of_the_map_are_continuous_and_its_contours_few():
+    terrain = load_terrain("shackleton-thesis")
+    area = area_cells(terrain, 1000.0)
+    radius = np.exp(np.interp(area.position_m[:, 0], [-1e4, 1e4], np.log([1.0, 400.0])))
+    assert len(class_bounds_m(radius)) > 3
+    pixels = prediction_picture(terrain, area.site, area.raster(radius), "title", [])[500, 100:890].astype(int)
+    steps = np.abs(np.diff(pixels, axis=0)).max(axis=1)
+    lines = np.flatnonzero(steps > 30)
+    assert np.median(steps) <= 2 and 0 < len(lines) < 20  # the edges of three contours and of the grid
+    assert pixels[60].min() > pixels[700].min() - 30 and pixels[60].sum() > pixels[700].sum() + 100  # light to dark
+
+
+def test_a_few_draws_are_called_rough(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        prediction_report.output, "path_picture", lambda *given: seen.append(given[4]) or np.zeros((2, 2, 3), np.uint8)
+    )
+    for draws, is_rough in ((1, True), (4, True), (5, False)):
+        report = SimpleNamespace(
+            plan=SimpleNamespace(
+                points=SimpleNamespace(distance_m=np.zeros(2)), terrain=SimpleNamespace(name="t"),
+                settings={"camera": "c", "exposure_s": 1.0, "first_time_utc": "2030-01-01T00:00", "draws": draws,
+                          "last_time_utc": "2030-01-01T00:00", "spacing_m": 10.0},
+            ),
+            cells={"radius95_m": np.ones(2), "p_ok": np.ones(2)},
+        )  # fmt: skip
+        prediction_report._picture(report)
+        assert seen[-1][0].endswith(": rough") == is_rough
+        assert ("1 draw every" in seen[-1][0]) == (draws == 1)

@@ -127,3 +127,24 @@ def test_the_frames_are_played(window):
     w.wait_for("document.querySelector('input[type=range]').value === '3'")
     w.page.get_by_role("button", name="Pause").click()
     assert w.page.get_by_role("button", name="Play").count() == 1
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_axe_finds_nothing_on_a_track(window, axe, size, scheme):
+    w = window(synthetic_track(), size, scheme)
+    assert w.violations(axe) == []
+    assert w.has_no_overflow()
+
+
+def test_the_lead_names_the_last_position_and_the_axis_of_radii_begins_at_zero(window):
+    track = synthetic_track()
+    w = window(track)
+    lead = w.page.locator("p.lead").inner_text().replace("\u00a0", " ")
+    east_m, north_m, _ = track.smoothed.position_enu_m[-1]
+    assert f"within {track.smoothed.radius95_m[-1]:.2f} m (95 %)" in lead
+    assert f"east {east_m:,.2f} m, north {north_m:,.2f} m".replace("-", "−") in lead
+    is_log, low, words = w.page.evaluate("[isLog, radii.world[1], radii.axes.y]")
+    radii_m = np.concatenate([track.smoothed.radius95_m, track.filtered.radius95_m])
+    assert is_log == (8 * np.nanmin(radii_m) < np.nanmax(radii_m))
+    assert (low == 0 and words == "95 % radius") or (is_log and words == "95 % radius (logarithmic)")

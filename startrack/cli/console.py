@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -13,7 +14,9 @@ from threading import Event, Thread
 from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 from startrack.core import errors
+from startrack.core.advice import fitting_advice
 from startrack.core.errors import BadInput, NoSolution, Reason
+from startrack.core.files import printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
@@ -26,6 +29,8 @@ LINE_S = 10.0
 ANNOUNCED_S = 5.0  # a longer wait is announced
 MOST_UNITS = 100  # of a duration, from which a larger unit is used
 UNITS = (1.0, "s"), (60.0, "minutes"), (3600.0, "hours")
+NUMBER_COLUMN = re.compile(r"([^\d+-]*)([+-]?\d+(?:\.\d+)?)(.*)")
+NUMBER_WIDTHS = {"E ": 8, "N ": 8, "±": 5, "heading ": 5, "": 4}  # least widths, by the text before the number
 Outcome = tuple[dict[str, Any], str]  # of an image: the JSON object, and the line or lines
 
 
@@ -33,37 +38,79 @@ def refusal(cause: BadInput | NoSolution, name: str, **first: Any) -> Outcome:
     """The outcome of an image or file `name` that was refused; `first` stands at the beginning of the JSON object."""
     reason, message = cause.reason, str(cause)
     record = {**first, "status": "refused", "reason": reason, "message": message, "advice": Reason(reason).advice}
-    return record, f"{errors.one_line(name)}  refused {reason}: {message}"
+    return record, f"{errors.one_line(name)}  refused  {reason}: {message}"
 
 
 def print_outcome(args: argparse.Namespace, record: dict[str, Any], line: str) -> int:
-    """Print the record or the line; the exit code of its reason."""
+    """Print the record or the line, with its advice; the exit code of its reason."""
+    reason = record["reason"]
     if args.json:
         print(json.dumps(record), flush=True)
-        return errors.exit_code_of(record["reason"])
-    if not args.quiet or record["status"] != "ok":
+        return errors.exit_code_of(reason)
+    if reason is not None and record.get("advice"):
+        print_refusal(args, line, reason, record["message"], own=record["advice"], to_stdout=not args.quiet)
+    elif not args.quiet or record["status"] != "ok":
         print(line, file=sys.stderr if args.quiet else sys.stdout, flush=True)
     for need in () if args.quiet else record.get("explain", ()):
         print(f"  needs {need}", file=sys.stderr, flush=True)
-    if record.get("advice"):
-        print_advice(record["reason"], record["message"], args, record["advice"])
-    return errors.exit_code_of(record["reason"])
+    return errors.exit_code_of(reason)
 
 
-def print_advice(reason: str | None, message: str, args: argparse.Namespace, own: str = "") -> None:
-    """What to do after a refusal, on stderr, where its `message` does not contain it; once for each reason.
+def print_refusal(
+    args: argparse.Namespace, line: str, reason: str, message: str, *, own: str = "", to_stdout: bool = False
+) -> None:
+    """Print the `line` of a refusal and, behind it, what to do where its `message` does not contain that.
 
-    `own` is the advice of the command, which comes before that of the reason.
+    `own` is the advice of the command, which comes before that of the reason. Each advice is printed once. It stands in
+    the same line, so that no pipe parts the two; on a terminal in an indented one below.
     """
-    if reason is None or getattr(args, "quiet", False):
-        return
-    advice = errors.next_step(reason, message)
-    if advice and own not in ("", errors.Reason(reason).advice):
-        advice = own
+    stream = sys.stdout if to_stdout else sys.stderr
+    advice = "" if getattr(args, "quiet", False) else _advice(reason, message, own)
     printed: set[str] = vars(args).setdefault("printed_advice", set())
     if advice and advice not in printed:
         printed.add(advice)
-        print(f"  next: {advice}", file=sys.stderr, flush=True)
+        first, *others = line.split("\n")
+        line = "\n".join([f"{first}\n  next: {advice}" if stream.isatty() else f"{first}  next: {advice}", *others])
+    print(line, file=stream, flush=True)
+
+
+def _advice(reason: str, message: str, own: str) -> str:
+    """What to do after a refusal: by its `message`, else the command's `own`, else that of the `reason`."""
+    fitting = fitting_advice(message)
+    if fitting is not None:
+        return fitting
+    advice = errors.next_step(reason, message)
+    return own if advice and own not in ("", errors.Reason(reason).advice) else advice
+
+
+class Columns:
+    """Lines of several images in steady columns: names as wide as the longest, numbers to the right."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self._name_width = max((len(errors.one_line(name)) for name in names), default=0)
+        self._widths: dict[tuple[str, str], int] = {}
+
+    def aligned(self, line: str) -> str:
+        """The `line` of an image, whose columns two spaces part, with the widths of the lines before."""
+        first, newline, rest = line.partition("\n")
+        name, *columns = first.split("  ")
+        return "  ".join([name.ljust(self._name_width), *map(self._padded, columns)]) + newline + rest
+
+    def _padded(self, column: str) -> str:
+        match = NUMBER_COLUMN.fullmatch(column)
+        if match is None:
+            return column
+        before, number, after = match.groups()
+        width = max(self._widths.get((before, after), NUMBER_WIDTHS.get(before, 0)), len(number))
+        self._widths[before, after] = width
+        return f"{before}{number.rjust(width)}{after}"
+
+
+def print_files(args: argparse.Namespace, files: str, page: str | os.PathLike[str] | None = None) -> None:
+    """The last line of a command, on stderr: where its `files` are, and the `page` for a browser if there is one."""
+    if not (args.quiet or args.json):
+        page_text = "" if page is None else f"; page {printable(page)}"
+        print(f"files {files}{page_text}", file=sys.stderr, flush=True)
 
 
 def print_warnings(args: argparse.Namespace, name: str, warnings: Iterable[str], *, of_all: bool = False) -> None:

@@ -81,8 +81,9 @@ class Command:
         parser: argparse.ArgumentParser = subparsers.add_parser(
             self.name,
             **({} if self.summary is None else {"help": self.summary}),
-            description=self.description,
-            epilog=self.start.partition("\n\n")[2] or (self.example and f"example: {self.example}"),
+            usage=None if self.actions else self._usage(),
+            description="\n\n".join(filter(None, (self.description, self.example and f"example:\n  {self.example}"))),
+            epilog=self.start.partition("\n\n")[2],
             formatter_class=_Formatter,
         )
         for title, flags in self.groups.items():
@@ -94,12 +95,27 @@ class Command:
         else:
             parser.set_defaults(run=self.run, usage_error=parser.error, memory_later=self.memory_later)
 
+    def _usage(self) -> str:
+        """What must be given, in a line: flags that are required, and arguments; the rest are options."""
+        words = ["%(prog)s", "[options]"]
+        for one in (one for flags in self.groups.values() for one in flags if isinstance(one, Flag)):
+            is_flag, value = one.names[0].startswith("-"), one.options.get("metavar", "")
+            more = {"+": "...", "*": "..."}.get(one.options.get("nargs", ""), "")
+            text = f"{one.names[0]} {value}" if is_flag else f"{value or one.names[0]}{more}"
+            if is_flag and one.options.get("required"):
+                words.append(text)
+            elif not is_flag:
+                words.append(f"[{text}]" if one.options.get("nargs") in ("*", "?") else text)
+        return " ".join(words)
+
 
 class _Formatter(argparse.HelpFormatter):
-    """Keeps the lines of a text that has several."""
+    """Fills each paragraph of a text, and keeps the lines of one that has several."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
-        return text if "\n" in text else super()._fill_text(text, width, indent)
+        paragraphs = text.split("\n\n")
+        fill = super()._fill_text
+        return "\n\n".join(one if "\n" in one else fill(one, width, indent) for one in paragraphs)
 
 
 def function_at(path: str) -> Callable[[argparse.Namespace], int]:
@@ -293,7 +309,7 @@ def cluster_address(text: str) -> str:
 IMAGES = flag("images IMAGE", "PNG, TIFF, FITS, JPEG, camera raw, ROS bag, or BAG#NUMBER", nargs="+")
 SOME_IMAGES = IMAGES._replace(options={**IMAGES.options, "nargs": "*"})
 PHOTOGRAPHS = flag("images IMAGE", "PNG, TIFF, FITS, JPEG or camera raw", nargs="+")
-TOPIC = flag("--image-topic TOPIC", "of a ROS bag with several")
+TOPIC = flag("--image-topic TOPIC", "topic of the images in a ROS bag that has several")
 CAMERA = flag(
     "-c --camera FILE", "camera file of startrack, ROS, Kalibr, COLMAP, OpenCV or RMS, or the name of a shipped one"
 )
@@ -306,14 +322,17 @@ PIXELS = (
     flag("--flat FILE", "flat field of the frame's size, its own dark subtracted"),
 )
 TIME_SIGMA = flag(
-    "--time-sigma SECONDS", "standard deviation of the clock's error (1, and more where it is not stated)", time_sigma_s
+    "--time-sigma SECONDS",
+    "standard deviation of the clock's error (1; where it is not stated the clock may also be grossly wrong)",
+    time_sigma_s,
 )
 TIME_LIMIT = flag(
     "--time-limit SECONDS",
-    "of processor time, all threads together: what is not found by then is refused as time_limit",
+    "limit of processor time, of all threads together; what is not found by then is refused as time_limit",
     positive_number,
 )
 FACTS = (CAMERA, TIME, TIME_SIGMA, EXPOSURE, *PIXELS)  # that images may lack
+MAIN_FACTS, OTHER_FACTS = (CAMERA, TERRAIN, TIME), (TIME_SIGMA, EXPOSURE, *PIXELS)
 SITE = flag("--site LAT,LON[,M]", "where the camera stands on the Earth, in degrees and metres (--site=-30.2,...)")
 SKY = (PHOTOGRAPHS, CAMERA, TIME, EXPOSURE, *PIXELS, SITE, TERRAIN)  # of photographs of the night sky
 
@@ -324,7 +343,7 @@ LOCALIZER = flag(
 )
 EVIDENCE = flag(
     "--evidence",
-    "of the position: stars, the light of the sky that stops at the skyline, or both",
+    "evidence of the position: stars, the light of the sky that stops at the skyline, or both",
     choices=("both", "stars", "sky"),  # as startrack.chain.stages has them; written here so that help is quick
     default="both",
 )
@@ -350,8 +369,11 @@ METHOD = (LOCALIZER, EVIDENCE, NEAR, POINTING)
 
 ODOMETRY = (
     flag("--odometry-sigma F", "error of a move on each horizontal axis, relative", amount, default=ODOMETRY_SIGMA),
-    flag("--odometry-floor M", "the same, beside that in quadrature", amount, default=ODOMETRY_FLOOR_M),
-)
+    flag(
+        "--odometry-floor M", "error of a move beside the relative one, added in quadrature", amount,
+        default=ODOMETRY_FLOOR_M,
+    ),
+)  # fmt: skip
 ODOMETRY_TIME = flag(
     "--odometry-time-sigma SECONDS",
     "offset of the odometry's clock from that of the images",
@@ -360,7 +382,7 @@ ODOMETRY_TIME = flag(
 )
 MAX_SPEED = flag(
     "--max-speed M_PER_S",
-    "of the rover: odometry with a faster move is refused",
+    "largest speed of the rover; odometry with a faster move is refused",
     positive_number,
     default=MAX_SPEED_M_S,
 )
@@ -375,6 +397,6 @@ OUTPUT = (DIR, OVERWRITE, JSON, NO_PLOTS)
 JOBS = flag("-j --jobs N", "processes (default: all cores)", positive_count)
 CLUSTER_TEXTS = "--cluster ADDRESS", "a Dask cluster to use instead (extra: cluster)"
 CLUSTER = flag(*CLUSTER_TEXTS)
-NO_SEED = flag("--seed N", "accepted everywhere; here nothing is random", int, default=0)
+NO_SEED = flag("--seed N", "no effect: this command draws nothing at random", int, default=0)
 VERBOSE = flag("-v --verbose", "more output; tracebacks of internal errors", action="count", default=0)
 MORE = (VERBOSE, flag("-q --quiet", "print errors only"))

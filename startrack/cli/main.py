@@ -20,7 +20,7 @@ from typing import Any, NoReturn
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: a second thread waits for work, 0.2 s a start
 
-from startrack.cli.console import discard_stdout, open_closed_streams, print_advice
+from startrack.cli.console import discard_stdout, open_closed_streams, print_refusal
 from startrack.cli.flags import Command
 from startrack.core import __version__, errors
 from startrack.core.errors import BadInput, BadOutput, NoSolution
@@ -36,19 +36,24 @@ COMMANDS = {  # name to the module of startrack.cli that declares it
 }  # fmt: skip
 USAGE, INTERRUPTED = 2, 130
 NEW_OBJECTS = 50_000  # until garbage is collected: Python's 700 cost a tenth of the time of a start
-EPILOG = """exit codes: 0 every image solved; 1 internal error; 2 usage; 3 an image ambiguous or refused; 4 bad input;
+GROUPS = {  # of commands in the help; those of no group follow
+    "see what it does": ("demo",),
+    "solve pictures": ("locate", "batch", "track", "identify", "detect"),
+    "cameras and horizons": ("calibrate", "horizon"),
+    "plan and simulate": ("predict", "render", "terrain", "reproduce"),
+    "look and check": ("report", "doctor", "cache", "schema"),
+}
+EXIT_CODES = """\
+exit codes: 0 every image solved; 1 internal error; 2 usage; 3 an image ambiguous or refused; 4 bad input;
 5 batch: some image not solved; 5 also if the reader of the output has gone before the end (a closed pipe);
-130 interrupted (Ctrl-C)
-
-startrack locate sample_images/near-centre.png     where is the rover?
-startrack identify sky.png -c camera.toml          which stars are these?
-startrack render --seed 1                          a synthetic exposure to try it on
-"""
-START = """usage: startrack COMMAND ... (startrack --help lists the commands; startrack demo shows what they do)
-
+130 interrupted (Ctrl-C)"""
+DOORS = """\
 rover navigation     startrack locate sample_images/near-wall.png    where is the camera, on a map of the ground?
 all-sky cameras      startrack calibrate NIGHT.jpg... --fov 180      the lens; then startrack horizon: the skyline
 star identification  startrack identify SKY.png --fov 60             which stars are these? no camera file is needed"""
+START = f"""usage: startrack COMMAND ... (startrack --help lists the commands; startrack demo shows what they do)
+
+{DOORS}"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -110,8 +115,8 @@ def _run(args: argparse.Namespace) -> int:
         return USAGE
     except (BadInput, NoSolution) as cause:
         code = errors.EXIT_BAD_INPUT if isinstance(cause, BadInput) else errors.EXIT_REFUSED
-        _report_failure(f"{cause.reason}: {cause}", code)
-        print_advice(cause.reason, str(cause), args)
+        line = f"startrack {args.command}  refused  {cause.reason}: {errors.one_line(str(cause))}"
+        print_refusal(args, line, cause.reason, str(cause))
         return code
     except LibraryMissing as cause:
         return _report_failure(str(cause), errors.EXIT_INTERNAL_ERROR)
@@ -145,6 +150,28 @@ class _Parser(argparse.ArgumentParser):
         self.exit(USAGE, f"{self.prog}: error: {errors.one_line(message)}\ntry '{self.prog} --help'\n")
 
 
+class _StartParser(_Parser):
+    """The parser of all commands, whose help shows the doors and the commands by their groups."""
+
+    summaries: dict[str, str]
+
+    def format_help(self) -> str:
+        """Usage, doors, commands with their summaries, and exit codes."""
+        named = {name for names in GROUPS.values() for name in names}
+        groups = {**GROUPS, "more": tuple(name for name in COMMANDS if name not in named)}
+        width = max(map(len, COMMANDS))
+        parts = [
+            "usage: startrack COMMAND ... (startrack COMMAND --help shows the flags and an example)",
+            "Rover position and attitude, or the names of the stars, from one picture of the sky.", DOORS,
+            *(
+                "\n".join([f"{title}:", *(f"  {name:<{width}}  {self.summaries[name]}" for name in names)])
+                for title, names in groups.items() if names
+            ),
+            "  --version  the version\n  -h, --help  this text", EXIT_CODES,
+        ]  # fmt: skip
+        return "\n\n".join(parts) + "\n"
+
+
 @contextmanager
 def _end_by_interrupt() -> Iterator[None]:
     """In the block Ctrl-C ends the process: while modules are loaded, Python can lose a KeyboardInterrupt."""
@@ -161,20 +188,16 @@ def _end_by_interrupt() -> Iterator[None]:
 
 def _parser() -> tuple[argparse.ArgumentParser, dict[str, Command]]:
     """The parser, and the commands and actions by their names."""
-    parser = _Parser(
-        prog="startrack",
-        description="Rover position and attitude from one star exposure.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = _StartParser(prog="startrack")
     parser.add_argument("--version", action="version", version=f"startrack {__version__}")
-    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND")
+    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
     commands: dict[str, Command] = {}
     for name, module in COMMANDS.items():
         for command in importlib.import_module(f"startrack.cli.{module}").COMMANDS:
             if command.name.split()[0] == name:
                 command.add_to(subparsers)
                 commands[command.name] = command
+    parser.summaries = {name: commands[name].summary or "" for name in COMMANDS}
     return parser, commands
 
 

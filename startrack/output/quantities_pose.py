@@ -64,6 +64,9 @@ POSITION_QUANTITIES: tuple[Quantity, ...] = (
       "circle about the position that holds 99.9 %", "positive", nullable=True, form="%.4f",
       shown=(Show("text", "error", ", {:.1f} m (99.9 %)"), Show("notebook", "99.9 % within", "{:.1f} m"),
              Show("page", "99.9 % within", "{:,.1f} m"))),
+    Q("position.wide_tail", "m", Positioned, values.wide_tail_m,
+      f"the 99.9 % circle, where it is {values.WIDE_TAIL:g} times that of 95 % or more", derived=True,
+      shown=(Show("summary", "radius", ", {:.1f} m (99.9 %)"),)),
     Q("position.protection_level_m", "m", values.has_position,
       lambda v: None if v.fix.integrity is None else v.fix.integrity.protection_level_m,
       "radius about the position beyond which the true one lies with probability `protection_risk` at most, also where "

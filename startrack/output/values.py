@@ -22,6 +22,7 @@ from startrack.terrain import Terrain
 
 ARCSEC_PER_RAD = 648_000 / np.pi
 SMALLEST_CHANCE = 1e-100  # smaller probabilities are beyond the models that they come from
+WIDE_TAIL = 5.0  # the ratio of the circles of 99.9 and 95 %; a normal distribution has 1.5
 DOMINANT = 3.0  # times the circle that a stated fact gives: the line of the terminal names it
 ROTATION_STEP_RAD = 1e-5  # of the numerical derivative of heading, pitch and roll
 HALF_STEP_PX = 0.5  # of the numerical derivative of the sky by pixels
@@ -151,6 +152,13 @@ def ellipse(at: At) -> tuple[float, float, float] | None:
         return None
     major_m, minor_m, azimuth_rad = error_ellipse(np.asarray(covariance, dtype=float))
     return float(major_m), float(minor_m), float(np.degrees(azimuth_rad))
+
+
+def wide_tail_m(at: At) -> float | None:
+    """The radius of the 99.9 % circle, where it is WIDE_TAIL times that of 95 % or more; else None."""
+    radius95_m, radius999_m = at("position.radius95_m"), at("position.radius999_m")
+    is_wide = radius95_m is not None and radius999_m is not None and radius999_m > WIDE_TAIL * radius95_m
+    return float(radius999_m) if is_wide else None
 
 
 def lacking_circle(at: At) -> str | None:

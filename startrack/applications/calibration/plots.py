@@ -18,9 +18,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 PLOT_STYLE: dict[Any, Any] = {
-    "figure.constrained_layout.use": True, "figure.dpi": 100, "axes.titlesize": 11, "legend.fontsize": 8
+    "figure.constrained_layout.use": True, "figure.dpi": 100, "axes.titlesize": 12, "legend.fontsize": 9,
+    "figure.facecolor": "#0d1119", "axes.facecolor": "#131924", "savefig.facecolor": "#0d1119",
+    "text.color": "#ecf0f5", "axes.labelcolor": "#ecf0f5", "xtick.color": "#a3afc0", "ytick.color": "#a3afc0",
+    "axes.edgecolor": "#4a5668", "legend.facecolor": "#131924", "legend.edgecolor": "#4a5668",
 }  # fmt: skip
-DARK, GOOD, BAD, LINE = "#1b2430", "#0072b2", "#d55e00", "#009e73"
+PLAIN, GOOD, BAD, LINE = "#ecf0f5", "#56b4e9", "#e69f00", "#2fd3a0"
+DARK_LETTERS_FROM = 0.45  # of the colour map, from which dark letters are read on it
 ARROW_FRACTION = 0.02  # of the frame's width: length of an arrow of the RMS residual
 MAP_SIDE = 160
 MAX_ARROWS = 1000  # more overlap
@@ -33,12 +37,15 @@ def report_png(calibration: Calibration) -> bytes:
 
     drawn = io.BytesIO()
     with rc_context(PLOT_STYLE):
-        figure = Figure(figsize=(13.0, 11.0))
+        width, height = calibration.camera.size_px
+        figure = Figure(figsize=(13.0, 2.0 + 10.5 * height / width))
         axes = figure.subplots(2, 2)
         _draw_vectors(axes[0, 0], calibration)
         _draw_by_angle(axes[0, 1], calibration)
         _draw_sigma(axes[1, 0], calibration.camera)
         _draw_sectors(axes[1, 1], calibration)
+        for one in axes.flat:
+            one.set_box_aspect(height / width)  # panels of one size
         figure.savefig(drawn, format="png", metadata={"Software": None})
     return drawn.getvalue()
 
@@ -68,7 +75,7 @@ def _draw_vectors(axes: Axes, calibration: Calibration) -> None:
     )  # fmt: skip
     rejected = ~fit.used
     axes.plot(px[rejected, 0], px[rejected, 1], "x", color=BAD, markersize=5, label=f"{rejected.sum()} rejected")
-    axes.set_title(f"Held-out residuals, {scale:.0f} times enlarged (RMS {fit.held_out_rms_px:.3f} px)")
+    axes.set_title(f"Errors at stars not in the fit, {scale:.0f} times enlarged (RMS {fit.held_out_rms_px:.3f} px)")
     _draw_frame(axes, camera)
 
 
@@ -84,12 +91,12 @@ def _draw_by_angle(axes: Axes, calibration: Calibration) -> None:
     grid = np.linspace(0.0, camera.calibrated_angle_rad, 60)
     sigma = projection_by_angle(camera, grid)[2]
     for sign in (-1, 1):
-        label = "3 map sigma" if sign > 0 else None
-        axes.plot(np.degrees(grid), sign * 3 * sigma, color=DARK, linewidth=1.2, label=label)
+        label = "3 sigma of the lens" if sign > 0 else None
+        axes.plot(np.degrees(grid), sign * 3 * sigma, color=PLAIN, linewidth=1.2, label=label)
     axes.axvline(float(np.degrees(camera.calibrated_angle_rad)), color=LINE, linewidth=1.2)
     top = 4.0 * max(fit.held_out_rms_px, 1e-3)
-    axes.set(ylim=(-top, top), xlabel="angle off the axis, degrees", ylabel="held-out residual px")
-    axes.set_title("Residuals by angle: a curve shows a wrong lens model")
+    axes.set(ylim=(-top, top), xlabel="angle off the axis, degrees", ylabel="error, px")
+    axes.set_title("By angle off the axis: a bend shows a wrong lens model")
     axes.legend(loc="upper left", ncols=3)
 
 
@@ -101,23 +108,23 @@ def _draw_sigma(axes: Axes, camera: Camera) -> None:
     sigma: Array = np.ma.masked_where(~inside, camera.projection_sigma_px(rays))
     drawn = axes.imshow(sigma, extent=(-0.5, width - 0.5, height - 0.5, -0.5), cmap="viridis", interpolation="bilinear")
     axes.figure.colorbar(drawn, ax=axes, shrink=0.85, label="px per axis")
-    axes.set_title("Projection sigma inside the calibrated radius, attitude free")
+    axes.set_title("One sigma of the lens within the calibrated angle")
     _draw_frame(axes, camera)
 
 
 def _draw_sectors(axes: Axes, calibration: Calibration) -> None:
     cover = star_coverage(calibration.joint)
-    drawn = axes.imshow(np.ma.masked_invalid(cover.rms_px), cmap="magma", aspect="auto", vmin=0.0)
-    axes.figure.colorbar(drawn, ax=axes, shrink=0.85, label="held-out RMS px")
-    dark = np.nanmax(cover.rms_px) * 0.5 if np.isfinite(cover.rms_px).any() else 0.0
+    drawn = axes.imshow(np.ma.masked_invalid(cover.rms_px), cmap="viridis", aspect="auto", vmin=0.0)
+    axes.figure.colorbar(drawn, ax=axes, shrink=0.85, label="RMS error, px")
+    dark = np.nanmax(cover.rms_px) * DARK_LETTERS_FROM if np.isfinite(cover.rms_px).any() else 0.0
     for ring, row in enumerate(cover.rms_px):
         for sector, value in enumerate(row):
             text = f"{value:.2f}\n{cover.stars[ring, sector]:.0f} stars" if np.isfinite(value) else "no star"
-            colour = "white" if np.isfinite(value) and value < dark else "black"
+            colour = "black" if np.isfinite(value) and value > dark else "white"
             axes.text(sector, ring, text, ha="center", va="center", fontsize=8, color=colour)
     edges = np.degrees(cover.ring_edges_rad)
     rings, sectors = cover.rms_px.shape
     axes.set_xticks(range(sectors), [f"{360 * k // sectors}°" for k in range(sectors)])
     axes.set_yticks(range(rings), [f"{a:.0f}–{b:.0f}°" for a, b in pairwise(edges)])
     axes.set(xlabel="sector, from image right, clockwise", ylabel="ring")
-    axes.set_title("Held-out RMS and number of stars by ring and sector")
+    axes.set_title("RMS error and number of stars by ring and sector")

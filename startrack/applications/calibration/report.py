@@ -10,21 +10,34 @@ from pathlib import Path
 import numpy as np
 
 from startrack.applications.calibration.acceptance import star_coverage
-from startrack.applications.calibration.record import arcmin_per_px, camera_summary, image_rows, summary
+from startrack.applications.calibration.record import arcmin_per_px, camera_summary, image_rows
 from startrack.applications.calibration.run import Calibration
 from startrack.core.errors import how_to_install
 from startrack.core.files import write_atomically
+from startrack.output import fill_frame
 
 NO_PICTURE = f"no picture: it needs matplotlib, the extra plots ({how_to_install('plots')})"
 STYLE = """
-body{font:16px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#1b2430;background:#fff}
-h1{font-size:1.6rem;margin-bottom:.2rem} h2{font-size:1.15rem;margin-top:2rem}
-table{border-collapse:collapse;margin:.5rem 0;font-variant-numeric:tabular-nums;display:block;overflow-x:auto}
-td,th{padding:.25rem .7rem;border-bottom:1px solid #d8dee6;text-align:right}
-td:first-child,th:first-child{text-align:left}
-.ok{color:#00694d;font-weight:600} .no{color:#b34700;font-weight:600} img{max-width:100%;height:auto}
-pre{background:#f3f5f8;padding:.8rem;overflow-x:auto} p.lead{font-size:1.05rem}
+.card table { margin: 0 0 .8rem; }
+.card td, .card th { padding: .25rem .7rem; border-bottom: 1px solid var(--grid); text-align: right; }
+.card td:first-child, .card th:first-child { text-align: left; font-weight: 400; }
+.card thead th, .card thead th:first-child { font-weight: 600; }
+.card img { display: block; max-width: 100%; height: auto; border-radius: 6px; margin-bottom: .8rem; }
+@media (max-width: 52rem) { .card td, .card th { padding: .25rem .3rem; } }
+pre { margin: 0; font-size: .9rem; }
 """
+LEAST_CHANCE = -299.5  # log10: a smaller one is only told to be that
+CHECKS = {  # of a check by its name: what the page calls it, and what it means
+    "matched stars": ("stars matched", "stars of the catalogue that were found in the pictures"),
+    "matched fraction": ("part of the stars that is matched", "of the stars that should be visible"),
+    "log10 chance of as many matches": ("probability of as many matches by chance", "at a wrong attitude"),
+    "held-out RMS [px]": ("error at stars that the fit did not see [px]", "root of the mean square distance"),
+    "rings with stars": ("rings with stars", "of four rings of equal width about the middle"),
+    "sectors with stars": ("sectors with stars", "of eight sectors about the middle"),
+    "map sigma [px]": ("error of the lens [px]", "one sigma of a projected direction, the largest within the "
+                       "calibrated angle"),
+    "opposite handedness [px]": ("error of the mirror image [px]", "a mirror image that fits as well would be one"),
+}  # fmt: skip
 
 
 def write_report(camera_path: Path, calibration: Calibration) -> str:
@@ -45,54 +58,85 @@ def write_report(camera_path: Path, calibration: Calibration) -> str:
 
 
 def _report_html(calibration: Calibration, picture: bytes) -> str:
-    """The page, without scripts or other files."""
+    """The page in the frame of the reports, without other files."""
     camera = calibration.camera
-    text = "accepted" if calibration.accepted else f"refused: {html.escape(calibration.message)}"
-    image = (
-        f'<img alt="residuals and map sigma" src="data:image/png;base64,{base64.b64encode(picture).decode()}">'
-        if picture
-        else f"<p>{NO_PICTURE}.</p>"
-    )
+    words = "Residuals by place and by angle, error of the lens, errors by ring and sector"
+    data = base64.b64encode(picture).decode()
+    image = f'<img alt="{words}" src="data:image/png;base64,{data}">' if picture else f"<p>{NO_PICTURE}.</p>"
     models = [
         [html.escape(c.name), str(c.parameters), f"{c.held_out_chi2:.0f}", f"{c.held_out_rms_px:.3f}"]
         for c in calibration.joint.fit.candidates
     ]
-    return (
-        '<!doctype html><html lang="en"><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f"<title>Calibration of {html.escape(camera.name)}</title><style>{STYLE}</style>"
-        f"<h1>Calibration of {html.escape(camera.name)}</h1>"
-        f'<p class="lead">{_verdict(calibration.accepted, text)}</p>'
-        f"<p>{html.escape(summary(calibration, camera.name))}</p>"
-        f"<h2>Acceptance checks</h2>{_checks_table(calibration)}"
-        f"<h2>Residuals</h2>{image}{_rings_table(calibration)}"
-        "<h2>Lens models, tested with held-out stars</h2>"
-        f"{_table(['model', 'parameters', 'held-out chi²', 'held-out RMS px'], models)}"
-        f"<h2>Pictures</h2>{_pictures_table(calibration)}"
-        f"<h2>Throughput and sensor</h2>{_photometry_table(calibration)}"
-        f"<h2>The camera</h2><pre>{html.escape(camera_summary(camera))}</pre></html>\n"
+    scale = arcmin_per_px(camera)
+    fit = calibration.joint.fit
+    lead = (
+        f"{len(image_rows(calibration))} pictures, {int(fit.used.sum()):,} stars: {fit.held_out_rms_px:.2f} px "
+        f"({fit.held_out_rms_px * scale:.2f}') off at stars that the fit did not see; known to "
+        f"{np.degrees(camera.calibrated_angle_rad):.1f}° off the axis."
     )
+    refused = "" if calibration.accepted else (
+        '<section class="card why refused"><h2>What to do</h2>'
+        f'<p class="message">{html.escape(calibration.message)}</p></section>'
+    )  # fmt: skip
+    main = (
+        f'<div class="title"><h1>Calibration of {html.escape(camera.name)}</h1>'
+        f"{_verdict(calibration.accepted, 'accepted' if calibration.accepted else 'refused')}</div>"
+        f'<p class="lead">{lead.replace("1 pictures", "1 picture")}</p>{refused}'
+        + _card("Checks", _checks_table(calibration))
+        + _card("Errors", image + _rings_table(calibration))
+        + _card(
+            "Lens models, tested with stars that the fit did not see",
+            _table(["model", "parameters", "chi²", "error [px]"], models, "Lens models"),
+        )
+        + _card("Pictures", _pictures_table(calibration))
+        + _card("Throughput and sensor", _photometry_table(calibration))
+        + _card("The camera", _scroll("The camera file", f"<pre>{html.escape(camera_summary(camera))}</pre>"))
+    )
+    title = f"Calibration of {camera.name} · startrack"
+    return fill_frame(title, {"results": {"columns": []}}, (), style=STYLE, main=main)
+
+
+def _card(title: str, content: str) -> str:
+    return f'<section class="card"><h2>{title}</h2>{content}</section>'
+
+
+def _scroll(name: str, content: str) -> str:
+    """The `content`, which scrolls inside itself, as a region with a `name`."""
+    return f'<div class="scroll" tabindex="0" role="region" aria-label="{name}">{content}</div>'
 
 
 def _verdict(good: bool, text: str) -> str:
-    return f'<span class="{"ok" if good else "no"}">{text}</span>'
+    return f'<span class="badge {"ok" if good else "refused"}">{text}</span>'
 
 
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    lines = [("th", head), *(("td", row) for row in rows)]
-    texts = ["<tr>" + "".join(f"<{tag}>{cell}</{tag}>" for cell in cells) + "</tr>" for tag, cells in lines]
-    return f"<table>{''.join(texts)}</table>"
+def _table(head: list[str], rows: list[list[str]], name: str) -> str:
+    """A table with a `name`; the first cell of a row is its heading. Without any word in the `head` it has none."""
+
+    def row_html(cells: list[str], kind: str) -> str:
+        first, *others = cells
+        kind_of_first = '<th scope="row">{}</th>' if kind == "td" else '<th scope="col">{}</th>'
+        rest = ("<td>{}</td>" if kind == "td" or not cell else '<th scope="col">{}</th>' for cell in others)
+        return "<tr>" + kind_of_first.format(first) + "".join(map(str.format, rest, others)) + "</tr>"
+
+    heading = f"<thead>{row_html(head, 'th')}</thead>" if any(head) else ""
+    body = "".join(row_html(row, "td") for row in rows)
+    return _scroll(name, f"<table>{heading}<tbody>{body}</tbody></table>")
 
 
 def _checks_table(calibration: Calibration) -> str:
-    return _table(
-        ["condition", "value", "required", "", "advice"],
-        [
-            [html.escape(c.name), f"{c.value:,.0f}" if c.value >= 1000 else f"{c.value:.3g}", html.escape(c.limit),
-             _verdict(c.passed, "passed" if c.passed else "failed"), "" if c.passed else html.escape(c.advice)]
-            for c in calibration.checks
-        ],
-    )  # fmt: skip
+    rows, failed = [], not calibration.accepted
+    for check in calibration.checks:
+        name, meaning = CHECKS.get(check.name, (check.name, ""))
+        title = f' class="tipped" title="{html.escape(meaning)}"' if meaning else ""
+        value, limit = f"{check.value:,.0f}" if check.value >= 1000 else f"{check.value:.3g}", check.limit
+        if check.name.startswith("log10 "):
+            value = f"{'below ' if check.value <= LEAST_CHANCE else ''}1e{check.value:.0f}"
+            limit = limit.replace("<= ", "<= 1e")
+        limit = html.escape(limit.replace(">=", "≥").replace("<=", "≤"))
+        verdict = _verdict(check.passed, "passed" if check.passed else "failed")
+        row = [f"<span{title}>{html.escape(name)}</span>", verdict, value, limit]
+        rows.append([*row, "" if check.passed else html.escape(check.advice)] if failed else row)
+    return _table(["condition", "", "value", "required", *(["what to do"] if failed else [])], rows, "Checks")
 
 
 def _rings_table(calibration: Calibration) -> str:
@@ -107,13 +151,13 @@ def _rings_table(calibration: Calibration) -> str:
     ]  # fmt: skip
     fit = calibration.joint.fit
     note = (
-        f"<p>Held-out RMS distance by ring and by sector (from image right, clockwise). All stars: "
+        f"<p>Errors (RMS) at stars that the fit did not see, by ring and by sector from image right, clockwise. All: "
         f"{fit.held_out_rms_px:.3f} px = {fit.held_out_rms_px * scale:.2f}', chi² per degree of freedom with the "
         f"stated centroid errors {fit.chi2_per_dof:.2f}; additional error {fit.extra_sigma_px:.3f} px per axis. "
         f"{int((~fit.used).sum())} of {len(fit.used)} matches were rejected.</p>"
     )
     head = ["ring", "stars", "RMS px", "RMS '", *(f"{360 * k // sectors}°" for k in range(sectors))]
-    return _table(head, rows) + note
+    return _table(head, rows, "Errors by ring and sector") + note
 
 
 def _two_decimals(value: float | None) -> str:
@@ -134,7 +178,8 @@ def _pictures_table(calibration: Calibration) -> str:
         "No site on the Earth was given: of pictures taken through air this lens contains the refraction (up to half a "
         "degree at the horizon). Give --site."
     )  # fmt: skip
-    return _table(["picture", "time", "stars", "matched", "RMS px", ""], rows) + f"<p>{note}</p>"
+    head = ["picture", "time", "stars", "matched", "error [px]", ""]
+    return _table(head, rows, "Pictures") + f"<p>{note}</p>"
 
 
 def _photometry_table(calibration: Calibration) -> str:
@@ -160,7 +205,7 @@ def _photometry_table(calibration: Calibration) -> str:
         ["hot pixels", "–" if sensor.hot_px is None else str(len(sensor.hot_px))],
     ]
     notes = "".join(f"<li>{html.escape(note)}</li>" for note in found.notes)
-    return _table(["", "measured"], rows) + (f"<ul>{notes}</ul>" if notes else "")
+    return _table(["", ""], rows, "Throughput and sensor") + (f"<ul>{notes}</ul>" if notes else "")
 
 
 def _amount_text(value: float | None, unit: str) -> str:

@@ -90,6 +90,15 @@ def landscape_picture(frames: Sequence[SkyFrame], skyline: MeasuredSkyline) -> N
     return picture
 
 
+def unrolled_photographs(frames: Sequence[SkyFrame], azimuth_rad: Array, elevation_rad: Array) -> Array:
+    """The mean of the photographs of `frames` as levels of grey (H, W), nan where none shows the direction.
+
+    Rows have the elevations (H,), columns the azimuths (W,).
+    """
+    everywhere = np.ones((len(elevation_rad), len(azimuth_rad)), dtype=np.bool_)
+    return _mean_grey([_ground_light(frame, azimuth_rad, elevation_rad, everywhere) for frame in frames], everywhere)
+
+
 def interpolate_unknown(skyline: MeasuredSkyline) -> Array:
     """Elevations (n,) with the unknown ones interpolated between their neighbours around the compass.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from functools import partial
 from itertools import permutations
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from startrack.applications.horizon.landscape import (
     interpolate_unknown,
     landscape_picture,
     landscape_text,
+    unrolled_photographs,
     zip_bytes,
 )
 from startrack.core.errors import BadOutput
@@ -90,7 +92,7 @@ def _encoded(
     """The files of one output with their content."""
     kind, name = kind_of(output), Path(output).stem
     if kind == ".png":
-        data = [png_bytes(skyline_picture(skyline))]
+        data = [png_bytes(skyline_picture(skyline, partial(unrolled_photographs, frames) if frames else None))]
     elif kind == ".zip":
         data = [zip_bytes(name, _landscape_files(name, skyline, site, frames))]
     elif kind:

@@ -38,6 +38,7 @@ from startrack.terrain import Terrain, can_write_maps, load_terrain, write_bands
 RECORD_FILE, MAP, STYLE = "predict.json", "predict.tif", "predict.qml"
 CELL_TABLE, MAP_PICTURE = "predict.ecsv", "predict.png"
 STYLED = "radius95_m"  # the band that QGIS shows
+FEW_DRAWS = 5  # at a place, below which its radius is mostly noise
 COMPARISON_TABLE, COMPARISON_PICTURE = "predict-compare.ecsv", "predict-compare.png"
 PREDICTION_FILES = {MAP, STYLE, CELL_TABLE, RECORD_FILE, MAP_PICTURE, COMPARISON_TABLE, COMPARISON_PICTURE}
 NO_RADIUS = "no position at half of the places"
@@ -235,6 +236,7 @@ def _picture(report: Report) -> Any:
     if s["last_time_utc"] != s["first_time_utc"]:
         times += f" to {s['last_time_utc'][:16].replace('T', ' ')}"
     draws = f"{s['draws']} draw{'' if s['draws'] == 1 else 's'} every {s['spacing_m']:.4g} m"
+    draws += ": rough" if s["draws"] < FEW_DRAWS else ""
     caption = [f"camera {s['camera']}, {s['exposure_s']:.3g} s, {times} UTC, {draws}"]
     if isinstance(points, AreaCells):
         return output.prediction_picture(report.plan.terrain, points.site, points.raster(radius), title, caption)

@@ -117,21 +117,28 @@ function layers() {
 
 // --- the stated errors ---
 
-const log = (metres) => Math.log10(Math.max(metres, 0.001));
+// Radii from 0 on, or their logarithms where they differ much, which the axis then says (as in track.png).
+const LOGARITHMIC = 8;
+const allRadii = ["filtered_", ""].flatMap((prefix) => frames[`${prefix}radius95_m`].filter((metres) => known(metres) && metres > 0));
+const isLog = allRadii.length > 0 && LOGARITHMIC * least(allRadii) < -least(allRadii.map((metres) => -metres));
+const heightOf = (metres) => (isLog ? Math.log10(Math.max(metres, 0.001)) : metres);
 const LENGTHS = [];
 for (let power = -3; power < 7; power += 1) LENGTHS.push(power, power + Math.log10(2), power + Math.log10(5));
 
 function radiiView() {
   const series = [["filtered_", "filtered"], ["", "place"]].map(([prefix, name]) => [
-    all.filter((k) => known(frames[`${prefix}radius95_m`][k])).map((k) => ({ x: k + 1, y: log(frames[`${prefix}radius95_m`][k]), k })), name,
+    all.filter((k) => known(frames[`${prefix}radius95_m`][k])).map((k) => ({ x: k + 1, y: heightOf(frames[`${prefix}radius95_m`][k]), k })), name,
   ]);
   const heights = series.flatMap(([line]) => line.map((point) => point.y));
-  const [low, high] = heights.length ? [least(heights) - 0.15, 0.15 - least(heights.map((y) => -y))] : [0, 1];
+  const top = heights.length ? -least(heights.map((y) => -y)) : 1;
+  const [low, high] = isLog ? [least(heights) - 0.15, top + 0.15] : [0, 1.15 * top || 1];
   const inRange = LENGTHS.filter((value) => value >= low && value <= high);
   const lengths = inRange.length > 6 ? LENGTHS.filter(Number.isInteger) : LENGTHS;
   const view = new View({
     label: "Stated 95 percent radius by frame", world: [0.5, low, count + 0.5, high], square: false, ratio: 0.4, most: Math.max(1, count / 8), points: series[1][0],
-    axes: { x: "frame", y: "95 % radius", left: 60, fixedY: lengths, text: (value, step) => (step === null ? sayLength(Number((10 ** value).toPrecision(3))) : say(value, 0)) },
+    axes: isLog
+      ? { x: "frame", y: "95 % radius (logarithmic)", left: 60, fixedY: lengths, text: (value, step) => (step === null ? sayLength(Number((10 ** value).toPrecision(3))) : say(value, 0)) }
+      : { x: "frame", y: "95 % radius", left: 60, text: (value, _, axis) => (axis ? sayLength(Number(value.toPrecision(3))) : say(value, 0)) },
     describe: ({ k }) => [frames.image[k], [["filtered", radiusText(k, "filtered_")], ["smoothed", radiusText(k, "")]]], open: ({ k }) => choose(k),
     draw(v, g) {
       for (const [line, name] of series) {
@@ -223,7 +230,9 @@ function table() {
 function leadText() {
   const of = (status) => frames.status.filter((one) => one === status).length;
   const parts = Object.entries(FRAME_WORDS).map(([status, words]) => [of(status), words]).filter(([n]) => n).map(([n, words]) => `${say(n, 0)} ${words}`);
-  return `${say(count, 0)} ${count === 1 ? "frame" : "frames"} on ${page.terrain}: ${[parts.join(", "), ...page.crater, ...page.legs].join("; ")}.`;
+  const last = all.filter((k) => isPlaced(k, "") && known(frames.radius95_m[k])).at(-1);
+  const where = last === undefined ? "" : ` Last position, ${sayTime(frames.time_utc[last])}: ${placeText(last, "").replaceAll(" ", "\u00a0").replace(",\u00a0", ", ")}, within ${radiusText(last, "")} (95 %).`;
+  return `${say(count, 0)} ${count === 1 ? "frame" : "frames"} on ${page.terrain}: ${[parts.join(", "), ...page.crater, ...page.legs].join("; ")}.${where}`;
 }
 
 map.node.append(layers());

@@ -46,7 +46,7 @@ def state_flag(key: str) -> str:
 
 COMMANDS = (
     Command(
-        "calibrate", function_at("inputs.calibrate.run"), "a camera file from star exposures",
+        "calibrate", function_at("inputs.calibrate.run"), "a camera file from pictures of the stars",
         "Fit the lens of a camera to the stars of one or more exposures of the open night sky, check the fit, and "
         "write the camera file with its covariance, a report and a JSON record. A fit that fails a check is refused, "
         "with the exposures that would help.",
@@ -148,8 +148,13 @@ COMMANDS = (
                 ),
             ),
             "output": (
-                flag("-o --output FILE", "the skyline; several -o: in several formats", action="append", required=True),
-                *flags.OUTPUT,
+                flag(
+                    "-o --output FILE",
+                    "the skyline, and beside it its picture, NAME.skyline.png; several -o: in several formats",
+                    action="append", required=True,
+                ),
+                flag("-D --dir OUT", "folder of FILE, where that is relative (default: the current one)"),
+                flags.OVERWRITE, flags.JSON, flag("--no-plots", "no picture beside FILE"),
             ),
             "more": (flags.TIME_LIMIT, flags.NO_SEED, *flags.MORE),
         },

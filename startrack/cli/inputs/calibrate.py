@@ -8,12 +8,13 @@ import sys
 from startrack.applications import calibration
 from startrack.camera import REFRACTION_CONTAINED, REFRACTION_REMOVED, SENSOR, load_camera, save_camera
 from startrack.catalog import load_catalog
-from startrack.cli.console import named_steps, print_left_out, print_outcome, refusal
+from startrack.cli.console import named_steps, print_files, print_left_out, print_outcome, refusal
 from startrack.cli.flags import checked_flag
 from startrack.cli.images import approximate_camera, check_one_time, flag_site, read, read_each_once, site_of
 from startrack.cli.inputs.camera_files import (
     check_camera_output,
     check_name,
+    files_of,
     remove_former,
     value_in_record,
     write_camera,
@@ -69,7 +70,9 @@ def run(args: argparse.Namespace) -> int:
             print(ABOUT_REFRACTION, file=sys.stderr, flush=True)
     if args.verbose:
         line += "".join(f"\n  {note}" for note in found.photometry.notes)
-    return print_outcome(args, record, line)
+    code = print_outcome(args, record, line)
+    print_files(args, f"{', '.join(files_of(out))} in {printable(out.parent)}")
+    return code
 
 
 def run_board(args: argparse.Namespace) -> int:
@@ -95,7 +98,9 @@ def run_board(args: argparse.Namespace) -> int:
         save_camera(found.camera, out)
         remove_former(out, [one.mask for one in exposures])
     write_record(out, record)
-    return print_outcome(args, record, line + (f"\n  {record['message']}" if record["message"] else ""))
+    code = print_outcome(args, record, line + (f"\n  {record['message']}" if record["message"] else ""))
+    print_files(args, f"{', '.join(files_of(out))} in {printable(out.parent)}")
+    return code
 
 
 def verify(args: argparse.Namespace) -> int:

@@ -148,6 +148,12 @@ def check_camera_output(args: argparse.Namespace) -> Path:
     return out
 
 
+def files_of(camera_file: Path) -> list[str]:
+    """Names of the files of a calibration that are there, the camera file first."""
+    paths = (camera_file.with_suffix(suffix) for suffix in (camera_file.suffix, RECORD, *REPORTS, MASK, HOT_PIXELS))
+    return [printable(path.name) for path in paths if path.is_file()]
+
+
 def value_in_record(camera_file: Path, *keys: str) -> Any:
     """The value in the record beside a camera file; None without a record, or in one of another kind."""
     try:

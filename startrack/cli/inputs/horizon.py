@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,10 @@ import numpy as np
 
 from startrack.applications import horizon
 from startrack.catalog import load_catalog
-from startrack.cli.console import Outcome, named_steps, print_left_out, print_outcome, refusal
+from startrack.cli.console import Outcome, named_steps, print_files, print_left_out, print_outcome, refusal
 from startrack.cli.images import approximate_camera, check_fov, check_one_time, read_each_once, site_of
 from startrack.core.errors import BadInput, BadOutput, NoSolution, Reason, one_line
+from startrack.core.files import printable
 from startrack.core.limits import limited_time, stating_work
 
 FORMAT = "startrack.horizon/1"
@@ -27,7 +29,10 @@ def run(args: argparse.Namespace) -> int:
     check_fov(args)
     check_one_time(args)
     try:
-        return print_outcome(args, *_measure(args))
+        record, line = _measure(args)
+        code = print_outcome(args, record, line)
+        print_files(args, ", ".join(map(printable, record["files"])))
+        return code
     except BadOutput:
         raise
     except (BadInput, NoSolution) as cause:
@@ -39,7 +44,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _measure(args: argparse.Namespace) -> Outcome:
     """The record and the line of a skyline that was measured and written."""
-    horizon.check_outputs(*args.output, overwrite=args.overwrite)
+    outputs = _outputs(args)
+    horizon.check_outputs(*outputs, overwrite=args.overwrite)
     done: list[str] = []
     with stating_work(lambda: done[-1] if done else "no image was identified"), limited_time(args.time_limit):
         exposures = read_each_once(args)
@@ -63,7 +69,7 @@ def _measure(args: argparse.Namespace) -> Outcome:
             )
             print_left_out(left_out if frames else ())  # else the refusal names them
             found = horizon.measure_frames(frames, left_out, site, begin)
-    files = horizon.write_skyline(found.skyline, site, found.frames, *args.output, overwrite=args.overwrite)
+    files = horizon.write_skyline(found.skyline, site, found.frames, *outputs, overwrite=args.overwrite)
     unknown = int((~found.skyline.known).sum())
     varying = int((found.skyline.source == "varies").sum())
     interpolates = unknown and any(map(horizon.needs_all_azimuths, args.output))
@@ -80,6 +86,14 @@ def _measure(args: argparse.Namespace) -> Outcome:
     if args.verbose:
         line += "".join(f"\n  {one_line(one.name)}: {len(one.matched_star)} stars fit the lens" for one in found.frames)
     return record, line
+
+
+def _outputs(args: argparse.Namespace) -> list[str]:
+    """The paths of -o, in the folder of -D, and that of the picture beside the first, where none of them is one."""
+    outputs = [os.path.join(args.dir or "", output) for output in args.output]
+    if args.no_plots or any(output.lower().endswith(".png") for output in outputs):
+        return outputs
+    return [*outputs, f"{os.path.splitext(outputs[0].rstrip('/'))[0]}.skyline.png"]
 
 
 def _count_text(images: int) -> str:

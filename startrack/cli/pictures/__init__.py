@@ -28,24 +28,25 @@ SKYLINE = (
     ),
     flag(
         "--attitude FILE|AZ,PITCH,ROLL",
-        "of the camera of a polyline: a result of startrack, or degrees: azimuth and elevation of the optical axis, "
-        "and a clockwise turn about it (--attitude=-10,...)",
+        "attitude of the camera of a polyline: a result of startrack, or degrees: azimuth and elevation of the optical "
+        "axis, and a clockwise turn about it (--attitude=-10,...)",
     ),
     flag("--heading-sigma DEG", "error of the attitude about the vertical; 180: not known", half_turn),
     flag("--tilt-sigma DEG", "error of the vertical, about each of two level axes", half_turn),
-    flag("--correlation DEG", "of azimuth, over which errors of heights are alike (1)", half_turn),
+    flag("--correlation DEG", "azimuth over which errors of heights are alike (1)", half_turn),
 )
 SHARED = {"output": flags.OUTPUT, "more": (flags.NO_SEED, *flags.MORE)}
 COMMANDS = (
     Command(
-        "locate", function_at("pictures.locate.locate"), "image to position and attitude",
+        "locate", function_at("pictures.locate.locate"), "picture to position and attitude",
         "Locate the camera in each image: detect, identify, attitude, evidence, position. Camera, terrain and time "
         "come from flags, else from NAME.json beside the image, else from its header. Writes NAME.fix.json, "
         "NAME.stars.ecsv, NAME.skyline.ecsv, NAME.wcs, NAME.corr, NAME.annotated.png and NAME.skyline.png. With "
         "--skyline the position is by a skyline that was measured elsewhere, without stars and time.",
         {
-            "input": (
-                flags.SOME_IMAGES, flags.TOPIC, *flags.FACTS, flags.TERRAIN,
+            "input": (flags.SOME_IMAGES, *flags.MAIN_FACTS),
+            "more about the input": (
+                flags.TOPIC, *flags.OTHER_FACTS,
                 flag("--fov DEG", argparse.SUPPRESS),  # a flag of identify and calibrate
             ),
             "a measured skyline": SKYLINE,
@@ -58,7 +59,7 @@ COMMANDS = (
                 ),
                 flag(
                     "--explain",
-                    "of a refused or wide answer: what the image would need (exposure, facts, skyline in view, time, "
+                    "what the image of a refused or wide answer would need (exposure, facts, skyline in view, time, "
                     "camera file, terrain), on stderr or in JSON as explain",
                 ),
                 flag("--report", "add a page for a browser, as startrack report makes it"),
@@ -101,7 +102,7 @@ COMMANDS = (
         example="startrack detect sky.png -c camera.toml", memory_later=True,
     ),
     Command(
-        "batch", function_at("pictures.batch.run"), "every image of a folder",
+        "batch", function_at("pictures.batch.run"), "every picture of a folder",
         "Locate the camera in every image of a tree, which OUT mirrors. A stopped run is resumed; images are repeated "
         "if they, their sidecar, camera or terrain file have changed. Adds results.ecsv, trajectory.tum, timings.ecsv, "
         "manifest.json and, with the extra parquet, results.parquet. Exit codes: 0 every image solved; 5 some not "
@@ -109,8 +110,10 @@ COMMANDS = (
         "input.",
         {
             "input": (
-                flag("folder FOLDER", "folder of the images, with all below it; or a ROS bag"),
-                flags.TOPIC, *flags.FACTS, flags.TERRAIN,
+                flag("folder FOLDER", "folder of the images, with all below it; or a ROS bag"), *flags.MAIN_FACTS,
+            ),
+            "more about the input": (
+                flags.TOPIC, *flags.OTHER_FACTS,
                 flag("--files-on-stdin", "only the images listed on stdin, one a line, or ended by NUL"),
             ),
             "method": flags.METHOD,
@@ -123,19 +126,19 @@ COMMANDS = (
         example="startrack batch NIGHT/ -c camera.toml -t shackleton -D results",
     ),
     Command(
-        "track", function_at("pictures.track.run"), "images of a drive or of a rover at rest to a trajectory",
+        "track", function_at("pictures.track.run"), "pictures of a drive or of a rover at rest to a trajectory",
         "Locate the images of one camera and estimate its trajectory from all of them, with the errors that they "
         "share. Writes track.tum (by all images), track.filtered.tum (by the images up to each), track.ecsv, "
         "track.geojson, track.json, track.png and track.html.",
         {
             "input": (
-                flag("frames FRAMES", "images, one folder, or one ROS bag", nargs="+"),
-                flags.TOPIC, *flags.FACTS, flags.TERRAIN,
+                flag("frames FRAMES", "images, one folder, or one ROS bag", nargs="+"), *flags.MAIN_FACTS,
             ),
+            "more about the input": (flags.TOPIC, *flags.OTHER_FACTS),
             "method": (flags.EVIDENCE, flags.NEAR_ATTITUDE),
             "motion between the images (without: each is alone but for shared errors)": (
                 flag("--odometry FILE", "TUM text, or a ROS bag"),
-                flag("--odometry-topic TOPIC", "of a bag with several"),
+                flag("--odometry-topic TOPIC", "topic of the odometry in a bag that has several"),
                 *flags.ODOMETRY, flags.ODOMETRY_TIME, flags.MAX_SPEED,
                 flag("--at-rest", "the camera did not move"),
             ),

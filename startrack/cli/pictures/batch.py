@@ -18,7 +18,7 @@ from typing import Any
 
 from startrack.applications import batch
 from startrack.applications.batch import Image, ImageDone, Task
-from startrack.cli.console import discard_stdout, print_warnings, progress
+from startrack.cli.console import discard_stdout, print_refusal, print_warnings, progress
 from startrack.cli.flags import check_cluster, check_localizer
 from startrack.cli.images import absolute_facts, maps_left_out, prepare_reference, settings_of
 from startrack.cli.pictures.report import write_page_of
@@ -104,10 +104,9 @@ def _locate_images(
         done = f"{stopped}: {len(records)} of {len(tasks)} images done, {tables}"
         print(f"startrack: {done}; {again} goes on", file=sys.stderr)
         return errors.EXIT_STOPPED
-    if args.report:
-        write_page_of(str(out))
+    page = f"; page {printable(write_page_of(str(out)))}" if args.report else ""
     if not args.quiet:
-        print(f"{shown.summary()}; {tables}", file=sys.stderr if args.json else sys.stdout)
+        print(f"{shown.summary()}; {tables}{page}", file=sys.stderr if args.json else sys.stdout)
         if not (args.json or args.report) and shown.counts["ok"]:
             print(f"  next: startrack report {shlex.quote(printable(out))}", file=sys.stderr)
     if shown.counts["error"]:
@@ -213,7 +212,8 @@ class _Shown:
             elif args.verbose:
                 print(f"{record['image']}: {record['status']} {record['message']}".rstrip(), flush=True)
             elif record["status"] == "refused" and reason != INTERNAL_ERROR and not args.quiet:
-                print(refusal_line(record["image"], reason, record["message"]), file=sys.stderr, flush=True)
+                line = refusal_line(record["image"], reason, record["message"])
+                print_refusal(args, line, reason, record["message"])
         except BrokenPipeError:
             discard_stdout()
             self.halt("the output is no longer read")

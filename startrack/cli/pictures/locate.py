@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import importlib
 import math
-import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -19,7 +18,7 @@ from startrack import chain, output
 from startrack.applications.batch import result_stems
 from startrack.camera import Camera, load_camera
 from startrack.catalog import load_catalog
-from startrack.cli.console import Outcome, print_outcome, print_warnings, wait_lines, worst_code
+from startrack.cli.console import Columns, Outcome, print_files, print_outcome, print_warnings, wait_lines, worst_code
 from startrack.cli.flags import attitude, check_localizer
 from startrack.cli.images import check_fov, flag_site, near_attitude_of, prepare, read, settings_of
 from startrack.cli.pictures.report import write_page_of_images
@@ -52,8 +51,7 @@ def locate(args: argparse.Namespace) -> int:
     settings = settings_of(args)
     code = _run_images(args, "fix", lambda exposure, _: chain.locate_exposure(exposure, settings), args.time_limit)
     page = write_page_of_images(args.dir, args.images) if args.report else None
-    if page is not None and not args.quiet:
-        print(f"page {printable(page)}", file=sys.stderr)
+    _print_folder(args, "fix", page)
     return code
 
 
@@ -70,12 +68,16 @@ def identify(args: argparse.Namespace) -> int:
             return chain.identify_blind(exposure, args.fov, load_catalog(), settings, site)
         return chain.identify(exposure, camera, load_catalog(), settings, site)
 
-    return _run_images(args, "identification", solve, args.time_limit)
+    code = _run_images(args, "identification", solve, args.time_limit)
+    _print_folder(args, "identification")
+    return code
 
 
 def detect(args: argparse.Namespace) -> int:
     """Detect in every image; the exit code of the worst."""
-    return _run_images(args, "detections", chain.detect)
+    code = _run_images(args, "detections", chain.detect)
+    _print_folder(args, "detections")
+    return code
 
 
 def _run_images(args: argparse.Namespace, kind: str, solve: Solve, limit_s: float | None = None) -> int:
@@ -87,7 +89,7 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve, limit_s: floa
         args.usage_error("--image-topic is for ROS bags, and none is given")
     needed = NEEDED_LATER[:-1] if args.no_plots else NEEDED_LATER
     Thread(target=_import_beside, args=(needed,)).start()
-    codes = set()
+    codes, columns = set(), Columns(Path(path).name for path in args.images)
     for path, stem in zip(args.images, result_stems(args.images), strict=True):
         name = Path(path).name
         try:
@@ -105,10 +107,15 @@ def _run_images(args: argparse.Namespace, kind: str, solve: Solve, limit_s: floa
             record = output.refused_dict(path, INTERNAL_ERROR, message, kind)
             line = f"{printable(name)}  {message}"
         print_warnings(args, name, record.get("warnings", ()))
-        codes.add(print_outcome(args, record, line))
-    if not (args.quiet or args.json) and any(Path(args.dir).glob(f"*.{kind}.json")):
-        print(f"files in {printable(args.dir)}", file=sys.stderr, flush=True)
+        aligned = columns.aligned(line) if len(args.images) > 1 and record["status"] == "ok" else line
+        codes.add(print_outcome(args, record, aligned))
     return worst_code(codes)
+
+
+def _print_folder(args: argparse.Namespace, kind: str, page: Path | None = None) -> None:
+    """The last line: the folder of results, if it has any, and the `page`."""
+    if any(Path(args.dir).glob(f"*.{kind}.json")):
+        print_files(args, f"in {printable(args.dir)}", page)
 
 
 def _import_beside(names: Sequence[str]) -> None:
@@ -202,7 +209,10 @@ def _locate_skyline(args: argparse.Namespace) -> int:
         record = output.refused_dict(args.skyline, cause.reason, str(cause))
         line = output.refusal_line(args.skyline, cause.reason, str(cause))
     print_warnings(args, Path(args.skyline).name, record.get("warnings", ()))
-    return print_outcome(args, record, line)
+    code = print_outcome(args, record, line)
+    if record["status"] == "ok":
+        _print_folder(args, "fix")
+    return code
 
 
 def _solve_skyline(args: argparse.Namespace) -> Outcome:

@@ -109,7 +109,7 @@ def run_demo(args: argparse.Namespace) -> int:
     code = main(["locate", str(image), "-D", args.dir, "-O", *(["-q"] if args.quiet else [])])
     page = write_page_of(str(image.with_suffix(".fix.json")), truth=args.dir)
     if not args.quiet:
-        print(f"the camera stood at E {east_north[0]} m, N {east_north[1]} m; report: {printable(page)}")
+        print(f"the camera stood at E {east_north[0]} m, N {east_north[1]} m; page {printable(page)}")
     if not args.no_open:
         import webbrowser
 

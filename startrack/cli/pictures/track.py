@@ -18,7 +18,7 @@ from startrack.applications.batch import images_under, names_under
 from startrack.applications.tracking import FrameStore, ObservedFrame, Odometry, OdometryFile, Track, TrackSession
 from startrack.catalog import load_catalog
 from startrack.chain import Settings
-from startrack.cli.console import progress, worst_code
+from startrack.cli.console import print_refusal, progress, worst_code
 from startrack.cli.images import (
     flag_facts,
     maps_left_out,
@@ -174,9 +174,8 @@ class TrackRun:
                 raise
             for frame in self.session.frames:
                 if frame.reason:
-                    line = f"{printable(frame.name)}  refused  {frame.reason}: {frame.message}"
-                    print(line, file=sys.stderr, flush=True)
-            print(f"startrack: {cause.reason}: {cause}", file=sys.stderr, flush=True)
+                    self._print_refusal(frame.name, frame.reason, frame.message)
+            self._print_refusal("startrack track", cause.reason, str(cause))
             self.codes.add(exit_code_of(cause.reason))
             return
         self._write(track)
@@ -190,7 +189,8 @@ class TrackRun:
         if not (self.args.quiet or self.args.json):
             for text in track.leg_texts:
                 print(printable(text))
-            print(f"{self._summary(track)}; files in {printable(self.args.dir)}/track.*")
+            page = "" if self.args.no_plots else f"; page {printable(self.args.dir)}/track.html"
+            print(f"{self._summary(track)}; files in {printable(self.args.dir)}/track.*{page}")
 
     def _summary(self, track: Track) -> str:
         """What became of all images, also of those that could not be read, and of the odometry."""
@@ -241,6 +241,9 @@ class TrackRun:
             east_m, north_m, radius_m = (record[f"{prefix}{key}"] for key in ("east_m", "north_m", "radius95_m"))
             is_known = east_m is not None and radius_m is not None
             place = f"E {east_m:.1f} m  N {north_m:.1f} m  ±{radius_m:.1f} m (95 %)" if is_known else "no position"
+            if record["status"] == "refused" and not is_known:
+                self._print_refusal(record["image"], record["reason"], record["message"], to_stdout=True)
+                continue
             why = f"  {record['reason']}: {record['message']}" if record["reason"] else ""
             slip = "  after a slip" if record["slipped"] else ""
             slip += "  outside the odometry" if record["outside_odometry"] else ""
@@ -266,7 +269,11 @@ class TrackRun:
 
     def _refuse(self, name: str, cause: BadInput) -> None:
         self._unread.append((name, exit_code_of(cause.reason)))
-        print(f"{name}  refused  {cause.reason}: {cause}", file=sys.stderr, flush=True)
+        self._print_refusal(name, cause.reason, str(cause))
+
+    def _print_refusal(self, name: str, reason: str, message: str, *, to_stdout: bool = False) -> None:
+        line = f"{printable(name)}  refused  {reason}: {message}"
+        print_refusal(self.args, line, reason, message, to_stdout=to_stdout)
 
     def _estimate(self) -> Track:
         is_live = bool(self.args.follow) and not self._has_ended

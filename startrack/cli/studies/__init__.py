@@ -30,7 +30,7 @@ look             startrack cache show     tables of horizons: folder, files, siz
 remove           startrack cache clear    the next commands compute them again"""
 COMMANDS = (
     Command(
-        "render", function_at("studies.render.run"), "make synthetic exposures and files with their truth",
+        "render", function_at("studies.render.run"), "synthetic pictures and files with their truth",
         "Render the image of a camera on the crater's floor. Position, heading, tilt and time are drawn from the seed "
         "unless they are given. With --every the exposures are at equal steps of time, at rest or, with --path, on a "
         "drive with odometry. Beside NAME.png: NAME.json (time, exposure, camera, terrain), NAME.truth.json (pose, "

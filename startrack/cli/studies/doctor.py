@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import platform
+import textwrap
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -14,6 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from startrack.core import __version__
+from startrack.core.errors import how_to_install
 from startrack.core.files import Locked, hold_lock, printable, remove_file
 from startrack.core.stored import cache_folder, limit_bytes
 
@@ -35,6 +37,7 @@ OPTIONAL = {  # extra: its packages and what they are for
 TABLES, KIND = "tables of horizons", "horizons"  # all that the cache holds
 SELF_TEST_SEED = 20080501
 SELF_TEST_LIMIT_M = 40.0
+WIDTH = 100  # of a line
 
 
 def run(args: argparse.Namespace) -> int:
@@ -64,8 +67,36 @@ def run(args: argparse.Namespace) -> int:
         print(f"startrack {__version__}, Python {platform.python_version()} on {where}")
     for one in () if args.json else done:
         if not args.quiet or not one["ok"]:
-            print(f"  {'ok  ' if one['ok'] else 'FAIL'}  {one['name']:<10} {one['message']}")
+            print_check(one)
     return 0 if all(one["ok"] for one in done) else 1
+
+
+def print_check(check: dict[str, Any]) -> None:
+    """Print a check: whether it is well, its name and its message, in lines no longer than WIDTH; each extra in one.
+
+    The message of a failure, which may have a command to copy, is one line.
+    """
+    head = f"  {'ok  ' if check['ok'] else 'FAIL'}  {check['name']:<11} "
+    if not check["ok"]:
+        print(head + check["message"])
+        return
+    lines = textwrap.wrap(check["message"], WIDTH - len(head), break_long_words=False, break_on_hyphens=False)
+    if check["name"] == "extras":
+        lines = extra_lines()
+    for number, line in enumerate(lines or [""]):
+        print((" " * len(head) if number else head) + line)
+
+
+def extra_lines() -> list[str]:
+    """A line for each extra: a star and the versions of its packages, or a dash and how to install it."""
+    lines = []
+    for extra, (names, purpose) in OPTIONAL.items():
+        try:
+            mark, state = "*", _versions(names)
+        except metadata.PackageNotFoundError:
+            mark, state = "-", how_to_install(extra)
+        lines.append(f"{mark} {extra:<{max(map(len, OPTIONAL))}} {purpose}: {state}")
+    return lines
 
 
 def _versions(names: tuple[str, ...]) -> str:

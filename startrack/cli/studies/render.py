@@ -146,11 +146,15 @@ def _render_one(args: argparse.Namespace, series: Series, number: int, image: Pa
 
 def _line(summary: dict[str, Any]) -> str:
     return (
-        f"{printable(summary['image'])}: east {summary['east_m']:.1f} m, north {summary['north_m']:.1f} m, "
-        f"heading {summary['heading_deg']:.2f}, pitch {summary['pitch_deg']:.2f}, "
-        f"roll {summary['roll_body_deg']:.2f} deg, "
-        f"{summary['time_utc']}, {summary['exposure_s']:.3g} s"
+        f"{printable(summary['image'])}  E {summary['east_m']:.1f} m  N {summary['north_m']:.1f} m  "
+        f"heading {summary['heading_deg']:.1f}°  pitch {summary['pitch_deg']:.1f}°  "
+        f"roll {summary['roll_body_deg']:.1f}°  {_seconds_of(summary['time_utc'])}  {summary['exposure_s']:.3g} s"
     )
+
+
+def _seconds_of(time_utc: str | None) -> str:
+    """A time to whole seconds."""
+    return "no time" if time_utc is None else f"{time_utc[:19].replace('T', ' ')} UTC"
 
 
 def _write_trajectories(args: argparse.Namespace, series: Series, poses: Sequence[Pose]) -> None:

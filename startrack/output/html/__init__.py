@@ -17,6 +17,7 @@ from urllib.parse import quote
 import numpy as np
 
 from startrack.core import REPORTED_IMAGES
+from startrack.core.advice import fitting_advice
 from startrack.core.errors import Reason
 from startrack.core.files import write_atomically
 from startrack.core.types import BadInput
@@ -39,6 +40,7 @@ from startrack.output.html.rows import (
     images_with_details,
     row_of,
 )
+from startrack.output.write import COMPANIONS
 from startrack.terrain import Terrain, load_terrain
 
 HERE = Path(__file__).parent
@@ -47,9 +49,11 @@ SCRIPTS = (
     "sky.js", "panorama.js", "picture.js", "evidence.js", "designations.js", "search.js", "map.js", "errors.js",
     "detail.js", "table.js", "page.js",
 )  # fmt: skip
+DRAWN_MAIN = """<noscript><p>This page draws its results with JavaScript, which is switched off here.</p></noscript>
+<div id="overview" hidden></div>
+<div id="detail" hidden></div>"""
 FEW_IMAGES = 4  # images whose details may be large
 LARGE, SMALL = (1400, 4000, 1441), (1000, 1500, 721)  # px of the picture, stars, azimuths of the horizon
-FILES = (".annotated.png", ".stars.ecsv", ".skyline.ecsv", ".skyline.png", ".wcs", ".corr")
 
 
 def write_page(path: str | os.PathLike[str], found: Sequence[Found], **options: Any) -> None:
@@ -110,14 +114,17 @@ def page_text(
 
 
 def fill_frame(
-    title: str, data: Mapping[str, Any], scripts: Sequence[str], *, style: str = "", script: str = ""
-) -> str:
+    title: str, data: Mapping[str, Any], scripts: Sequence[str], *, style: str = "", script: str = "",
+    main: str = DRAWN_MAIN,
+) -> str:  # fmt: skip
     """A page with a `title`, the `data` by their names, the style, and this room's DRAWING and further `scripts`.
 
-    `style` and `script` are texts that follow those of this room.
+    `style` and `script` are texts that follow those of this room. `main` is its content as HTML, for pages that no
+    script draws.
     """
     parts = {
         "TITLE": html.escape(title),
+        "MAIN": main,
         "STYLE": _join_files(["page.css"]) + style,
         "DATA": "\n".join(_script_of_data(name, value) for name, value in data.items()),
         "SCRIPT": _join_files(dict.fromkeys((*DRAWING, *scripts))) + script,
@@ -142,10 +149,11 @@ def _detail(found: Found, terrains: Mapping[str, Terrain], size: tuple[int, int,
         unknown_rad = terrains[found.at("provenance.terrain")].unknown_below_rad(around_rad)
         unknown = round_values(np.degrees(np.where(unknown_rad > elevation_rad, unknown_rad, np.nan)), 2)
         horizon = None if line is None else horizon  # a position off the map
-    files = (found.companion(end) for end in FILES)
+    files = (found.companion(end) for end in COMPANIONS)
     return {
         "record": {k: value for k, value in found.record.items() if k not in ("matches", "detections", "camera")},
         "facts": facts_of(found.at),
+        "advice": fitting_advice(str(found.record.get("message") or "")),
         "picture": picture_of(found.companion(".annotated.png"), longest_px),
         "stars": shown,
         "horizon": line,

@@ -67,11 +67,11 @@ function writeOn(g, text, x, y, fill, rim = colour("plot"), width = 4) {
 const fileName = (path) => String(path).split(/[\\/]/).pop().replace(/\.toml$/, "");
 const fileNode = (path) => (known(path) ? [make("span", fileName(path) === path ? {} : { title: path, class: "tipped" }, fileName(path))] : null);
 
-// Rows of a table of facts: a term and what is known of it; unknown ones are left out.
+// Rows of a table of facts: a term, what is known of it, and perhaps what it means; unknown ones are left out.
 function facts(rows) {
   const shown = rows.filter(([, value]) => known(value) && value !== "–");
-  return make("dl", { class: "facts" }, ...shown.flatMap(([term, value]) => [
-    make("dt", {}, term), make("dd", {}, ...(Array.isArray(value) ? value : [value])),
+  return make("dl", { class: "facts" }, ...shown.flatMap(([term, value, help]) => [
+    make("dt", help ? { title: help } : {}, help ? make("span", { class: "tipped" }, term) : term), make("dd", {}, ...(Array.isArray(value) ? value : [value])),
   ]));
 }
 

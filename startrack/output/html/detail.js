@@ -16,8 +16,8 @@ function showDetail(host, k) {
   const views = []; // with stars to be found
   host.replaceChildren(...[
     make("div", { class: "title" }, make("h1", { tabindex: "-1" }, name), badge(record.status)),
-    make("p", { class: "lead" }, leadOf(value)),
-    refusalCard(record), warningsCard(record), detail ? null : leftOut(),
+    make("p", { class: "lead" }, leadOf(value, detail?.record)),
+    refusalCard(record, detail?.advice), warningsCard(record), detail ? null : leftOut(),
     detail?.picture ? pictureCard(detail, stars, name, groups.splice(0, 3), views) : null,
     mapsCard(record, real, name),
     detail && stars.some((star) => known(star.az)) ? panoramaCard(detail, stars, name, views) : null,
@@ -27,18 +27,34 @@ function showDetail(host, k) {
   ].filter(Boolean));
 }
 
-function leadOf(value) {
+const LEAST_STAGES = 3; // of which a picture of their times shows something
+const WIDE_TAIL = 5; // times the 95 % radius, from which that of 99.9 % is stated in the headline
+
+// When, where, how sure, whither, and whether anything is doubtful.
+function leadOf(value, record) {
   if (known(value("east_m"))) {
-    const error = known(value("error_m")) ? ` The true position is ${say(value("error_m"), 1, "m")} away.` : "";
-    const within = known(value("radius95_m")) ? `within ${say(value("radius95_m"), 1, "m")} (95 %)` : "approximate, no circle";
-    return `East ${say(value("east_m"), 1, "m")}, north ${say(value("north_m"), 1, "m")}, ${within}.${error}`;
+    const [radius95, radius999] = [value("radius95_m"), value("radius999_m")];
+    const tail = known(radius999) && radius999 > WIDE_TAIL * radius95 ? ` and ${say(radius999, 1, "m")} (99.9 %)` : "";
+    const level = record?.position?.protection_level_m;
+    const heading = record?.attitude?.heading_deg;
+    const warnings = record?.warnings?.length;
+    return [
+      known(value("time_utc")) ? `${sayTime(value("time_utc"))}: ` : "",
+      `east\u00a0${say(value("east_m"), 1, "m")}, north\u00a0${say(value("north_m"), 1, "m")}, `,
+      known(radius95) ? `within ${say(radius95, 1, "m")} (95 %)${tail}` : "approximate, no circle",
+      known(level) ? `, protection level ${say(level, 1, "m")}` : "",
+      known(heading) ? `; heading ${say(heading, 1)}°` : "",
+      record?.warnings ? `; ${warnings ? say(warnings, 0) : "no"} warning${warnings === 1 ? "" : "s"}.` : ".",
+      known(value("error_m")) ? ` The true position is ${say(value("error_m"), 1, "m")} away.` : "",
+    ].join("").replace(/^e/, "E");
   }
   return value("status") === "ok" ? `${say(value("identified"), 0)} stars named.` : "";
 }
 
-function refusalCard(record) {
+function refusalCard(record, fitting) {
   if (record.status === "ok") return null;
-  const [words, advice] = page.words[record.reason] || [record.reason ? record.reason.replaceAll("_", " ") : statusWord(record.status), ""];
+  const [words, general] = page.words[record.reason] || [record.reason ? record.reason.replaceAll("_", " ") : statusWord(record.status), ""];
+  const advice = fitting || general;
   const modes = record.status === "ambiguous" && record.modes ? make("ol", {}, ...record.modes.map((mode) => make("li", {},
     `East ${say(mode.east_m, 1, "m")}, north ${say(mode.north_m, 1, "m")}${known(mode.radius95_m) ? `, within ${say(mode.radius95_m, 1, "m")} (95 %)` : ""}: probability ${say(100 * mode.weight, 1)} %`))) : null;
   return make("section", { class: `card why ${record.status}`, "aria-label": "Why there is no single position" },
@@ -61,9 +77,10 @@ function pictureCard(detail, stars, name, groups, views) {
   if (found) views.push(view);
   const hint = found ? "Point at a star, or tap it. Fainter stars appear as you zoom in. " : "";
   const ground = detail.record.modes?.length ? "; orange crosses are stars that should be here and are hidden, the blue line is the skyline at the estimated position." : ".";
-  return section("Picture", make("p", { class: "dim" }, `${hint}Green rings are identified stars, grey rings other point sources${ground}`),
-    found ? searchForm([...stars, ...bodiesOf(detail)], detail, views) : null,
-    make("div", { class: "beside" }, view.node, make("div", {}, ...groups.map(([title, body]) => make("div", {}, make("h3", {}, title), body)))));
+  const below = [found ? searchForm([...stars, ...bodiesOf(detail)], detail, views) : null,
+    make("p", { class: "dim" }, `${hint}Green rings are identified stars, grey rings other point sources${ground}`)];
+  view.node.append(...below.filter(Boolean));
+  return section("Picture", make("div", { class: "beside" }, view.node, make("div", {}, ...groups.map(([title, body]) => make("div", {}, make("h3", {}, title), body)))));
 }
 
 function panoramaCard(detail, stars, name, views) {
@@ -96,7 +113,7 @@ function factGroups(detail, value) {
     ["Error", known(value("error_m")) ? say(value("error_m"), 2, "m") : null], ["NEES", known(value("nees")) ? say(value("nees"), 2) : null]] : rows)]);
   return [
     ...groups,
-    record.timing_ms && ["Time of each stage", timings(record.timing_ms)],
+    Object.values(record.timing_ms || {}).filter((ms) => ms > 0).length >= LEAST_STAGES && ["Time of each stage", timings(record.timing_ms)],
     v && ["Made from", facts([["Time", sayTime(v.time_utc)], ["Exposure", known(v.exposure_s) ? say(v.exposure_s, 3, "s") : null], ["Camera", fileNode(v.camera)], ["Terrain", fileNode(v.terrain)],
       ["Catalogue", v.catalog], ["startrack", v.version], ["Image's SHA-256", v.image_sha256 ? [make("code", {}, v.image_sha256)] : null]])],
   ].filter(Boolean);

@@ -161,14 +161,28 @@ def headings() -> list[list[Any]]:
 
 
 def facts_of(at: At) -> list[list[Any]]:
-    """The quantities of a record for people: title of each group, and its rows of a name and a text."""
+    """The quantities of a record for people: title of each group, and its rows of a name, a text and what it means."""
     groups = (
         ("Position", ("position", "search", "clock")),
         ("Attitude", ("attitude", "middle")),
         ("Stars", ("stars", "evidence", "sky")),
     )
-    found = [(title, rows("page", at, sections)) for title, sections in groups]
-    return [[title, [[name, text.replace("-", "−")] for name, text in facts]] for title, facts in found if facts]
+    found = [(title, rows("page", at, sections), _helps(sections)) for title, sections in groups]
+    return [
+        [title, [[name, text.replace("-", "−"), helps.get(name)] for name, text in facts]]
+        for title, facts, helps in found
+        if facts
+    ]
+
+
+def _helps(sections: Sequence[str]) -> dict[str, str]:
+    """What each row of a page shows, in words, by its name: the description of its first quantity with its unit."""
+    helps: dict[str, str] = {}
+    for one in (one for one in QUANTITIES if one.section in sections):
+        for show in (show for show in one.shown if "page" in show.place.split()):
+            unit = f" [{one.unit}]" if one.unit else ""
+            helps.setdefault(show.row[0].upper() + show.row[1:], one.description.replace("`", "") + unit)
+    return helps
 
 
 def errors_of(table: Sequence[Sequence[Any]]) -> dict[str, Any] | None:

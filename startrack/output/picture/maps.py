@@ -19,6 +19,7 @@ from startrack.terrain import Terrain
 Image = NDArray[np.float32]
 CIRCLE_RAD = np.linspace(0.0, 2 * np.pi, 181)
 SIDE_PX, MARGIN_PX, BELOW_PX = 860.0, 4 * TEXT_PX, 3 * TEXT_PX  # of a picture of one map, and beside it, for its scales
+LEAST_CONTOUR_PX = 4 * TEXT_PX  # a shorter one is noise
 SEARCH_MARGIN = 1.07  # of a map, in radii of the search area
 RELIEF_LIGHT = 3.0  # slopes that face the light, as a multiple of the floor's colour
 MAX_LEVELS = 12
@@ -118,10 +119,13 @@ class Map:
             half_px = 0.36 * TEXT_PX * len(text) + GAP_PX
             for row_column in find_contours(values, level, mask=inside):
                 line = row_column[:, ::-1] + self.box[:2]
+                length_px = float(np.hypot(*np.diff(line, axis=0).T).sum())
+                if length_px < LEAST_CONTOUR_PX:
+                    continue  # a speck
                 self.window.line(line, colour, width)
                 at = line[:: int(GAP_PX)]
                 at = at[(np.abs(at - self.middle) < extent / 2 - half_px - GAP_PX).all(axis=1)]
-                for _ in range(min(2, int(np.hypot(*np.diff(line, axis=0).T).sum() / (6 * TEXT_PX)))):
+                for _ in range(min(2, int(length_px / (6 * TEXT_PX)))):
                     free = [place for place in at if self.canvas.is_free(box_around(place, half_px))]
                     if not free:
                         break

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from startrack.chain import Measured, Positioned
 from startrack.core.types import Array, MeasuredSkyline
 from startrack.evidence import Skyline
 from startrack.output.picture.axes import GAP_PX, Axes, known_runs, multiples, nice_step
-from startrack.output.picture.canvas import TEXT_PX, Canvas, Colour, Ink, mix_colours, text_width
+from startrack.output.picture.canvas import TEXT_PX, Canvas, Colour, Ink, mix_colours, text_box, text_width
 from startrack.output.picture.maps import MARGIN_PX, draw_overview, draw_zoom
 from startrack.output.picture.marks import COMPASS
 from startrack.output.record import image_name
@@ -25,6 +26,7 @@ ABOVE_PX, RIGHT_PX = 2 * TEXT_PX, TEXT_PX  # about a plot
 AZIMUTHS_RAD = np.radians(np.linspace(0.0, 360.0, 3601))
 UNKNOWN = mix_colours(Ink.HIDDEN, Ink.PAPER, 0.75)
 UNKNOWN_WORDS = "brown: the maps end, and ground beyond could stand so high"
+UNSEEN_WORDS, HATCH_PX = "not seen", 9.0  # of azimuths without a skyline; between the lines
 MAX_STARS = 1500  # the brightest
 LEGEND: dict[str, tuple[str, str, float, Colour]] = {  # words, mark, half its size, colour
     "seen": ("seen star", "disc", 2.3, Ink.IDENTIFIED),
@@ -36,6 +38,10 @@ LEGEND: dict[str, tuple[str, str, float, Colour]] = {  # words, mark, half its s
     "varies": ("differs between the pictures", "cross", 2.5, Ink.HIDDEN),
 }
 BANDS = {"sky light": Ink.MEASURED, "file": Ink.MEASURED, "stars": Ink.IDENTIFIED, "both": Ink.SKYLINE}
+
+
+# Azimuths (W,) and elevations (H,) [rad] to levels of grey (H, W), nan where there is none.
+Photograph = Callable[[Array, Array], Array]
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,28 @@ class Plot(Axes):
             at = azimuth_rad[run]
             low = self.canvas_px(np.array([at[-1], at[0]]), self.y[0])
             self.window.area(np.concatenate([self.canvas_px(at, elevation_rad[run]), low]), Ink.FLOOR)
+
+    def draw_photograph(self, photograph: Photograph) -> None:
+        """The directions of the box in a `photograph`, in its levels of grey."""
+        pixels = self.window.pixels
+        (low, high), (rows, columns) = self.y, pixels.shape[:2]
+        across, down = ((np.arange(count) + 0.5) / count for count in (columns, rows))
+        grey = photograph(2 * np.pi * across, high - (high - low) * down)
+        shown = np.isfinite(grey)
+        pixels[shown] = np.rint(grey[shown]).astype(np.uint8)[:, None]
+
+    def draw_unseen(self, azimuth_rad: Array, unseen: NDArray[np.bool_]) -> None:
+        """Hatch the azimuths (n,), in ascending order, that are `unseen` (n,); with the words where there is room."""
+        window, (_, top, _, bottom) = self.window, self.box
+        for run in known_runs(unseen):
+            left, right = self.canvas_px(azimuth_rad[[run.start, run.stop - 1]], self.y[0])[:, 0]
+            band = self.canvas.window((left, top, right, bottom))
+            for start in np.arange(left - (bottom - top), right, HATCH_PX):
+                band.line([(start, bottom), (start + bottom - top, top)], Ink.FAINT)
+            if right - left > text_width(UNSEEN_WORDS, TEXT_PX) + TEXT_PX:
+                middle = (left + right) / 2, top + TEXT_PX
+                window.rectangle(text_box(middle, UNSEEN_WORDS, "mt", TEXT_PX), Ink.PAPER)
+                self.canvas.text(middle, UNSEEN_WORDS, Ink.PLAIN, "mt", halo=True)
 
     def draw_unknown(self, azimuth_rad: Array, low_rad: Array, high_rad: Array) -> None:
         """Elevations from `low_rad` (n,) up to `high_rad` (n,), at ascending azimuths (n,), where that is higher."""
@@ -92,14 +120,18 @@ def horizon_picture(terrain: Terrain, position_m: tuple[float, float]) -> NDArra
     return canvas.rendered_pixels()
 
 
-def skyline_picture(skyline: MeasuredSkyline) -> NDArray[np.uint8]:
-    """A measured `skyline` (H, W, 3) from north to north, with one sigma to either side."""
+def skyline_picture(skyline: MeasuredSkyline, photograph: Photograph | None = None) -> NDArray[np.uint8]:
+    """A measured `skyline` (H, W, 3) from north to north, with one sigma to either side.
+
+    Behind it is the `photograph`, if there is one. Azimuths without a skyline are hatched.
+    """
     azimuth_rad = np.append(skyline.azimuth_rad, 2 * np.pi)
     elevation_rad, sigma_rad = (np.append(a, a[0]) for a in (skyline.elevation_rad, skyline.sigma_rad))
     canvas = Canvas(WIDTH_PX, HEIGHT_PX)
     varies = np.where(skyline.source == "varies", "varies", "")
     title = f"measured skyline{'; crossed: it ' + LEGEND['varies'][0] if (varies != '').any() else ''}"
-    plot = _draw_horizon(canvas, title, azimuth_rad, elevation_rad)
+    plot = _draw_horizon(canvas, title, azimuth_rad, elevation_rad, photograph=photograph)
+    plot.draw_unseen(azimuth_rad, ~np.isfinite(elevation_rad))
     for run in known_runs(np.isfinite(elevation_rad)):
         for shift in (-sigma_rad[run], sigma_rad[run]):
             plot.window.line(plot.canvas_px(azimuth_rad[run], elevation_rad[run] + shift), Ink.FAINT)
@@ -166,11 +198,16 @@ def _draw_maps(canvas: Canvas, value: Positioned) -> None:
 
 
 def _draw_horizon(
-    canvas: Canvas, title: str, azimuth_rad: Array, elevation_rad: Array, unknown_rad: Array | None = None
+    canvas: Canvas,
+    title: str,
+    azimuth_rad: Array,
+    elevation_rad: Array,
+    unknown_rad: Array | None = None,
+    photograph: Photograph | None = None,
 ) -> Plot:
     """A plot at the canvas's top with the ground below elevations (n,) at ascending azimuths (n,).
 
-    Above it what ground off the maps could hide, up to `unknown_rad` (n,).
+    Above it what ground off the maps could hide, up to `unknown_rad` (n,). A `photograph` covers both.
     """
     if unknown_rad is not None and (unknown_rad > elevation_rad).any():
         title += f"; {UNKNOWN_WORDS}"
@@ -182,6 +219,8 @@ def _draw_horizon(
     plot.draw_ground(azimuth_rad, elevation_rad)
     if unknown_rad is not None:
         plot.draw_unknown(azimuth_rad, elevation_rad, unknown_rad)
+    if photograph is not None:
+        plot.draw_photograph(photograph)
     plot.draw_degrees(step)
     return plot
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.errors import length_text
-from startrack.core.types import Array, Bools, Ints
+from startrack.core.types import Array, Bools
 from startrack.frames import Site, latlon_from_enu
 from startrack.output.picture.axes import NICE, Axes
 from startrack.output.picture.canvas import LINE_PX, TEXT_PX, TITLE_PX, Canvas, Colour, Ink, rgb_colours
@@ -37,6 +37,7 @@ LEAST_SPREAD = 0.05  # of the radii, relative: less is one class
 COLOURS = rgb_colours("fde725 5ec962 21918c 3b528b 58286e")
 SHADE = 0.55  # of a colour in the darkest shadow of the relief
 CURVES = (Ink.BLUE, Ink.ORANGE, Ink.GREEN, Ink.PURPLE)
+MOST_CONTOURS, SCALE_PX = 3, 220
 RADIUS = "95 % radius [m]"
 LOCATED = 0.9  # share of the draws below which a point is marked
 
@@ -44,7 +45,7 @@ LOCATED = 0.9  # share of the draws below which a point is marked
 def prediction_picture(
     terrain: Terrain, site: Site, radius95_m: Raster, title: str, lines: list[str]
 ) -> NDArray[np.uint8]:
-    """The search area in colours of the 95 % radius, with contours, a legend and `lines` of text below the title.
+    """The search area in colours of the 95 % radius, with contours, their scale and `lines` of text below the title.
 
     `site` is the terrain's. `radius95_m` is NaN outside of the search area and infinite where half of the draws or more
     have no position.
@@ -52,24 +53,68 @@ def prediction_picture(
     box = (MARGIN_PX, HEAD_PX, MARGIN_PX + SIDE_PX, HEAD_PX + SIDE_PX)
     canvas = _headed_canvas(round(box[2] + KEY_PX), round(box[3] + BELOW_PX), title, lines)
     half_m = SEARCH_MARGIN * max(terrain.search_radius_m, terrain.rim.radius_m if terrain.rim else 0.0)
-    drawn, classes = Map.of_extent(canvas, box, (0.0, 0.0), half_m), radius_classes(radius95_m.heights_m)
-    bounds_m = [bound for bound, _, _ in classes[:-1]]
-    colours = [*([colour for _, _, colour in classes] or COLOURS[:1]), Ink.VERMILLION]  # the last: no position
-    radius = _radius_of_pixels(drawn, site, radius95_m)
-    inside = _draw_classes(drawn, terrain, np.searchsorted([*bounds_m, np.inf], radius, side="right"), colours)
+    drawn, bounds_m = Map.of_extent(canvas, box, (0.0, 0.0), half_m), class_bounds_m(radius95_m.heights_m)
+    radius, ends_m = _radius_of_pixels(drawn, site, radius95_m), _scale_ends_m(radius95_m.heights_m)
+    inside = _draw_colours(drawn, terrain, _colours_of(radius, ends_m))
     drawn.window.line(drawn.canvas_px(ring((0.0, 0.0), terrain.search_radius_m)), Ink.DIM, 2)
     known = np.isfinite(radius)
     inside = cv2.erode((inside & known).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    few = np.linspace(0, len(bounds_m) - 1, min(MOST_CONTOURS, len(bounds_m))).astype(int)
+    bounds_m = [bounds_m[k] for k in few]
     levels = {bound: f"{bound:g} m" for bound in bounds_m}
     drawn.draw_contours(np.where(known, radius, 0.0), levels, inside, Ink.PAPER, 2)
     drawn.draw_distances()
     left, top = box[2] + 1.5 * TEXT_PX, box[1] + TEXT_PX
     top = canvas.paragraph(left, top, "95 of 100 positions lie within", KEY_PX - 3 * TEXT_PX, Ink.PLAIN)
-    entries = [("box", colour, words) for _, words, colour in classes]
+    top = _draw_scale(canvas, left, top, ends_m, bounds_m)
     if np.isinf(radius95_m.heights_m).any():
-        entries.append(("box", colours[-1], "mostly no position"))
-    canvas.legend(left, top + TEXT_PX, KEY_PX - TEXT_PX, entries)
+        canvas.legend(left, top + LINE_PX, KEY_PX - TEXT_PX, [("box", Ink.VERMILLION, "mostly no position")])
+    _draw_north(canvas, (box[2] - 2 * TEXT_PX, box[1] + 3 * TEXT_PX))
     return canvas.rendered_pixels()
+
+
+def _scale_ends_m(radius_m: NDArray[np.floating[Any]]) -> tuple[float, float]:
+    """Radii of the first and the last colour: the 2nd and the 98th percentile of those that are finite."""
+    known = radius_m[np.isfinite(radius_m)]
+    low, high = np.percentile(known, [2, 98]).tolist() if known.size else (1.0, 1.0)
+    return low, max(high, low * (1.0 + LEAST_SPREAD))
+
+
+def _colours_of(radius_m: Array, ends_m: tuple[float, float]) -> Array:
+    """Colours (..., 3) of radii (...), by their logarithm between the ends; of infinite ones Ink.VERMILLION."""
+    low, high = np.log(np.maximum(ends_m, 1e-9))
+    with np.errstate(divide="ignore"):
+        part = (np.log(np.maximum(radius_m, 1e-9)) - low) / (high - low)
+    at, known = np.linspace(0.0, 1.0, len(COLOURS)), np.isfinite(radius_m)
+    ramp = np.array(COLOURS, dtype=float)
+    mixed = np.stack([np.interp(np.where(known, part, 0.0), at, ramp[:, k]) for k in range(3)], axis=-1)
+    return np.where(known[..., None], mixed, np.array(Ink.VERMILLION, dtype=float))
+
+
+def _draw_scale(
+    canvas: Canvas, left: float, top: float, ends_m: tuple[float, float], bounds_m: list[float]
+) -> float:  # fmt: skip
+    """The scale of the colours, with the contours' radii and its ends beside it; the place below it [px]."""
+    heights = np.arange(SCALE_PX)
+    radii_m = np.exp(np.interp(heights, [0, SCALE_PX - 1], np.log(ends_m)))
+    for height, colour in zip(heights, _colours_of(radii_m, ends_m).round().astype(int).tolist(), strict=True):
+        canvas.rectangle((left, top + height, left + TEXT_PX, top + height), (colour[0], colour[1], colour[2]))
+    occupied: list[float] = []
+    for radius_m in [*bounds_m, *ends_m]:
+        y = top + float(np.interp(np.log(radius_m), np.log(ends_m), [0, SCALE_PX - 1]))
+        if all(abs(y - other) > TEXT_PX for other in occupied):
+            occupied.append(y)
+            if radius_m in bounds_m:
+                canvas.line([(left, y), (left + TEXT_PX, y)], Ink.PAPER, 2)
+            canvas.text((left + 1.6 * TEXT_PX, y), length_text(radius_m), anchor="lm")
+    return top + SCALE_PX + TEXT_PX
+
+
+def _draw_north(canvas: Canvas, tip: tuple[float, float]) -> None:
+    """An arrow up, with its letter."""
+    x, y = tip
+    canvas.area([(x, y), (x - 0.4 * TEXT_PX, y + 1.2 * TEXT_PX), (x + 0.4 * TEXT_PX, y + 1.2 * TEXT_PX)], Ink.PLAIN)
+    canvas.text((x, y - TEXT_PX / 4), "N", Ink.PLAIN, "ms")
 
 
 def radius_classes(radius_m: NDArray[np.floating[Any]]) -> list[tuple[float, str, Colour]]:
@@ -116,15 +161,15 @@ def _radius_of_pixels(drawn: Map, site: Site, radius95_m: Raster) -> Array:
     return np.where(nowhere > 0, np.inf, filled)
 
 
-def _draw_classes(drawn: Map, terrain: Terrain, number: Ints, colours: list[Colour]) -> Bools:
-    """The `colours` of the classes of `number` (H, W) on the relief; where they are drawn (H, W)."""
+def _draw_colours(drawn: Map, terrain: Terrain, colours: Array) -> Bools:
+    """The `colours` (H, W, 3) on the relief; where they are drawn (H, W)."""
     ground_m, known = drawn.ground(terrain)
     known &= np.linalg.norm(cell_points(drawn.half_m, known.shape), axis=-1) <= terrain.search_radius_m
     window = drawn.window
     light = cv2.resize(hill_shading(ground_m, known, drawn.half_m), window.size, interpolation=cv2.INTER_CUBIC)
     shade = SHADE + (1.0 - SHADE) * np.clip(light, 0.0, 1.0)[:, :, None]
     cover, paper = edge_cover(known, window.size), np.array(Ink.PAPER)
-    lit = paper + cover[:, :, None] * (np.array(colours, dtype=float)[number] * shade - paper)
+    lit = paper + cover[:, :, None] * (colours * shade - paper)
     window.pixels[:] = lit.clip(0, 255).astype(np.uint8)
     return np.asarray(cover > 0.5)
 

@@ -186,7 +186,7 @@ def test_every_member_exists_and_describes_the_ground(name):
     assert all(error.sigma >= 0.0 and error.is_stated for error in terrain.errors.shape)
     assert terrain.errors.slopes_rad(np.zeros((4, 1, 2)), AZIMUTHS).shape == (len(terrain.errors.shape), 4, 12)
     assert isinstance(terrain.with_shape(np.zeros(len(terrain.errors.shape))), Terrain)
-    assert terrain.masked_sectors() == []
+    assert terrain.warnings() == []
     assert isinstance(terrain.facts()["kind"], str)
     near = terrain.near(np.zeros(2), 20.0, AZIMUTHS)
     assert near.horizon_rad(np.zeros(2), AZIMUTHS) == pytest.approx(

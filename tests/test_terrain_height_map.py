@@ -380,9 +380,9 @@ def test_rays_that_run_off_the_map_give_no_evidence(shackleton):
     low = small.horizon_rad(np.zeros(2), azimuth)
     assert set(small.mask_reason(azimuth, low)) == {"ground off the map"}
     assert set(small.mask_reason(azimuth, np.full(len(azimuth), np.radians(80.0)))) == {""}
-    (line,) = small.masked_sectors()
+    (line,) = small.warnings()
     assert line.startswith("azimuths 0 to 360 degrees: the maps end")
-    assert shackleton.masked_sectors() == []
+    assert shackleton.warnings() == []
     blind = evidence_at(small, np.zeros(2), np.random.default_rng(6), -0.2)
     with pytest.raises(NotLocated):
         ExactPosterior()(blind, small)
@@ -394,7 +394,7 @@ def test_glare_removes_the_evidence_of_its_azimuths(shackleton):
     assert told.tolist() == [True, False, False, False, True, True]
     why = lit.mask_reason(np.radians([349.0, 351.0]), np.full(2, 0.5))
     assert why.tolist() == ["", "glare of a lit rim"]
-    (line,) = lit.masked_sectors()
+    (line,) = lit.warnings()
     assert line.startswith("azimuths 350 to 20 degrees: no evidence")
 
 
@@ -423,7 +423,7 @@ def test_azimuths_where_the_maps_end_are_listed_as_ranges(shackleton):
     for columns in (slice(0, whole.heights_m.shape[1] // 2 + 20), slice(None)):
         cut = replace(shackleton, maps=(whole.crop(slice(None), columns),), search_radius_m=200.0)
         silent = ~cut.is_informative(azimuth, cut.horizon_rad(place, azimuth))
-        lines = cut.masked_sectors()
+        lines = cut.warnings()
         assert bool(lines) == bool(silent.any())
         said = np.zeros(360, dtype=bool)
         for line in lines:

@@ -1,7 +1,10 @@
 """Cameras: lenses (listed in `lenses.py`), a camera around one, and camera files."""
 
 from startrack.camera.camera import (
+    MIN_THROUGHPUT_1,
     Camera,
+    Decentring,
+    Sensor,
     cap_grid,
     compensating_rotation,
     difference_px,
@@ -28,7 +31,6 @@ from startrack.camera.io import (
 )
 from startrack.camera.lens import Lens
 from startrack.camera.lenses import KannalaBrandt, Pinhole, default_lens, lens_kinds
-from startrack.camera.optics import MIN_THROUGHPUT_1, Decentring, Sensor
 from startrack.camera.platepar import Platepar, platepar_of
 from startrack.camera.virtualsky import VirtualSkyOverlay, virtualsky_of
 

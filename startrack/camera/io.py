@@ -15,10 +15,13 @@ from typing import Any
 import numpy as np
 
 from startrack.camera.camera import (
+    MIN_THROUGHPUT_1,
     REFRACTION_CONTAINED,
     REFRACTION_REMOVED,
     ZENITH_MOUNT_R_BODY_CAM,
     Camera,
+    Decentring,
+    Sensor,
     cap_grid,
     difference_px,
     require_not_mirrored,
@@ -26,7 +29,6 @@ from startrack.camera.camera import (
 from startrack.camera.formats import FOREIGN_FORMATS, choose_part, find_program
 from startrack.camera.lens import Lens
 from startrack.camera.lenses import default_lens, lens_kinds
-from startrack.camera.optics import MIN_THROUGHPUT_1, Decentring, Sensor
 from startrack.core.declaration import Choice, Flag, List, Number, Table, Text
 from startrack.core.files import (
     FOREIGN_CAMERA_SUFFIXES,

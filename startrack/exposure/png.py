@@ -62,20 +62,16 @@ def decode(raw: bytes) -> Decoded:
     data = b"".join(picture)
     rows = _inflate_rows(data, width, height, depth * channels, ADAM7 if interlaced else WHOLE)
     if interlaced:
-        stored = _decode_by_opencv(b"".join((raw[:IHDR_END], chunk(b"IDAT", data), chunk(b"IEND", b""))))
+        import cv2
+
+        plain = b"".join((raw[:IHDR_END], chunk(b"IDAT", data), chunk(b"IEND", b"")))
+        stored: Any = cv2.imdecode(np.frombuffer(plain, np.uint8), cv2.IMREAD_UNCHANGED)
     else:
         stored = _undo_filters(rows, height, channels, depth // 8)
     if stored is None or stored.shape[:2] != (height, width):
         raise bad_image(DAMAGED)
     pixels, colour = (stored, ()) if stored.dtype == np.float32 else grey_float32(stored)
     return Decoded(pixels_adu=pixels, saturation_adu=2.0**depth - 1.0, header=header, warnings=warnings + colour)
-
-
-def _decode_by_opencv(png: bytes) -> NDArray[Any] | None:
-    """Pixels as they are stored; None where OpenCV decodes none."""
-    import cv2
-
-    return cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
 
 
 def add_text(png: bytes, texts: Mapping[str, str]) -> bytes:

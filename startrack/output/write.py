@@ -26,8 +26,8 @@ from startrack.output.wcs import matches_bytes, wcs_bytes
 ANNOTATED = ".annotated.png"
 SKYLINE_TABLE, SKYLINE_PICTURE = SKYLINE_FILES = (".skyline.ecsv", ".skyline.png")  # where the image shows a skyline
 PICTURES = (ANNOTATED, SKYLINE_PICTURE)
-STAR_FILES = (".stars.ecsv", ANNOTATED, ".wcs", ".corr")  # beside NAME.identification.json
-COMPANIONS = (*STAR_FILES, *SKYLINE_FILES)  # beside NAME.fix.json
+COMPANIONS = (ANNOTATED, ".stars.ecsv", *SKYLINE_FILES, ".wcs", ".corr")  # beside NAME.fix.json
+STAR_FILES = tuple(one for one in COMPANIONS if one not in SKYLINE_FILES)  # beside NAME.identification.json
 COMPANIONS_OF = {"fix": COMPANIONS, "identification": STAR_FILES, "detections": (ANNOTATED,)}  # most complete first
 FilePath = str | os.PathLike[str]
 

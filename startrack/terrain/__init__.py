@@ -1,4 +1,4 @@
-"""Ground that hides stars: one kind of terrain per file, behind one protocol; its maps and their import in folders."""
+"""Ground that hides stars: one kind of terrain per file, behind one protocol."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ def make_height_map(keys: dict[str, Any], folder: Path, **shared: Any) -> Terrai
         maps=maps,
         search_radius_m=search.get("radius_m", Terrain.search_radius_m),
         height_sigma_m=dem.get("height_sigma_m", 0.0),
-        unstated_errors=() if "height_sigma_m" in dem else ("height_sigma_m",),
+        height_sigma_is_stated="height_sigma_m" in dem,
         horizon_sigma_common_rad=shape.radians(dem.get("horizon_sigma_deg")),
         stretch_sigma_1=dem.get("stretch_sigma_1"),
         vertical_sigma_rad=shape.radians(dem.get("vertical_sigma_deg")),

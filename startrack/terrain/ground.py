@@ -79,7 +79,12 @@ def pack_maps(site: Site, maps: Sequence[Raster], *, keep_voids: bool = False) -
         if voids.any():
             h = _fill_voids(h, voids, site, height_map, maps[number + 1 :])
             voids = np.isnan(h)
-            known = _fill_nearest(h, voids) if voids.any() else h
+            known = h
+            if voids.any():
+                from scipy.ndimage import distance_transform_edt
+
+                nearest = distance_transform_edt(voids, return_distances=False, return_indices=True)
+                known = np.asarray(h[tuple(nearest)])
             h = h if keep_voids else known
         heights.append(h.ravel())
         posts.append((first_post, *h.shape))
@@ -160,13 +165,6 @@ def _fill_voids(
     return h
 
 
-def _fill_nearest(h: NDArray[np.float32], voids: Bools) -> NDArray[np.float32]:
-    from scipy.ndimage import distance_transform_edt
-
-    nearest = distance_transform_edt(voids, return_distances=False, return_indices=True)
-    return np.asarray(h[tuple(nearest)])
-
-
 def _cell_tops(h: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.maximum(np.maximum(h[:-1, :-1], h[:-1, 1:]), np.maximum(h[1:, :-1], h[1:, 1:]))
 
@@ -244,7 +242,7 @@ def ground_up_m(site: Site, maps: Sequence[Raster], points_m: Array) -> Array:
 
 
 def cell_posts(site: Site, maps: Sequence[Raster], points_enu_m: Array) -> tuple[Ints, Array]:
-    """Posts (n, 4) of the cells that hold points (n, 3) in enu, and their bilinear weights (n, 4).
+    """Posts (n, 4) of the cells that hold `points_enu_m` (n, 3) in enu of a `site`, and their weights (n, 4), bilinear.
 
     The posts of all maps are numbered one map after the other, the finest first, row by row.
     """

@@ -42,7 +42,7 @@ class HeightMap(TracedMap):
     terrestrial_refraction_sigma_1: float | None = shape.EXACT
     most_slope_rad: float = np.pi / 2  # a rover does not stand on steeper ground
     glare_rad: Sectors = ()  # lit by the Sun: no evidence there
-    unstated_errors: tuple[str, ...] = ()
+    height_sigma_is_stated: bool = True  # else it counts as 0, with a warning
 
     @cached_property
     def errors(self) -> MapErrors:  # type: ignore[override]
@@ -89,9 +89,9 @@ class HeightMap(TracedMap):
         reason = np.where(self.is_informative(azimuths_rad, elevations_rad), "", OFF_MAP)
         return np.where((reason != "") & are_in_sectors(azimuths_rad, self.glare_rad), GLARE, reason)
 
-    def masked_sectors(self) -> list[str]:
-        """One line of text per range of azimuths that is not informative."""
-        return describe_masks(self.glare_rad, self.unknown_rad)
+    def warnings(self) -> list[str]:
+        """One line of text per range of azimuths that is not informative, and those of its errors."""
+        return [*describe_masks(self.glare_rad, self.unknown_rad), *self.errors.warnings()]
 
     @cached_property
     def unknown_rad(self) -> Array:

@@ -18,18 +18,20 @@ from startrack.core.files import parse_toml, printable, read_text, resolve_named
 from startrack.core.obstacles import read_obstacles
 from startrack.core.types import Array, BadInput
 from startrack.frames import AIR_TABLE, Site
-from startrack.terrain import shape
 from startrack.terrain.cylinder import CYLINDER_TABLE, make_cylinder
 from startrack.terrain.dem import DEM_TABLE, FILE, HEIGHT, make_height_map, paths_of
 from startrack.terrain.protocol import Terrain, TerrainFile
 from startrack.terrain.shape import (
+    AMOUNT,
     BIAS,
     CAMERA_ERROR,
     CYLINDER_FACTS,
     DEPTH,
     DIAMETER,
+    LENGTH,
     OFFSETS,
     REFRACTION,
+    REFRACTION_1,
     STRETCH,
     WAVE_PER_POST,
     WAVES,
@@ -90,10 +92,10 @@ KEYS = Table(
             AIR_TABLE,
             keys={
                 **AIR_TABLE.keys,
-                "terrestrial_refraction": Number(low=-1.0, high=0.8, default=shape.REFRACTION_1,
+                "terrestrial_refraction": Number(low=-1.0, high=0.8, default=REFRACTION_1,
                                                  description="curvature of a level sight line to the ground, "
                                                              "relative to the Earth's"),
-                shape.REFRACTION.key: shape.REFRACTION.limits,
+                REFRACTION.key: REFRACTION.limits,
             },
         ),
         "ground": GROUND_TABLE,
@@ -102,14 +104,14 @@ KEYS = Table(
         "rover": Table(
             default={},
             keys={
-                "camera_height_m": replace(shape.AMOUNT, default=1.5),
-                shape.CAMERA_ERROR.key: shape.CAMERA_ERROR.limits,
+                "camera_height_m": replace(AMOUNT, default=1.5),
+                CAMERA_ERROR.key: CAMERA_ERROR.limits,
             }
         ),
         "search": Table(
             default={},
             keys={
-                "radius_m": shape.LENGTH,
+                "radius_m": LENGTH,
                 "max_slope_deg": Number(low=0.0, high=90.0, above=True, default=90.0),
                 "glare_deg": List(each=List(each=Number(low=-720.0, high=720.0), count=2),
                                   description="azimuth ranges that the Sun lights"),

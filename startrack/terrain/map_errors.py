@@ -44,8 +44,7 @@ class MapErrors(GroundErrors):
     """Errors of the height maps of a ground: what is stated of them there, and what counts where it is silent."""
 
     def __init__(self, whole: HeightMap) -> None:
-        self.map = whole
-        self.height_sigma_m, self.unstated = whole.height_sigma_m, whole.unstated_errors
+        self.map, self.height_sigma_m = whole, whole.height_sigma_m
 
     @cached_property
     def common_sigma_rad(self) -> float:  # type: ignore[override]
@@ -164,16 +163,20 @@ class MapErrors(GroundErrors):
         return post_positions(self.map.site, self.map.maps, posts)
 
     def warnings(self) -> list[str]:
-        """Lines of text: errors that the terrain file leaves out, so that they count as 0; datums of unknown place."""
+        """Lines of text: an error of posts that no file states, so that it counts as 0; datums of unknown place."""
         of_maps = [
-            (one.source, text) for one in self.map.maps for text in (one.projection.transformation_warning, *one.notes)
+            f"map {one.source}: {text}"
+            for one in self.map.maps
+            for text in (one.projection.transformation_warning, *one.notes)
+            if text
         ]
-        return [
-            f"terrain {self.map.name}: its file states no {key}: taken as 0; circles are too small unless the ground "
-            "is exactly so; state the errors (0 for a model from which pictures are rendered)"
-            for key in self.unstated
-            if not getattr(self.map, key)
-        ] + [f"map {source}: {warning}" for source, warning in of_maps if warning]
+        if self.map.height_sigma_is_stated or self.height_sigma_m:
+            return of_maps
+        silent = (
+            f"terrain {self.map.name}: its file states no height_sigma_m: taken as 0; circles are too small unless the "
+            "ground is exactly so; state the errors (0 for a model from which pictures are rendered)"
+        )
+        return [silent, *of_maps]
 
 
 class PostErrors(MapErrors):

@@ -140,13 +140,9 @@ class Terrain(ABC):
         """Why rays (n,) are not informative; empty where they are."""
         return np.where(self.is_informative(azimuths_rad, elevations_rad), "", "ground off the map")
 
-    def masked_sectors(self) -> list[str]:
-        """One line of text per range of azimuths that is not informative."""
-        return []
-
     def warnings(self) -> list[str]:
         """What the ground does not cover, and what its file does not state: the same for every image."""
-        return [*self.masked_sectors(), *self.errors.warnings()]
+        return self.errors.warnings()
 
     def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = 3) -> Terrain:
         """The same ground, prepared for positions within `half_m` of a centre (2,), at the azimuths (n,).

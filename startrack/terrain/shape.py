@@ -250,13 +250,14 @@ class ExpectedCrests(NamedTuple):
 class GroundErrors:
     """Errors of the map of a ground: of single posts, and of its shape, which all azimuths share.
 
-    The defaults are those of exact ground. Positions and directions are as in `Terrain`.
+    The defaults are those of exact ground. Arguments of the methods are as in `Terrain`: `points_m` (..., 2)
+    positions; `centres_m` (..., 2) and `half_m` centres and half sides of boxes of positions; `point_m` (2,) one
+    position; `azimuths_rad` (...) directions in enu; `azimuth_half_rad` half the width of a range of azimuths.
     """
 
     height_sigma_m: float = 0.0  # standard deviation of the height of a post, independent of the others
     common_sigma_rad: float = 0.0  # standard deviation of an error of the horizon that all azimuths and positions share
     shape: tuple[ShapeError, ...] = ()  # errors that all azimuths share, those that are stated as zero too
-    unstated: tuple[str, ...] = ()  # keys of errors that the terrain file leaves out: they count as zero
     crest_distance_m: float = 10_000.0  # of the skyline from about the origin: over it waves of the map's error change
     unknown_steepness_1: float = 0.0  # relative sigma of the horizon's tangent, where a search must find it; 0: known
     steepness_1: float = 1.0  # the horizon's tangent that errors are counted from, over that of the stated shape
@@ -292,5 +293,5 @@ class GroundErrors:
         return np.zeros((len(posts), 3))
 
     def warnings(self) -> list[str]:
-        """One line of text for each error that the terrain file leaves out: the ground then counts as exact."""
+        """Lines of text: what makes the errors larger than they are stated."""
         return []

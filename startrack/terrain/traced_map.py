@@ -102,8 +102,9 @@ class TracedMap(Terrain):
 
     def with_voids(self) -> Self:
         """The same map whose `horizons` end at its voids, without its table."""
-        has_voids = any(np.isnan(one.heights_m).any() for one in self.maps)
-        return self.without_table().changed(**({"ground": self._pack(keep_voids=True)} if has_voids else {}))
+        if any(np.isnan(one.heights_m).any() for one in self.maps):
+            return self.without_table().changed(ground=self._pack(keep_voids=True))
+        return self.without_table()
 
     def _pack(self, keep_voids: bool) -> Ground:
         packed = pack_maps(self.site, self.maps, keep_voids=keep_voids)

@@ -38,7 +38,7 @@ def images_of_bag(bag: str | os.PathLike[str], topic: str | None = None) -> list
 
 
 def images_under(folder: str | os.PathLike[str], excluded: str | os.PathLike[str] | None = None) -> list[Image]:
-    """Every image of the tree of a `folder`, sorted by name; see `names_under`. Raises BadInput (bad_image)."""
+    """Every image of the tree of a `folder` without the folder `excluded`, by name. Raises as `names_under`."""
     folders: dict[str, list[str]] = {}
     for name in sorted(names_under(folder, excluded)):
         folders.setdefault(str(PurePosixPath(name).parent), []).append(name)

@@ -40,6 +40,7 @@ from startrack.output.html.rows import (
     images_with_details,
     row_of,
 )
+from startrack.output.write import COMPANIONS
 from startrack.terrain import Terrain, load_terrain
 
 HERE = Path(__file__).parent
@@ -53,7 +54,6 @@ DRAWN_MAIN = """<noscript><p>This page draws its results with JavaScript, which 
 <div id="detail" hidden></div>"""
 FEW_IMAGES = 4  # images whose details may be large
 LARGE, SMALL = (1400, 4000, 1441), (1000, 1500, 721)  # px of the picture, stars, azimuths of the horizon
-FILES = (".annotated.png", ".stars.ecsv", ".skyline.ecsv", ".skyline.png", ".wcs", ".corr")
 
 
 def write_page(path: str | os.PathLike[str], found: Sequence[Found], **options: Any) -> None:
@@ -149,7 +149,7 @@ def _detail(found: Found, terrains: Mapping[str, Terrain], size: tuple[int, int,
         unknown_rad = terrains[found.at("provenance.terrain")].unknown_below_rad(around_rad)
         unknown = round_values(np.degrees(np.where(unknown_rad > elevation_rad, unknown_rad, np.nan)), 2)
         horizon = None if line is None else horizon  # a position off the map
-    files = (found.companion(end) for end in FILES)
+    files = (found.companion(end) for end in COMPANIONS)
     return {
         "record": {k: value for k, value in found.record.items() if k not in ("matches", "detections", "camera")},
         "facts": facts_of(found.at),

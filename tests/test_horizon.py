@@ -240,7 +240,7 @@ def test_the_command_writes_files_of_one_computation_and_the_record(tmp_path, ca
     Draft202012Validator(SCHEMAS["horizon"]).validate(record)
     assert set(record) <= set(SCHEMAS["horizon"]["properties"])
     files = {tmp_path / name for name in ("a.hrz", "a.csv", "garden/landscape.ini", "garden/horizon.txt")}
-    files.add(tmp_path / "a.skyline.png")
+    files.add(tmp_path / "a.hrz.png")
     assert {*map(Path, record["files"])} == files == {path for path in tmp_path.rglob("*") if path.is_file()}
     measured = np.genfromtxt(tmp_path / "a.csv", delimiter=",", skip_header=1)[:, 1]
     known = np.isfinite(measured)
@@ -256,8 +256,8 @@ def test_the_folder_of_results_and_no_plots_hold(tmp_path, monkeypatch, capsys):
     assert main([*words, "--no-plots"]) == 0
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.csv"]
     assert main([*words, "-O"]) == 0
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"a.csv", "a.skyline.png"}
-    assert capsys.readouterr().err.splitlines()[-1] == "files out/a.csv, out/a.skyline.png"
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"a.csv", "a.csv.png"}
+    assert capsys.readouterr().err.splitlines()[-1] == "files out/a.csv, out/a.csv.png"
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 

@@ -14,7 +14,8 @@ from horizon_helpers import LOWELL, small_skyline
 from startrack.applications.horizon.landscape import interpolate_unknown
 from startrack.applications.horizon.write import check_outputs, csv_text, nina_text, write_skyline
 from startrack.core.errors import BadInput, BadOutput
-from startrack.output import Ink, skyline_picture, skyline_table_text
+from startrack.output import Ink, horizon_picture, skyline_picture, skyline_table_text
+from startrack.terrain import load_terrain
 
 
 def test_the_csv_has_a_row_a_degree(tmp_path):
@@ -95,6 +96,13 @@ def test_azimuths_that_are_not_seen_are_hatched_and_named():
     left, right = 64 + np.array([99, 161]) / 360 * (1440 - 64 - 16)  # the plot of this picture
     assert changed.min() >= left - 8 and changed.max() <= right + 8
     assert len(changed) > 0.9 * (right - left)
+
+
+def test_the_horizon_of_a_terrain_fills_its_picture():
+    """From below its lowest elevation on, and not from 0: here it is between 25 and 29 degrees."""
+    picture = horizon_picture(load_terrain("shackleton-thesis"), (1000.0, 0.0)).astype(int)
+    line = np.argwhere(np.abs(picture - Ink.SKYLINE).sum(axis=-1) < 30)[:, 0]
+    assert np.ptp(line) > 0.4 * len(picture)
 
 
 def crosses_in(picture: np.ndarray) -> np.ndarray:

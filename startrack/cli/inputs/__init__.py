@@ -150,7 +150,7 @@ COMMANDS = (
             "output": (
                 flag(
                     "-o --output FILE",
-                    "the skyline, and beside it its picture, NAME.skyline.png; several -o: in several formats",
+                    "the skyline, and beside it its picture, FILE.png; several -o: in several formats",
                     action="append", required=True,
                 ),
                 flag("-D --dir OUT", "folder of FILE, where that is relative (default: the current one)"),

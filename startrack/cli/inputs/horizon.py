@@ -93,7 +93,7 @@ def _outputs(args: argparse.Namespace) -> list[str]:
     outputs = [os.path.join(args.dir or "", output) for output in args.output]
     if args.no_plots or any(output.lower().endswith(".png") for output in outputs):
         return outputs
-    return [*outputs, f"{os.path.splitext(outputs[0].rstrip('/'))[0]}.skyline.png"]
+    return [*outputs, f"{outputs[0].rstrip('/')}.png"]
 
 
 def _count_text(images: int) -> str:

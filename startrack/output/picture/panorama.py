@@ -115,7 +115,7 @@ def horizon_picture(terrain: Terrain, position_m: tuple[float, float]) -> NDArra
     title = f"{terrain.name}: horizon seen from E {position_m[0]:.0f} m, N {position_m[1]:.0f} m"
     canvas = Canvas(WIDTH_PX, HEIGHT_PX)
     unknown_rad = terrain.unknown_below_rad(AZIMUTHS_RAD)
-    plot = _draw_horizon(canvas, title, AZIMUTHS_RAD, horizon_rad, unknown_rad)
+    plot = _draw_horizon(canvas, title, AZIMUTHS_RAD, horizon_rad, unknown_rad, from_level=False)
     plot.draw_curve(AZIMUTHS_RAD, horizon_rad, Ink.SKYLINE)
     return canvas.rendered_pixels()
 
@@ -167,7 +167,7 @@ def located_picture(value: Positioned, skyline: MeasuredSkyline) -> NDArray[np.u
     half = np.degrees(half_range_rad(raised_rad, skyline.sigma_rad))
     step = nice_step(half / 2)
     half = np.ceil(half / step - 1e-9) * step
-    plot = _empty_plot(canvas, HEIGHT_PX, "enlarged: height above that horizon", -half, half)
+    plot = _empty_plot(canvas, HEIGHT_PX, "enlarged: height above that horizon; bars: one sigma", -half, half)
     ends_rad = np.array([0.0, 2 * np.pi])
     plot.draw_ground(ends_rad, np.zeros(2))
     plot.draw_unknown(AZIMUTHS_RAD, np.zeros(len(AZIMUTHS_RAD)), unknown_rad - horizon(AZIMUTHS_RAD))
@@ -204,15 +204,20 @@ def _draw_horizon(
     elevation_rad: Array,
     unknown_rad: Array | None = None,
     photograph: Photograph | None = None,
+    from_level: bool = True,
 ) -> Plot:
     """A plot at the canvas's top with the ground below elevations (n,) at ascending azimuths (n,).
 
-    Above it what ground off the maps could hide, up to `unknown_rad` (n,). A `photograph` covers both.
+    Above it what ground off the maps could hide, up to `unknown_rad` (n,). A `photograph` covers both. The plot begins
+    at elevation 0 or lower if it is `from_level`, else below the lowest elevation.
     """
     if unknown_rad is not None and (unknown_rad > elevation_rad).any():
         title += f"; {UNKNOWN_WORDS}"
     known = np.degrees(elevation_rad[np.isfinite(elevation_rad)])
-    low, high = min(float(known.min(initial=0.0)), 0.0), float(known.max(initial=0.0))
+    low, high = float(known.min(initial=0.0)), float(known.max(initial=0.0))
+    if not from_level and known.size:
+        low, high = float(known.min()), float(known.max())
+        low -= 0.3 * max(high - low, 2.0)
     step = nice_step(max(high - low, 2.0) / 3)
     low, high = np.floor(low / step) * step, np.ceil((high + 0.3 * step) / step) * step
     plot = _empty_plot(canvas, 0, title, low, high)

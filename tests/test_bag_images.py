@@ -176,7 +176,9 @@ def test_no_room_is_made_for_more_than_a_bag_holds(tmp_path):
     (summary,) = struct.unpack_from("<Q", data, len(data) - 37 + 9)  # of the footer
     struct.pack_into("<Q", data, summary + 1, 2**40)
     bag.write_bytes(data)
-    with pytest.raises(BadInput, match="damaged or unknown ROS bag"):
+    with pytest.raises(
+        BadInput, match=r"damaged or unknown ROS bag \((a length in it is beyond its end|.*Truncated record)"
+    ):
         list_bag_images(bag)
 
 

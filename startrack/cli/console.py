@@ -14,8 +14,7 @@ from threading import Event, Thread
 from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 from startrack.core import errors
-from startrack.core.advice import fitting_advice
-from startrack.core.errors import BadInput, NoSolution, Reason
+from startrack.core.errors import BadInput, NoSolution, Reason, fitting_advice
 from startrack.core.files import printable
 
 if TYPE_CHECKING:

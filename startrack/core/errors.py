@@ -130,9 +130,20 @@ ADVICE_IN_MESSAGE = re.compile(  # the imperatives of our messages, a flag, or a
     r"\?|(^|\s)--[a-z]"
     r"|\b(give|choose|correct|enlarge|expose|find|flip|install|make|replace|run|set|state|try|use|widen) "
 )
+ADVICE_BY_MESSAGE = {  # part of a message: what to do
+    "or a sidecar with terrain": "A picture from the Earth needs no terrain for its stars (startrack identify) and its "
+    "skyline (startrack horizon).",
+    "no such folder of results": "Give the folder OUT of startrack locate or batch, or one NAME.fix.json.",
+    "images there": "Give the folder that holds the pictures.",
+}
 MISSING = "No such file"
 MISSING_ADVICE = "Check the name and the folder of the file."
 BAD_INPUT_REASONS = frozenset(one for one in Reason if one.exit_code == EXIT_BAD_INPUT)  # BadInput in the library
+
+
+def fitting_advice(message: str) -> str | None:
+    """What to do after a refusal with this `message`; None where the advice of its reason fits."""
+    return next((advice for part, advice in ADVICE_BY_MESSAGE.items() if part in message), None)
 
 
 def next_step(reason: str, message: str) -> str:

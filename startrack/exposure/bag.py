@@ -225,9 +225,10 @@ def _refusals(path: FilePath, reason: str) -> Iterator[None]:
         raise BadInput(reason, f"{printable(path)}: cannot be read ({error.strerror or error})") from error
     except Exception as error:  # rosbags raises many types for a damaged file
         cause = _escape(f"{type(error).__name__}: {error}")[:MAX_CAUSE_CHARS]
-        damaged = BadInput(reason, f"{printable(path)}: damaged or unknown ROS bag ({cause})")
-        is_length = isinstance(error, MemoryError) and has_room()  # a length in the file that no file has
-        raise (None if is_length else memory_refusal(error)) or damaged from error
+        damaged = f"{printable(path)}: damaged or unknown ROS bag"
+        if isinstance(error, MemoryError) and has_room():  # room for as many bytes as the file states
+            raise BadInput(reason, f"{damaged} (a length in it is beyond its end)") from None
+        raise memory_refusal(error) or BadInput(reason, f"{damaged} ({cause})") from error
 
 
 def _escape(text: str) -> str:

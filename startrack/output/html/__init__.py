@@ -17,8 +17,7 @@ from urllib.parse import quote
 import numpy as np
 
 from startrack.core import REPORTED_IMAGES
-from startrack.core.advice import fitting_advice
-from startrack.core.errors import Reason
+from startrack.core.errors import Reason, fitting_advice
 from startrack.core.files import write_atomically
 from startrack.core.types import BadInput
 from startrack.output.html.details import (

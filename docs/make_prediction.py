@@ -40,7 +40,7 @@ if __name__ == "__main__":
     text = (shipped / "shackleton.toml").read_text().replace("radius_m = 10500.0", "radius_m = 4000.0")
     FLOOR.write_text(text.replace('"ldem', f'"{shipped.as_posix()}/ldem'))
     waypoints.write_text(WAYPOINTS)
-    area = run("area", str(FLOOR), "--spacing", "1000", "--draws", "5")
+    area = run("area", str(FLOOR), "--spacing", "1000", "--draws", "2")
     Image.open(area / "predict.png").save(IMAGES / "predict.webp", quality=90)
     drive = run("drive", "shackleton-thesis", "--path", str(waypoints), *DRIVE)
     shutil.copy(drive / "predict.png", IMAGES / "predict-drive.png")

@@ -257,7 +257,7 @@ def track_geojson(track: Track, records: Sequence[dict[str, Any]]) -> str:
 
 
 def track_page(track: Track, title: str) -> str:
-    """The page as text, with a plain `title`: HTML with its style, scripts and data."""
+    """The page of a `track` as text, with a plain `title`: HTML with its style, scripts and data."""
     (east_m, north_m), half_m = track_extent(track)
     records = frame_records(track)
     head = {

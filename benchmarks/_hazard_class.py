@@ -57,7 +57,7 @@ class Default:
     gross_sigma: float
 
 
-DEFAULTS = {  # as the design proposes; where the terrain has `shape_errors`, those count
+DEFAULTS = {  # as the design proposes; where the terrain states its own, those count
     "depth": Default(("depth_1",), 1e-3, 1e-2),
     "width": Default(("diameter_1",), 1e-3, 1e-2),
     "ellipse": Default(("ellipse_cos_1", "ellipse_sin_1"), 5e-4, 5e-3),
@@ -147,7 +147,7 @@ def defaults_drawn(gross: str = "") -> Ground:
 def _sigmas(stated: Terrain) -> dict[str, tuple[float, float]]:
     """Default and gross sigma of each error by its name: those of the terrain where it has them."""
     found = {name: (fact.sigma, fact.gross_sigma) for fact in DEFAULTS.values() for name in fact.names}
-    for error in getattr(stated, "shape_errors", ()):
+    for error in stated.errors.shape:
         if error.name in found:
             found[error.name] = (error.sigma, error.gross_sigma or error.sigma)
     return found

@@ -68,29 +68,29 @@ class Rim:
 
 
 class Walled(ForwardingTerrain):
-    """The floor of a crater within a `rim`."""
+    """The floor of a crater within a `wall`."""
 
-    def __init__(self, whole: Terrain, rim: Rim) -> None:
+    def __init__(self, whole: Terrain, wall: Rim) -> None:
         super().__init__(whole)
-        self.rim = rim
+        self.wall = wall
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """By the distance to the wall along each azimuth, from Newton's method."""
         points, azimuth = np.asarray(points_m, dtype=float), np.asarray(azimuths_rad, dtype=float)
         along = points[..., 0] * np.sin(azimuth) + points[..., 1] * np.cos(azimuth)
         off2 = np.square(points).sum(axis=-1)
-        distance = np.sqrt(np.maximum(np.square(along) + np.square(self.rim.radius_m(azimuth)) - off2, 1.0)) - along
+        distance = np.sqrt(np.maximum(np.square(along) + np.square(self.wall.radius_m(azimuth)) - off2, 1.0)) - along
         for _ in range(STEPS):
             at = points + distance[..., None] * np.stack([np.sin(azimuth), np.cos(azimuth)], axis=-1)
             away, about = np.hypot(at[..., 0], at[..., 1]), np.arctan2(at[..., 0], at[..., 1])
-            radius = self.rim.radius_m(about)
-            bend = (self.rim.radius_m(about + TURN_RAD) - radius) / TURN_RAD
+            radius = self.wall.radius_m(about)
+            bend = (self.wall.radius_m(about + TURN_RAD) - radius) / TURN_RAD
             outward, across = np.cos(azimuth - about), np.sin(azimuth - about) / away
             step = (radius - away) / (outward - bend * across)
             distance = np.maximum(distance + step, 1e-3)
             if np.all(np.abs(step) < 1e-6):
                 break
-        return np.asarray(np.arctan2(self.rim.height_m(about) - self.whole.camera_height_m, distance))
+        return np.asarray(np.arctan2(self.wall.height_m(about) - self.whole.camera_height_m, distance))
 
 
 def crater_with(crater: Cylinder, values: Mapping[str, float]) -> Terrain:

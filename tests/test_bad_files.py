@@ -126,7 +126,8 @@ def test_only_regular_files_are_replaced(tmp_path, capsys, kind, name):
     assert "next:" not in printed.err  # the advice of bad_image is about pictures
     assert f"{name}: cannot be replaced: it is no regular file; remove it, or write elsewhere" in line
     assert "-O" not in line
-    assert path.lstat() == before
+    after = path.lstat()  # a link's time of reading may be another
+    assert (after.st_mode, after.st_ino, after.st_mtime_ns) == (before.st_mode, before.st_ino, before.st_mtime_ns)
 
 
 @pytest.mark.parametrize("kind", ["pipe", "folder", "socket", "loop"])
@@ -176,7 +177,7 @@ def test_control_characters_in_names_are_escaped(tmp_path, capsys, command, cont
     assert main([command, str(source), *folder, *more.get(command, [])]) != 0
     printed = capsys.readouterr()
     text = printed.out + printed.err
-    assert "a\\nb\\x1b[31m\\x07c" in text or "c.toml  refused no_stars" in text
+    assert "a\\nb\\x1b[31m\\x07c" in text or "c.toml  refused  no_stars" in text
     assert all(line.isprintable() for line in text.splitlines()) and "\nb" not in text
 
 

@@ -57,8 +57,9 @@ def test_a_pipe_is_no_image_and_a_link_to_nothing_is_one(tmp_path):
     os.mkfifo(tmp_path / "pipe.png")
     (tmp_path / "linked-pipe.png").symlink_to(tmp_path / "pipe.png")
     (tmp_path / "nothing.png").symlink_to(tmp_path / "gone.png")
+    (tmp_path / "itself.png").symlink_to(tmp_path / "itself.png")
     (tmp_path / "folder.png").mkdir()
-    assert names(tmp_path) == ["nothing.png"]
+    assert names(tmp_path) == ["itself.png", "nothing.png"]
     assert locate_image(task_of(tmp_path / "pipe.png", tmp_path))[0]["reason"] == "bad_image"
 
 

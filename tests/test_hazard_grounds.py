@@ -43,8 +43,8 @@ def test_a_rim_of_any_form_is_met_where_small_steps_meet_it(crater: Cylinder) ->
         for azimuth, horizon in list(zip(AZIMUTHS, horizons, strict=True))[::7]:
             x, y = point[0] + steps * np.sin(azimuth), point[1] + steps * np.cos(azimuth)
             about = np.arctan2(x, y)
-            first = np.flatnonzero(np.hypot(x, y) >= ground.rim.radius_m(about))[0]
-            expected = np.arctan2(ground.rim.height_m(about[first]) - crater.camera_height_m, steps[first])
+            first = np.flatnonzero(np.hypot(x, y) >= ground.wall.radius_m(about))[0]
+            expected = np.arctan2(ground.wall.height_m(about[first]) - crater.camera_height_m, steps[first])
             assert horizon == pytest.approx(expected, rel=2e-3)
             assert horizon >= expected - 1e-9  # the step is beyond the wall
 

@@ -244,6 +244,19 @@ def test_a_users_own_terrain_is_searched():
     assert np.hypot(*(fix.position_enu_m[:2] - position_m)) < fix.radius999_m < 20.0
 
 
+def test_a_users_own_errors_stay_under_other_air():
+    terrain = FacingWall()
+    terrain.site = Site("earth", np.radians(46.0), np.radians(9.0), 1600.0)
+    terrain.errors = GroundErrors(common_sigma_rad=1e-3)
+    other = terrain.with_air({"pressure_hpa": 700.0})
+    assert other.errors is terrain.errors and other.air != terrain.air
+
+
+def test_what_a_wrapper_takes_from_its_terrain_cannot_be_changed_in_it():
+    with pytest.raises(AttributeError, match="name of a ForwardingTerrain is a property"):
+        ForwardingTerrain(FacingWall()).changed(name="other")
+
+
 class NaNHorizon(FacingWall):
     """Its bounds are right; of its horizons those to the east are NaN."""
 

@@ -1,4 +1,4 @@
-"""Images that are followed: complete files, facts that come late, and folders that grow."""
+"""Images that are followed: complete files, facts that come late, and folders that stay as they are."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import time
 
 import pytest
 
-from startrack.applications.batch import names_under
+from startrack.applications.batch import find as finding
+from startrack.applications.batch import image_tree
 from startrack.applications.tracking import follow_images, session
 from startrack.core.types import BadInput
 
@@ -16,6 +17,7 @@ from startrack.core.types import BadInput
 def quick(monkeypatch):
     """The same with short waits."""
     monkeypatch.setattr(session, "TRIES_S", (0.02, 0.2))
+    monkeypatch.setattr(finding, "COARSE_S", 0.05)
 
 
 class Run:
@@ -23,8 +25,9 @@ class Run:
 
     def __init__(self, folder, until_idle_s=0.3):
         self.taken, self.refused = [], []
+        tree = image_tree(folder)
         self.images = follow_images(
-            lambda: [str(folder / name) for name in names_under(folder)], self.take,
+            lambda: [str(folder / name) for name in tree.changes()], self.take,
             lambda path, cause: self.refused.append(os.path.basename(path)), until_idle_s=until_idle_s,
         )  # fmt: skip
 
@@ -79,11 +82,21 @@ def test_an_image_that_was_refused_is_tried_again_with_its_facts(tmp_path):
     run.until(lambda: run.taken == ["b.png", "a.png"])
 
 
-def test_images_of_all_folders_are_listed_as_they_come(tmp_path):
+def test_folders_that_stay_are_not_listed_again(tmp_path, monkeypatch):
     for k in range(20):
         write(tmp_path / "day" / f"{k % 2}", f"{k}.png")
-    assert len(names_under(tmp_path)) == 20
+    tree = image_tree(tmp_path)
+    assert len(tree.changes()) == 20
+    time.sleep(0.1)  # longer than a step of the folders' times
+    tree.changes()
+    listed, scandir = [], os.scandir
+    monkeypatch.setattr(os, "scandir", lambda path: [listed.append(str(path)), scandir(path)][1])
+    for _ in range(5):
+        assert tree.changes() == []
+    assert not listed
     write(tmp_path / "day" / "1", "new.png")
+    assert "day/1/new.png" in tree.changes() and listed == [str(tmp_path / "day" / "1")]
     write(tmp_path / "night", "first.png")
-    assert {"day/1/new.png", "night/first.png"} <= set(names_under(tmp_path))
-    assert len(names_under(tmp_path)) == 22
+    assert "night/first.png" in tree.changes()
+    monkeypatch.setattr(finding, "RELIST_S", 0.0)  # as on a file system whose folders have no times
+    assert len(tree.changes()) == 22

@@ -3,8 +3,8 @@
 A Kalman filter has the last position, the errors that frames and moves share, and the errors of all posts and waves of
 the map that a recent observation has depended on, in standard deviations. Posts that were not seen for the longest time
 are left out, so that memory stays flat; where they are seen again, they count as new. Positions of earlier frames may
-be part of the state, where each observation moves them by their covariance with the others. That is a fixed-point
-smoother, whose last result is the estimate by all frames. Source: Anderson and Moore 1979, Optimal Filtering, 7.2.
+follow: each observation moves them by their covariance with the filter's state. That is a fixed-point smoother, whose
+last result is the estimate by all frames. Source: Anderson and Moore 1979, Optimal Filtering, 7.2.
 """
 
 from __future__ import annotations
@@ -19,17 +19,51 @@ from startrack.core.types import Array, Bools, Ints
 from startrack.estimation.observations import UNKNOWN_M, FrameEstimate, Steps
 
 MOST_POSTS = 2000  # in the state; 40 frames 50 m apart depend on 500
-MOST_FOLLOWING = 200  # earlier positions; later frames change those before no more
+MOST_FOLLOWING = 400  # earlier positions; later frames change those before no more
 SIGMAS_95 = float(np.sqrt(-2.0 * np.log(0.05)))  # half axes of the ellipse that holds 95 % of a Gaussian
 DIRECTIONS = 256  # over half a turn
+
+
+@dataclass(eq=False)
+class Followers:
+    """Positions (m,) of earlier frames, which observations of later ones move, for each of b explanations."""
+
+    mean: Array  # (b, 2 m)
+    own: Array  # (b, m, 2, 2) covariances
+    cross: Array  # (b, 2 m, s) covariance with the state
+    settled: list[tuple[Array, Array]] = field(default_factory=list)  # mean (b, 2) and covariance of those before
+
+    @classmethod
+    def none(cls, count: int, size: int) -> Self:
+        """Before the second frame, for a `count` of explanations with a state of this `size`."""
+        return cls(np.zeros((count, 0)), np.zeros((count, 0, 2, 2)), np.zeros((count, 0, size)))
+
+    def append(self, mean: Array, covariance: Array) -> None:
+        """One more position, the first of a state with this mean (b, s) and covariance (b, s, s)."""
+        self.mean = np.hstack([self.mean, mean[:, :2]])
+        self.own = np.concatenate([self.own, covariance[:, None, :2, :2]], axis=1)
+        self.cross = np.concatenate([self.cross, covariance[:, :2]], axis=1)
+        if self.own.shape[1] > MOST_FOLLOWING:
+            self.settled.append((self.mean[:, :2], self.own[:, 0]))
+            self.mean, self.own, self.cross = self.mean[:, 2:], self.own[:, 1:], self.cross[:, 2:]
+
+    def update(self, cross: Array, covariance: Array, residual: Array, gain: Array) -> None:
+        """Take in an observation that leaves a `residual` (b, p) of this `covariance` (b, p, p).
+
+        `cross` (b, 2 m, p) is that of the positions with it, `gain` (b, p, s) the state's.
+        """
+        own_gain = np.linalg.solve(covariance, cross.swapaxes(1, 2))
+        self.mean = self.mean + (residual[:, None] @ own_gain)[:, 0]
+        self.cross = self.cross - cross @ gain
+        b, m, p = len(cross), self.own.shape[1], cross.shape[2]
+        self.own = self.own - cross.reshape(b, m, 2, p) @ own_gain.reshape(b, p, m, 2).transpose(0, 2, 1, 3)
 
 
 @dataclass(eq=False)
 class TrackFilter:
     """Estimates by b explanations after the frames so far; moves and observations come in the order of time.
 
-    The state (s,): the last position, the shared errors, those of all moves and of the last leg; then posts and
-    positions of earlier frames in the order in which they came.
+    The state (s,): the last position, the shared errors, those of all moves and of the last leg, and posts.
     """
 
     mean: Array  # (b, s)
@@ -39,25 +73,20 @@ class TrackFilter:
     leg_count: int  # of errors that the moves of a leg share
     unknown_m: float  # standard deviation of a position about which nothing is known
     posts: dict[int, int] = field(default_factory=dict)  # number of a post to its place in the state
-    earlier: list[int] | None = None  # places of the positions of earlier frames; None: they are not kept
-    settled: list[tuple[Array, Array]] = field(default_factory=list)  # mean (2,) and covariance of those before
+    followers: Followers | None = None
 
     @classmethod
     def start(
         cls, shared_count: int, moves_count: int = 0, leg_count: int = 0, *, count: int = 1,
-        unknown_m: float = UNKNOWN_M, keeps_earlier: bool = False,
+        unknown_m: float = UNKNOWN_M, follows: bool = False,
     ) -> Self:  # fmt: skip
-        """Before the first frame, for a `count` of explanations; `keeps_earlier`: with positions of earlier frames."""
+        """Before the first frame, for a `count` of explanations; `follows`: with the positions of earlier frames."""
         size = 2 + shared_count + moves_count + leg_count
         prior = np.diag([unknown_m**2] * 2 + [1.0] * (size - 2))
         return cls(
             np.zeros((count, size)), np.tile(prior, (count, 1, 1)), shared_count, moves_count, leg_count, unknown_m,
-            earlier=[] if keeps_earlier else None,
+            followers=Followers.none(count, size) if follows else None,
         )  # fmt: skip
-
-    @property
-    def _first_post(self) -> int:
-        return 2 + self.shared_count + self.moves_count + self.leg_count
 
     @property
     def position_m(self) -> Array:
@@ -70,20 +99,16 @@ class TrackFilter:
         return self.covariance[0, :2, :2].copy()
 
     def positions(self) -> tuple[Array, Array]:
-        """Positions (n, 2) and covariances (n, 2, 2) of all earlier frames and of the last one, by the first."""
-        found = [*self.settled, *(self._position_at(place) for place in [*(self.earlier or []), 0])]
-        return np.array([mean for mean, _ in found]), np.array([covariance for _, covariance in found])
-
-    def _position_at(self, place: int) -> tuple[Array, Array]:
-        of = slice(place, place + 2)
-        return self.mean[0, of].copy(), self.covariance[0, of, of].copy()
+        """Positions (n, 2) and covariances (n, 2, 2) of all frames that follow, and of the last one, by the first."""
+        last = self.followers or Followers.none(1, 0)
+        settled, before = [mean[0] for mean, _ in last.settled], last.mean[0].reshape(-1, 2)
+        mean = np.vstack([*settled, before, self.mean[0, :2]])
+        return mean, np.stack([*(own[0] for _, own in last.settled), *last.own[0], self.covariance[0, :2, :2]])
 
     def __getitem__(self, which: Ints | Bools | slice) -> Self:
-        """A copy of the explanations of an index."""
+        """A copy of the explanations of an index, without followers."""
         mean, covariance = self.mean[which].copy(), self.covariance[which].copy()
-        earlier = None if self.earlier is None else self.earlier.copy()
-        posts, settled = self.posts.copy(), self.settled.copy()
-        return replace(self, mean=mean, covariance=covariance, posts=posts, earlier=earlier, settled=settled)
+        return replace(self, mean=mean, covariance=covariance, posts=self.posts.copy(), followers=None)
 
     @staticmethod
     def join(parts: Sequence[TrackFilter]) -> TrackFilter:
@@ -104,12 +129,14 @@ class TrackFilter:
 
         `by_m` (b, 2, f) are their changes by one sigma of each error that all moves share.
         """
-        if self.earlier is not None:
-            self._keep_position(self.earlier)
+        if self.followers is not None:
+            self.followers.append(self.mean, self.covariance)
         lost = ~np.isfinite(sigma_m)
         if lost.any():
             self.mean[lost, :2] = 0.0
             self.covariance[lost, :2], self.covariance[lost, :, :2] = 0.0, 0.0
+            if self.followers is not None:
+                self.followers.cross[lost, :, :2] = 0.0
         first = 2 + self.shared_count
         self._shift(np.where(lost[:, None, None], 0.0, by_m), slice(first, first + self.moves_count))
         self.mean[:, :2] += np.where(lost[:, None], 0.0, move_m)
@@ -121,7 +148,8 @@ class TrackFilter:
 
     def move_by_leg(self, by_m: Array, *, is_new: bool) -> None:
         """Move by the errors of the last leg, or of a new one: `by_m` (b, 2, l) by one sigma of each."""
-        leg = slice(self._first_post - self.leg_count, self._first_post)
+        end = 2 + self.shared_count + self.moves_count + self.leg_count
+        leg = slice(end - self.leg_count, end)
         if is_new:
             self._forget(leg)
         self._shift(by_m, leg)
@@ -135,6 +163,8 @@ class TrackFilter:
         """Of the errors in a `part` of the state, their prior is all that is known."""
         self.mean[:, part], self.covariance[:, part], self.covariance[:, :, part] = 0.0, 0.0, 0.0
         self.covariance[:, part, part] = np.eye(part.stop - part.start)
+        if self.followers is not None:
+            self.followers.cross[:, :, part] = 0.0
 
     def _shift(self, by_m: Array, part: slice) -> None:
         """Move by errors of a `part` of the state: `by_m` (b, 2, f) by one sigma of each."""
@@ -142,13 +172,18 @@ class TrackFilter:
         self.mean[:, :2] += (by_m @ self.mean[:, part, None])[..., 0]
         self.covariance[:, :2] += by_m @ self.covariance[:, part]
         self.covariance[:, :, :2] += self.covariance[:, :, part] @ turned
+        if self.followers is not None:
+            self.followers.cross[:, :, :2] += self.followers.cross[:, :, part] @ turned
 
     def update(self, estimate: FrameEstimate) -> Array:
         """Take in the observation of one frame; returns the logarithm (b,) of its probability density."""
         residual, covariance, cross = self.innovation(estimate)
         gain = np.asarray(np.linalg.solve(covariance, cross.swapaxes(1, 2)), dtype=np.float64)
+        if self.followers is not None:
+            of_followers = self._with(self.followers.cross, estimate)
+            self.followers.update(of_followers, covariance, residual, gain)
         self.mean = self.mean + (residual[:, None] @ gain)[:, 0]
-        self.covariance -= cross @ gain
+        self.covariance = self.covariance - cross @ gain
         self._forget_posts(estimate)
         return log_normal(residual, covariance)
 
@@ -171,38 +206,29 @@ class TrackFilter:
 
     def _add_posts(self, numbers: Sequence[int]) -> None:
         """The errors of more posts, of which nothing is known but their prior."""
-        if numbers:
-            size, more = self.mean.shape[1], len(numbers)
-            self.posts.update((number, size + k) for k, number in enumerate(numbers))
-            self._grow(np.zeros((more, size)))
-            self.covariance[:, range(size, size + more), range(size, size + more)] = 1.0
-
-    def _keep_position(self, earlier: list[int]) -> None:
-        """The last position becomes one of `earlier` frames; the first of too many are settled: they change no more."""
-        earlier.append(self.mean.shape[1])
-        self._grow(np.eye(2, self.mean.shape[1]))
-        if len(earlier) > MOST_FOLLOWING:
-            self.settled.append(self._position_at(earlier.pop(0)))
-
-    def _grow(self, by: Array) -> None:
-        """More quantities, which are products of `by` (m, s) with the state."""
-        size, cross = self.mean.shape[1], by @ self.covariance
-        grown = np.empty((len(self.mean), size + len(by), size + len(by)))
-        grown[:, :size, :size], grown[:, size:, :size] = self.covariance, cross
-        grown[:, :size, size:], grown[:, size:, size:] = cross.swapaxes(1, 2), cross @ by.T
-        self.mean, self.covariance = np.concatenate([self.mean, self.mean @ by.T], axis=1), grown
+        if not numbers:
+            return
+        (count, size), more = self.mean.shape, len(numbers)
+        self.posts.update((number, size + k) for k, number in enumerate(numbers))
+        self.mean = np.pad(self.mean, ((0, 0), (0, more)))
+        grown = np.tile(np.eye(size + more), (count, 1, 1))
+        grown[:, :size, :size] = self.covariance
+        self.covariance = grown
+        if self.followers is not None:
+            self.followers.cross = np.pad(self.followers.cross, ((0, 0), (0, 0), (0, more)))
 
     def _forget_posts(self, estimate: FrameEstimate) -> None:
         """Leave out the posts that were not seen for the longest time, where there are too many."""
         for number in estimate.post.tolist():  # the last ones of the dictionary are the latest
             self.posts[number] = self.posts.pop(number)
-        others = [*range(self._first_post), *(k for place in self.earlier or () for k in (place, place + 1))]
-        if self.mean.shape[1] - len(others) > MOST_POSTS:  # settled positions count as posts
-            kept = sorted([*others, *[*self.posts.values()][-(3 * MOST_POSTS // 4) :]])
-            self.mean, self.covariance = self.mean[:, kept], self.covariance[:, kept][:, :, kept]
-            now = dict(zip(kept, range(len(kept)), strict=True))
-            self.posts = {number: now[place] for number, place in self.posts.items() if place in now}
-            self.earlier = self.earlier and [now[place] for place in self.earlier]
+        if len(self.posts) > MOST_POSTS:
+            kept = list(self.posts)[-(3 * MOST_POSTS // 4) :]
+            first = 2 + self.shared_count + self.moves_count + self.leg_count
+            place = np.append(np.arange(first), [self.posts[number] for number in kept])
+            self.mean, self.covariance = self.mean[:, place], self.covariance[:, place[:, None], place]
+            self.posts = {number: first + k for k, number in enumerate(kept)}
+            if self.followers is not None:
+                self.followers.cross = self.followers.cross[..., place]
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,9 +249,7 @@ def smooth(estimates: Sequence[FrameEstimate | None], steps: Steps) -> Smoothed:
     one = next((estimate for estimate in estimates if estimate is not None), None)
     if one is None:
         raise ValueError("no frame has an estimate")
-    state = TrackFilter.start(
-        one.parameters - 2, steps.by_shared_m.shape[-1], steps.by_leg_m.shape[-1], keeps_earlier=True
-    )
+    state = TrackFilter.start(one.parameters - 2, steps.by_shared_m.shape[-1], steps.by_leg_m.shape[-1], follows=True)
     for k, estimate in enumerate(estimates):
         if k:
             state.predict(steps, k - 1)

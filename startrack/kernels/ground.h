@@ -74,7 +74,7 @@ static inline struct place cell_by_projection(const double *grid, int64_t m, dou
     return at;
 }
 
-/* The Earth's maps, see ellipsoid_fit.py; (-1, -1) where their polynomials do not hold. */
+/* The Earth's maps, see maps/ellipsoid.py; (-1, -1) where their polynomials do not hold. */
 static inline struct place cell_by_polynomials(const double *grid, int64_t m, double east, double north, double up)
 {
     const double x = (east / up - grid[2]) * grid[4], y = (north / up - grid[3]) * grid[5];

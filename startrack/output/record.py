@@ -16,7 +16,7 @@ from startrack.core.errors import Reason
 from startrack.core.types import Exposure
 from startrack.exposure import SIDECAR as SIDECAR_KEYS
 from startrack.kernels.library import LEVEL
-from startrack.output.quantities import BY_PATH, OWN_QUANTITIES, QUANTITIES
+from startrack.output.quantities import BY_PATH, QUANTITIES
 from startrack.output.quantity import (
     Quantity,
     Schema,
@@ -71,7 +71,8 @@ def image_name(exposure: Exposure) -> str:
 
 def _record(kind: str, image: str, reason: str | None, message: str, value: Inputs | None) -> dict[str, Any]:
     """The record of a refused image. The `value` is None where nothing is known."""
-    found = record_from((*QUANTITIES, *OWN_QUANTITIES), value)
+    wanted = {*KINDS[kind], "provenance"}
+    found = record_from((one for one in BY_PATH.values() if (one.section or one.key) in wanted), value)
     return {
         "format": FORMATS[kind],
         "image": image,

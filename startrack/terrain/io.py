@@ -298,6 +298,8 @@ def stateable_errors(text: str) -> list[StateableError]:
     keys = read_keys(text)
     vertical = vertical_fact(keys["body"])
     dem, rover, cylinder = keys.get("dem", {}), keys.get("rover", {}), keys.get("cylinder")
+    if cylinder is None and not dem:
+        raise BadInput("bad_terrain", "the file has neither [cylinder] nor [dem]: its errors are not known")
     if cylinder is not None:
         sizes_m = {DEPTH.key: cylinder["depth_m"], DIAMETER.key: cylinder["diameter_m"]}
         inexact = not cylinder.get("exact", False)

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -35,7 +36,7 @@ class TerrainFile:
 
 
 class Rim(NamedTuple):
-    """A circular rim about the origin of a flat floor; of an uneven one the mean."""
+    """A circular rim about the origin of a flat floor; of an uneven one the mean. The thesis's methods need it."""
 
     radius_m: float
     height_m: float  # above the camera
@@ -77,9 +78,16 @@ class Terrain(ABC):
         return self.changed(site=self.site.with_air(stated))
 
     def changed(self, **values: Any) -> Self:
-        """A copy with other `values` of attributes, which keeps all that this one has computed but its errors."""
+        """A copy with other `values` of attributes, which keeps all that this one has computed but its errors.
+
+        Raises AttributeError for a property: it is computed, or another terrain's.
+        """
+        for name in values:
+            if hasattr(getattr(type(self), name, None), "__set__"):
+                raise AttributeError(f"{name} of a {type(self).__name__} is a property: it cannot be changed")
         other = copy(self)
-        other.__dict__.pop("errors", None)  # of a class that keeps them
+        if isinstance(type(self).errors, cached_property):
+            other.__dict__.pop("errors", None)  # they are computed anew
         other.__dict__.update(values)
         return other
 
@@ -244,7 +252,7 @@ for _name in set(vars(Terrain)) - set(vars(ForwardingTerrain)):
 
 def with_refraction_error(ground: Terrain, error_1: float) -> Terrain:
     """The `ground` below stars whose refraction is larger than that of its air, relatively by `error_1`."""
-    return ground if error_1 == 0.0 or ground.air is None else MisrefractedGround(ground, ground.air, error_1)
+    return ground if error_1 == 0.0 or ground.air is None else MisrefractedGround(ground, error_1)
 
 
 class MisrefractedGround(ForwardingTerrain):
@@ -252,13 +260,14 @@ class MisrefractedGround(ForwardingTerrain):
 
     near, with_shape = Terrain.near, Terrain.with_shape
 
-    def __init__(self, whole: Terrain, air: Air, error_1: float) -> None:
+    def __init__(self, whole: Terrain, error_1: float) -> None:
         super().__init__(whole)
-        self._air, self._error_1 = air, error_1
+        self._error_1 = error_1
 
     def _lowered_rad(self, horizon_rad: Array) -> Array:
         """Elevations (...) [rad], in the order of the `horizon_rad` (...)."""
-        return np.asarray(horizon_rad - self._error_1 * self._air.lift_rad(horizon_rad))
+        air = self.whole.air
+        return np.asarray(horizon_rad if air is None else horizon_rad - self._error_1 * air.lift_rad(horizon_rad))
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation [rad]; see `Terrain`."""

@@ -3,12 +3,12 @@
 from startrack.applications.batch.find import (
     LOCK,
     Image,
+    image_tree,
     images_of_bag,
     images_under,
     listed_images,
     lock_results,
     maps_among,
-    names_under,
     record_path,
     result_stems,
 )
@@ -35,7 +35,7 @@ from startrack.applications.batch.task import (
 
 __all__ = [
     "JOB", "LOCK", "MANIFEST", "Image", "ImageDone", "Rows", "Task", "belongs_to_other_images", "has_parquet",
-    "images_of_bag", "images_under", "listed_images", "locate_image", "locate_images", "lock_results",
-    "maps_among", "names_under", "read_task", "record_path", "result_stems", "stored_record", "table_rows",
+    "image_tree", "images_of_bag", "images_under", "listed_images", "locate_image", "locate_images", "lock_results",
+    "maps_among", "read_task", "record_path", "result_stems", "stored_record", "table_rows",
     "table_values", "tabled_results", "text_of_name", "write_tables",
 ]  # fmt: skip

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path, PurePosixPath
+from typing import Literal
 
 from startrack.core.errors import BadInput
 from startrack.core.files import Locked, existing_folder, hold_lock
@@ -17,6 +19,8 @@ from startrack.output import PICTURES
 from startrack.terrain import is_geotiff
 
 LOCK = ".startrack-batch.lock"
+COARSE_S = 2.0  # steps of a folder's time on the coarsest file systems (FAT): a later change within one does not show
+RELIST_S = 10.0  # after which a folder is listed again whatever its time: some network file systems do not keep it
 
 
 @dataclass(frozen=True, order=True)
@@ -38,43 +42,26 @@ def images_of_bag(bag: str | os.PathLike[str], topic: str | None = None) -> list
 
 
 def images_under(folder: str | os.PathLike[str], excluded: str | os.PathLike[str] | None = None) -> list[Image]:
-    """Every image of the tree of a `folder` without the folder `excluded`, by name. Raises as `names_under`."""
+    """Every image of the tree, sorted by name.
+
+    Links to folders outside the tree are followed, each folder once. Hidden files and folders, the folder `excluded`
+    and anything but regular files are left out. Raises BadInput (bad_image) if `folder` is none.
+    """
+    root = existing_folder(folder)
     folders: dict[str, list[str]] = {}
-    for name in sorted(names_under(folder, excluded)):
+    for name in sorted(image_tree(root, excluded).changes()):
         folders.setdefault(str(PurePosixPath(name).parent), []).append(name)
     found = [
-        Image(name, (PurePosixPath(parent) / of_results).as_posix(), str(Path(folder) / name))
+        Image(name, (PurePosixPath(parent) / of_results).as_posix(), str(root / name))
         for parent, group in folders.items()
         for name, of_results in zip(group, result_stems(group), strict=True)
     ]
     return sorted(found)
 
 
-def names_under(folder: str | os.PathLike[str], excluded: str | os.PathLike[str] | None = None) -> list[str]:
-    """Paths of the images of the tree of a `folder`, relative to it, with / on every system.
-
-    Links to folders outside the tree are followed, each folder once, by its own name rather than by a link. Hidden
-    files and folders, the folder `excluded` and anything but regular files are left out. Raises BadInput (bad_image) if
-    `folder` is none.
-    """
-    root = existing_folder(folder)
-    top, left_out = os.path.realpath(root), None if excluded is None else os.path.realpath(excluded)
-    entered, found, waiting = {top}, list[str](), [root]
-    while waiting:
-        inside, here = list[Path](), waiting.pop()
-        with suppress(OSError), os.scandir(here) as entries:  # a folder that may not be read, or is gone
-            for one in sorted((one for one in entries if not one.name.startswith(".")), key=lambda one: one.name):
-                if one.is_dir():
-                    real = os.path.realpath(one.path)
-                    inside_by_link = one.is_symlink() and Path(real).is_relative_to(top)
-                    if real != left_out and real not in entered and not inside_by_link:
-                        entered.add(real)
-                        inside.append(here / one.name)
-                # A pipe would block the reader; a broken link is an image that will be refused.
-                elif _is_image(one.name) and (one.is_file() or not os.path.exists(one.path)):
-                    found.append((here / one.name).relative_to(root).as_posix())
-        waiting += inside[::-1]
-    return found
+def image_tree(folder: str | os.PathLike[str], excluded: str | os.PathLike[str] | None = None) -> ImageTree:
+    """The tree of a `folder` without the folder `excluded`. Raises BadInput (bad_image) if `folder` is none."""
+    return ImageTree(existing_folder(folder), None if excluded is None else os.path.realpath(excluded))
 
 
 def listed_images(
@@ -154,6 +141,78 @@ def lock_results(out: Path) -> Iterator[None]:
         except OSError as cause:
             raise BadInput("bad_image", f"{out / LOCK}: cannot be used as lock file ({cause.strerror})") from cause
         yield
+
+
+@dataclass(eq=False)
+class ImageTree:
+    """The images of the tree of a folder as they come: of its folders those are listed anew that may have changed.
+
+    Links to folders outside the tree are followed, each folder once, by its own name rather than by a link. Hidden
+    files and folders, the folder `excluded` (a real path) and anything but regular files are left out.
+    """
+
+    root: Path
+    excluded: str | None = None
+    _listed: dict[str, _Listing] = field(default_factory=dict)
+
+    def changes(self) -> list[str]:
+        """Paths, relative to the tree's folder, of the images in folders that were listed anew: at first of all."""
+        top = os.path.realpath(self.root)
+        entered, found, waiting = {top}, [], [self.root]
+        while waiting:
+            here = waiting.pop()
+            listing, is_new = self._listing(here)
+            if is_new:
+                found += [(here / name).relative_to(self.root).as_posix() for name in listing.images]
+            inside = []
+            for path in (here / name for name in listing.folders):
+                real = os.path.realpath(path)
+                inside_by_link = path.is_symlink() and Path(real).is_relative_to(top)
+                if real != self.excluded and real not in entered and not inside_by_link:
+                    entered.add(real)
+                    inside.append(path)
+            waiting += inside[::-1]
+        return found
+
+    def _listing(self, folder: Path) -> tuple[_Listing, bool]:
+        """What the folder holds, and whether it was listed anew."""
+        now, known = time.monotonic(), self._listed.get(str(folder))
+        try:
+            stamp = os.stat(folder).st_mtime_ns
+            is_same = known is not None and known.stamp == stamp
+            changed_s = known.changed_s if known is not None and is_same else now
+            if known is not None and is_same and now - changed_s > COARSE_S and now - known.listed_s < RELIST_S:
+                return known, False
+            with os.scandir(folder) as entries:
+                held = [one for one in entries if not one.name.startswith(".")]
+            kinds = {one.name: _kind_of(one) for one in held}
+            folders = sorted(name for name, kind in kinds.items() if kind == "folder")
+            images = [name for name, kind in kinds.items() if kind == "file" and _is_image(name)]
+            found = _Listing(stamp, now, changed_s, folders, images)
+        except OSError:  # a folder that may not be read, or is gone
+            found = _Listing(0, now, now, [], [])
+        self._listed[str(folder)] = found
+        return found, True
+
+
+@dataclass(frozen=True)
+class _Listing:
+    """What a folder held."""
+
+    stamp: int  # time of its last change [ns], by the clock of its file system
+    listed_s: float  # by the clock of this process
+    changed_s: float  # when the stamp was seen first
+    folders: list[str]
+    images: list[str]
+
+
+def _kind_of(entry: os.DirEntry[str]) -> Literal["folder", "file", "other"]:
+    """What an entry is, or leads to; a link that leads nowhere, or to itself, is a file that will be refused."""
+    if entry.is_symlink():
+        if os.path.isdir(entry.path):
+            return "folder"
+        return "file" if os.path.isfile(entry.path) or not os.path.exists(entry.path) else "other"
+    return "folder" if entry.is_dir() else "file" if entry.is_file() else "other"  # a pipe would block the reader
 
 
 def _is_image(name: str) -> bool:

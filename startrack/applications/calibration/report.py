@@ -69,8 +69,9 @@ def _report_html(calibration: Calibration, picture: bytes) -> str:
     ]
     scale = arcmin_per_px(camera)
     fit = calibration.joint.fit
+    count = len(image_rows(calibration))
     lead = (
-        f"{len(image_rows(calibration))} pictures, {int(fit.used.sum()):,} stars: {fit.held_out_rms_px:.2f} px "
+        f"{count} picture{'s' * (count != 1)}, {int(fit.used.sum()):,} stars: {fit.held_out_rms_px:.2f} px "
         f"({fit.held_out_rms_px * scale:.2f}') off at stars that the fit did not see; known to "
         f"{np.degrees(camera.calibrated_angle_rad):.1f}° off the axis."
     )
@@ -81,7 +82,7 @@ def _report_html(calibration: Calibration, picture: bytes) -> str:
     main = (
         f'<div class="title"><h1>Calibration of {html.escape(camera.name)}</h1>'
         f"{_verdict(calibration.accepted, 'accepted' if calibration.accepted else 'refused')}</div>"
-        f'<p class="lead">{lead.replace("1 pictures", "1 picture")}</p>{refused}'
+        f'<p class="lead">{lead}</p>{refused}'
         + _card("Checks", _checks_table(calibration))
         + _card("Errors", image + _rings_table(calibration))
         + _card(

@@ -44,8 +44,9 @@ def run(args: argparse.Namespace) -> int:
 
 def _measure(args: argparse.Namespace) -> Outcome:
     """The record and the line of a skyline that was measured and written."""
-    outputs = _outputs(args)
+    outputs, picture = _outputs(args)
     horizon.check_outputs(*outputs, overwrite=args.overwrite)
+    horizon.check_outputs(*picture, overwrite=True)
     done: list[str] = []
     with stating_work(lambda: done[-1] if done else "no image was identified"), limited_time(args.time_limit):
         exposures = read_each_once(args)
@@ -70,6 +71,7 @@ def _measure(args: argparse.Namespace) -> Outcome:
             print_left_out(left_out if frames else ())  # else the refusal names them
             found = horizon.measure_frames(frames, left_out, site, begin)
     files = horizon.write_skyline(found.skyline, site, found.frames, *outputs, overwrite=args.overwrite)
+    files += horizon.write_skyline(found.skyline, site, found.frames, *picture, overwrite=True)
     unknown = int((~found.skyline.known).sum())
     varying = int((found.skyline.source == "varies").sum())
     interpolates = unknown and any(map(horizon.needs_all_azimuths, args.output))
@@ -88,12 +90,15 @@ def _measure(args: argparse.Namespace) -> Outcome:
     return record, line
 
 
-def _outputs(args: argparse.Namespace) -> list[str]:
-    """The paths of -o, in the folder of -D, and that of the picture beside the first, where none of them is one."""
+def _outputs(args: argparse.Namespace) -> tuple[list[str], list[str]]:
+    """The paths of -o, in the folder of -D, and that of the picture beside the first, where none of them is one.
+
+    The picture replaces one of an earlier run: nobody named it.
+    """
     outputs = [os.path.join(args.dir or "", output) for output in args.output]
     if args.no_plots or any(output.lower().endswith(".png") for output in outputs):
-        return outputs
-    return [*outputs, f"{outputs[0].rstrip('/')}.png"]
+        return outputs, []
+    return outputs, [f"{outputs[0].rstrip('/')}.png"]
 
 
 def _count_text(images: int) -> str:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from startrack.applications import tracking
-from startrack.applications.batch import images_under, names_under
+from startrack.applications.batch import image_tree, images_under
 from startrack.applications.tracking import FrameStore, ObservedFrame, Odometry, OdometryFile, Track, TrackSession
 from startrack.catalog import load_catalog
 from startrack.chain import Settings
@@ -130,6 +130,7 @@ class TrackRun:
     def follow(self) -> None:
         """Take images as they come; Ctrl-C and SIGTERM end it, before the first image with the code of a stop."""
         folder = self.args.frames[0]
+        tree = image_tree(folder, self.args.dir)
         load_catalog()  # before the first image comes
         prepare_reference(self.args.terrain, self.args)
         former = signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -146,7 +147,7 @@ class TrackRun:
 
         try:
             for path in tracking.follow_images(
-                lambda: [os.path.join(folder, name) for name in names_under(folder, self.args.dir)],
+                lambda: [os.path.join(folder, name) for name in tree.changes()],
                 take,
                 lambda path, cause: self._refuse(forget(path), cause),
                 until_idle_s=self.args.until_idle,
@@ -241,12 +242,13 @@ class TrackRun:
             east_m, north_m, radius_m = (record[f"{prefix}{key}"] for key in ("east_m", "north_m", "radius95_m"))
             is_known = east_m is not None and radius_m is not None
             place = f"E {east_m:.1f} m  N {north_m:.1f} m  ±{radius_m:.1f} m (95 %)" if is_known else "no position"
+            notes = ["after a slip"] * record["slipped"] + ["outside the odometry"] * record["outside_odometry"]
             if record["status"] == "refused" and not is_known:
-                self._print_refusal(record["image"], record["reason"], record["message"], to_stdout=True)
+                message = "; ".join([record["message"], *notes])
+                self._print_refusal(record["image"], record["reason"], message, to_stdout=True)
                 continue
             why = f"  {record['reason']}: {record['message']}" if record["reason"] else ""
-            slip = "  after a slip" if record["slipped"] else ""
-            slip += "  outside the odometry" if record["outside_odometry"] else ""
+            slip = "".join(f"  {note}" for note in notes)
             search = "  search: beam" if record["search"] == "beam" else ""
             status = record["status"].replace("_", " ")
             print(f"{printable(record['image'])}  {status}  {place}{search}{slip}{why}", flush=True)

@@ -247,7 +247,7 @@ def test_a_users_own_terrain_is_searched():
 def test_a_users_own_errors_stay_under_other_air():
     terrain = FacingWall()
     terrain.site = Site("earth", np.radians(46.0), np.radians(9.0), 1600.0)
-    terrain.errors = GroundErrors(common_sigma_rad=1e-3)
+    terrain.errors = GroundErrors()
     other = terrain.with_air({"pressure_hpa": 700.0})
     assert other.errors is terrain.errors and other.air != terrain.air
 

@@ -65,7 +65,7 @@ POSITION_QUANTITIES: tuple[Quantity, ...] = (
       shown=(Show("text", "error", ", {:.1f} m (99.9 %)"), Show("notebook", "99.9 % within", "{:.1f} m"),
              Show("page", "99.9 % within", "{:,.1f} m"))),
     Q("position.wide_tail", "m", Positioned, values.wide_tail_m,
-      f"the 99.9 % circle, where it is {values.WIDE_TAIL:g} times that of 95 % or more", derived=True,
+      f"the 99.9 % circle, where it is more than {values.WIDE_TAIL:g} times that of 95 %", derived=True,
       shown=(Show("summary", "radius", ", {:.1f} m (99.9 %)"),)),
     Q("position.protection_level_m", "m", values.has_position,
       lambda v: None if v.fix.integrity is None else v.fix.integrity.protection_level_m,

@@ -155,7 +155,7 @@ def ellipse(at: At) -> tuple[float, float, float] | None:
 
 
 def wide_tail_m(at: At) -> float | None:
-    """The radius of the 99.9 % circle, where it is WIDE_TAIL times that of 95 % or more; else None."""
+    """The radius of the 99.9 % circle, where it is more than WIDE_TAIL times that of 95 %; else None."""
     radius95_m, radius999_m = at("position.radius95_m"), at("position.radius999_m")
     is_wide = radius95_m is not None and radius999_m is not None and radius999_m > WIDE_TAIL * radius95_m
     return float(radius999_m) if is_wide else None

@@ -7,7 +7,7 @@ import json
 import platform
 import textwrap
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
@@ -89,30 +89,31 @@ def print_check(check: dict[str, Any]) -> None:
 
 def extra_lines() -> list[str]:
     """A line for each extra: a star and the versions of its packages, or a dash and how to install it."""
-    lines = []
-    for extra, (names, purpose) in OPTIONAL.items():
-        try:
-            mark, state = "*", _versions(names)
-        except metadata.PackageNotFoundError:
-            mark, state = "-", how_to_install(extra)
-        lines.append(f"{mark} {extra:<{max(map(len, OPTIONAL))}} {purpose}: {state}")
-    return lines
-
-
-def _versions(names: tuple[str, ...]) -> str:
-    return ", ".join(f"{name} {metadata.version(name)}" for name in names)
+    wide = max(map(len, OPTIONAL))
+    return [
+        f"{'*' if state else '-'} {extra:<{wide}} {purpose}: {state or how_to_install(extra)}"
+        for extra, purpose, state in _states_of_extras()
+    ]
 
 
 def _extras() -> str:
     """Each extra with the versions of its packages; one that is missing is no failure."""
-    texts = []
+    return "; ".join(
+        f"{extra} ({purpose}): {state or 'not installed'}" for extra, purpose, state in _states_of_extras()
+    )
+
+
+def _states_of_extras() -> Iterator[tuple[str, str, str]]:
+    """Name and purpose of each extra, and the versions of its packages; "" where one is missing."""
     for extra, (names, purpose) in OPTIONAL.items():
         try:
-            state = _versions(names)
-        except metadata.PackageNotFoundError as cause:
-            state = f"not installed ({cause.name})"
-        texts.append(f"{extra} ({purpose}): {state}")
-    return "; ".join(texts)
+            yield extra, purpose, _versions(names)
+        except metadata.PackageNotFoundError:
+            yield extra, purpose, ""
+
+
+def _versions(names: tuple[str, ...]) -> str:
+    return ", ".join(f"{name} {metadata.version(name)}" for name in names)
 
 
 def _catalogue() -> str:

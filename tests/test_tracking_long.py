@@ -10,7 +10,7 @@ from tracking_helpers import SHARED, attitudes, observed, odometry_of, shifted, 
 
 from startrack.applications.tracking import ObservedFrame, Odometry, TrackSession, estimate_track
 from startrack.applications.tracking import session as session_module
-from startrack.applications.tracking.explanations import BEGINS, CONTINUES, explain
+from startrack.applications.tracking.explanations import BEGINS, CONTINUES, MOST_WAITING, explain
 from startrack.applications.tracking.explanations import WINDOW as SETTLED_AFTER
 from startrack.applications.tracking.moves import Moves, odometry_moves
 from startrack.applications.tracking.positions import OnlineTrack, filter_positions
@@ -204,3 +204,11 @@ def test_odometry_of_which_two_scales_are_likely_keeps_its_errors(monkeypatch):
             if k > 25 and np.isfinite(off).all():
                 nees.append(off @ np.linalg.solve(one.filtered.covariance_m2[0], off))
     assert np.mean(nees) < 2.8
+
+
+def test_a_long_run_of_refused_frames_does_not_grow():
+    """As by day: frames before it are settled although no other one with a position has come."""
+    drive = simulate_drive(np.random.default_rng(24), 20 * WINDOW)
+    modes = [(one,) if k < WINDOW else () for k, one in enumerate(drive.estimates)]
+    *_, last = followed(modes, [Moves.of(drive.steps)])
+    assert len(last.compared._frames) == MOST_WAITING * WINDOW

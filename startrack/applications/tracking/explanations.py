@@ -31,6 +31,7 @@ FOREIGN_SIGMA_M = 5000.0  # of a position anywhere in a search area, about its m
 MIXED_PROBABILITY, MIXED_PART = 1e-3, 0.1  # of a set with images from elsewhere, and how many of its images these are
 LEAST_VARIANT = 0.01  # part of an explanation's probability, by other moves, that counts in its positions
 WINDOW = 200  # frames with a position, of a live track, that are not settled
+MOST_WAITING = 10  # times as many frames wait at most, refused ones included: memory stays flat
 SETTLED_DOUBT = 1e-3  # probability of explanations that take a frame otherwise, from which on it is not settled
 KEPT_NATS, MOST_KEPT = 60.0, 60  # of explanations beside the best, and for each kind of odometry
 OF_MOVE = "delta_m", "sigma_m", "freedom_m"
@@ -156,8 +157,12 @@ class Explanations:
             wrong.log_likelihood += doubt[known]
             branches = [right, wrong]
         self._found = self._likeliest(Branches.join(branches))
-        while sum(map(bool, self._frames)) > self.window and self._settle():
+        while self._has_overflown() and self._settle():
             pass
+
+    def _has_overflown(self) -> bool:
+        """Whether more frames wait than the window has, with a position or, after many refusals, at all."""
+        return sum(map(bool, self._frames)) > self.window or len(self._frames) > MOST_WAITING * self.window
 
     @property
     def settled(self) -> int:

@@ -124,6 +124,15 @@ def test_the_ground_behind_an_obstacle_says_nothing():
     assert not light.llr[behind].any()
 
 
+def test_obstacles_that_are_scanned_anew_count(tmp_path):
+    text = (ROOT / "terrain" / "shackleton-thesis.toml").read_text(encoding="utf-8")
+    (tmp_path / "ground.toml").write_text('obstacles = "deck.csv"\n' + text)
+    for elevation_deg in (30.0, 40.0):
+        (tmp_path / "deck.csv").write_text(f"azimuth_deg,elevation_deg\n0,{elevation_deg}\n10,{elevation_deg}\n")
+        found = load_terrain(tmp_path / "ground.toml").file.obstacles
+        assert hides(found, 5.0, elevation_deg - 1.0) and not hides(found, 5.0, elevation_deg + 1.0)
+
+
 def test_terrain_sidecar_and_camera_name_the_same_obstacles(tmp_path):
     shutil.copy(IMAGE, tmp_path / "image.png")
     sidecar = json.loads(IMAGE.with_suffix(".json").read_text()) if IMAGE.with_suffix(".json").exists() else {}

@@ -177,19 +177,19 @@ def load_terrain(name_or_path: str | Path) -> Terrain:
     path = resolve_named(name_or_path, "terrain", "bad_terrain")
     text = read_text(path, "bad_terrain")
     try:
-        return _load_cached(path.absolute(), text, _map_stamps(path.parent, read_keys(text)))
+        return _load_cached(path.absolute(), text, _file_stamps(path.parent, read_keys(text)))
     except BadInput as cause:
         reason = cause.reason if cause.reason is Reason.OUT_OF_MEMORY else "bad_terrain"
         raise BadInput(reason, f"{printable(path)}: {cause}") from cause
 
 
 def files_of_terrain(path: str | Path) -> tuple[Path, ...]:
-    """The files that the terrain of the file at `path` is read from, beside it; where it cannot be loaded, its maps."""
+    """The files that the terrain of the file at `path` is read from, beside it; also where it cannot be loaded."""
     try:
         return load_terrain(path).file.paths
     except BadInput:  # refused when it is used; a map that is missing may come
         with suppress(BadInput):
-            return _files_of_maps(read_keys(read_text(path, "bad_terrain")), Path(path).parent)
+            return _files_beside(read_keys(read_text(path, "bad_terrain")), Path(path).parent)
         return ()
 
 
@@ -231,21 +231,22 @@ def _map_files(keys: dict[str, Any], folder: Path) -> list[Path]:
     return paths_of(ground.get("file", ()), folder)
 
 
-def _files_of_maps(keys: dict[str, Any], folder: Path) -> tuple[Path, ...]:
-    """Paths of the files that the maps of the keys are read from: masks and labels of some stand beside them."""
+def _files_beside(keys: dict[str, Any], folder: Path) -> tuple[Path, ...]:
+    """Paths of the files that the keys name: obstacles, and maps with the masks and labels that stand beside some."""
+    obstacles = [folder / keys["obstacles"]] if "obstacles" in keys else []
     maps = _map_files(keys, folder)
     if not maps:
-        return ()
+        return tuple(obstacles)
     from startrack.terrain.maps.reading import files_of_map
 
-    return tuple(dict.fromkeys(file for path in maps for file in files_of_map(path)))
+    return tuple(dict.fromkeys([*(file for path in maps for file in files_of_map(path)), *obstacles]))
 
 
-def _map_stamps(folder: Path, keys: dict[str, Any]) -> tuple[Any, ...]:
-    """Values that change when one of the maps does."""
+def _file_stamps(folder: Path, keys: dict[str, Any]) -> tuple[Any, ...]:
+    """Values that change when one of the files beside does."""
     stamps: list[tuple[Any, ...]] = []
-    for path in _files_of_maps(keys, folder):
-        with suppress(OSError, ValueError):  # `read_map` reports it
+    for path in _files_beside(keys, folder):
+        with suppress(OSError, ValueError):  # who reads it reports it
             status = path.stat()
             stamps.append((path.name, status.st_ino, status.st_size, status.st_mtime_ns))
     return tuple(stamps)
@@ -274,12 +275,10 @@ def terrain_from_dict(values: dict[str, Any], default_name: str = "terrain", fol
 
 def _file_facts(keys: dict[str, Any], folder: Path) -> TerrainFile:
     """What the `keys` of a terrain file in a `folder` state beside the ground. Raises BadInput bad_terrain."""
-    paths, obstacles, brightness = _files_of_maps(keys, folder), None, keys.get("ground", {}).get("brightness")
-    if "obstacles" in keys:
-        file = folder / keys["obstacles"]
-        paths, obstacles = (*paths, file), read_obstacles(file, "bad_terrain")
+    brightness = keys.get("ground", {}).get("brightness")
+    obstacles = read_obstacles(folder / keys["obstacles"], "bad_terrain") if "obstacles" in keys else None
     light = None if brightness is None else GroundBrightness.of(brightness)
-    return TerrainFile(paths=paths, obstacles=obstacles, ground_brightness=light)
+    return TerrainFile(paths=_files_beside(keys, folder), obstacles=obstacles, ground_brightness=light)
 
 
 @dataclass(frozen=True)

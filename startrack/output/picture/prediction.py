@@ -104,9 +104,11 @@ def _draw_scale(
         y = top + float(np.interp(np.log(radius_m), np.log(ends_m), [0, SCALE_PX - 1]))
         if all(abs(y - other) > TEXT_PX for other in occupied):
             occupied.append(y)
+            words = length_text(radius_m, 3)
             if radius_m in bounds_m:
+                words = f"{radius_m:g} m"  # as beside the contour
                 canvas.line([(left, y), (left + TEXT_PX, y)], Ink.PAPER, 2)
-            canvas.text((left + 1.6 * TEXT_PX, y), length_text(radius_m), anchor="lm")
+            canvas.text((left + 1.6 * TEXT_PX, y), words, anchor="lm")
     return top + SCALE_PX + TEXT_PX
 
 

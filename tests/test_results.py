@@ -39,6 +39,13 @@ def test_each_result_has_its_place_and_a_command_that_exists(results):
             assert "text" in block or all(len(row) == len(block["head"]) for row in block["rows"]), one.section
 
 
+def test_a_repeated_benchmark_stores_its_result(results):
+    run = importlib.import_module("run")
+    for one in results.stored_results():
+        needs_flag = "args.write" in one.benchmark.read_text(encoding="utf-8")
+        assert ("--write" in run.storing_command(one)) == needs_flag, one.section
+
+
 def test_a_result_is_marked_when_its_sources_change_and_no_other_is(results, sources, monkeypatch):
     """As if a line of the detector were another one."""
     detector = ROOT / "startrack/detection/detector.py"

@@ -20,7 +20,7 @@ ERF_COEFFICIENTS = tuple(
 
 
 def pixel_profile(offset_px: Array, sigma_px: float | Array, radius: int) -> tuple[Array, Array]:
-    """1-D pixel-integrated Gaussian (n, 2 radius + 1) and its derivative with respect to the offset.
+    """Pixel-integrated 1-D Gaussian (n, 2 radius + 1) and its derivative with respect to the offset.
 
     P_j = Phi((j + 1/2 - offset) / sigma) - Phi((j - 1/2 - offset) / sigma), j = -radius..radius, for the offsets (n,)
     of the centre from the stamp's middle pixel [px]; `sigma_px` is a number or (n,). The 2-D PSF is the product of two.
@@ -34,7 +34,7 @@ def pixel_profile(offset_px: Array, sigma_px: float | Array, radius: int) -> tup
 
 
 def pixel_profile_single(offset_px: Array, sigma_px: float | Array, radius: int) -> tuple[Single, Single]:
-    """`pixel_profile` in single precision (to 1e-6), in a fifth of the time.
+    """Profiles and derivatives of `pixel_profile` in single precision (to 1e-6), in a fifth of the time.
 
     The error function from the exponential that the derivative needs anyway (Abramowitz & Stegun 1964, 7.1.26).
     """
@@ -66,7 +66,7 @@ def pixel_profile_table(sigma_px: float, radius: int) -> Array:
 
 
 def filter_kernel(sigma_px: float) -> NDArray[np.float32]:
-    """1-D matched-filter kernel (2 r + 1,) of a centred star."""
+    """Matched-filter kernel (2 r + 1,) of a centred star, along one axis."""
     radius = stamp_radius(sigma_px)
     return pixel_profile(np.zeros(1), sigma_px, radius)[0][0].astype(np.float32)
 
@@ -77,6 +77,6 @@ def stamp_radius(sigma_px: float) -> int:
 
 
 def noise_area_px(sigma_px: float) -> float:
-    """1 / sum P^2 [px]: background pixels whose noise a matched filter collects (4 pi sigma^2 for a wide PSF)."""
+    """Area 1 / sum P^2 [px]: background pixels whose noise a matched filter collects (4 pi sigma^2 for a wide PSF)."""
     kernel = filter_kernel(sigma_px).astype(np.float64)
     return float(1.0 / np.square(np.sum(kernel**2)))

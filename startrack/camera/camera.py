@@ -26,7 +26,7 @@ SQUARE_PIXEL_SIGMA_1 = 1e-7  # relative sigma of fx / fy where they are fitted a
 
 @dataclass(frozen=True)
 class Decentring:
-    """(du, dv) = (2 p1 s t + p2 (a^2 + 2 s^2), p1 (a^2 + 2 t^2) + 2 p2 s t), in focal lengths.
+    """Shift by a decentred lens: (du, dv) = (2 p1 s t + p2 (a^2 + 2 s^2), p1 (a^2 + 2 t^2) + 2 p2 s t) [focal lengths].
 
     (s, t) = a (cos b, sin b), a the angle off the axis [rad]; added to rho (cos b, sin b). Brown's tangential
     distortion on the angles of a fisheye, as in COLMAP's THIN_PRISM_FISHEYE.
@@ -41,7 +41,7 @@ class Decentring:
         return bool(self.p1 or self.p2)
 
     def shift(self, st: Array) -> Array:
-        """(du, dv) (..., 2) at the angles `st` = (s, t) (..., 2) [rad]."""
+        """Shift (du, dv) (..., 2) [focal lengths] at the angles `st` = (s, t) (..., 2) [rad]."""
         s, t = st[..., 0], st[..., 1]
         a2 = s * s + t * t
         return np.stack(
@@ -50,7 +50,7 @@ class Decentring:
         )
 
     def gradient(self, st: Array) -> Array:
-        """d (du, dv) / d (s, t) (..., 2, 2), symmetric, at the angles `st` (..., 2) [rad]."""
+        """Derivative d (du, dv) / d (s, t) (..., 2, 2), symmetric, at the angles `st` (..., 2) [rad]."""
         s, t = st[..., 0], st[..., 1]
         across = 2 * (self.p1 * s + self.p2 * t)
         return np.stack(
@@ -83,7 +83,7 @@ class Decentring:
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
-    """Sensor and whole optics: from light to numbers."""
+    """Sensor and whole optics: what turns light into numbers."""
 
     zero_point_e_per_s: float  # electrons per second of a V = 0 star on the axis, whole PSF
     gain_e_per_adu: float = 1.0
@@ -138,7 +138,7 @@ class Camera:
 
     @property
     def handed_focal_px(self) -> tuple[float, float]:
-        """(fx, fy), fx negative if the image is mirrored."""
+        """Focal lengths fx and fy [px], fx negative if the image is mirrored."""
         return (-self.focal_px[0] if self.mirrored else self.focal_px[0]), self.focal_px[1]
 
     def project(self, rays_cam: Array) -> tuple[Array, Bools]:
@@ -160,6 +160,7 @@ class Camera:
         return self._pixels(rays_cam, off_axis, angle, self.lens.rho(angle))
 
     def _pixels(self, rays_cam: Array, off_axis: Array, angle_rad: Array, rho: Array) -> Array:
+        """Pixels (..., 2) of `rays_cam` (..., 3) with the angle (...) [rad] off the axis and its radius `rho` (...)."""
         per_off_axis = 1.0 / np.where(off_axis > 0, off_axis, 1.0)
         scale = rho * per_off_axis
         u, v = scale * rays_cam[..., 0], scale * rays_cam[..., 1]
@@ -186,7 +187,7 @@ class Camera:
         return self.lens.angle_rad(length_xy(*self.radial(px)))
 
     def radial(self, px: Array) -> tuple[Array, Array]:
-        """u, v = rho (cos b, sin b) of the pixels `px` (..., 2), decentring removed."""
+        """Image points u, v (...) [focal lengths] of pixels `px` (..., 2): rho (cos b, sin b), decentring removed."""
         px = np.asarray(px, dtype=np.float64)
         fx, fy = self.handed_focal_px
         u, v = (px[..., 0] - self.centre_px[0]) / fx, (px[..., 1] - self.centre_px[1]) / fy
@@ -196,7 +197,7 @@ class Camera:
         return u, v
 
     def jacobian_px_per_rad(self, rays_cam: Array) -> Array:
-        """d px / d w (..., 2, 3) for a small rotation w of the unit `rays_cam` (..., 3): ray -> ray + w x ray.
+        """Derivative d px / d w (..., 2, 3) by a rotation w of the unit `rays_cam` (..., 3): ray -> ray + w x ray.
 
         From x_px = cx + fx rho(a) u with u = (x, y) / s, s = sin a:  d(rho u) = u rho' da + (rho / s) v (v . d(x, y)),
         v across u, da = z u . d(x, y) - s dz.
@@ -245,7 +246,7 @@ class Camera:
 
 
 def _polar_by_ray(along: Array, across: Array, down: Array, ux: Array, uy: Array) -> Array:
-    """d (r u) / d ray (2, 3, ...), u = (ux, uy) the direction off the axis: across u it changes by `across`."""
+    """Derivative (2, 3, ...) of r u by the ray, u = (ux, uy): `along` u, `across` it, and -`down` u along the axis."""
     mixed = (along - across) * ux * uy
     return np.array([
         [along * ux * ux + across * uy * uy, mixed, -down * ux],
@@ -254,7 +255,7 @@ def _polar_by_ray(along: Array, across: Array, down: Array, ux: Array, uy: Array
 
 
 def lens_jacobian(camera: Camera, rays_cam: Array, order: tuple[str, ...]) -> Array:
-    """d px / d parameter (..., 2, m) of a camera at `rays_cam` (..., 3), for the m parameters named in `order`.
+    """Derivatives d px / d parameter (..., 2, m) at `rays_cam` (..., 3), for the m parameters of `camera` in `order`.
 
     Names: f (both focal lengths, their ratio kept), fx, fy, cx, cy, those of the lens (k1 to k4), and p1 and p2 of the
     decentring [px per px, or px per 1]. Raises ValueError for a name that the lens does not have.
@@ -339,7 +340,7 @@ def projection_covariance_px2(camera: Camera, rays_cam: Array) -> Array:
 
 
 def with_update(camera: Camera, step: Mapping[str, float]) -> Camera:
-    """The camera with `step` added to its parameters, by name; the lens keeps those that are not named."""
+    """Copy of the `camera` with `step` added to its parameters, by name; parameters that are not named stay."""
     fx, fy = camera.focal_px
     scale = 1.0 + step.get("f", 0.0) / fx
     p1, p2 = camera.decentring.p1 + step.get("p1", 0.0), camera.decentring.p2 + step.get("p2", 0.0)
@@ -353,7 +354,7 @@ def with_update(camera: Camera, step: Mapping[str, float]) -> Camera:
 
 
 def with_covariance(camera: Camera, free: tuple[str, ...], covariance: Array) -> Camera:
-    """The camera with the covariance (m, m) of its free parameters; f becomes fx and fy; fy may be free too."""
+    """Copy of `camera` with the `covariance` (m, m) of `free` parameters; f becomes fx and fy; fy may be free too."""
     if free[0] == "fx":
         return replace(camera, covariance_order=free, covariance=0.5 * (covariance + covariance.T))
     names = ("fx", "fy", *(name for name in free if name not in ("f", "fy")))

@@ -39,7 +39,7 @@ SHOWN_PARTS = 6  # cameras named in a refusal
 
 
 class Part(NamedTuple):
-    """One camera of a file: its name there, the size of its pictures as text, and its content."""
+    """A camera in a file of another program: its name there, the size of its pictures as text, and its content."""
 
     name: str
     size: str
@@ -55,7 +55,7 @@ def matrix_of(camera: Camera) -> list[float]:
 def keys_of(
     size_px: Sequence[Any], focal_px: tuple[float, float], centre_px: tuple[float, float], k: Coefficients
 ) -> dict[str, Any]:
-    """The keys of a camera file."""
+    """Keys of a camera file: size, focal lengths, centre [px], and coefficients `k` of the lens (None: a pinhole)."""
     keys = {"size_px": tuple(map(int, size_px)), "focal_px": focal_px, "centre_px": centre_px}
     if k is None:
         return {**keys, "model": Pinhole.model}
@@ -63,7 +63,7 @@ def keys_of(
 
 
 def read_numbers(values: Any, count: int, key: str) -> list[float]:
-    """`count` finite numbers. Raises ValueError naming the key."""
+    """List of `count` finite numbers that a `key` holds. Raises ValueError naming the key."""
     if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != count:
         raise ValueError(f"{key} must be {count} numbers")
     numbers = [float(v) for v in values]
@@ -75,7 +75,7 @@ def read_numbers(values: Any, count: int, key: str) -> list[float]:
 def read_distortion(
     model: str, coefficients: Any, fisheyes: tuple[str, ...], pinholes: tuple[str, ...]
 ) -> tuple[float, ...] | None:
-    """k1 to k4 of a fisheye `model`, None for a pinhole without distortion. Raises ValueError for any other."""
+    """Coefficients k1 to k4 of a fisheye `model`, None for a pinhole without distortion; else raises ValueError."""
     if model in fisheyes:
         return tuple(read_numbers(coefficients, MAX_COEFFICIENTS, "distortion coefficients"))
     if model not in pinholes:
@@ -107,7 +107,7 @@ def read_yaml(text: str) -> list[dict[str, Any]]:
 
 
 def yaml_list(values: Sequence[float]) -> str:
-    """A list in one line of YAML, numbers to the last digit."""
+    """Text of a list in one line of YAML, numbers to the last digit."""
     import yaml
 
     return str(yaml.safe_dump([float(v) for v in values], default_flow_style=True, width=math.inf)).strip()
@@ -129,7 +129,7 @@ def read_xml(text: str) -> dict[str, Any]:
 
 
 def write_ros(camera: Camera, k: Coefficients) -> str:
-    """A camera_info file (camera_calibration_parsers): equidistant for fisheyes, plumb_bob for pinholes."""
+    """Text of a camera_info file (camera_calibration_parsers): equidistant for fisheyes, plumb_bob for pinholes."""
     model, coefficients = ("plumb_bob", (0.0,) * 5) if k is None else ("equidistant", k)
     (fx, fy), (cx, cy) = camera.focal_px, camera.centre_px
     name = json.dumps(camera.name, ensure_ascii=False)  # a JSON string is one of YAML
@@ -145,7 +145,7 @@ def write_ros(camera: Camera, k: Coefficients) -> str:
 
 
 def split_ros(text: str) -> list[Part]:
-    """The camera_info of a file, or those printed from a topic, whose keys ROS 1 writes in capitals.
+    """Cameras of a camera_info file, or of messages printed from a topic, whose keys ROS 1 writes in capitals.
 
     Names are their numbers; the message's header does not count.
     """
@@ -162,9 +162,9 @@ def split_ros(text: str) -> list[Part]:
 
 
 def read_ros(d: dict[str, Any], _angle_rad: float | None) -> dict[str, Any]:
-    """A camera_info. Width, height and matrix are of the whole sensor: region of interest, then binning, are applied.
+    """Keys of a camera file from a camera_info `d`, whose width, height and matrix are of the whole sensor.
 
-    A pixel of the picture covers pixels of the sensor: its centre is between theirs.
+    Region of interest, then binning, are applied: the centre of a binned pixel is between those of the sensor's.
     """
     coefficients = read_distortion(
         d["distortion_model"], d["d"], ("equidistant", "fisheye"), ("plumb_bob", "rational_polynomial")
@@ -196,12 +196,12 @@ def read_ros(d: dict[str, Any], _angle_rad: float | None) -> dict[str, Any]:
 
 
 class Format(NamedTuple):
-    """The camera files of one program.
+    """The format of one program's camera files.
 
     `write` takes a camera and the coefficients of its fisheye, None for a pinhole; None where a file holds a pointing
-    too. `split` finds the cameras of a text; `read` gives of one's content, and of the calibrated angle [rad] (None:
-    not stated), the keys of our own camera file, beside them `R_body_cam` where there is a mount and `notes` on what
-    was chosen or left out, and no angles. Both raise ValueError, LookupError, TypeError or AttributeError.
+    too. `split` finds the cameras of a text; `read` gives, from the content of one and from the calibrated angle [rad]
+    (None: not stated), the keys of our own camera file, beside them `R_body_cam` where there is a mount and `notes` on
+    what was chosen or left out, and no angles. Both raise ValueError, LookupError, TypeError or AttributeError.
     """
 
     title: str
@@ -249,7 +249,7 @@ def choose_part(program: str, text: str, wanted: str | None) -> Any:
 
 
 def _write_kalibr(camera: Camera, k: Coefficients) -> str:
-    """A camchain of one camera, cam0: pinhole with equidistant distortion for fisheyes; the mount as T_cam_imu."""
+    """Text of a camchain of one camera, cam0: equidistant distortion for fisheyes; the mount as T_cam_imu."""
     model, coefficients = ("radtan", (0.0,) * 4) if k is None else ("equidistant", k)
     rows = "".join(f"  - {yaml_list([*row, 0.0])}\n" for row in np.asarray(camera.R_body_cam).T.tolist())
     return (
@@ -269,7 +269,7 @@ def _split_kalibr(text: str) -> list[Part]:
 
 
 def _read_kalibr(d: dict[str, Any], _angle_rad: float | None) -> dict[str, Any]:
-    """One camera of a camchain."""
+    """Keys of a camera file from one camera `d` of a camchain."""
     if d["camera_model"] != "pinhole":
         raise ValueError(f"camera_model {d['camera_model']!r} has no counterpart")
     fx, fy, cx, cy = read_numbers(d["intrinsics"], 4, "intrinsics")
@@ -289,7 +289,7 @@ def _read_kalibr(d: dict[str, Any], _angle_rad: float | None) -> dict[str, Any]:
 
 
 def _write_colmap(camera: Camera, k: Coefficients) -> str:
-    """A cameras.txt file of one camera: PINHOLE, OPENCV_FISHEYE, or THIN_PRISM_FISHEYE where the lens is decentred."""
+    """Text of a cameras.txt of one camera: PINHOLE, OPENCV_FISHEYE, or THIN_PRISM_FISHEYE for a decentred lens."""
     (fx, fy), (cx, cy), bent = camera.focal_px, camera.centre_px, camera.decentring
     values = [fx, fy, cx + CORNER_PX, cy + CORNER_PX]
     model = "PINHOLE"
@@ -314,7 +314,7 @@ def _split_colmap(text: str) -> list[Part]:
 
 
 def _read_colmap(content: list[str], _angle_rad: float | None) -> dict[str, Any]:
-    """One camera of a cameras.txt file, from its words after the number."""
+    """Keys of a camera file from the words after the number in a line of cameras.txt."""
     model, width, height, *words = content
     values = [float(word) for word in words]
     if len(values) != COLMAP_COUNTS.get(model, -1):
@@ -334,7 +334,7 @@ def _read_colmap(content: list[str], _angle_rad: float | None) -> dict[str, Any]
 
 
 def _write_opencv(camera: Camera, k: Coefficients) -> str:
-    """OpenCV's FileStorage as YAML, with the keys of its calibration program.
+    """Text of OpenCV's FileStorage in YAML, with the keys of its calibration program.
 
     fisheye_model = 1: cv2.fisheye's four coefficients, which are k1 to k4. cv2.fisheye itself mirrors rays past 90
     degrees: the numbers are right, that program's geometry there is not.
@@ -359,7 +359,7 @@ def _split_opencv(text: str) -> list[Part]:
 
 
 def _read_opencv(d: dict[str, Any], _angle_rad: float | None) -> dict[str, Any]:
-    """The camera of a FileStorage."""
+    """Keys of a camera file from the entries `d` of a FileStorage."""
     arrays = []
     for key, counts in (("camera_matrix", (9,)), (OPENCV_DISTORTION, OPENCV_COUNTS)):
         count = int(d[key]["rows"]) * int(d[key]["cols"])

@@ -130,7 +130,7 @@ def save_camera(camera: Camera, path: str | Path) -> None:
 
 
 def camera_text(camera: Camera, folder: Path | None = None) -> str:
-    """The camera file as text; its mask as seen from the `folder` of the file (None: the current one)."""
+    """Text of the `camera`'s file; mask and obstacles as seen from the `folder` of the file (None: the current one)."""
     import tomli_w
 
     values = camera_to_dict(camera)
@@ -143,8 +143,8 @@ def camera_text(camera: Camera, folder: Path | None = None) -> str:
 def camera_from_dict(d: dict[str, Any], default_name: str = "camera", folder: Path | None = None) -> Camera:
     """The camera of the keys `d` of a camera file, called `default_name` if they have no name.
 
-    The path of a mask is relative to `folder` (None: the current one). Raises BadInput bad_calibration with a line that
-    names the wrong key.
+    Paths of mask and obstacles are relative to `folder` (None: the current one). Raises BadInput bad_calibration with
+    a line that names the wrong key.
     """
     try:
         model = d.get("model", default_lens().model)
@@ -155,7 +155,7 @@ def camera_from_dict(d: dict[str, Any], default_name: str = "camera", folder: Pa
 
 
 def camera_to_dict(camera: Camera) -> dict[str, Any]:
-    """The camera file's keys of a camera."""
+    """Keys and values of the file of a `camera`."""
     d: dict[str, Any] = {
         "format": 1,
         "name": camera.name,
@@ -226,7 +226,7 @@ def _camera_of_values(values: dict[str, Any], default_name: str, folder: Path) -
 
 
 def _covariance(values: dict[str, Any] | None, lens: Lens) -> tuple[tuple[str, ...], Array | None]:
-    """Names and matrix: symmetric, no negative variance, of parameters that this lens has."""
+    """Names (m,) and covariance (m, m) of parameters. Raises ValueError for what is no covariance of this lens's."""
     if values is None:
         return (), None
     order, rows = values["order"], values["matrix"]
@@ -278,7 +278,7 @@ def read_camera(name_or_path: str | Path) -> Camera:
 
 
 def read_foreign_camera(name_or_path: str | Path, program: str | None, calibrated_angle_rad: float | None) -> Camera:
-    """The camera of a file of `program`, None: found by the content.
+    """The camera of a file of `program`; None: a program that is found by the content.
 
     `name_or_path` is the file, or FILE#NAME, one camera of a file of several; `calibrated_angle_rad` is the angle off
     the axis up to which the lens was calibrated, None: that of the frame's nearest edge. Raises BadInput as
@@ -293,13 +293,13 @@ def read_foreign_camera(name_or_path: str | Path, program: str | None, calibrate
 
 
 def known_programs() -> str:
-    """The programs whose camera files are read, as text."""
+    """Text that lists the programs whose camera files are read."""
     *titles, last = [one.title for one in FOREIGN_FORMATS.values()]
     return f"{', '.join(titles)} or {last}"
 
 
 def _stem(path: Path, wanted: str | None) -> str:
-    """The name of a camera from that of its file."""
+    """Name of a camera, from that of its file and, of several cameras there, the `wanted` one's."""
     return printable(path.stem + (f"-{wanted}" if wanted else ""))
 
 
@@ -365,7 +365,7 @@ def _framed_camera(keys: dict[str, Any], name: str) -> Camera:
 
 
 def _frame_edges(camera: Camera) -> Array:
-    """Left and right, and top and bottom, edge (2, 2) of the frame [px]."""
+    """Edges (2, 2) of the frame [px]: left and right, top and bottom."""
     return np.array([[-0.5, n - 0.5] for n in camera.size_px])
 
 

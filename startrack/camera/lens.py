@@ -54,7 +54,7 @@ class Lens(ABC):
         """d rho / d angle [1/rad] at the angles `angle_rad` off the axis, any shape."""
 
     def derivative(self, name: str, angle_rad: Array) -> Array:
-        """d rho / d parameter `name` [1 per 1] at the angles `angle_rad` off the axis, any shape."""
+        """Derivative d rho / d parameter `name` [1 per 1] at the angles `angle_rad` off the axis, any shape."""
         raise ValueError(f"the {self.model} lens has no parameter {name}")
 
     @property
@@ -63,7 +63,7 @@ class Lens(ABC):
         return {name: float(getattr(self, name)) for name in self.parameter_names}
 
     def with_update(self, step: Mapping[str, float]) -> Self:
-        """The lens with `step` added to the parameters that it names; other names are ignored."""
+        """Copy of this lens with `step` added to the parameters that it names; other names are ignored."""
         values = {name: value + step[name] for name, value in self.parameters.items() if name in step}
         return replace(self, **values) if values else self  # type: ignore[type-var]
 
@@ -103,7 +103,7 @@ class Lens(ABC):
 
     @classmethod
     def file_keys(cls) -> dict[str, Key]:
-        """The lens's own keys in camera files: by default each parameter by its name."""
+        """Keys of the lens itself in camera files: by default each parameter by its name."""
         return {name: Number(required=True, low=-1e3, high=1e3) for name in cls.parameter_names}
 
     @classmethod
@@ -164,8 +164,8 @@ class Lens(ABC):
 
     @property
     def opencv_coefficients(self) -> tuple[str, tuple[float, ...]] | None:
-        """("pinhole", ()) or ("fisheye", (k1, k2, k3, k4)) if OpenCV's model equals this lens, or None.
+        """Name and coefficients of OpenCV's model that equals this lens, or None.
 
-        ROS, Kalibr and COLMAP use the same two models.
+        ("pinhole", ()) or ("fisheye", (k1, k2, k3, k4)); ROS, Kalibr and COLMAP use the same two models.
         """
         return None

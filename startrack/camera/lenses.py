@@ -18,7 +18,7 @@ MAX_PINHOLE_RAD = 1.57  # 89.95 degrees: beyond this the tangent is no radius
 
 @dataclass(frozen=True)
 class KannalaBrandt(Lens):
-    """rho = a + k1 a^3 + k2 a^5 + k3 a^7 + k4 a^9, a = angle off the axis [rad], rho in units of the focal length.
+    """A lens with rho = a + k1 a^3 + k2 a^5 + k3 a^7 + k4 a^9, a the angle off the axis [rad], rho in focal lengths.
 
     Without coefficients this is the equidistant lens. Valid past 90 degrees, up to the polynomial's first maximum.
     Source: Kannala & Brandt 2006, IEEE TPAMI 28, 1335, eq. 6 (with k of the linear term absorbed by the focal length).
@@ -41,7 +41,7 @@ class KannalaBrandt(Lens):
         return np.asarray(angle_rad * (1.0 + polynomial))
 
     def slope(self, angle_rad: Array) -> Array:
-        """d rho / d angle [1/rad] at the angles `angle_rad` off the axis, any shape."""
+        """Slope d rho / d angle [1/rad] at the angles `angle_rad` off the axis, any shape."""
         a2 = np.square(angle_rad)
         polynomial = np.zeros_like(a2)
         for n in range(len(self.k), 0, -1):
@@ -49,7 +49,7 @@ class KannalaBrandt(Lens):
         return 1.0 + polynomial
 
     def derivative(self, name: str, angle_rad: Array) -> Array:
-        """d rho / d k_n = a^(2 n + 1), a = `angle_rad`, for the `name` "kn", also of coefficients not in use."""
+        """Derivative d rho / d k_n = a^(2 n + 1), a = `angle_rad`, for the `name` "kn"; also of unused coefficients."""
         power = angle_rad
         for _ in range(self.parameter_names.index(name) + 1):
             power = power * np.square(angle_rad)
@@ -61,7 +61,7 @@ class KannalaBrandt(Lens):
         return dict(zip(self.parameter_names, map(float, self.k), strict=False))
 
     def with_update(self, step: Mapping[str, float]) -> KannalaBrandt:
-        """The lens with `step` added to its coefficients; those not in use begin at 0."""
+        """Copy of this lens with `step` added to its coefficients; those not in use begin at 0."""
         named = [n + 1 for n, name in enumerate(self.parameter_names) if name in step]
         k = np.zeros(max([len(self.k), *named]))
         k[: len(self.k)] = self.k
@@ -77,7 +77,7 @@ class KannalaBrandt(Lens):
 
     @classmethod
     def file_keys(cls) -> dict[str, Key]:
-        """The coefficients as one list."""
+        """Key `k` of camera files: the coefficients as one list."""
         return {"k": List(each=Number(low=-1e3, high=1e3), most=MAX_COEFFICIENTS, description="k1 to k4")}
 
     @classmethod
@@ -86,17 +86,17 @@ class KannalaBrandt(Lens):
         return cls(values.get("k", ()))
 
     def file_values(self) -> dict[str, Any]:
-        """The coefficients as one list."""
+        """Value of the key `k`: the coefficients as one list."""
         return {"k": [float(k) for k in self.k]}
 
     @classmethod
     def fit_sizes(cls) -> tuple[int, ...]:
-        """None to all of the coefficients."""
+        """Numbers of free coefficients that a calibration tries: none to all."""
         return tuple(range(MAX_COEFFICIENTS + 1))
 
     @classmethod
     def fit_start(cls, lens: Lens, size: int) -> KannalaBrandt:
-        """The first `size` coefficients of `lens`, zeros where it has none."""
+        """Lens with the first `size` coefficients of `lens`, zeros where it has none."""
         return cls((*super().fit_start(lens, size).k, *(MAX_COEFFICIENTS * (0.0,)))[:size])
 
     @classmethod
@@ -120,7 +120,7 @@ class KannalaBrandt(Lens):
         return f"{cls.label} with {size} k"
 
     def wcs_projection(self, max_angle_rad: float) -> WcsProjection:
-        """Zenithal polynomial, or zenithal equidistant without coefficients: exact at any `max_angle_rad`."""
+        """FITS zenithal polynomial, or zenithal equidistant without coefficients: exact at any `max_angle_rad`."""
         if not any(self.k):
             return WcsProjection("ARC")
         cards = {f"PV2_{2 * n + 3}": float(k) for n, k in enumerate(self.k)}
@@ -128,13 +128,13 @@ class KannalaBrandt(Lens):
 
     @property
     def opencv_coefficients(self) -> tuple[str, tuple[float, ...]]:
-        """The coefficients of cv2.fisheye: k1 to k4."""
+        """Name of OpenCV's fisheye model, with its coefficients k1 to k4."""
         return "fisheye", (*self.k, *(MAX_COEFFICIENTS * (0.0,)))[:MAX_COEFFICIENTS]
 
 
 @dataclass(frozen=True)
 class Pinhole(Lens):
-    """rho = tan a, a = angle off the axis [rad], rho in units of the focal length. Valid below 90 degrees."""
+    """A lens with rho = tan a, a the angle off the axis [rad], rho in focal lengths. Valid below 90 degrees."""
 
     model: ClassVar[str] = "pinhole"
     label: ClassVar[str] = "pinhole"
@@ -146,7 +146,7 @@ class Pinhole(Lens):
         return np.where(a <= MAX_PINHOLE_RAD, np.tan(np.minimum(a, MAX_PINHOLE_RAD)), np.inf)
 
     def slope(self, angle_rad: Array) -> Array:
-        """d rho / d angle [1/rad] at the angles `angle_rad` off the axis, any shape."""
+        """Slope d rho / d angle [1/rad] at the angles `angle_rad` off the axis, any shape."""
         return 1.0 / np.square(np.cos(np.minimum(angle_rad, MAX_PINHOLE_RAD)))
 
     def angle_rad(self, rho: Array) -> Array:
@@ -155,16 +155,16 @@ class Pinhole(Lens):
 
     @property
     def max_invertible_rad(self) -> float:  # type: ignore[override]
-        """MAX_PINHOLE_RAD."""
+        """Angle up to which rho rises [rad]: MAX_PINHOLE_RAD."""
         return MAX_PINHOLE_RAD
 
     def wcs_projection(self, max_angle_rad: float) -> WcsProjection:
-        """Gnomonic: exact at any `max_angle_rad`."""
+        """FITS gnomonic projection: exact at any `max_angle_rad`."""
         return WcsProjection("TAN")
 
     @property
     def opencv_coefficients(self) -> tuple[str, tuple[float, ...]]:
-        """No distortion."""
+        """Name of OpenCV's pinhole model, which has no coefficients."""
         return "pinhole", ()
 
 
@@ -176,7 +176,7 @@ LENSES: tuple[type[Lens], ...] = (
 
 
 def lens_kinds() -> dict[str, type[Lens]]:
-    """The lenses by the name in camera files."""
+    """Lenses by their names in camera files."""
     return {lens.model: lens for lens in LENSES}
 
 

@@ -2,9 +2,9 @@
 
 RMS's model (github.com/CroatianMeteorNetwork/RMS, RMS/Astrometry/CyFunctions.pyx): from the distortion centre the
 radius r of a pixel, in half widths of the frame, becomes r + k1 r^3 + k2 r^5 + k3 r^7 (+ k4 r^9), which is the angle
-off the axis times `F_scale` [px/deg]. Of the way back it is r - k1 r^3 - ... of that angle; it is not read.
-`radialN-odd` and `radialN-all` have such a radius, `poly3+radial...` add polynomials of the place from the frame's
-middle. Pixel (0, 0) is the centre of the first pixel.
+off the axis times `F_scale` [px/deg]. From the sky to pixels the law is r - k1 r^3 - ..., r that angle, with numbers of
+its own, which are not read. `radialN-odd` and `radialN-all` have such a radius, `poly3+radial...` add polynomials of
+the place from the frame's middle. Pixel (0, 0) is the centre of the first pixel.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ FIT_STEPS = 6  # of Gauss-Newton: the fourth moves no pixel by 1e-6 px
 
 @dataclass(frozen=True)
 class Platepar:
-    """The text of a platepar, and how well RMS's polynomials are the lens within the calibrated angle."""
+    """Text of a platepar, with the errors of RMS's polynomials against the lens within the calibrated angle."""
 
     text: str
     kind: str  # RMS's distortion type
@@ -99,7 +99,7 @@ def platepar_of(camera: Camera, R_cam_icrs: Array, time: datetime, site: Site) -
 
 @dataclass(frozen=True)
 class _RmsLens:
-    """RMS's model nearest to a lens: shift [half widths], asymmetry (2 numbers each), k1, k2, ..., both ways (n,)."""
+    """RMS's model nearest to a lens, (n,) for each way: shift [half widths], asymmetry (2 numbers each), k1, k2, ..."""
 
     R_axis_cam: Array  # (3, 3) to the camera about RMS's axis
     forward: Array
@@ -111,7 +111,8 @@ class _RmsLens:
 def _fit_lens(camera: Camera, terms: int) -> _RmsLens:
     """RMS's model of a lens with so many `terms` k1, k2, ..., by least squares over the calibrated angle.
 
-    A decentred lens is not in it. Its axis, centre and asymmetry, which are then free, leave a fifth of the difference.
+    RMS has no decentring. For a decentred lens its axis, centre and asymmetry are free, which leaves a fifth of the
+    difference.
     """
     from scipy.optimize import least_squares
 
@@ -122,13 +123,13 @@ def _fit_lens(camera: Camera, terms: int) -> _RmsLens:
     free = np.array([bool(camera.decentring)] * 4 + [True] * terms)
 
     def wide(p: Array, start: int = 0) -> Array:
-        """All parameters from those that are free."""
+        """All parameters (n,), from the free ones in `p` from `start` on."""
         full = np.zeros(len(free))
         full[free] = p[start:]
         return full
 
     def sky(rotation: Array) -> Array:
-        """Equidistant positions [half widths] about the turned axis."""
+        """Equidistant positions (rays, 2) [half widths] about the axis turned by `rotation` (2,) [rad]."""
         turned = rays @ R_from_rotvec([*rotation, 0.0]).T
         off_axis = length_xy(turned[:, 0], turned[:, 1])
         angle = np.arctan2(off_axis, turned[:, 2]) / np.where(off_axis > 0, off_axis, 1.0)
@@ -164,7 +165,7 @@ def _rms_row(camera: Camera, parameters: Array, aspect: list[float]) -> list[flo
 
 
 def _fields_of_view_deg(camera: Camera) -> dict[str, float]:
-    """Angles across the middle row and column, at most those of the image circle."""
+    """Angles [deg] across the middle row and column, by RMS's names, at most those of the image circle."""
     (width, height), (cx, cy) = camera.size_px, camera.centre_px
     ends = np.array([[-0.5, cy], [width - 0.5, cy], [cx, -0.5], [cx, height - 0.5]])
     left, right, top, bottom = np.minimum(np.degrees(camera.angle_rad(ends)), np.degrees(camera.max_angle_rad)).tolist()
@@ -172,7 +173,7 @@ def _fields_of_view_deg(camera: Camera) -> dict[str, float]:
 
 
 def _pointing(camera: Camera, R_cam_icrs: Array, time: datetime, site: Site) -> dict[str, float]:
-    """The axis among the stars and above the horizon, as RMS counts it, and the time [deg, days].
+    """Values by RMS's names: the axis among the stars and above the horizon, and the time [deg, days].
 
     RMS takes RA_d and dec_d as those of the date, and turns them to J2000 by its own precession and nutation.
     """
@@ -207,13 +208,13 @@ def _tangents(ray: Array) -> tuple[Array, Array]:
 
 
 def _angle_to_parallel(direction: Array, ray: Array) -> float:
-    """Angle from a `direction` (3,) to the parallel at a `ray` (3,), about it."""
+    """Angle [rad] about a `ray` (3,) from a `direction` (3,) to the parallel there."""
     east, _ = _tangents(ray)
     return float(np.arctan2(np.cross(direction, east) @ ray, direction @ east))
 
 
 def _rms_precession(days: float) -> tuple[Array, Array]:
-    """RMS's rotation (3, 3) to J2000 from the date, so many `days` after it, and its part by precession.
+    """Rotation (3, 3) of RMS to J2000 from the date that is `days` after it, and its part (3, 3) by precession.
 
     IAU 1976 precession, and the low-precision nutation of Meeus, Astronomical Algorithms, ch. 22, which RMS applies as
     rotations about x and z: up to 20 arcsec from the true equinox, so that our own rotation would not do.
@@ -320,7 +321,7 @@ def _terms(plate: Mapping[str, Any], axis: str, count: int) -> list[float]:
 
 
 def _radial(plate: Mapping[str, Any], kind: str, width: int, height: int) -> Callable[[Array], Array]:
-    """Equidistant positions (n, 2) [px] of places (n, 2) from the middle, by a radial distortion."""
+    """Function from places (n, 2) [px] about the middle to equidistant positions (n, 2) [px], by radial distortion."""
     powers, half = RADIAL_POWERS[kind], width / 2
     has_centre, has_aspect = not plate.get("force_distortion_centre"), not plate.get("equal_aspect")
     has_asymmetry = bool(plate.get("asymmetry_corr"))
@@ -342,7 +343,7 @@ def _radial(plate: Mapping[str, Any], kind: str, width: int, height: int) -> Cal
 
 
 def _polynomial(plate: Mapping[str, Any], kind: str) -> Callable[[Array], Array]:
-    """Equidistant positions (n, 2) [px] of places (n, 2) from the middle, by polynomials with radial terms."""
+    """Function from places (n, 2) [px] about the middle to equidistant positions (n, 2) [px], by polynomials."""
     a, b = (np.array(_terms(plate, axis, POLYNOMIAL_TERMS[kind])) for axis in "xy")
 
     def plane(place: Array) -> Array:
@@ -360,9 +361,9 @@ def _polynomial(plate: Mapping[str, Any], kind: str) -> Callable[[Array], Array]
 def _fit_to_plate(
     start: Camera, px: Array, place: Array, order: tuple[str, ...], *, free_axis: bool
 ) -> tuple[Camera, float, float]:
-    """The lens whose pixels are nearest to `px` (n, 2) for the equidistant positions `place` (n, 2) [rad].
+    """Camera whose pixels are nearest to `px` (n, 2) for equidistant positions `place` (n, 2) [rad]; its errors [px].
 
-    Its largest and RMS differences [px] follow. Gauss-Newton steps from the camera `start` in the parameters of `order`
+    The errors are the largest and the RMS one. Gauss-Newton steps from the camera `start` in the parameters of `order`
     and, with `free_axis`, in a rotation, which an attitude takes up.
     """
     angle = length_xy(place[:, 0], place[:, 1])

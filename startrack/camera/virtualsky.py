@@ -27,7 +27,7 @@ FIRST_TURNS_RAD = np.arange(8) * np.pi / 4  # about the axis, from which the fit
 
 @dataclass(frozen=True)
 class VirtualSkyOverlay:
-    """The text of indi-allsky's keys, and the errors of its ideal lens [px] above 5 degrees of elevation."""
+    """Text of indi-allsky's keys, with the errors of its ideal lens [px] above 5 degrees of elevation."""
 
     text: str
     largest_px: float
@@ -35,7 +35,7 @@ class VirtualSkyOverlay:
 
 
 def virtualsky_of(camera: Camera, R_cam_icrs: Array, time: datetime, site: Site) -> VirtualSkyOverlay:
-    """indi-allsky's numbers of a `camera` with the attitude `R_cam_icrs` (3, 3) at a `time` and a `site` on the Earth.
+    """Overlay for a `camera` with the attitude `R_cam_icrs` (3, 3) at a `time` and a `site` on the Earth.
 
     Raises BadInput bad_calibration for a mirrored camera.
     """
@@ -82,7 +82,7 @@ def virtualsky_of(camera: Camera, R_cam_icrs: Array, time: datetime, site: Site)
 
 
 def _draw(rays_icrs: Array, sidereal: float, latitude: float, p: Array, size_px: tuple[int, int]) -> Array:
-    """Pixels (n, 2) of stars (n, 3) in indi-allsky's drawing: see the module."""
+    """Pixels (n, 2) of stars (n, 3) in indi-allsky's drawing; `p`: azimuth, two tilts [rad], diameter, offsets [px]."""
     x = rays_icrs[:, 0] * np.cos(sidereal) + rays_icrs[:, 1] * np.sin(sidereal)
     east = rays_icrs[:, 1] * np.cos(sidereal) - rays_icrs[:, 0] * np.sin(sidereal)
     north = np.cos(latitude) * rays_icrs[:, 2] - np.sin(latitude) * x

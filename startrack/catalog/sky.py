@@ -51,14 +51,14 @@ class Sky:
 
     @property
     def includes_refraction(self) -> bool:
-        """Whether refraction is in the directions."""
+        """Whether the directions of the stars include refraction."""
         return self.elevation_rad is not None
 
 
 def sky_at(
     catalog: StarCatalog, time_utc: datetime, site: Site | None, lowest_rad: float = LOWEST_PREDICTED_RAD
 ) -> Sky:
-    """The `catalog` at `time_utc` and a `site`, with aberration.
+    """Sky of the `catalog` at `time_utc` over a `site`, with aberration.
 
     On the Earth the directions have refraction, and stars are above `lowest_rad` of elevation.
 
@@ -76,7 +76,7 @@ def sky_at(
 
 
 def apparent_stars(catalog: StarCatalog, time_utc: datetime | None, site: Site | None) -> Stars:
-    """The whole `catalog` as seen at `time_utc` from a `site`, with aberration, and with refraction in its air.
+    """Stars of the whole `catalog` as seen at `time_utc` from a `site`, with aberration and the refraction of its air.
 
     Stars below the horizon are there too. Without a time (None) at J2000.0 without both; without a site (None) as from
     the Moon.
@@ -171,7 +171,7 @@ class _View:
 
     @property
     def phase_deg(self) -> float:
-        """Sun - body - observer: 0 when full."""
+        """Angle Sun - body - observer [degrees]: 0 when full."""
         return float(np.degrees(angle_between_rad(self.from_sun_au, self.from_observer_au)))
 
     def latitudes_deg(self, pole: Array) -> tuple[float, float]:
@@ -181,6 +181,7 @@ class _View:
 
 
 def _apparent_body(source: _Source, observer_m: Array, velocity_m_s: Array, et: float) -> Body:
+    """Body of a `source` as seen from `observer_m` (3,) [m] at the time `et` [s], with light time and aberration."""
     light_time_s = 0.0
     for _ in range(3):  # each round shrinks the error by v / c = 1e-4
         body_m, _ = barycentric_state(source.naif, et - light_time_s)
@@ -202,19 +203,19 @@ _SATURN_POLE, _URANUS_POLE = (rays_from_azel(*np.radians(at)) for at in ((49.411
 
 
 def _saturns_rings(view: _View) -> float:
-    """They show their dark side when Sun and observer are on opposite sides."""
+    """Magnitudes that Saturn's rings add: 0 where Sun and observer are on opposite sides, so that they are dark."""
     sun, observer = view.latitudes_deg(_SATURN_POLE)
     tilt = np.sin(np.radians(np.sqrt(max(sun * observer, 0.0))))
     return float(-1.825 * tilt - 0.378 * tilt * np.exp(-2.25 * view.phase_deg))
 
 
 def _uranus_poles(view: _View) -> float:
-    """They are brighter than the equator. The phase never exceeds 3.1 degrees from Earth or Moon."""
+    """Magnitudes that Uranus's bright poles add. The phase never exceeds 3.1 degrees from Earth or Moon."""
     return -0.00084 * sum(map(abs, view.latitudes_deg(_URANUS_POLE))) / 2
 
 
 def _neptunes_rise(view: _View) -> float:
-    """It grew brighter from 1980 to 2000. Its phase never exceeds 1.9 degrees from Earth or Moon."""
+    """Magnitude of Neptune at 1 au; it fell from 1980 to 2000. The phase stays below 1.9 degrees from Earth or Moon."""
     return float(np.clip(-6.89 - 0.0054 * (view.year - 1980), -7.00, -6.89))
 
 
@@ -228,7 +229,7 @@ class _Source:
     rest: Callable[[_View], float] = lambda view: 0.0
 
     def v_mag(self, view: _View) -> float:
-        """Apparent magnitude."""
+        """Apparent V magnitude of the body in a `view` of it."""
         far_au = np.linalg.norm(view.from_observer_au)
         if self is not _SUN:
             far_au = far_au * np.linalg.norm(view.from_sun_au)

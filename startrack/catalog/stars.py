@@ -71,11 +71,11 @@ class StarCatalog(Rows):
 
     @property
     def is_deep(self) -> bool:
-        """Whether it has Gaia's stars, so that it lacks none of the sky's to about magnitude 10."""
+        """Whether the catalogue has Gaia's stars, so that it lacks none of the sky's to about magnitude 10."""
         return "GAIA" in self.sources
 
     def brighter_than(self, v_mag: float) -> StarCatalog:
-        """The stars with V < v_mag."""
+        """Catalogue of the stars with V < `v_mag`."""
         return self.take(slice(int(np.searchsorted(self.v_mag, v_mag, side="left"))))
 
     def at(self, time: datetime | None, velocity_m_s: ArrayLike | None) -> Stars:
@@ -145,7 +145,7 @@ def rays_and_motion(ra: Array, dec: Array, east: Array, north: Array) -> tuple[A
 
 @lru_cache(maxsize=1)
 def star_names() -> Mapping[int, str]:
-    """Hipparcos number -> proper name ("Sirius"), else Bayer, Flamsteed or variable-star designation ("61 Cyg").
+    """Names by Hipparcos number: the proper one ("Sirius"), else the Bayer, Flamsteed or variable-star one ("61 Cyg").
 
     The stars of the Bright Star Catalogue that have one; read-only.
     """
@@ -154,11 +154,12 @@ def star_names() -> Mapping[int, str]:
 
 @lru_cache(maxsize=1)
 def proper_name_designations() -> Mapping[str, str]:
-    """Proper name ("Rigil Kentaurus") -> Bayer, Flamsteed or variable-star designation ("alpha1 Cen"); read-only."""
+    """Bayer, Flamsteed or variable-star designation ("alpha1 Cen") by proper name ("Rigil Kentaurus"); read-only."""
     return MappingProxyType({name: designation for designation, name in _pairs_of("proper_names")})
 
 
 def _pairs_of(table: str) -> Iterator[list[str]]:
+    """Pairs of texts in the rows of a `table` (CSV) beside the catalogues."""
     lines = (data_dir("catalogs") / f"{table}.csv").read_text(encoding="utf-8").splitlines()[1:]
     return (line.split(",", 1) for line in lines)
 

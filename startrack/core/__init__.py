@@ -1,4 +1,4 @@
-"""What every package uses: values, errors with exit codes, files and locks, settings, processes."""
+"""Values, errors with exit codes, files and locks, settings and processes, which every package uses."""
 
 __version__ = "0.2.0"  # of startrack
 MAX_EXPOSURE_S = 1e6  # of an image

@@ -33,7 +33,7 @@ Progress = Callable[[str, int], AbstractContextManager[Bar]]  # text and number 
 
 
 class ChunkStore(Runner[Task, Chunk]):
-    """Applies `work` to tasks and keeps their chunks in `folder`; a context manager that ends its processes.
+    """Runner of `work` on tasks that keeps their chunks in `folder`; as a context manager it ends its processes.
 
     `key` is the name of a task's chunk: it must differ where the result may. Memory stays constant: a finished chunk
     goes to disk, and is read again when it is needed.
@@ -91,6 +91,7 @@ def settings_digest(sources: tuple[str, ...], settings: Any) -> str:
 
 @lru_cache(maxsize=8)
 def _source_digest(patterns: tuple[str, ...]) -> str:
+    """SHA-256 of the names and contents of the package's files that match the `patterns`."""
     found = [path for pattern in patterns for path in sorted(PACKAGE.glob(pattern)) or [PACKAGE / pattern]]
     missing = [path for path in found if not path.is_file()]
     if missing:

@@ -23,13 +23,13 @@ SIMILAR_NAME_1 = 0.8  # ratio (difflib) from which an unknown name counts as a m
 
 
 def similar_name(name: str, known: Iterable[str]) -> str:
-    """The one of the `known` names that is most similar to a misspelt `name`; empty where none is similar."""
+    """Name among the `known` ones that is most similar to a misspelt `name`; empty where none is similar."""
     return next(iter(get_close_matches(name, known, n=1, cutoff=SIMILAR_NAME_1)), "")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Key(ABC):
-    """One key: its meaning, whether it is required, and its default value."""
+    """A key of a file: its meaning, whether it is required, and its default value."""
 
     description: str = ""
     required: bool = False
@@ -53,7 +53,7 @@ class Key(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Number(Key):
-    """A finite number within limits; `above` excludes the lower one. Integers count as numbers, true and false do not.
+    """A key for a finite number within limits; `above` excludes the lower one. Integers count, true and false do not.
 
     `integer`: a whole number, returned as int.
     """
@@ -86,7 +86,7 @@ class Number(Key):
 
 @dataclass(frozen=True, kw_only=True)
 class Text(Key):
-    """One line of printable text; a path may hold any characters."""
+    """A key for one line of printable text; a path may hold any characters."""
 
     max_chars: int = 1000
     is_path: bool = False
@@ -104,7 +104,7 @@ class Text(Key):
 
 @dataclass(frozen=True, kw_only=True)
 class Flag(Key):
-    """true or false."""
+    """A key whose value is true or false."""
 
     def check(self, value: Any, name: str) -> bool:
         if not isinstance(value, bool):
@@ -117,7 +117,7 @@ class Flag(Key):
 
 @dataclass(frozen=True, kw_only=True)
 class Choice(Key):
-    """One of a few values."""
+    """A key whose value is one of a few `values`."""
 
     values: tuple[str | int, ...]
 
@@ -132,7 +132,7 @@ class Choice(Key):
 
 @dataclass(frozen=True, kw_only=True)
 class List(Key):
-    """A list of `count` values of one kind, or of `least` to `most`."""
+    """A key for a list of `count` values of one kind, or of `least` to `most`."""
 
     each: Key
     count: int | None = None
@@ -158,7 +158,7 @@ class List(Key):
 
 @dataclass(frozen=True, kw_only=True)
 class Either(Key):
-    """A value of the first of several kinds that it fits."""
+    """A key for a value of several kinds: the first kind that it fits gives the result."""
 
     kinds: tuple[Key, ...]
 
@@ -177,7 +177,7 @@ class Either(Key):
 
 @dataclass(frozen=True, kw_only=True)
 class Table(Key):
-    """Keys with values of their own. Unknown keys are ignored, but for misspelt ones; a `closed` table has none."""
+    """A table of keys with values of their own. Misspelt keys are refused; a `closed` table refuses unknown ones."""
 
     keys: Mapping[str, Key] = field(default_factory=dict)
     closed: bool = False

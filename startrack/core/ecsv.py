@@ -40,7 +40,7 @@ class Column:
 
 
 def ecsv_text(columns: Sequence[Column]) -> str:
-    """The table as ECSV. Raises ValueError for columns of different lengths."""
+    """ECSV text of the table of `columns`. Raises ValueError for columns of different lengths."""
     head, bodies = ["# %ECSV 1.0", "# ---", "# delimiter: ','", "# datatype:"], []
     for one in columns:
         unit, description = f"unit: {one.unit}, " if one.unit else "", one.description.replace("'", "''")
@@ -54,7 +54,7 @@ def ecsv_text(columns: Sequence[Column]) -> str:
 
 
 def column_texts(form: str, values: Iterable[Any]) -> list[str]:
-    """The `values` (n,) in the %-format `form`; an empty text for None and nan."""
+    """Texts of the `values` (n,) in the %-format `form`; empty for None and nan."""
     listed = values.tolist() if isinstance(values, np.ndarray) else values
     return ["" if one is None or one != one else form % one for one in listed]
 

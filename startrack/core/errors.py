@@ -16,7 +16,7 @@ EXIT_OK, EXIT_INTERNAL_ERROR, EXIT_REFUSED, EXIT_BAD_INPUT, EXIT_STOPPED = 0, 1,
 
 
 class Reason(StrEnum):
-    """Why an image has no position, as the result format spells it; each value is also that text.
+    """Reason why an image has no position, spelt as in the result format; each value is also that text.
 
     `exit_code` is the command's, `meaning` a heading, `advice` a text for the user.
     """
@@ -142,7 +142,7 @@ BAD_INPUT_REASONS = frozenset(one for one in Reason if one.exit_code == EXIT_BAD
 
 
 def fitting_advice(message: str) -> str | None:
-    """What to do after a refusal with this `message`; None where the advice of its reason fits."""
+    """Advice after a refusal with this `message`; None where the advice of its reason fits."""
     return next((advice for part, advice in ADVICE_BY_MESSAGE.items() if part in message), None)
 
 
@@ -180,7 +180,7 @@ class BadInput(Exception):
         self.reason = Reason(reason)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """So that it passes between processes: exceptions are made anew of their message alone."""
+        """Parts from which another process makes the exception anew; by default they are the message alone."""
         return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # type: ignore[attr-defined]
 
 
@@ -190,7 +190,7 @@ def how_to_install(extra: str) -> str:
 
 
 class BadOutput(BadInput):
-    """A path at which results cannot be written; of a flag it is wrong usage (exit code 2).
+    """Path at which results cannot be written; as the value of a flag it is wrong usage (exit code 2).
 
     `command_message` is the cause with flags of the command instead of arguments of the library.
     """
@@ -201,7 +201,7 @@ class BadOutput(BadInput):
 
 
 class NoSolution(Exception):
-    """A stage found no reliable answer (exit code 3). The message is a `fact`, followed by an `advice` where one is."""
+    """Refusal of a stage without a reliable answer (exit code 3). Its message: a `fact`, then `advice` if given."""
 
     reason: Reason = Reason.INCONSISTENT_EVIDENCE
 
@@ -214,18 +214,18 @@ class NoSolution(Exception):
 
 
 class TooFewStars(NoSolution):
-    """Too few point sources for an identification."""
+    """Refusal of a picture with too few point sources for an identification."""
 
     reason = Reason.NO_STARS
 
 
 class NotIdentified(NoSolution):
-    """No attitude explains the point sources."""
+    """Refusal of a picture whose point sources no attitude explains."""
 
     reason = Reason.NOT_IDENTIFIED
 
 
 class NotLocated(NoSolution):
-    """The evidence does not determine a position."""
+    """Refusal of evidence that does not determine a position."""
 
     reason = Reason.INSUFFICIENT_GEOMETRY

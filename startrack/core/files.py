@@ -72,9 +72,9 @@ def is_path(reference: FilePath) -> bool:
 
 
 def split_camera(reference: FilePath) -> tuple[str, str | None]:
-    """The file and the name of one of its cameras of a `reference` FILE#NAME; None for a file alone.
+    """File and camera's name of a `reference` FILE#NAME; the name is None for a file alone.
 
-    Only other programs' camera files hold several. A file whose own name is so written stays one.
+    Only other programs' camera files hold several cameras. An existing file whose own name has a # is taken whole.
     """
     text = os.fspath(reference)
     file, mark, name = text.rpartition("#")
@@ -122,7 +122,7 @@ def resolve_named(name_or_path: str | Path, kind: str, reason: str) -> Path:
 
 
 def missing_text(path: FilePath) -> str:
-    """What is said of a `path` without a file; it names the file of its folder whose name is the most similar."""
+    """Message for a `path` without a file; it names the file in that folder whose name is the most similar."""
     folder, name = os.path.split(path)
     there: set[str] = set()
     with suppress(OSError, ValueError):  # no such folder, or a NUL in its name
@@ -240,7 +240,7 @@ def _write_error(cause: Exception, reason: str, path: FilePath, text: str, advic
 
 
 def check_free(path: FilePath, *, overwrite: bool, reason: str = "bad_image") -> None:
-    """Raise BadOutput `reason` if the file exists and may not be replaced, as nothing but a regular file may."""
+    """Raise BadOutput `reason` if `path` exists and may not be replaced (not `overwrite`), or is no regular file."""
     check_regular(path, reason)
     if not overwrite and os.path.lexists(path):
         text, ways = f"{printable(path)}: exists already: replace it with", ("overwrite=True", "-O")
@@ -248,7 +248,7 @@ def check_free(path: FilePath, *, overwrite: bool, reason: str = "bad_image") ->
 
 
 def check_regular(path: FilePath, reason: str = "bad_image") -> None:
-    """Raise BadOutput `reason` for a folder, a pipe, a device, a socket or a link to none of the user's files."""
+    """Raise BadOutput `reason` if `path` is a folder, a pipe, a device, a socket or a link that leads to no file."""
     if os.path.lexists(path) and not os.path.isfile(path):
         cause = "cannot be replaced: it is no regular file; remove it, or write elsewhere"
         raise BadOutput(reason, f"{printable(path)}: {cause}")
@@ -294,7 +294,7 @@ def hold_lock(path: FilePath, *, wait: bool = True, on_wait: Callable[[], None] 
 
 
 def replace_file(target: Path, data: bytes) -> None:
-    """Write the `data` to a part, which then takes the place of `target`; remove those of killed processes beside it.
+    """Write the `data` to a part file that then takes the place of `target`; remove part files of killed processes.
 
     Raises OSError, and ValueError for a name with a null character.
     """
@@ -318,7 +318,7 @@ def replace_file(target: Path, data: bytes) -> None:
 
 @lru_cache(maxsize=4096)
 def _remove_parts(folder: Path) -> None:
-    """Remove what killed processes left half-written in a `folder`, once a process: it is listed once.
+    """Remove the part files that killed processes left in a `folder`. A process lists each folder only once.
 
     A process holds the lock of its part up to the renaming, and writes once it has it: an empty part may be in use.
     Another host may not see the lock, so that a part also has to be old.

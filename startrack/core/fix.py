@@ -35,7 +35,7 @@ class PositionPrior:
 
     @property
     def mean_m(self) -> Array:
-        """East and north (2,) [m]."""
+        """Mean position (2,) in enu, east and north [m]."""
         return np.array([self.east_m, self.north_m])
 
     def log_density(self, points_m: Array) -> Array:
@@ -46,10 +46,10 @@ class PositionPrior:
 
 @dataclass(frozen=True, kw_only=True)
 class Clock(Value):
-    """How directions in enu depend on an error of the clock.
+    """Effect of an error of the clock on directions in enu, with the prior of this error.
 
-    The prior of its error is a mixture: `sigma_s`, or with `gross_probability` the wider `gross_sigma_s`, which is
-    also what the error would be if a stated `sigma_s` were wrong.
+    The prior is a mixture: `sigma_s`, or with `gross_probability` the wider `gross_sigma_s`, which is also what the
+    error would be if a stated `sigma_s` were wrong.
     """
 
     turn_rad_s: Array = vector()  # rotation vector in enu: by one second that the true time is later
@@ -60,13 +60,13 @@ class Clock(Value):
     gross_sigma_s: float = 0.0
 
     def log_prior(self, later_s: float) -> float:
-        """Logarithm of the prior density, less its maximum and its gross part, `later_s` than the directions' time."""
+        """Logarithm of the prior at `later_s` after the directions' time, less its maximum; without the gross part."""
         return -0.5 * ((self.offset_s + later_s) / self.sigma_s) ** 2
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mode(Value):
-    """One connected region of the posterior."""
+    """A connected region of the posterior of the position."""
 
     east_m: float
     north_m: float
@@ -77,7 +77,7 @@ class Mode(Value):
 
 @dataclass(frozen=True)
 class ClockError:
-    """How much later the true time is than the stated one."""
+    """Time by which the true time is later than the stated one, with its standard deviation."""
 
     offset_s: float
     sigma_s: float
@@ -102,7 +102,7 @@ class ShownError:
 
     @property
     def text(self) -> str:
-        """The error in words."""
+        """Text that names the error, with its value, sign and unit."""
         words, unit = self.name.rsplit("_", 1)
         value = f"{100 * self.value:+.2f} %" if unit == "1" else f"{self.value:+.4g} {unit}"
         return f"an error of {words.replace('_', ' ')} of {value}"
@@ -119,11 +119,11 @@ class Blocked:
 
     @property
     def whole(self) -> Bools:
-        """(n,) in which sectors it is more likely not the map's."""
+        """Whether the skyline is more likely not the map's than the map's, for each sector (n,)."""
         return np.asarray(self.probability > 0.5)
 
     def hides(self, azimuth_rad: Array) -> Bools:
-        """Whether directions (n,) at `azimuth_rad` are in such sectors."""
+        """Whether directions (n,) at `azimuth_rad` [rad] are in sectors whose skyline is more likely not the map's."""
         n = len(self.probability)
         return self.whole[(azimuth_rad / (2 * np.pi) * n).astype(np.int64) % n]
 
@@ -132,7 +132,7 @@ class Blocked:
 
     @property
     def ranges_rad(self) -> list[tuple[float, float]]:
-        """From and to of each range of such sectors, eastward; across north `to` is the smaller."""
+        """Azimuths [rad] from and to of each range of blocked sectors, eastward; across north `to` is the smaller."""
         if self.whole.all():
             return [(0.0, 2 * np.pi)]
         width = 2 * np.pi / len(self.whole)
@@ -144,13 +144,13 @@ class Blocked:
 
     @property
     def text(self) -> str:
-        """The ranges in words."""
+        """Text of the blocked ranges of azimuth in degrees."""
         return ", ".join(f"{a:.0f} to {b:.0f}" for a, b in np.degrees(self.ranges_rad)) + " degrees"
 
 
 @dataclass(frozen=True, eq=False)
 class Integrity:
-    """Solutions without one group of directions each, of several divisions of the compass into groups."""
+    """Changes of a fix without one group of directions each, for several divisions of the compass into groups."""
 
     first_azimuth_rad: Array  # (m,) where the groups begin, of all divisions
     separation_m: Array  # (m, 2) of the fix without the group from the fix; nan where the group alone holds it
@@ -158,14 +158,14 @@ class Integrity:
     protection_level_m: float  # infinite where one group alone holds the fix
 
     def carriers(self) -> list[int]:
-        """The fewest groups that hold half of the information, the strongest first."""
+        """Indices of the fewest groups that hold half of the information about the position, the strongest first."""
         order = np.argsort(-self.part, kind="stable")
         count = int(np.searchsorted(np.cumsum(self.part[order]), CARRIED_PART * self.part.sum())) + 1
         return [int(group) for group in order[:count] if self.part[group] > 0.0]
 
 
 class Explored(NamedTuple):
-    """Positions that rows allow, as the posterior on equal squares: of a search, or the likeliest ones of a fix."""
+    """Positions that rows of evidence allow, with the posterior on equal squares: of a search, or of a fix."""
 
     centres_m: Array  # (n, 2) east and north
     half_m: float  # of the side of a square
@@ -212,5 +212,5 @@ class Fix(Value):
 
     @property
     def cautions(self) -> list[str]:
-        """What a search that proved nothing means; empty after any other."""
+        """Warning for the user after a search that was not proven to its end; empty after any other."""
         return [UNPROVEN] if self.search == "beam" else []

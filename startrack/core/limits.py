@@ -37,7 +37,7 @@ def check_memory(pixels: int = 0, base_bytes: float = COMMAND_BYTES) -> None:
 
 @contextmanager
 def refusing_shortage() -> Iterator[None]:
-    """In the block exceptions that come from a lack of memory become BadInput (out_of_memory)."""
+    """Context in which exceptions that come from a lack of memory become BadInput (out_of_memory)."""
     try:
         yield
     except (BadInput, NoSolution):
@@ -49,7 +49,7 @@ def refusing_shortage() -> Iterator[None]:
 
 
 def memory_refusal(cause: BaseException) -> BadInput | None:
-    """The refusal (out_of_memory) of a `cause` that comes from a lack of memory; None for others."""
+    """The refusal (out_of_memory) for a `cause` that comes from a lack of memory; None for others."""
     chain: list[BaseException] = []
     one: BaseException | None = cause
     while one is not None and one not in chain:
@@ -93,7 +93,7 @@ def _limit_bytes() -> int | None:
 
 
 class TimeLimitReached(NoSolution):
-    """The limit of the processor time came before an answer."""
+    """Refusal of a run whose limit of processor time came before an answer."""
 
     reason = Reason.TIME_LIMIT
 
@@ -136,7 +136,7 @@ _LIMIT: ContextVar[_Limit | None] = ContextVar("time limit", default=None)
 
 @contextmanager
 def limited_time(seconds: float | None) -> Iterator[None]:
-    """In the block `check_time` raises once so much processor time [s] was used; None: as outside of the block.
+    """Context in which `check_time` raises once `seconds` of processor time were used; None: the outer limit holds.
 
     Raises ValueError for a limit that is not above 0.
     """
@@ -154,7 +154,7 @@ def limited_time(seconds: float | None) -> Iterator[None]:
 
 @contextmanager
 def uncounted_time() -> Iterator[None]:
-    """In the block no processor time counts: what it makes is kept, and a second run does not need it."""
+    """Context whose processor time does not count: what is made in it is kept, and a second run does not need it."""
     CLOCK.pause()
     try:
         yield
@@ -163,7 +163,7 @@ def uncounted_time() -> Iterator[None]:
 
 
 def check_time() -> None:
-    """Raises TimeLimitReached where the limit of the block has come."""
+    """Raise TimeLimitReached where the processor time of the enclosing `limited_time` is used up."""
     limit = _LIMIT.get()
     if limit is not None and CLOCK.now_s() > limit.end_s:
         raise TimeLimitReached(f"the limit of {limit.seconds:g} s of processor time came before an answer")
@@ -171,7 +171,7 @@ def check_time() -> None:
 
 @contextmanager
 def stating_work(text: Callable[[], str]) -> Iterator[None]:
-    """In the block TimeLimitReached becomes another one, which also states the `text`: what was done by then."""
+    """Context in which TimeLimitReached becomes another one that also states the `text`: what was done by then."""
     try:
         yield
     except TimeLimitReached as cause:

@@ -60,14 +60,14 @@ def read_columns(path: FilePath, names: Sequence[str], reason: str, *, gaps_in: 
 
 @dataclass(frozen=True, eq=False)
 class Obstacles:
-    """The skyline of obstacles (n,) around the compass, straight between two of its points; see `MOST_GAP_RAD`."""
+    """Skyline of scanned obstacles, straight between its n points; gaps of more than 10 degrees hide nothing."""
 
     azimuth_rad: Array  # (n,) ascending, from 0 to below a turn
     elevation_rad: Array  # (n,)
     sha256: str = ""  # of the values
 
     def hides(self, azimuth_rad: Array, elevation_rad: Array) -> Bools:
-        """Whether directions (...) lie below it."""
+        """Whether directions (...) at `azimuth_rad` and `elevation_rad` [rad] lie below the obstacles' skyline."""
         at, turn = np.mod(azimuth_rad, 2 * np.pi), 2 * np.pi
         around = np.r_[self.azimuth_rad[-1] - turn, self.azimuth_rad, self.azimuth_rad[0] + turn]
         top = np.interp(at, around, np.r_[self.elevation_rad[-1], self.elevation_rad, self.elevation_rad[0]])
@@ -78,7 +78,8 @@ class Obstacles:
 def read_obstacles(path: FilePath, reason: str) -> Obstacles:
     """The obstacles in a CSV file at `path`; rows without an elevation are gaps.
 
-    Raises BadInput `reason` for a file without both columns, with words, with angles that are none, or without rows.
+    Raises BadInput `reason` for a file without both columns, with words, with numbers that are no angles, or without
+    two rows.
     """
     found = read_columns(path, OBSTACLE_COLUMNS, reason, gaps_in=OBSTACLE_COLUMNS[1:])
     azimuth, elevation = found.T

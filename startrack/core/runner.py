@@ -54,7 +54,7 @@ def count_cores() -> int:
 
 
 def map_in_threads(work: Callable[..., Result], *tasks: Iterable[Any]) -> Iterator[Result]:
-    """The results of `work` for the `tasks`, as of `map`, by a thread a core; the first exception is raised.
+    """Results of `work` for the `tasks`, in their order, from a thread a core; the first exception is raised.
 
     For work on arrays, which numpy, OpenCV and the compiled kernels do beside other threads. The limit of time of
     the caller holds in the threads; each task begins with asking for it.
@@ -81,7 +81,7 @@ class Died:
 
 
 class Runner(Generic[Task, Result]):
-    """Applies `work` to tasks, in `jobs` processes or on the workers of the Dask scheduler at `cluster`.
+    """Executor of `work` on tasks, in `jobs` processes or on the workers of the Dask scheduler at `cluster`.
 
     `work` and the tasks must be picklable. With `in_process`, a single job runs in this process. As a context manager
     it connects to the cluster, and ends its processes; they are kept from one call of `results` to the next.
@@ -104,7 +104,7 @@ class Runner(Generic[Task, Result]):
         self._client: Client | None = None
 
     def __enter__(self) -> Self:
-        """Raises BadInput (no_cluster) if no scheduler answers."""
+        """This runner, connected to its cluster. Raises BadInput (no_cluster) if no scheduler answers."""
         if self.cluster is not None:
             self._client = _connect(self.cluster)
         return self
@@ -122,7 +122,7 @@ class Runner(Generic[Task, Result]):
         self._stopping = True
 
     def results(self, tasks: Iterable[Task]) -> Generator[tuple[Task, Result | Died], None, None]:
-        """(task, result) in the order of completion. Exceptions of `work` are raised here.
+        """Pairs (task, result) in the order of completion. Exceptions of `work` are raised here.
 
         After a process has died or blocked, the tasks in progress are repeated one by one to find the cause. Dask
         repeats those of a lost worker on another. Raises RunStopped if the cluster fails.
@@ -141,7 +141,7 @@ class Runner(Generic[Task, Result]):
                 self._end_pool()
 
     def _run(self, coming: Iterator[Task], most: int) -> Generator[tuple[Task, Result | Died], None, list[Task]]:
-        """Yield results, with `most` tasks handed out at a time; return those of them when a process died or blocked.
+        """Yield pairs (task, result), `most` tasks at a time; return those in progress when a process died or blocked.
 
         None are returned when all are done. The processes are killed after a death, and when the caller closes the
         generator: files are complete or absent, so that nothing is damaged.
@@ -175,7 +175,7 @@ class Runner(Generic[Task, Result]):
         return partial(_submit, self._start_pool(most))
 
     def _start_pool(self, jobs: int) -> ProcessPoolExecutor:
-        """The pool, else a new one of `jobs` processes with one thread each."""
+        """Pool of processes: the present one, else a new one of `jobs` processes with one thread each."""
         if self._pool is None:
             for name in THREAD_LIMITS:  # inherited when the processes load NumPy: the other cores do other tasks
                 os.environ.setdefault(name, "1")
@@ -221,7 +221,7 @@ def _connect(cluster: str) -> Client:
 
 
 def _submit(pool: ProcessPoolExecutor, work: Callable[[Task], Result], task: Task) -> Future[Result]:
-    """The future result; in a broken pool a future with BrokenProcessPool.
+    """Future of the result of `work` on `task`; in a broken pool a future with BrokenProcessPool.
 
     SIGINT and SIGTERM are blocked meanwhile: a process that starts in here never gets them, this one gets them after.
     """
@@ -239,7 +239,7 @@ def _submit(pool: ProcessPoolExecutor, work: Callable[[Task], Result], task: Tas
 
 
 def _submit_to_cluster(client: Client, work: Callable[[Task], Result], task: Task) -> Future[Result]:
-    """The future result, or the exception of the work, of its transfer or of a lost connection."""
+    """Future of the result of `work` on `task`, or of the exception of the work, its transfer or a lost connection."""
     import asyncio
 
     from distributed import Future as FarFuture
@@ -253,7 +253,7 @@ def _submit_to_cluster(client: Client, work: Callable[[Task], Result], task: Tas
 
 
 def _begin_process(log_level: int) -> None:
-    """The first call in a new process: its logs are as quiet as the parent's, and it ends with the parent alone."""
+    """Begin a new process: its logs are as quiet as the parent's, and it ends with the parent alone."""
     logging.getLogger("startrack").setLevel(log_level)
     for number in SIGNALS:  # sent to the whole process group: the tasks in progress are finished
         signal.signal(number, signal.SIG_IGN)
@@ -274,7 +274,7 @@ def _is_lost(future: Future[Any]) -> bool:
 
 
 def _check_connection(client: Client, finished: Collection[Future[Any]]) -> None:
-    """Raises RunStopped if the scheduler has gone; not beside `finished` futures, which have results or the cause."""
+    """Raise RunStopped if the scheduler has gone; not beside `finished` futures, which have results or the cause."""
     if not finished and client.status != "running":
         raise RunStopped(f"the Dask scheduler has gone (the client is {client.status})")
 

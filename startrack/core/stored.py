@@ -54,7 +54,7 @@ def read_json_object(path: FilePath) -> dict[str, Any] | None:
 
 
 def finite_json(text: str | bytes) -> Any:
-    """What a JSON `text` holds; None for NaN and infinity, which JSON has not, and for numbers larger than any of ours.
+    """Content of a JSON `text`; None for NaN and infinity, which JSON has not, and for numbers larger than any of ours.
 
     Raises ValueError or RecursionError for what is no JSON.
     """
@@ -95,7 +95,7 @@ def _temporary_folder() -> Path:
 
 
 def limit_bytes() -> float:
-    """The most that tables of horizons take on the disk. Raises BadInput bad_terrain for a variable that is no size."""
+    """Largest size [bytes] of all horizon tables on disk. Raises BadInput bad_terrain for what is no size."""
     text = os.environ.get(LIMIT_VARIABLE) or str(LIMIT_GB)
     with suppress(ValueError):
         if float(text) >= 0.0:  # False for NaN
@@ -104,7 +104,7 @@ def limit_bytes() -> float:
 
 
 def remove_oldest(folder: Path, pattern: str, newest: Path) -> None:
-    """Remove files of the `pattern`, the one that was used first first, until all take the limit at most.
+    """Remove files of the `pattern` from `folder`, the least recently used first, until the rest keep within the limit.
 
     The `newest` stays, whatever its size. What cannot be listed or removed stays.
     """

@@ -46,7 +46,7 @@ MIDDLES_RAD = (np.arange(SECTORS) + 0.5) * 2 * np.pi / SECTORS
 
 
 def sector_of(azimuth_rad: Array) -> Ints:
-    """Sector (n,) of each `azimuth_rad` (n,)."""
+    """Index (n,) of the sector of azimuth that holds each `azimuth_rad` (n,) [rad]."""
     return np.asarray((azimuth_rad * (SECTORS / (2 * np.pi))).astype(np.int64) % SECTORS)
 
 
@@ -84,7 +84,7 @@ class Correction:
 
 @dataclass(frozen=True, kw_only=True)
 class Exposure(Value):
-    """One image with the facts that travel with it."""
+    """An image with the facts that travel with it."""
 
     pixels_adu: NDArray[np.float32]  # (H, W) [ADU]; a sensor's 16 bits fit float32 exactly
     name: str = ""  # stem of the file's name
@@ -118,7 +118,7 @@ class Exposure(Value):
 
     @property
     def size_px(self) -> tuple[int, int]:
-        """(W, H)."""
+        """Width and height of the image [px]."""
         return self.pixels_adu.shape[1], self.pixels_adu.shape[0]
 
     @property
@@ -137,12 +137,12 @@ class SmoothImage:
 
     @classmethod
     def of(cls, image: Image) -> SmoothImage:
-        """Any image (H, W): each of its rows is kept."""
+        """Smooth image that equals any `image` (H, W): each of its rows is kept."""
         return cls(image, 1, len(image))
 
     @classmethod
     def from_blocks(cls, values: NDArray[Any], side: int, shape: tuple[int, ...]) -> SmoothImage:
-        """Linear interpolation, in x too, between the middles of square blocks (n, m) that cover an image (H, W)."""
+        """Smooth image (H, W) of this `shape`, linear between the middles of square blocks with `values` (n, m)."""
         import cv2
 
         size = values.shape[1] * side, values.shape[0]
@@ -150,7 +150,7 @@ class SmoothImage:
         return cls(np.ascontiguousarray(wide[:, : shape[1]]), side, shape[0])
 
     def whole(self) -> Image:
-        """The image itself (H, W)."""
+        """Whole image (H, W), pixel by pixel."""
         import cv2
 
         size = self.rows.shape[1], len(self.rows) * self.side
@@ -158,7 +158,7 @@ class SmoothImage:
         return full[: self.height]
 
     def at(self, row: Any, column: Any) -> Image:
-        """Values at whole pixels; the indices are broadcast."""
+        """Values (...) of the image at the whole pixels `row`, `column`; the indices are broadcast."""
         above = np.clip((row + 0.5) / self.side - 0.5, 0.0, len(self.rows) - 1)
         low = above.astype(np.int64)
         part = (above - low).astype(np.float32)
@@ -239,7 +239,7 @@ class Attitude(Value):
 
 @dataclass(frozen=True, kw_only=True)
 class Identification(Rows):
-    """Which detection is which catalogue star; one-to-one."""
+    """Pairs of a detection and a catalogue star, one-to-one, with the attitude at which they match."""
 
     detection: Ints = array("n", dtype=np.int64)  # index into Detections
     star: Ints = array("n", dtype=np.int64)  # index into Stars
@@ -304,7 +304,10 @@ class Evidence(Rows):
 
     @classmethod
     def concatenate(cls, *parts: Evidence, **shared: Any) -> Evidence:
-        """The rows of all `parts`, of several sources or exposures, in one value, with the first clock and so on."""
+        """Evidence with the rows of all `parts`, of several sources or exposures.
+
+        `clock`, `near`, `image_errors` and `support` are each the first that is given.
+        """
         for name in ("clock", "near", "image_errors", "support"):
             shared[name] = next((getattr(part, name) for part in parts if getattr(part, name) is not None), None)
         return super().concatenate(*parts, **shared)

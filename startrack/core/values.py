@@ -81,7 +81,7 @@ class Rows(Value):
         return len(getattr(self, self._columns()[0]))
 
     def take(self, which: Any) -> Self:
-        """The rows that a mask, slice or index array `which` selects; parts of checked rows need no check."""
+        """Copy of this value with the rows that a mask, slice or index array `which` selects, not checked again."""
         taken = object.__new__(type(self))
         for f in fields(self):  # type: ignore[arg-type]
             part = whole = getattr(self, f.name)
@@ -95,7 +95,7 @@ class Rows(Value):
         return taken
 
     def with_rows(self, which: Ints, others: Self) -> Self:
-        """The same with the rows of `others`, which are checked too, at the indices `which`."""
+        """Copy of this value with the rows of `others`, which are checked too, at the indices `which`."""
         changed = object.__new__(type(self))
         for f in fields(self):  # type: ignore[arg-type]
             value = getattr(self, f.name)
@@ -108,7 +108,7 @@ class Rows(Value):
 
     @classmethod
     def concatenate(cls, *parts: Self, **shared: Any) -> Self:
-        """The rows of all `parts` in one value; its other fields are `shared`."""
+        """Value with the rows of all `parts`; its other fields are `shared`."""
         return cls(**shared | {name: np.concatenate([getattr(one, name) for one in parts]) for name in cls._columns()})
 
     @classmethod

@@ -84,7 +84,7 @@ class Air:
         return cls(pressure_hpa=hpa, temperature_c=sea_k * ratio - ZERO_C_K, height_m=height_m)
 
     def with_stated(self, stated: Mapping[str, Any]) -> Air:
-        """The same air with what is `stated`, by key of `AIR_KEYS`; with other keys too, which do not count.
+        """Copy of this air with the values that are `stated`, by key of `AIR_KEYS`; other keys do not count.
 
         Where both pressure and temperature are stated, the error of refraction is smaller.
         """
@@ -95,7 +95,7 @@ class Air:
 
     @property
     def is_none(self) -> bool:
-        """Whether there is none: neither refraction nor extinction."""
+        """Whether there is no air: neither refraction nor extinction."""
         return self.pressure_hpa == 0.0
 
     @cached_property
@@ -121,7 +121,7 @@ class Air:
         return np.asarray(apparent_rad, dtype=float) - self.lift_rad(apparent_rad)
 
     def lift_rad(self, apparent_rad: ArrayLike) -> Array:
-        """By how much (...) [rad] the air raises sources to the apparent elevations `apparent_rad` (...)."""
+        """Lift (...) [rad] by the air of sources at the apparent elevations `apparent_rad` (...)."""
         return np.asarray(
             np.interp(np.asarray(apparent_rad, dtype=float), self._table.apparent_rad, self._table.lift_rad)
         )
@@ -129,21 +129,24 @@ class Air:
     def refract(self, rays_icrs: Array, R_enu_icrs: Array) -> Array:
         """Apparent directions (..., 3), ICRS axes, of sources in the directions `rays_icrs` (..., 3) without air.
 
-        `R_enu_icrs` (3, 3) has the vertical.
+        `R_enu_icrs` (3, 3) gives the vertical.
         """
         azimuth, elevation = azel_from_rays(rays_icrs @ R_enu_icrs.T)
         return np.asarray(rays_from_azel(azimuth, self.apparent_rad(elevation)) @ R_enu_icrs)
 
     def straighten(self, rays_icrs: Array, R_enu_icrs: Array) -> Array:
-        """Inverse of `refract`, of apparent `rays_icrs` (..., 3); `R_enu_icrs` (3, 3) has the vertical."""
+        """Directions (..., 3), ICRS axes, without air of sources at apparent `rays_icrs` (..., 3).
+
+        Inverse of `refract`; `R_enu_icrs` (3, 3) gives the vertical.
+        """
         azimuth, elevation = azel_from_rays(rays_icrs @ R_enu_icrs.T)
         return np.asarray(rays_from_azel(azimuth, self.true_rad(elevation)) @ R_enu_icrs)
 
 
 def turn_sky(azimuth_rad: Array, elevation_rad: Array, R: Array, air: Air | None) -> tuple[Array, Array]:
-    """Apparent directions (n,), (n,) [rad] of stars after a turn `R` (3, 3) in enu of the sky beyond the `air`.
+    """Apparent azimuth and elevation (n,), (n,) [rad] of stars after the sky beyond the `air` turned by `R` (3, 3).
 
-    They were seen at `azimuth_rad` (n,) and `elevation_rad` (n,).
+    They were seen at `azimuth_rad` (n,) and `elevation_rad` (n,). `R` is a rotation in enu.
     """
     if air is None:
         return turn_azel(azimuth_rad, elevation_rad, R)
@@ -152,7 +155,7 @@ def turn_sky(azimuth_rad: Array, elevation_rad: Array, R: Array, air: Air | None
 
 
 def airmass(elevation_rad: ArrayLike) -> Array:
-    """Airmass (...) of lines of sight at apparent `elevation_rad` (...), zenith = 1; below the horizon that there.
+    """Airmass (...) of lines of sight at apparent `elevation_rad` (...) [rad]: 1 at the zenith, below 0 that of 0.
 
     Source: Rozenberg 1966, Twilight, p. 160.
     """
@@ -170,7 +173,7 @@ class _Table(NamedTuple):
 
 @lru_cache(maxsize=16)
 def _table_of(*air: float) -> _Table:
-    """That of pressure [hPa], temperature [C], relative humidity, wavelength [um] and height of the site [m]."""
+    """Table of refraction for `air`: hPa, degrees C, relative humidity, wavelength [um], height of the site [m]."""
     site_m, lowest_m = EARTH_RADIUS_M + air[-1], EARTH_RADIUS_M + LOWEST_RAY_M
     first = max(-np.arccos(min(lowest_m / site_m, 1.0)), LOWEST_TABULATED_RAD)
     apparent = first + (np.pi / 2 - first) * np.square(np.linspace(0.0, 1.0, TABULATED))
@@ -211,7 +214,7 @@ class _Layers:
         return dry - wet, -LAPSE_K_M / self.kelvin / t * slope
 
     def above(self, radius_m: Array) -> tuple[Array, Array]:
-        """The same in the stratosphere."""
+        """Index less 1, and its gradient [1/m], in the stratosphere at radii (...)."""
         kelvin = self.kelvin - LAPSE_K_M * (self.tropopause_m - self.site_m)
         decay_1_m = self.power * LAPSE_K_M / max(kelvin, 0.1 * self.kelvin)
         n = self.below(np.asarray(self.tropopause_m))[0] * np.exp(-decay_1_m * (radius_m - self.tropopause_m))

@@ -30,7 +30,7 @@ def rays_from_azel(azimuth_rad: ArrayLike, elevation_rad: ArrayLike) -> Array:
 
 
 def length_xy(x: Array, y: Array) -> Array:
-    """sqrt(x^2 + y^2) of two components (...), for numbers far from overflow: np.hypot takes seven times as long."""
+    """Length (...) of vectors with components `x`, `y` (...), far from overflow: np.hypot takes seven times as long."""
     return np.sqrt(x * x + y * y)
 
 

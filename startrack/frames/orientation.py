@@ -162,6 +162,7 @@ def _spice() -> Iterator[Any]:
 
 @cache
 def _kernel_paths() -> tuple[str, ...]:
+    """Paths of SPICE's kernels in the installed packages. Raises RuntimeError where one is missing."""
     paths = []
     for package, module, inside in _KERNELS:
         spec = find_spec(module)
@@ -174,7 +175,7 @@ def _kernel_paths() -> tuple[str, ...]:
 
 @cache
 def _coverage_et_s() -> tuple[float, float]:
-    """First and last time at which both the orientation and the ephemeris are known; the caller holds the lock."""
+    """First and last time [s, as `et_s`] with both orientation and ephemeris known; the caller holds the lock."""
     import spiceypy
 
     *_, orientation, ephemeris = _kernel_paths()
@@ -185,7 +186,7 @@ def _coverage_et_s() -> tuple[float, float]:
 
 
 def _close_kernels() -> None:
-    """Before a fork: parent and child each load the kernels again when they next need them."""
+    """Close the kernels before a fork: parent and child each load them again when they next need them."""
     _lock.acquire()  # held across the fork, so that no other thread is inside SPICE at that moment
     while _loaded:
         import spiceypy

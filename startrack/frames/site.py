@@ -51,7 +51,7 @@ class Site:
         return None if air.is_none else air
 
     def with_air(self, stated: Mapping[str, Any] | None) -> Site:
-        """The site under the air that is `stated` (keys of `AIR_KEYS`), else under its own; None: itself.
+        """Copy of this site under the air that is `stated` (keys of `AIR_KEYS`), the rest of it its own; None: itself.
 
         Raises BadInput (bad_terrain) for impossible air, and off the Earth.
         """
@@ -78,8 +78,8 @@ def position_fixed_m(site: Site) -> Array:
 def sphere_radius_m(site: Site) -> float:
     """Radius [m] of the sphere through the site with its centre on the site's vertical that fits the body's surface.
 
-    On the Moon that of its own sphere. On the Earth the Gaussian radius of curvature, sqrt(M N) of the ellipsoid, of
-    the surface that is parallel to it at the site's height.
+    On the Moon the radius of its maps plus the site's height. On the Earth the Gaussian radius of curvature,
+    sqrt(M N) of the ellipsoid, of the surface that is parallel to it at the site's height.
     """
     if site.body == "moon":
         return MOON_RADIUS_M + site.height_m
@@ -173,6 +173,7 @@ def observer_state(site: Site, time: datetime) -> tuple[Array, Array]:
 
 
 def _fixed_from_latlon(body: str, latitude_rad: ArrayLike, longitude_rad: ArrayLike, height_m: ArrayLike) -> Array:
+    """Positions (..., 3) [m] in the body-fixed frame of latitudes, longitudes [rad] and heights [m] (...)."""
     lat, lon, h = np.broadcast_arrays(*(np.asarray(v, dtype=float) for v in (latitude_rad, longitude_rad, height_m)))
     if body == "earth":
         import erfa

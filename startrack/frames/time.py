@@ -48,7 +48,7 @@ def _utc_text(local: str) -> str:
 
 
 def format_utc(time: datetime) -> str:
-    """`time` as ISO 8601 with microseconds and Z: parse_utc(format_utc(time)) == time.
+    """Text of `time` in ISO 8601 with microseconds and Z: parse_utc(format_utc(time)) == time.
 
     Raises:
         ValueError: the datetime carries no time zone.
@@ -57,7 +57,7 @@ def format_utc(time: datetime) -> str:
 
 
 def as_utc(time: datetime) -> datetime:
-    """The same instant with time zone UTC.
+    """Instant of `time` with time zone UTC.
 
     Raises:
         ValueError: the datetime carries no time zone, so that it names no instant.

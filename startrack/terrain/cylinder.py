@@ -55,7 +55,7 @@ def distance_to_circle(points_m: Array, azimuths_rad: Array, radius_m: Array | f
 
 
 def chord(along_m: Array, off_centre_m: Array, radius_m: Array | float) -> Array:
-    """Distance to the circle ahead of a point `off_centre_m` from its middle, `along_m` of that in the direction."""
+    """Distance (...) [m] to a circle ahead of a point `off_centre_m` off its middle, `along_m` of it along the ray."""
     inner = np.square(np.maximum(radius_m, 0.0)) - np.square(off_centre_m)
     root = np.sqrt(np.maximum(np.square(along_m) + inner, 0.0))
     # Outside the circle (inner < 0) the rim no longer surrounds the point: the wall is overhead, at distance 0.
@@ -66,7 +66,7 @@ def distance_bounds(
     centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float,
     least_radius_m: float, greatest_radius_m: float,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Least and greatest distance (...) to a rim between two circles, over boxes and azimuths as in `Terrain`.
+    """Least and greatest distance (...) [m] to a rim between two circles, over boxes and azimuths as in `Terrain`.
 
     A point within r of the centre c sees the circle of radius R no nearer than c sees the one of radius R - r, and no
     farther than c sees the one of radius R + r. Over azimuths the distance grows steadily from the side that the point
@@ -100,12 +100,12 @@ class Crater(Terrain):
 
     @property
     def radius_m(self) -> float:
-        """Of the rim, or of the round one that it differs from."""
+        """Radius [m] of the rim, or of the round rim that a deformed one differs from."""
         return self.diameter_m / 2
 
     @property
     def rim(self) -> Rim:  # type: ignore[override]
-        """The top of the wall."""
+        """Rim at the top of the wall."""
         return Rim(self.radius_m, self.wall_m)
 
     @property
@@ -115,7 +115,7 @@ class Crater(Terrain):
 
     @property
     def reach_m(self) -> float:
-        """The floor, or the search area and a quarter more."""
+        """Radius [m] about the origin in which a camera may stand: the floor's, or 1.25 of the search area's."""
         return float(min(self.radii_m[1], super().reach_m))
 
     @property
@@ -128,7 +128,7 @@ class Crater(Terrain):
         return self.radius_m, self.depth_m
 
     def ground_m(self, points_m: Array) -> Array:
-        """Zero: the floor is the plane z = 0."""
+        """Height of the ground (...) [m]: zero, as the floor is the plane z = 0."""
         return np.zeros(np.shape(points_m)[:-1])
 
     def allowed(self, points_m: Array) -> Bools:
@@ -167,14 +167,14 @@ class DeformedCrater(Crater):
         return self.radius_m * radius, self.depth_m + self.radius_m * raised
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
-        """Horizon elevation [rad]; pi/2 from inside the wall. See `Terrain`."""
+        """Elevation (...) [rad] of the horizon from points at azimuths; pi/2 from inside the wall. See `Terrain`."""
         points = np.asarray(points_m, dtype=np.float64)
         distance = self._distance_m(points, azimuths_rad)
         height = self.rim_m(_points_ahead(points, distance, azimuths_rad))[1]
         return np.arctan2(height - self.camera_height_m, distance)
 
     def _distance_m(self, points: Array, azimuths_rad: Array) -> Array:
-        """Distance to the rim, halved in between the circles that lie wholly within and wholly outside of it."""
+        """Distance (...) [m] to the rim, halved in between circles wholly within and wholly outside of it; else 0."""
         near = distance_to_circle(points, azimuths_rad, self.radii_m[0])
         far = distance_to_circle(points, azimuths_rad, self.radii_m[1])
         for _ in range(HALVINGS if np.any(far > near) else 0):
@@ -184,19 +184,20 @@ class DeformedCrater(Crater):
         return np.where(self._is_within(points), 0.5 * (near + far), 0.0)
 
     def _is_within(self, points_m: Array) -> Bools:
+        """Whether points (..., 2) [m] lie within the rim."""
         return np.asarray(np.hypot(points_m[..., 0], points_m[..., 1]) < self.rim_m(points_m)[0])
 
     def horizon_bounds_rad(
         self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
     ) -> tuple[Array, Array]:
-        """Bounds [rad] from the circles and the heights between which the rim lies; see `Terrain`."""
+        """Least and greatest horizon [rad] over boxes, from the circles and heights between which the rim lies."""
         near, far = distance_bounds(centres_m, half_m, azimuths_rad, azimuth_half_rad, *self.radii_m)
         raised = self.radius_m * float(np.hypot(self.rim_tilt_east_rad, self.rim_tilt_north_rad))
         low, high = self.wall_m - raised, self.wall_m + raised
         return np.arctan2(low, far if low > 0 else near), np.arctan2(high, near if high > 0 else far)
 
     def facts(self) -> dict[str, Any]:
-        """Diameter, depth, ellipse and tilt, as JSON values."""
+        """Facts about the crater as JSON values: diameter, depth, ellipse and tilt."""
         names = ("diameter_m", "depth_m", "ellipse_cos_1", "ellipse_sin_1", "rim_tilt_east_rad", "rim_tilt_north_rad")
         return {"kind": "deformed crater", **{name: getattr(self, name) for name in names}}
 
@@ -228,7 +229,7 @@ def slopes_of_round_crater(crater: Crater, points_m: Array, azimuths_rad: Array)
 
 
 def _points_ahead(points: Array, distance: Array, azimuths_rad: Array) -> Array:
-    """The points (..., 2) that lie at the distances (...) along the azimuths."""
+    """Points (..., 2) that lie at the distances (...) from `points` along the azimuths."""
     return np.stack(
         [points[..., 0] + distance * np.sin(azimuths_rad), points[..., 1] + distance * np.cos(azimuths_rad)], axis=-1
     )
@@ -236,7 +237,7 @@ def _points_ahead(points: Array, distance: Array, azimuths_rad: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Cylinder(Crater):
-    """tan H = (depth - camera height) / d(p, a), d the distance from p along azimuth a to the circle of the rim.
+    """A round crater: tan H = (depth - camera height) / d(p, a), d the distance from p along azimuth a to the rim.
 
     Source: Kua 2008, section 3.1 (eq. 3.1 seen from the camera's height instead of the floor). Raises BadInput
     bad_terrain for lengths that are no numbers, not positive or above 10,000 km, for a camera that is not below the
@@ -273,7 +274,7 @@ class Cylinder(Crater):
                 raise BadInput("bad_terrain", f"{key} must be below {MAX_SHAPE_SIGMA * size:g} m, half of it")
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
-        """Horizon elevation [rad]; pi/2 from inside the wall. See `Terrain`."""
+        """Elevation (...) [rad] of the horizon from points at azimuths; pi/2 from inside the wall. See `Terrain`."""
         points, azimuths = np.asarray(points_m, dtype=np.float64), np.asarray(azimuths_rad, dtype=np.float64)
         if points.ndim == 3 and points.shape[1] == 1 and azimuths.ndim == 1:  # each point with each azimuth
             found = np.empty((len(points), len(azimuths)))
@@ -285,17 +286,17 @@ class Cylinder(Crater):
     def horizon_bounds_rad(
         self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
     ) -> tuple[Array, Array]:
-        """Bounds of the horizon over boxes [rad], from circles grown and shrunk by the half diagonal."""
+        """Least and greatest horizon [rad] over boxes, from circles grown and shrunk by the half diagonal."""
         nearest, farthest = distance_bounds(centres_m, half_m, azimuths_rad, azimuth_half_rad, *self.radii_m)
         return np.arctan2(self.wall_m, farthest), np.arctan2(self.wall_m, nearest)
 
     @property
     def errors(self) -> CylinderErrors:  # type: ignore[override]
-        """Errors of its sizes, of the rim's shape, and of the camera's height."""
+        """Errors of the crater's sizes, of the rim's shape, and of the camera's height."""
         return CylinderErrors(self)
 
     def with_shape(self, values: Array) -> Terrain:
-        """The crater with these errors; see `Terrain`."""
+        """Crater with the errors `values` (n,), in the order of `errors.shape`; see `Terrain`."""
         errors = errors_by_name(self.errors.shape, values)
         refraction_1 = errors.pop("refraction_1", 0.0)
         crater = DeformedCrater(
@@ -307,7 +308,7 @@ class Cylinder(Crater):
         return with_refraction_error(crater, refraction_1)
 
     def with_steepness(self, steepness_1: float) -> Cylinder:
-        """See `Terrain`: of another depth."""
+        """Copy of this crater, of another depth: its wall above the camera is `steepness_1` times the stated one."""
         if steepness_1 == self.errors.steepness_1:
             return self
         depth_m = self.camera_height_m + steepness_1 * (self.about_depth_m - self.camera_height_m)
@@ -319,7 +320,7 @@ class Cylinder(Crater):
         return self.depth_m if self.stated_depth_m is None else self.stated_depth_m
 
     def facts(self) -> dict[str, Any]:
-        """Diameter and depth, as JSON values."""
+        """Facts about the crater as JSON values: diameter and depth."""
         return {"kind": "cylinder", "diameter_m": self.diameter_m, "depth_m": self.depth_m}
 
 
@@ -344,7 +345,7 @@ class CylinderErrors(GroundErrors):
         )  # fmt: skip
 
     def slopes_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
-        """In closed form; zero from inside the wall."""
+        """Change (k, ...) [rad] of the horizon by one unit of each error, in closed form; zero from inside the wall."""
         shape = np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))
         errors, crater = self.shape, self.crater
         slopes = slopes_of_round_crater(crater, points_m, azimuths_rad) if errors else {}
@@ -354,14 +355,14 @@ class CylinderErrors(GroundErrors):
 
     @property
     def unknown_steepness_1(self) -> float:  # type: ignore[override]
-        """Of depth over diameter."""
+        """Relative sigma of depth over diameter, if too large for linear errors and no depth was chosen; else 0."""
         sigma = {one.name: one.sigma for one in self.shape}
         found = float(np.hypot(sigma.get("depth_1", 0.0), sigma.get("diameter_1", 0.0)))
         return found if found > LINEAR_SHAPE_1 and self.crater.stated_depth_m is None else 0.0
 
     @property
     def steepness_1(self) -> float:  # type: ignore[override]
-        """That of its depth."""
+        """Height of the wall above the camera, over that of the stated depth."""
         return self.crater.wall_m / (self.crater.about_depth_m - self.crater.camera_height_m)
 
 

@@ -93,7 +93,7 @@ def make_height_map(keys: dict[str, Any], folder: Path, **shared: Any) -> Terrai
 
 
 def paths_of(files: str | tuple[str, ...], folder: Path) -> list[Path]:
-    """Paths of one of the `files` of a key or of several, relative to `folder`."""
+    """Paths of the `files` of a key, one or several, relative to `folder`."""
     return [folder / file for file in ((files,) if isinstance(files, str) else files)]
 
 

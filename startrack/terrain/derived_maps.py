@@ -55,16 +55,17 @@ class DeformedMap(ForwardingTerrain):
 
     @cached_property
     def errors(self) -> PostErrors:  # type: ignore[override]
-        """Those of the map's single posts."""
+        """Errors of the map's single posts: the only ones that are left."""
         return PostErrors(self.whole)
 
     @property
     def camera_height_m(self) -> float:  # type: ignore[override]
-        """Of the camera above the ground, with its error."""
+        """Height [m] of the camera above the ground, with its error."""
         return max(self.whole.camera_height_m + self._raised_m, 0.0)
 
     @cached_property
     def _raised(self) -> TracedMap:
+        """Map with the camera at the changed height and the changed bend of sight lines; `whole` without changes."""
         if not self._raised_m and not self._refraction_1:
             return self.whole
         refraction_1 = min(self.whole.terrestrial_refraction_1 + self._refraction_1, MOST_REFRACTION_1)
@@ -75,15 +76,15 @@ class DeformedMap(ForwardingTerrain):
         return raised
 
     def without_table(self) -> DeformedMap:
-        """The same ground of the raised camera's map without its table; see `Terrain`."""
+        """Copy of this ground whose raised camera's map has no table of horizons; see `Terrain`."""
         return self.changed(_raised=self._raised.without_table())
 
     def _level_rad(self, horizon_rad: Array) -> Array:
-        """A horizon [rad] of the raised camera, stretched."""
+        """Elevations (...) [rad] with tan stretched, from those of the raised camera's horizon."""
         return np.asarray(np.arctan((1.0 + self._stretch_1) * np.tan(horizon_rad)))
 
     def _before_turn_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
-        """The horizon [rad] with all errors but the turn; see `horizon_rad`."""
+        """Elevation (...) [rad] of the horizon with all errors but the turn; see `horizon_rad`."""
         if not self._most_risen_rad:
             return self._level_rad(self._raised.horizon_rad(points_m, azimuths_rad))
         tan, distance_m, _ = self._raised.horizons(points_m, azimuths_rad)
@@ -92,12 +93,12 @@ class DeformedMap(ForwardingTerrain):
         return self._level_rad(np.arctan(tan)) + risen_rad * self.whole.crest_share(tan, distance_m)
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
-        """Horizon elevation [rad], traced; see `Terrain`."""
+        """Elevation (...) [rad] of the horizon with all errors, traced; see `Terrain`."""
         found = self._before_turn_rad(points_m, azimuths_rad)
         return self._turned_rad(points_m, azimuths_rad, found) if self._tilt_rad else found
 
     def _turned_rad(self, points_m: Array, azimuths_rad: Array, about_rad: Array) -> Array:
-        """The horizon after the turn (...); before it, at the same azimuths, it stands at about `about_rad` (...)."""
+        """Elevation (...) [rad] of the horizon after the turn; before it, it stands at about `about_rad` (...)."""
         azimuths, found = np.broadcast_to(azimuths_rad, about_rad.shape), about_rad
         own = np.array(azimuths)
         for _ in range(TILT_ROUNDS):
@@ -118,7 +119,7 @@ class DeformedMap(ForwardingTerrain):
     def horizon_bounds_rad(
         self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
     ) -> tuple[Array, Array]:
-        """Bounds [rad] from those of the raised camera's map, over azimuths that hold what the turn brings in."""
+        """Least and greatest horizon [rad] over boxes, by the raised camera's map and the azimuths that a turn adds."""
         turn, around_rad = np.asarray(azimuth_half_rad), self._tilt_rad + self._most_risen_rad
         if self._tilt_rad:
             high = self._level_rad(
@@ -129,7 +130,7 @@ class DeformedMap(ForwardingTerrain):
         return self._level_rad(low) - around_rad, self._level_rad(high) + around_rad
 
     def horizon_spread_rad(self, points_m: Array, half_m: float, azimuths_rad: Array) -> tuple[Array, Array]:
-        """As of the map, about the horizon of this ground; see `Terrain`."""
+        """Middle (...) [rad] of this ground's horizon over boxes, and half width of that of the map; see `Terrain`."""
         return self.horizon_rad(points_m, azimuths_rad), self.whole.horizon_spread_rad(points_m, half_m, azimuths_rad)[
             1
         ]
@@ -148,7 +149,7 @@ class Nodes(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class HorizonInterpolator(ForwardingTerrain):
-    """The terrain near a centre, with fast horizons at the azimuths that it was made for; else as `whole`.
+    """The terrain near a centre, with fast horizons at the azimuths that it was made for; elsewhere those of `whole`.
 
     A crest at the distance d is seen higher as the camera's own ground falls: tan H + z / d bends much less from point
     to point than tan H, and is taken as bilinear between traced nodes.
@@ -162,7 +163,7 @@ class HorizonInterpolator(ForwardingTerrain):
 
     @cached_property
     def nodes(self) -> Nodes:
-        """The horizons traced at the nodes."""
+        """Horizons traced at the nodes."""
         line = np.linspace(-self.half_m, self.half_m, self.across)
         points = np.asarray(self.centre_m + np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1), dtype=np.float64)
         tan, distance, _ = self.whole.horizons(points[:, :, None, :], self.azimuths_rad)
@@ -173,11 +174,11 @@ class HorizonInterpolator(ForwardingTerrain):
         return Nodes(tan, near, middle, float(self.centre_m[0]), float(self.centre_m[1]), float(self.half_m))
 
     def without_table(self) -> TracedMap:
-        """The whole map: nothing is interpolated; see `Terrain`."""
+        """The whole map without its table, where nothing is interpolated; see `Terrain`."""
         return self.whole.without_table()
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
-        """Horizon elevation [rad]; see `Terrain`."""
+        """Elevation (...) [rad] of the horizon from points at azimuths; see `Terrain`."""
         shape, points, azimuths = rows_of_rays(points_m, azimuths_rad)
         column = np.minimum(np.searchsorted(self.azimuths_rad, azimuths), len(self.azimuths_rad) - 1)
         near = np.abs(points - self.centre_m).max(axis=-1) <= self.half_m * (1 + 1e-9)

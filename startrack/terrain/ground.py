@@ -47,7 +47,7 @@ class Ground:
 
     @cached_property
     def record(self) -> Record:
-        """The maps as a struct of the compiled library."""
+        """Record of the maps for the compiled kernels."""
         return Record(
             "ground", self.grid.reshape(*self.grid.shape[:2], -1), self.heights, self.posts, self.tops, self.wide_tops,
             self.slopes, self.blocks, self.levels, self.slope_unit, self.post_m, self.radius_m, self.highest_m,
@@ -65,7 +65,7 @@ surfaces = kernel("surfaces", "ground: ground", "points: float64[n, 2]", "up: ou
 
 
 def pack_maps(site: Site, maps: Sequence[Raster], *, keep_voids: bool = False) -> Ground:
-    """The maps, finest first, ready for tracing in the site's enu.
+    """Ground of the `maps`, finest first, packed for tracing in the enu of the `site`.
 
     Voids have the ground of a coarser map, else the height of the nearest post. With `keep_voids` the latter have NaN,
     for tracing where the known ground ends.
@@ -126,7 +126,7 @@ def pack_maps(site: Site, maps: Sequence[Raster], *, keep_voids: bool = False) -
 
 
 def fill_cut_out(raster: Raster, widest_m: float) -> Raster:
-    """The map without its voids that are no wider than `widest_m` [m], which known posts surround.
+    """Map like `raster` without its voids that are no wider than `widest_m` [m], which known posts surround.
 
     What was cut out of the map, such as roofs and trees: the ground is linear between the posts around.
     """
@@ -166,13 +166,15 @@ def _fill_voids(
 
 
 def _cell_tops(h: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Highest post (rows - 1, columns - 1) of each cell between the posts `h` (rows, columns) [m]."""
     return np.maximum(np.maximum(h[:-1, :-1], h[:-1, 1:]), np.maximum(h[1:, :-1], h[1:, 1:]))
 
 
 def _cell_slopes(h: NDArray[np.float32], unit: float) -> NDArray[np.int8]:
-    """(rows, columns, 8): most fall, then most rise, per step along (1, 0), (0, 1), (1, 1), (-1, 1) in (column, row).
+    """Slopes (rows, columns, 8): most fall, then most rise, per step along (1, 0), (0, 1), (1, 1), (-1, 1), in units.
 
-    In a bilinear cell the rise along columns lies between those of its two edges, whatever the row, and so for rows.
+    Steps are (column, row), units `unit` [m]. In a bilinear cell the rise along columns lies between those of its two
+    edges, whatever the row, and so for rows.
     """
     h = h * np.float32(1 / unit)
     along, down = h[:, 1:] - h[:, :-1], h[1:] - h[:-1]
@@ -188,13 +190,13 @@ def _cell_slopes(h: NDArray[np.float32], unit: float) -> NDArray[np.int8]:
 
 
 def merge_blocks(a: np.ndarray, choose: np.ufunc) -> np.ndarray:
-    """An array (rows, columns, ...) at half the resolution: of two by two blocks the one that `choose` prefers."""
+    """Array (rows, columns, ...) at half the resolution: of two by two blocks the value that `choose` prefers."""
     a = np.pad(a, [(0, n % 2) for n in a.shape[:2]] + [(0, 0)] * (a.ndim - 2), mode="edge")
     return np.asarray(choose(choose(a[::2, ::2], a[1::2, ::2]), choose(a[::2, 1::2], a[1::2, 1::2])))
 
 
 def _spread_largest(a: np.ndarray) -> np.ndarray:
-    """The largest values (rows, columns, ...) of blocks and their neighbours."""
+    """Largest values (rows, columns, ...) of each block of `a` and its eight neighbours."""
     tall = a.copy()
     np.maximum(tall[1:], a[:-1], out=tall[1:])
     np.maximum(tall[:-1], a[1:], out=tall[:-1])
@@ -207,7 +209,7 @@ def _spread_largest(a: np.ndarray) -> np.ndarray:
 def _raise_to_finer_maps(
     tops: NDArray[np.float32], height_map: Raster, finer: Sequence[Raster], site: Site
 ) -> NDArray[np.float32]:
-    """Cells of a coarse map where finer maps lie are as high as any post of these there or close by."""
+    """Copy of the `tops` of a coarse map's cells, raised to the posts of finer maps there or close by."""
     tops = tops.copy()
     for fine in finer:
         size = 1
@@ -226,7 +228,7 @@ def _raise_to_finer_maps(
 
 
 def ground_up_m(site: Site, maps: Sequence[Raster], points_m: Array) -> Array:
-    """Height in enu (...) of the surface at east and north (..., 2) [m]; NaN where no map reaches."""
+    """Height (...) [m] in enu of the surface at east and north (..., 2) [m]; NaN where no map reaches."""
     east, north = points_m[..., 0], points_m[..., 1]
     up = np.zeros(np.shape(east))
     for _ in range(SURFACE_ROUNDS):
@@ -273,7 +275,7 @@ def number_of_maps(site: Site, maps: Sequence[Raster], points_enu_m: Array) -> I
 
 
 def post_positions(site: Site, maps: Sequence[Raster], posts: Ints) -> Array:
-    """East, north and up (n, 3) in enu of posts (n,), by the map."""
+    """Positions (n, 3) [m] in enu, east, north and up, of the `posts` (n,) at the heights of the maps."""
     found, first = np.zeros((len(posts), 3)), 0
     for raster in maps:
         columns, last = raster.heights_m.shape[1], first + raster.heights_m.size

@@ -46,11 +46,11 @@ class HeightMap(TracedMap):
 
     @cached_property
     def errors(self) -> MapErrors:  # type: ignore[override]
-        """Those that are stated, or usual, by the horizons of a copy: a circle would keep the maps in memory."""
+        """Errors of the maps, stated or usual, by a copy's horizons: a circle would keep the maps in memory."""
         return MapErrors(self.changed(ground=self.ground))
 
     def with_shape(self, values: Array) -> Terrain:
-        """The ground with these errors; see `Terrain`."""
+        """Ground with the errors `values` (n,), in the order of `errors.shape`; see `Terrain`."""
         errors = shape.errors_by_name(self.errors.shape, values)
         offsets_m = [errors.pop(name, 0.0) for name in shape.offset_names(len(self.maps))]
         refraction_1 = errors.pop("refraction_1", 0.0)
@@ -80,22 +80,22 @@ class HeightMap(TracedMap):
         return np.asarray(above & ~are_in_sectors(azimuths_rad, self.glare_rad))
 
     def unknown_below_rad(self, azimuths_rad: Array) -> Array:
-        """The same from everywhere in the search area; see `Terrain`."""
+        """Elevation (...) [rad] below which ground off the maps could stand: the same from all of the search area."""
         b = np.floor(np.asarray(azimuths_rad) / (2 * np.pi) * AZIMUTH_BINS).astype(np.int64) % AZIMUTH_BINS
         return np.asarray(self.unknown_rad[b])
 
     def mask_reason(self, azimuths_rad: Array, elevations_rad: Array) -> NDArray[np.str_]:
-        """Why rays (n,) are not informative; empty where they are."""
+        """Reason (n,) why rays (n,) are not informative: glare, or off the map; empty where they are."""
         reason = np.where(self.is_informative(azimuths_rad, elevations_rad), "", OFF_MAP)
         return np.where((reason != "") & are_in_sectors(azimuths_rad, self.glare_rad), GLARE, reason)
 
     def warnings(self) -> list[str]:
-        """One line of text per range of azimuths that is not informative, and those of its errors."""
+        """Warnings: a line per range of azimuths that is not informative, and those of the map's errors."""
         return [*describe_masks(self.glare_rad, self.unknown_rad), *self.errors.warnings()]
 
     @cached_property
     def unknown_rad(self) -> Array:
-        """(AZIMUTH_BINS,) elevation below which ground off the maps could stand, or -pi/2; needs no table."""
+        """Elevation (AZIMUTH_BINS,) [rad] below which ground off the maps could stand, or -pi/2; needs no table."""
         table = load_table(self.table_key, self.square)
         return unknown_elevations_rad(self) if table is None else table.unknown_rad
 
@@ -113,6 +113,6 @@ class HeightMap(TracedMap):
         }
 
     def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = 3) -> Terrain:
-        """The ground near a centre (2,), see `HorizonInterpolator`."""
+        """Terrain near a centre (2,) [m] with horizons interpolated between traced nodes, see `HorizonInterpolator`."""
         centre = np.asarray(centre_m, dtype=np.float64)
         return HorizonInterpolator(self, centre, half_m, np.unique(azimuths_rad), across)

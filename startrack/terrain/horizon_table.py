@@ -41,13 +41,13 @@ NEW = np.uint64(np.iinfo(np.uint64).max)  # a NaN, which no box has
 
 
 def flatten_rays(points_m: Array, azimuths_rad: Array) -> tuple[tuple[int, ...], Array, Array]:
-    """The shape of points (..., 2) broadcast with azimuths (...), and its n points (n, 2) and azimuths (n,)."""
+    """Shape of points (..., 2) broadcast with azimuths (...), and its n points (n, 2) and azimuths (n,)."""
     shape = np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))
     return shape, flatten(points_m, (*shape, 2)).reshape(-1, 2), flatten(azimuths_rad, shape).ravel()
 
 
 def rows_of_rays(points_m: Array, azimuths_rad: Array) -> tuple[tuple[int, ...], Array, Array]:
-    """The same shape, and its points (n, 2) and azimuths: (1, m) those of all points, else (n, 1)."""
+    """Shape of points (..., 2) broadcast with azimuths, points (n, 2), azimuths: (1, m) of all points, else (n, 1)."""
     if np.ndim(points_m) > 1 and np.shape(points_m)[-2] == 1 and np.ndim(azimuths_rad) == 1:
         shape = (*np.shape(points_m)[:-2], len(azimuths_rad))
         return shape, flatten(points_m, np.shape(points_m)).reshape(-1, 2), np.array(azimuths_rad, np.float64)[None]
@@ -56,7 +56,7 @@ def rows_of_rays(points_m: Array, azimuths_rad: Array) -> tuple[tuple[int, ...],
 
 
 def flatten(a: Any, shape: tuple[int, ...]) -> Array:
-    """The values of `a`, broadcast to the shape, in one contiguous array of their own: kernels have one layout."""
+    """Copy of `a`, broadcast to the `shape`, as one contiguous array: kernels have one layout."""
     return np.array(np.broadcast_to(np.asarray(a, dtype=np.float64), shape), order="C")
 
 
@@ -76,7 +76,7 @@ def run_in_threads(function: Any, fixed: tuple[Any, ...], arrays: tuple[Array, .
 
 @cache
 def _thread_pool() -> ThreadPoolExecutor:
-    """Threads beside the calling one, kept: each start takes as long as a thousand rays."""
+    """Pool of threads beside the calling one, kept: each start takes as long as a thousand rays."""
     return ThreadPoolExecutor(MAX_THREADS)
 
 
@@ -93,11 +93,12 @@ class Square:
 
     @property
     def half_m(self) -> float:
+        """Half the side of a cell [m]."""
         return self.reach_m / self.across
 
     @property
     def centres_m(self) -> Array:
-        """(across^2, 2), the north running fastest."""
+        """Centres (across^2, 2) [m] of the cells, east and north, the north running fastest."""
         line = self.half_m * (2 * np.arange(self.across) + 1) - self.reach_m
         east, north = np.meshgrid(line, line, indexing="ij")
         return np.stack([east.ravel(), north.ravel()], axis=-1)
@@ -117,7 +118,7 @@ class BoxMemory:
     """
 
     def __init__(self, slots: int, numbers: int, azimuths: int) -> None:
-        """`numbers` are those of a box (and its azimuths, where they differ); of each, bounds at so many `azimuths`."""
+        """Keep in `slots` the bounds at `azimuths` azimuths of boxes that are told apart by `numbers` numbers each."""
         self._shape = slots, numbers, azimuths
         self._keys, self._bounds = np.full((slots, numbers), NEW), np.empty((slots, 2, azimuths))
         self._lock = Lock()
@@ -126,9 +127,9 @@ class BoxMemory:
         return BoxMemory, self._shape  # another process computes for itself
 
     def fill(self, numbers: Array, low: Array, high: Array, compute: Callable[[Bools], Array]) -> None:
-        """Fill low and high (n, azimuths) for boxes of `numbers` (n, numbers).
+        """Fill bounds `low` and `high` (n, azimuths) of the horizon for boxes of `numbers` (n, numbers).
 
-        `compute` gives those (2, k, azimuths) of the boxes that are not kept, of which it takes a mask (n,).
+        `compute` gives the bounds (2, k, azimuths) of the k boxes that are not kept, of which it takes a mask (n,).
         """
         keys = np.ascontiguousarray(numbers).view(np.uint64)
         missing = np.empty(len(low), dtype=np.bool_)
@@ -170,14 +171,14 @@ class HorizonTable:
 
     @cached_property
     def tangents(self) -> Array:
-        """(65536,) tan of the table's elevations; infinite at the zenith and the nadir."""
+        """Tangents (65536,) of the table's elevations; infinite at the zenith and the nadir."""
         found = np.tan(np.arange(FARTHEST + 1) * ANGLE_STEP_RAD - np.pi / 2)
         found[0], found[round(np.pi / ANGLE_STEP_RAD) :] = -np.inf, np.inf
         return found
 
     @cached_property
     def record(self) -> Record:
-        """The table as a struct of the compiled library."""
+        """Record of the table for the compiled kernels."""
         return Record(
             "table", self.values, self.tangents, np.sin(MIDDLES_RAD), np.cos(MIDDLES_RAD), self.square.across,
             self.square.reach_m, ANGLE_STEP_RAD, DISTANCE_STEP_M, RISE_STEP,
@@ -218,7 +219,7 @@ class HorizonSigma:
     height_sigma_m: float
 
     def sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
-        """Sigma (...) at the points (..., 2) in these azimuths."""
+        """Sigma (...) [rad] of the horizon at the points (..., 2) [m] in these azimuths (...) [rad]."""
         square = self.table.square
         cell = np.clip((np.asarray(points_m) + square.reach_m) / (2 * square.half_m), 0, square.across - 1)
         cell = cell.astype(np.int64)
@@ -226,7 +227,7 @@ class HorizonSigma:
         return self.blocks_rad[0][cell[..., 0], cell[..., 1], b]
 
     def max_sigma_rad(self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float) -> Array:
-        """The largest of `sigma_rad` (n,) over boxes and azimuths: it changes from cell to cell of the table."""
+        """Largest sigma (...) [rad] over boxes and azimuths: it changes from cell to cell of the table."""
         most = self.blocks_rad[self.table.level_for(half_m)]
         reach_m = self.table.square.reach_m
         n, side = len(most), 2 * reach_m / len(most)
@@ -242,7 +243,7 @@ class HorizonSigma:
 
     @cached_property
     def blocks_rad(self) -> list[NDArray[np.float32]]:
-        """(m, m, AZIMUTH_BINS) the sigma of the cells, then the largest of ever larger blocks of them."""
+        """Sigmas (m, m, AZIMUTH_BINS) [rad] of the cells, then the largest of ever larger blocks of them."""
         n, values = self.table.square.across, self.table.values
         distance = np.maximum(values[..., 4].astype(np.float32) * DISTANCE_STEP_M, NEAREST_M)
         middle = (values[..., 0].astype(np.float32) + values[..., 1]) / 2 * ANGLE_STEP_RAD - np.pi / 2

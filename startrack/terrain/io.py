@@ -155,7 +155,7 @@ class GroundBrightness:
 
     @property
     def value(self) -> float | dict[str, float]:
-        """The value of the key that states it."""
+        """Value of the key `ground.brightness` that states this brightness."""
         if self.low == self.high:
             return self.low
         return {"low": self.low, "high": self.high, "size_deg": float(np.degrees(self.size_rad)), "seed": self.seed}
@@ -221,7 +221,7 @@ def read_keys(text: str) -> dict[str, Any]:
 
 @lru_cache(maxsize=2)
 def _load_cached(path: Path, text: str, stamps: tuple[Any, ...]) -> Terrain:
-    """Read once for many images: maps, packed ground and tables take some 0.3 GB and half a second."""
+    """Terrain of a file's `text`, read once for many images: it takes some 0.3 GB and half a second."""
     return terrain_from_dict(parse_toml(text, "bad_terrain"), default_name=printable(path.stem), folder=path.parent)
 
 
@@ -243,7 +243,7 @@ def _files_beside(keys: dict[str, Any], folder: Path) -> tuple[Path, ...]:
 
 
 def _file_stamps(folder: Path, keys: dict[str, Any]) -> tuple[Any, ...]:
-    """Values that change when one of the files beside does."""
+    """Values that change when one of the files beside the terrain file does."""
     stamps: list[tuple[Any, ...]] = []
     for path in _files_beside(keys, folder):
         with suppress(OSError, ValueError):  # who reads it reports it
@@ -274,7 +274,7 @@ def terrain_from_dict(values: dict[str, Any], default_name: str = "terrain", fol
 
 
 def _file_facts(keys: dict[str, Any], folder: Path) -> TerrainFile:
-    """What the `keys` of a terrain file in a `folder` state beside the ground. Raises BadInput bad_terrain."""
+    """Facts that the `keys` of a terrain file in a `folder` state beside the ground. Raises BadInput bad_terrain."""
     brightness = keys.get("ground", {}).get("brightness")
     obstacles = read_obstacles(folder / keys["obstacles"], "bad_terrain") if "obstacles" in keys else None
     light = None if brightness is None else GroundBrightness.of(brightness)
@@ -328,13 +328,13 @@ def stateable_errors(text: str) -> list[StateableError]:
 
 
 def _waves_text() -> str:
-    """What counts where a file leaves the waves out."""
+    """Text of what counts where a file leaves the waves out."""
     gross = f"with probability {100 * WAVES.gross_probability:g} % a seam of {np.degrees(WAVES.gross_sigma):.4g}"
     return f"{WAVE_PER_POST:g} of what {HEIGHT_KEY} makes of the horizon, and {gross}"
 
 
 def _default_text(fact: Fact, size_m: float | None = None) -> str:
-    """The prior of a fact that a file leaves out, in the unit of its key; `size_m` is what a relative error is of."""
+    """Text of the prior of a `fact` that a file leaves out, in its key's unit; a relative error is one of `size_m`."""
     unit = 180.0 / np.pi if fact.key.endswith("_deg") else size_m or 1.0
     text = f"{fact.sigma * unit:.4g}"
     if fact.gross_probability:
@@ -343,7 +343,7 @@ def _default_text(fact: Fact, size_m: float | None = None) -> str:
 
 
 def state_errors(text: str, values: Mapping[tuple[str, str], float | bool]) -> str:
-    """The `text` of a terrain file with `values` by table and key written in; all else is as before.
+    """Text of a terrain file: `text` with `values`, by table and key, written in; all else is as before.
 
     Raises BadInput bad_terrain where a key is there already, or the file's notation leaves no place for it.
     """
@@ -362,7 +362,7 @@ def state_errors(text: str, values: Mapping[tuple[str, str], float | bool]) -> s
 
 
 def _keys_of(text: str) -> dict[str, Any] | None:
-    """The keys of a TOML text; None if it is none."""
+    """Keys of a TOML `text`; None for any other text."""
     try:
         return parse_toml(text, "bad_terrain")
     except BadInput:

@@ -1,4 +1,4 @@
-"""Where a ground gives no evidence: where its maps end, below how high ground beyond could stand, and in glare."""
+"""Directions in which a ground gives no evidence: beyond the maps' ends, below what could stand there, and in glare."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Sectors = tuple[tuple[float, float], ...]  # azimuth ranges [rad], each from the
 
 
 def unknown_elevations_rad(ground: TracedMap) -> Array:
-    """(AZIMUTH_BINS,) elevation below which ground off the maps might be seen from somewhere in the search area.
+    """Elevation (AZIMUTH_BINS,) [rad] below which ground off the maps might be seen from somewhere in the search area.
 
     -pi/2 where none might.
     """
@@ -43,7 +43,7 @@ def unknown_elevations_rad(ground: TracedMap) -> Array:
 
 
 def distances_to_end_m(ground: TracedMap) -> Array:
-    """(AZIMUTH_BINS,) distance from the origin [m] at which the maps end or have a void, in the middle of each bin.
+    """Distance (AZIMUTH_BINS,) [m] from the origin at which the maps end or have a void, in the middle of each bin.
 
     It is too far by less than the spacing of the finest posts, or 0.5 % of it. A void that is narrower than a bin, and
     than two steps between the places that are looked up, may be missed.
@@ -62,7 +62,7 @@ def distances_to_end_m(ground: TracedMap) -> Array:
 
 
 def facts_of_ends(ground: TracedMap, unknown_rad: Array) -> dict[str, Any]:
-    """Where the maps of a `ground` end, as JSON values; `unknown_rad` is that of `unknown_elevations_rad`."""
+    """Facts about the ends of a `ground`'s maps, as JSON values; `unknown_rad` is that of `unknown_elevations_rad`."""
     end_m = distances_to_end_m(ground)
     nearest = int(np.argmin(end_m))
     highest_post_m = max(float(np.nanmax(one.heights_m)) for one in ground.maps)
@@ -103,7 +103,7 @@ def are_in_sectors(azimuths_rad: Array, sectors_rad: Sectors) -> Bools:
 
 
 def describe_masks(glare_rad: Sectors, unknown_rad: Array) -> list[str]:
-    """One line per masked range of azimuths.
+    """Lines of text, one for each masked range of azimuths.
 
     `unknown_rad` (n,) of n equal sectors from north eastward is the elevation below which unmapped ground may stand,
     or -pi/2.
@@ -123,6 +123,7 @@ def describe_masks(glare_rad: Sectors, unknown_rad: Array) -> list[str]:
 
 
 def _range_text(start_rad: float, end_rad: float) -> str:
+    """Text of a range of azimuths [rad] in whole degrees."""
     if end_rad - start_rad >= 2 * np.pi - 1e-9:
         return "0 to 360 degrees"
     return f"{np.degrees(start_rad) % 360:.0f} to {np.degrees(end_rad) % 360:.0f} degrees"

@@ -41,7 +41,7 @@ BETWEEN_POSTS = 2.0 / 3.0  # RMS over a cell of the bilinear mean of independent
 
 
 class MapErrors(GroundErrors):
-    """Errors of the height maps of a ground: what is stated of them there, and what counts where it is silent."""
+    """Errors of the height maps of a ground: the stated ones, and usual ones where its file is silent."""
 
     def __init__(self, whole: HeightMap) -> None:
         self.map, self.height_sigma_m = whole, whole.height_sigma_m
@@ -60,7 +60,7 @@ class MapErrors(GroundErrors):
 
     @cached_property
     def post_rad(self) -> float:
-        """What the error of single posts makes of the horizon [rad]: the median over search area and azimuth."""
+        """Sigma [rad] of the horizon by the error of single posts: the median over search area and azimuth."""
         if not self.height_sigma_m:
             return 0.0
         cells = np.hypot(*self.map.square.centres_m.T) < self.map.search_radius_m
@@ -68,12 +68,12 @@ class MapErrors(GroundErrors):
 
     @cached_property
     def crest_distance_m(self) -> float:  # type: ignore[override]
-        """The median over azimuth, from the origin [m]."""
+        """Median distance [m] over azimuth from the origin to the crest that makes the horizon."""
         return float(np.median(self.map.horizons(np.zeros(2), MIDDLES_RAD)[1]))
 
     @cached_property
     def shape(self) -> tuple[ShapeError, ...]:  # type: ignore[override]
-        """Bias, stretch, tilt, waves, offsets of maps, camera, refraction. The bias needs the table of horizons.
+        """Errors of bias, stretch, tilt, waves, map offsets, camera and refraction. The bias needs the table.
 
         The camera stands as much too high as the ground between four posts is.
         """
@@ -88,7 +88,7 @@ class MapErrors(GroundErrors):
         )  # fmt: skip
 
     def slopes_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
-        """From the traced horizon and the distance of its crest; see `GroundErrors`.
+        """Change (k, ...) [rad] of the horizon by one unit of each error, from the traced horizon and its distance.
 
         The bias and the waves are errors of the crests' heights, see `crest_share`. Of a tilt the change of elevation
         alone: that of azimuth moves the skyline by its slope times tan H times the tilt, which is left out.
@@ -122,13 +122,13 @@ class MapErrors(GroundErrors):
         return {name: per_m * (1.0 * (of_crest == k) - (of_camera == k)) for k, name in enumerate(names, 1)}
 
     def sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
-        """From the height of the single post that makes the horizon: sigma cos^2 H / its distance."""
+        """Sigma (...) [rad] by the height of the single post that makes the horizon: sigma cos^2 H / its distance."""
         if self.height_sigma_m == 0:
             return super().sigma_rad(points_m, azimuths_rad)
         return self._sigma.sigma_rad(points_m, azimuths_rad)
 
     def most_sigma_rad(self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float) -> Array:
-        """The largest `sigma_rad` (n,) over boxes and azimuths."""
+        """Largest `sigma_rad` (...) over boxes and azimuths."""
         if self.height_sigma_m == 0:
             return super().most_sigma_rad(centres_m, half_m, azimuths_rad, azimuth_half_rad)
         return self._sigma.max_sigma_rad(centres_m, half_m, azimuths_rad, azimuth_half_rad)
@@ -138,7 +138,7 @@ class MapErrors(GroundErrors):
         return HorizonSigma(self.map.table, self.height_sigma_m)
 
     def expected_crests(self, point_m: Array, azimuths_rad: Array) -> ExpectedCrests | None:
-        """By the places along each ray that may stand highest; see kernels/crests.c and `Terrain`."""
+        """Skyline with all errors of posts, by the places along each ray that may stand highest; None without such."""
         if self.height_sigma_m == 0.0:
             return None
         tan, distance, _ = self.map.horizons(point_m, azimuths_rad)
@@ -152,14 +152,14 @@ class MapErrors(GroundErrors):
         return ExpectedCrests(rise, flat * np.sqrt(own), post, flat[:, None] * response)
 
     def ground_posts(self, point_m: Array, azimuths_rad: Array) -> tuple[Ints, Array]:
-        """The posts about a camera at `point_m`; see `GroundErrors`."""
+        """Posts (n, 4) about a camera at `point_m` (2,), and the change (n, 4) [rad/m] of the horizon by each."""
         tan, distance, _ = self.map.horizons(point_m, azimuths_rad)
         post, weight = cell_posts(self.map.site, self.map.maps, np.append(point_m, self.map.ground_m(point_m))[None])
         weights = -weight / ((1.0 + tan * tan) * distance)[:, None]
         return np.repeat(post, len(tan), axis=0), weights
 
     def post_positions_m(self, posts: Ints) -> Array:
-        """By the maps."""
+        """Positions (n, 3) [m] in enu of the `posts` (n,), by the maps."""
         return post_positions(self.map.site, self.map.maps, posts)
 
     def warnings(self) -> list[str]:
@@ -180,7 +180,7 @@ class MapErrors(GroundErrors):
 
 
 class PostErrors(MapErrors):
-    """The errors of single posts alone."""
+    """Errors of the single posts of a map alone."""
 
     shape, common_sigma_rad = (), 0.0  # type: ignore[assignment]
     slopes_rad = GroundErrors.slopes_rad

@@ -28,7 +28,7 @@ BOUNDS_ROUNDING_RAD = 1e-9  # by which a least horizon may exceed the greatest
 
 @dataclass(frozen=True, kw_only=True)
 class TerrainFile:
-    """What a terrain file states beside its ground and the errors of that."""
+    """Facts that a terrain file states beside its ground and the errors of that."""
 
     paths: tuple[Path, ...] = ()  # files read beside it: what is made with the terrain depends on them
     obstacles: Obstacles | None = None  # that hide its skyline, scanned from about where the camera stands
@@ -68,11 +68,11 @@ class Terrain(ABC):
 
     @property
     def air(self) -> Air | None:
-        """That of its site; None where there is none, or no site."""
+        """Air of its site; None where there is none, or no site."""
         return None if self.site is None else self.site.air
 
     def with_air(self, stated: Mapping[str, Any] | None) -> Self:
-        """The same ground under the air that is `stated`, see `Site.with_air`; None, or no site: itself."""
+        """Copy of this ground under the air that is `stated`, see `Site.with_air`; None, or no site: itself."""
         if stated is None or self.site is None:
             return self
         return self.changed(site=self.site.with_air(stated))
@@ -98,7 +98,7 @@ class Terrain(ABC):
 
     @property
     def projection(self) -> Projection | EarthProjection | None:
-        """That of maps of this ground: stereographic about the origin. None where that is not on the Moon."""
+        """Projection of maps of this ground: stereographic about the origin; None where that is not on the Moon."""
         if self.site is None or self.site.body != "moon":
             return None
         return Projection(
@@ -145,29 +145,29 @@ class Terrain(ABC):
         return np.full(np.shape(azimuths_rad), -np.pi / 2)
 
     def mask_reason(self, azimuths_rad: Array, elevations_rad: Array) -> NDArray[np.str_]:
-        """Why rays (n,) are not informative; empty where they are."""
+        """Reason (n,) why rays (n,) are not informative; empty where they are."""
         return np.where(self.is_informative(azimuths_rad, elevations_rad), "", "ground off the map")
 
     def warnings(self) -> list[str]:
-        """What the ground does not cover, and what its file does not state: the same for every image."""
+        """Warnings of what the ground does not cover and its file does not state: the same for every image."""
         return self.errors.warnings()
 
     def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = 3) -> Terrain:
-        """The same ground, prepared for positions within `half_m` of a centre (2,), at the azimuths (n,).
+        """Terrain prepared for positions within `half_m` [m] of a centre (2,), at the azimuths (n,) [rad].
 
         The terrain itself where horizons cost little; else they may be interpolated between `across` x `across` points.
         """
         return self
 
     def with_steepness(self, steepness_1: float) -> Terrain:
-        """The same knowledge of a ground, its errors counted from one of this `steepness_1`.
+        """Terrain with the same knowledge, whose errors are counted from a ground of this `steepness_1`.
 
         For grounds whose `errors.unknown_steepness_1` may differ from 0.
         """
         return self
 
     def with_shape(self, values: Array) -> Terrain:
-        """The ground that has the errors `values` (k,), in the units of the k errors of its shape, exactly.
+        """Ground that has the errors `values` (k,), in the units of the k errors of its shape, exactly.
 
         For simulation: its horizon may cost much, and its bounds may be wide. Raises ValueError for another number of
         values.
@@ -188,7 +188,7 @@ class Terrain(ABC):
         """Discard the table of `prepare`, in memory and on disk."""
 
     def without_table(self) -> Terrain:
-        """The same ground with a `horizon_rad` that is the same bits before and after `prepare`, in every process.
+        """Copy of this ground whose `horizon_rad` is the same bits before and after `prepare`, in every process.
 
         A table tells a trace where to begin: it is quicker, and its last digits are others.
         """
@@ -199,7 +199,7 @@ class Terrain(ABC):
         return {"kind": "other"}
 
     def costs_s(self) -> dict[str, float]:
-        """About how long work on this machine takes [s], measured on a part of it; {} where nothing takes long.
+        """Times [s] that work on this machine takes, measured on a part of it; {} where nothing takes long.
 
         "horizons" is the table that `prepare` computes, where it is not there; "frame" the position of an image.
         """
@@ -215,33 +215,34 @@ class ForwardingTerrain(Terrain):
         self.whole = whole
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
-        """As of `whole`."""
+        """Elevation (...) [rad] of the horizon of `whole` from points at azimuths."""
         return self.whole.horizon_rad(points_m, azimuths_rad)
 
     def horizon_bounds_rad(
         self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
     ) -> tuple[Array, Array]:
-        """As of `whole`."""
+        """Least and greatest horizon (...), (...) [rad] of `whole` over boxes."""
         return self.whole.horizon_bounds_rad(centres_m, half_m, azimuths_rad, azimuth_half_rad)
 
     def ground_m(self, points_m: Array) -> Array:
-        """As of `whole`."""
+        """Height (...) [m] in enu of the ground of `whole`."""
         return self.whole.ground_m(points_m)
 
     def without_table(self) -> Terrain:
-        """A copy of this one, about `whole` without its table."""
+        """Copy of this terrain about `whole` without its table."""
         return self.changed(whole=self.whole.without_table())
 
     def with_air(self, stated: Mapping[str, Any] | None) -> Self:
-        """A copy of this one, about `whole` under the air that is `stated`."""
+        """Copy of this terrain about `whole` under the air that is `stated`."""
         return self.changed(whole=self.whole.with_air(stated))
 
     def with_steepness(self, steepness_1: float) -> Terrain:
-        """A copy of this one, about `whole` of this `steepness_1`."""
+        """Copy of this terrain about `whole` of this `steepness_1`."""
         return self.changed(whole=self.whole.with_steepness(steepness_1))
 
 
 def _forward(name: str) -> Any:
+    """Property that gives the attribute `name` of `whole`."""
     return property(lambda self: getattr(self.whole, name))
 
 
@@ -265,29 +266,29 @@ class MisrefractedGround(ForwardingTerrain):
         self._error_1 = error_1
 
     def _lowered_rad(self, horizon_rad: Array) -> Array:
-        """Elevations (...) [rad], in the order of the `horizon_rad` (...)."""
+        """Elevations (...) [rad] of the `horizon_rad` (...) less the error of the refraction there."""
         air = self.whole.air
         return np.asarray(horizon_rad if air is None else horizon_rad - self._error_1 * air.lift_rad(horizon_rad))
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
-        """Horizon elevation [rad]; see `Terrain`."""
+        """Elevation (...) [rad] of the horizon less the error of the refraction; see `Terrain`."""
         return self._lowered_rad(self.whole.horizon_rad(points_m, azimuths_rad))
 
     def horizon_bounds_rad(
         self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
     ) -> tuple[Array, Array]:
-        """Bounds [rad] from those of the whole; see `Terrain`."""
+        """Least and greatest horizon [rad] over boxes, from those of `whole`; see `Terrain`."""
         low, high = self.whole.horizon_bounds_rad(centres_m, half_m, azimuths_rad, azimuth_half_rad)
         return self._lowered_rad(low), self._lowered_rad(high)
 
     def horizon_spread_rad(self, points_m: Array, half_m: float, azimuths_rad: Array) -> tuple[Array, Array]:
-        """As of the whole, about the horizon of this ground; see `Terrain`."""
+        """Middle (...) [rad] of this ground's horizon over boxes, and half width of that of `whole`; see `Terrain`."""
         middle, half = self.whole.horizon_spread_rad(points_m, half_m, azimuths_rad)
         return self._lowered_rad(middle), half
 
 
 def require_terrain(given: Any) -> Terrain:
-    """`given`, if it is a terrain: of a class derived from Terrain, or with every member of one.
+    """The `given` object, if it is a terrain: of a class derived from Terrain, or with every member of one.
 
     The one check of the members of a user's object; `require_bounds` and `require_horizons` check the values. All other
     code relies on the protocol. Raises BadInput (bad_terrain) that names the required methods which are missing.

@@ -21,7 +21,7 @@ AMOUNT = replace(LENGTH, above=False)  # a length or a sigma [m] that may be zer
 
 @dataclass(frozen=True, kw_only=True)
 class Prior:
-    """Of an error: normal about 0 with `sigma`, or with `gross_probability` with the wider `gross_sigma`."""
+    """The prior of an error: normal about 0 with `sigma`, or with `gross_probability` with the wider `gross_sigma`."""
 
     sigma: float
     gross_probability: float = 0.0
@@ -31,11 +31,10 @@ class Prior:
 
 @dataclass(frozen=True, kw_only=True)
 class ShapeError(Prior):
-    """One error that all azimuths share, in the unit that its name ends with.
+    """An error that all azimuths share, in the unit that its name ends with.
 
-    Errors of a pair (the terms of
-    an ellipse, the axes of a tilt) have the same `fact`, and one gross part: both are gross, or neither. Of a stated
-    error `gross_sigma` is what it would be if the statement were wrong.
+    Errors of a pair (the terms of an ellipse, the axes of a tilt) have the same `fact`, and one gross part: both are
+    gross, or neither. Of a stated error `gross_sigma` is what it would be if the statement were wrong.
     """
 
     name: str  # such as "depth_1" (relative), "bias_rad", "camera_height_m"
@@ -60,7 +59,7 @@ class Fact(Prior):
     limits: Number  # of the value in the file
 
     def errors_of_shape(self, stated: float | None, beside: float = 0.0) -> list[ShapeError]:
-        """Those of the errors that count; `stated` is the sigma in the unit of the errors, None where it is not.
+        """Errors of this fact that count; `stated` is the sigma in the unit of the errors, None where no file has it.
 
         `beside` is the sigma of an independent error with the same effect.
         """
@@ -171,7 +170,7 @@ STAR_REFRACTION = Fact(
 
 
 def radians(degrees: float | None) -> float | None:
-    """The angle [rad] of one in `degrees`; None of None."""
+    """Angle [rad] from `degrees`; None from None."""
     return None if degrees is None else float(np.radians(degrees))
 
 
@@ -186,12 +185,12 @@ def offset_names(maps: int) -> tuple[str, ...]:
 
 
 def sigmas_of_waves(sigma: float) -> tuple[float, ...]:
-    """Those of waves 1 to WAVE_COUNT where one number, of wave 1, states them."""
+    """Sigmas of waves 1 to WAVE_COUNT where one number, the `sigma` of wave 1, states them."""
     return tuple(sigma * m**WAVE_FALL for m in range(1, WAVE_COUNT + 1))
 
 
 def refraction_errors(air: Air | None) -> list[ShapeError]:
-    """The error of the refraction in an `air`; none without."""
+    """Error of the refraction of stars in an `air`, in a list that is empty without air."""
     return [] if air is None else STAR_REFRACTION.errors_of_shape(air.refraction_sigma_1)
 
 
@@ -278,20 +277,20 @@ class GroundErrors:
         return np.zeros(np.broadcast_shapes(np.shape(centres_m)[:-1], np.shape(azimuths_rad)))
 
     def expected_crests(self, point_m: Array, azimuths_rad: Array) -> ExpectedCrests | None:
-        """The skyline seen from `point_m` (2,) at the azimuths (n,), with all errors of posts; None without such."""
+        """Skyline seen from `point_m` (2,) at the azimuths (n,), with all errors of posts; None without such."""
         return None
 
     def ground_posts(self, point_m: Array, azimuths_rad: Array) -> tuple[Ints, Array]:
-        """The posts (n, k) of the ground below a camera at `point_m` (2,), and by how much each lowers the horizon.
+        """Posts (n, k) of the ground below a camera at `point_m` (2,), and the change of the horizon by each.
 
         The latter is (n, k), negative, at the azimuths (n,) [rad/m].
         """
         return np.zeros((len(azimuths_rad), 0), dtype=np.int64), np.zeros((len(azimuths_rad), 0))
 
     def post_positions_m(self, posts: Ints) -> Array:
-        """East, north and up (n, 3) in enu of the posts with these numbers (n,)."""
+        """Positions (n, 3) [m] in enu, east, north and up, of the posts with these numbers (n,)."""
         return np.zeros((len(posts), 3))
 
     def warnings(self) -> list[str]:
-        """Lines of text: what makes the errors larger than they are stated."""
+        """Lines of text on what makes the errors larger than they are stated."""
         return []

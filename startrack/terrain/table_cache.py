@@ -85,7 +85,7 @@ def load_table(key: str, square: Square) -> HorizonTable | None:
 
 
 def keep_table(key: str, table: HorizonTable) -> bool:
-    """Keep the table in memory and, if the folder can be written, on disk; whether it can."""
+    """Keep the table in memory and, if the folder can be written, on disk; return whether it can."""
     TABLES_IN_MEMORY[key] = table
     try:
         write_sealed(path_of_table(key), table.unknown_rad.tobytes() + table.values.tobytes())
@@ -145,7 +145,7 @@ def load_or_build_table(ground: TracedMap, progress: Progress | None = None) -> 
 
 @contextmanager
 def _single_builder(path: Path, name: str) -> Iterator[None]:
-    """Within the block this process alone makes the table; others wait until it is done or has died.
+    """Context in which this process alone makes the table; others wait until it is done or has died.
 
     Where files cannot be locked (a read-only folder, some network disks) no process waits, and each makes its own.
     """
@@ -173,7 +173,7 @@ def build_table(ground: TracedMap, progress: Progress | None = None) -> HorizonT
     done = 0
 
     def fill_part(part: Ints) -> int:
-        """Write the fields of cells (k,) to `values`, traced or from disk; how many cells they are."""
+        """Write the fields of cells (k,) to `values`, traced or from disk; return the number of these cells."""
         path = path_of_part(ground.table_key, part)
         kept = read_sealed(path)
         if kept is not None:
@@ -229,7 +229,7 @@ def seconds_of_frame(ground: TracedMap) -> float:
 
 
 def _mean_seconds(work: Callable[[float], None]) -> float:
-    """Mean time of `work` on parts all over the whole, which it takes by a number from 0 to 1."""
+    """Mean time [s] of `work` on parts all over the whole, which it takes by a number from 0 to 1."""
     parts = [(0.618 * number + 0.5) % 1.0 for number in range(PROBES)]  # evenly spread, the first of them too
     start, done = clock.perf_counter(), 0
     while done < PROBES and clock.perf_counter() - start < PROBE_S:

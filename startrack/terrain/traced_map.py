@@ -92,21 +92,22 @@ class TracedMap(Terrain):
 
     @property
     def projection(self) -> Projection | EarthProjection:  # type: ignore[override]
-        """That of the finest map."""
+        """Projection of the finest map."""
         return self.maps[0].projection
 
     @cached_property
     def ground(self) -> Ground:
-        """The maps packed for tracing."""
+        """Ground of the maps, packed for tracing."""
         return self._pack(keep_voids=False)
 
     def with_voids(self) -> Self:
-        """The same map whose `horizons` end at its voids, without its table."""
+        """Copy of this map whose `horizons` end at its voids, without its table."""
         if any(np.isnan(one.heights_m).any() for one in self.maps):
             return self.without_table().changed(ground=self._pack(keep_voids=True))
         return self.without_table()
 
     def _pack(self, keep_voids: bool) -> Ground:
+        """Ground of the maps, packed with the bend of sight lines and the height of ground beyond."""
         packed = pack_maps(self.site, self.maps, keep_voids=keep_voids)
         return replace(
             packed,
@@ -116,13 +117,13 @@ class TracedMap(Terrain):
 
     @cached_property
     def reach_m(self) -> float:
-        """The search area and a margin, as far as the maps reach."""
+        """Half side [m] of the searched square: the search area and a margin, as far as the maps reach."""
         wider = self.search_radius_m * REACH_RADII
         return wider if self._covers(wider) else self.search_radius_m
 
     @cached_property
     def square(self) -> Square:
-        """The cells of the table."""
+        """Square of the cells of the table."""
         across = 1
         while 2 * self.reach_m / across > CELL_M and across < MAX_CELLS_ACROSS:
             across *= 2
@@ -130,17 +131,18 @@ class TracedMap(Terrain):
 
     @cached_property
     def crest_rad_per_m(self) -> float:
-        """Rise of the horizon by a metre of its crest's height, cos^2 H / distance: the median from the origin."""
+        """Rise [rad/m] of the horizon with its crest's height, cos^2 H / distance: the median from the origin."""
         return float(np.median(self._rad_per_m(*self.horizons(np.zeros(2), SECTOR_AZIMUTHS_RAD[0])[:2])))
 
     def crest_share(self, tan: Array, distance_m: Array) -> Array:
-        """Error of horizons (...) by an error of height that crests share, in that at the median crest.
+        """Error (...) of horizons by an error of height that crests share, relative to that at the median crest.
 
         Nearer than the spacing of the posts the ground below the camera errs with the crest.
         """
         return self._rad_per_m(tan, distance_m) / self.crest_rad_per_m
 
     def _rad_per_m(self, tan: Array, distance_m: Array) -> Array:
+        """Rise (...) [rad/m] of horizons with the height of their crests, at `tan` of the horizon and distances."""
         return np.asarray(1.0 / ((1.0 + np.square(tan)) * np.maximum(distance_m, self.maps[0].post_m)))
 
     @cached_property
@@ -177,17 +179,17 @@ class TracedMap(Terrain):
         discard_table(self.table_key)
 
     def costs_s(self) -> dict[str, float]:
-        """See `Terrain`."""
+        """Times [s] of "horizons", the table, where it is not there, and of "frame", the position of an image."""
         return costs_of(self)
 
     def without_table(self) -> Self:
-        """The same map whose traces begin at the camera; see `Terrain`."""
+        """Copy of this map whose traces begin at the camera; see `Terrain`."""
         return self.changed(_uses_table=False)
 
     def horizons(self, points_m: Array, azimuths_rad: Array) -> tuple[Array, Array, Array]:
-        """tan, distance, and distance of the maps' end, (...) each, of the points (..., 2) at the azimuths (...).
+        """Tangent, distance, and distance of the maps' end, (...) each, for the points (..., 2) at the azimuths (...).
 
-        The last is 1e9 beyond the horizon. A table in memory tells a trace where to begin.
+        Distances are in metres, the last 1e9 beyond the horizon. A table in memory tells a trace where to begin.
         """
         shape, points, azimuths = flatten_rays(points_m, azimuths_rad)
         found = np.empty((3, len(azimuths)))
@@ -199,13 +201,13 @@ class TracedMap(Terrain):
         return tan, distance, edge
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
-        """Horizon elevation [rad], traced. See `Terrain`."""
+        """Elevation (...) [rad] of the horizon from points at azimuths, traced. See `Terrain`."""
         return np.arctan(self.horizons(points_m, azimuths_rad)[0])
 
     def horizon_bounds_rad(
         self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
     ) -> tuple[Array, Array]:
-        """Bounds of the horizon over boxes [rad]: from the table, and for single rays and small boxes by tracing."""
+        """Least and greatest horizon [rad] over boxes: by the table, for single rays and small boxes by tracing."""
         if np.ndim(half_m) == np.ndim(azimuth_half_rad) == 0 and half_m > POINT_M:
             shape, centres, azimuths = rows_of_rays(centres_m, azimuths_rad)
             if azimuth_half_rad >= MAX_TRACED_TURN_RAD or half_m >= self.table.square.half_m:
@@ -239,7 +241,7 @@ class TracedMap(Terrain):
         return low.reshape(shape), high.reshape(shape)
 
     def _trace_bounds(self, *arrays: Array) -> None:
-        """Bounds over small boxes: centres (n, 2), half sides, azimuths and their half widths; results low, high."""
+        """Fill bounds over small boxes: centres (n, 2), half sides, azimuths, their half widths; then low, high."""
         *boxes, low, high = arrays
 
         def trace(missing: Bools) -> Array:
@@ -250,7 +252,7 @@ class TracedMap(Terrain):
         self.table.box_memory.fill(np.column_stack(boxes), low[:, None], high[:, None], trace)
 
     def _look_up_bounds(self, *arrays: Array) -> None:
-        """Bounds from the table over boxes of one size; arrays as in `_trace_bounds`."""
+        """Fill bounds by the table over boxes of one size; arrays as in `_trace_bounds`."""
         centres, half, azimuths, turn, low, high = arrays
         each = azimuths[:, None], turn[:, None], centres, half, low[:, None], high[:, None]
         run_in_threads(sector_bounds, self._look_up_arguments(float(half[0])), each)
@@ -287,21 +289,21 @@ class TracedMap(Terrain):
         return self.ground.record, (table or NO_TABLE).record, self.camera_height_m
 
     def horizon_spread_rad(self, points_m: Array, half_m: float, azimuths_rad: Array) -> tuple[Array, Array]:
-        """From the horizon of the middle and its distance d: a move by `half_m` changes tan H by slopes half_m / d."""
+        """Middle and half width (...) [rad] of the horizon over boxes: tan H changes by slopes `half_m` / distance."""
         points = np.asarray(points_m, dtype=np.float64)
         tan, distance, _ = self.horizons(points, azimuths_rad)
         slopes = np.abs(tan) + np.tan(self.slope_rad(points))
         return np.arctan(tan), half_m * slopes / np.maximum(distance, half_m) / (1.0 + tan * tan)
 
     def ground_m(self, points_m: Array) -> Array:
-        """Height of the ground in enu (...) [m]."""
+        """Height (...) [m] of the ground in enu."""
         points = np.array(points_m, dtype=np.float64, order="C")
         up = np.empty(points.shape[:-1])
         surfaces(self.ground.record, points.reshape(-1, 2), up.reshape(-1))
         return up
 
     def slope_rad(self, points_m: Array) -> Array:
-        """Slope of the ground (...) over 10 m."""
+        """Slope (...) [rad] of the ground over 10 m."""
         points = np.asarray(points_m, dtype=np.float64)
         steps = SLOPE_STEP_M * np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]])
         z = self.ground_m(points[..., None, :] + steps)

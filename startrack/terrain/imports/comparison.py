@@ -65,7 +65,7 @@ class MapComparison:
         return float(max(measured, COMMON_PER_POST * self.height_sigma_m))
 
     def line(self) -> str:
-        """The comparison in one line of text."""
+        """Text of the comparison in one line."""
         crests = (
             "too few crests in the overlap"
             if np.isnan(self.crest_bias_m)
@@ -106,7 +106,7 @@ def heights_of_both(height_map: Raster, finer: Raster) -> tuple[Array, Array, Ar
 
 
 def offsets_of_maps_m(maps: Sequence[Raster]) -> list[float]:
-    """By how much each further one of the `maps`, finest first, stands above the first one that it overlaps [m].
+    """Height [m] by which each further one of the `maps`, finest first, stands above the first that it overlaps.
 
     The median over the ground that both cover; 0 where none is.
     """
@@ -151,7 +151,7 @@ def _terrains_of(height_map: Raster, finer: Raster, overlap: Array) -> tuple[Hei
 
 
 def _crest_errors(errors: CrestErrors, post_m: float) -> dict[str, Any]:
-    """What a comparison states of crests: their bias, its spread, the rest, and how it correlates."""
+    """Fields of a comparison about the crests: their bias, its spread, the rest, and how it correlates."""
     means_m = errors.means_m[np.isfinite(errors.means_m)]
     if len(means_m) < MIN_CRESTS:
         return dict.fromkeys(("crest_bias_m", "crest_bias_sigma_m", "crest_sigma_m"), float("nan"))

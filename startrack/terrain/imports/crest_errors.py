@@ -44,7 +44,7 @@ class CrestErrors:
 
     @property
     def means_m(self) -> Array:
-        """The mean error (p,) of each position; NaN where few crests count."""
+        """Mean error (p,) [m] of the crests about each position; NaN where few crests count."""
         count = self.inside.sum(axis=1)
         total_m = np.where(self.inside, self.higher_m, 0.0).sum(axis=1)
         return np.where(count >= MIN_CRESTS, total_m / np.maximum(count, 1), np.nan)
@@ -60,7 +60,7 @@ class Correlation:
     def waves_m(self, crests_m: Array) -> Array:
         """Standard deviations [m] of the cosine's and the sine's coefficient of waves 1 to WAVE_COUNT, (WAVE_COUNT,).
 
-        Of the errors of crests (p, a, 2) at `a` equal steps of azimuth, the median over the p positions.
+        Waves of the errors of crests (p, a, 2) at `a` equal steps of azimuth; the median over the p positions.
         """
         count = crests_m.shape[1]
         azimuths = 2 * np.pi * np.arange(count) / count
@@ -125,7 +125,7 @@ def measure_crest_errors(
 
 
 def correlate(errors: CrestErrors, post_m: float) -> Correlation | None:
-    """The correlation of errors of crests on a map with posts `post_m` apart; None where too few crests are seen.
+    """Correlation of errors of crests on a map with posts `post_m` apart; None where too few crests are seen.
 
     Fitted to the covariance of crests that are seen from one position, about their mean, which `horizon_sigma_deg`
     states.
@@ -194,7 +194,7 @@ def standing_positions(terrain: HeightMap) -> Array:
 
 
 def spread_positions(radius_m: float, count: int = CREST_POSITIONS) -> Array:
-    """Positions (count, 2) spread evenly over a circle."""
+    """Positions (count, 2) [m] spread evenly over a circle about the origin."""
     rng = np.random.default_rng(SEED)
     azimuth, distance = rng.uniform(0, 2 * np.pi, count), radius_m * np.sqrt(rng.random(count))
     return distance[:, None] * np.stack([np.sin(azimuth), np.cos(azimuth)], axis=-1)
@@ -207,4 +207,5 @@ def _places(positions: Array, distance_m: Array) -> Array:
 
 
 def _azimuths() -> Array:
+    """Azimuths (CREST_AZIMUTHS,) [rad] in which horizons are compared."""
     return np.arange(CREST_AZIMUTHS) * 2 * np.pi / CREST_AZIMUTHS

@@ -206,7 +206,7 @@ def _state_offsets(values: dict[str, Any], crops: Sequence[Raster]) -> list[str]
 
 
 def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, crops: dict[Path, Raster]) -> HeightMap:
-    """The terrain, whose maps and file are written. They replace former ones only once the terrain is known to load.
+    """Write maps and file of a terrain, and return it; they replace former ones only once it is known to load.
 
     The horizon's sigma, where it was measured, follows from the distance of the crests on the terrain.
     """

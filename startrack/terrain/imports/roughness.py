@@ -30,7 +30,7 @@ MIN_STRETCHES = 30  # for a mean spectrum
 
 @dataclass(frozen=True)
 class MapProduct:
-    """A product: what its files are called, and the standard deviation of its heights."""
+    """A published map product: what its files are called, and the standard deviation of its heights."""
 
     name: str
     pattern: str  # of the file's name, without regard to case
@@ -131,7 +131,7 @@ def carried_spacing(heights_m: Array) -> float:
 
 
 def _spacing_by_spectrum(h: Array) -> float:
-    """From the longest waves at which the power falls, over half an octave, faster than that of any ground."""
+    """Spacing [posts] by the longest waves whose power falls, over half an octave, faster than that of any ground."""
     power = _power(h)
     if power is None:
         return 1.0

@@ -35,7 +35,7 @@ BASE_M = 10_000.0  # from the site to the points that give the slope: the grids 
 
 
 def fit_cells(raster: Raster, site: Site) -> Array:
-    """Numbers (n, 2) of a map for `map_cell`, in two columns for x and y, or for column and row.
+    """Numbers (n, 2) of a map for the kernels' `map_cell`, in two columns for x and y, or for column and row.
 
     The degree, the middle, 1 / half width, and the coefficients.
     x = east / up and y = north / up of a direction from the sphere's centre. Raises BadInput bad_terrain for a map
@@ -108,7 +108,7 @@ def geoid_at(grid: str, site: Site) -> Geoid:
 
 
 def above_ellipsoid(raster: Raster, site: Site, geoid_m: float, slope_arcsec: Sequence[float]) -> Raster:
-    """The map with heights above the ellipsoid, of one with heights above a geoid that stands `geoid_m` at the site.
+    """Copy of a map with heights above the ellipsoid; `raster` has them above a geoid `geoid_m` high at the site.
 
     slope_arcsec: how the geoid rises there above the ellipsoid to the east and to the north.
     """
@@ -120,7 +120,7 @@ def above_ellipsoid(raster: Raster, site: Site, geoid_m: float, slope_arcsec: Se
 
 
 def maps_above_ellipsoid(maps: Sequence[Raster], dem: Mapping[str, Any], site: Site) -> tuple[Raster, ...]:
-    """The `maps` with heights above the ellipsoid, by what the table `dem` of a terrain file states of their geoid.
+    """Copies of the `maps` with heights above the ellipsoid, by what the table `dem` of a file states of their geoid.
 
     Raises BadInput bad_terrain where it states it of another number of maps.
     """

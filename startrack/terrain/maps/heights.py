@@ -36,14 +36,14 @@ SURVEY_FOOT_WORD = "sft"  # of BT files
 
 
 class Ground(NamedTuple):
-    """What heights a body has."""
+    """The range of heights that the ground of a body has."""
 
     lowest_m: float
     highest_m: float  # above its sphere, or above the sea
     radii_km: tuple[float, float]  # from its centre
 
     def has(self, height_m: float) -> bool:
-        """Whether it has ground at a height [m] above its sphere or the sea, or from its centre."""
+        """Whether the body has ground at a height [m] above its sphere or the sea, or from its centre."""
         low_km, high_km = self.radii_km
         return self.lowest_m <= height_m <= self.highest_m or low_km <= height_m / 1000.0 <= high_km
 
@@ -62,7 +62,7 @@ class Mark(NamedTuple):
     is_void: bool  # ground cannot be so; else it may be
 
     def note(self) -> str:
-        """What a user has to know of it."""
+        """Text for the user: what posts of this value are taken as."""
         kind = "voids: the file does not state it, and no ground leads up to it" if self.is_void else (
             "ground, though most steps onto them are steeper than elsewhere: is it the value for voids? Then state it "
             f"(rio edit-info --nodata {self.value:g} FILE)"
@@ -186,12 +186,12 @@ def find_marks(
 
 
 def highest_step_m(post_m: float) -> float:
-    """The most that heights of ground differ between posts so far apart [m]."""
+    """Largest difference [m] of the heights of ground between posts `post_m` apart."""
     return CLIFF_M + CLIFF_SLOPE * post_m
 
 
 def _step_onto(values: NDArray[np.generic], known: Bools, value: float) -> float:
-    """The median step from neighbours onto posts of a `value`; 0 unless it is higher than steps between others."""
+    """Median step, in units of `values`, onto posts of a `value`; 0 unless higher than steps between others."""
     here = known & (values == value)
     others = known & ~here
     if not others.any() or np.ptp(values[others]) == 0:
@@ -248,7 +248,7 @@ def _require_heights(
 
 
 def _advice_to_scale(scaling: tuple[float, float], metres: float) -> str:
-    """What to state where the heights of a scale and an offset are in a unit of so many `metres`."""
+    """Advice on what to state where the heights of a scale and an offset are in a unit of so many `metres`."""
     scale, offset = (f"{metres * value:.10g}" for value in scaling)
     if not scaling[1]:
         return f"Then state --scale {scale} of terrain import, or scale = {scale} in [dem]"
@@ -273,7 +273,7 @@ def _require_slopes(h: Array, post_m: float, name: str) -> None:
 def _cause_of_range(
     heights_m: Array, values: NDArray[np.generic], outside: Bools, scaling: tuple[float, float], ground: Ground
 ) -> str:  # fmt: skip
-    """What may be wrong with heights (n,), some `outside` of what the ground has: a void, the unit, the level."""
+    """Likely faults of heights (n,), some `outside` of what the ground has: a void, the unit, the level."""
     wrong, counts = np.unique(values[outside], return_counts=True)
     most = int(np.argmax(counts))
     if 2 * counts[most] > len(heights_m[outside]) and 2 * np.count_nonzero(outside) < len(heights_m):
@@ -294,7 +294,7 @@ def _cause_of_range(
 
 
 def note_bands(count: int, alphas: Sequence[int], descriptions: Sequence[str | None]) -> tuple[str, ...]:
-    """A note on the bands of a map file that are not read: all but the first and those of alpha."""
+    """Notes (none or one) on bands of a map file that are not read: all but the first and those of alpha."""
     others = [k for k in range(1, count) if k not in alphas]
     if not others:
         return ()
@@ -303,7 +303,7 @@ def note_bands(count: int, alphas: Sequence[int], descriptions: Sequence[str | N
 
 
 def metres_of(unit: str) -> float | None:
-    """The length [m] of a `unit` as map files spell it; None for one that is not known."""
+    """Length [m] of a `unit` as map files spell it; None for one that is not known."""
     word = " ".join(unit.lower().strip(" \t\n\0'\"<>[]").replace("_", " ").replace("-", " ").split())
     word = word.replace("(", "").replace(")", "")
     return _units_m().get(word)

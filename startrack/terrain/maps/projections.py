@@ -33,7 +33,7 @@ AREA_DEG = 1.0  # about a place, for the choice of a datum's transformation
 
 @dataclass(frozen=True, kw_only=True)
 class Projection:
-    """x to the east and y to the north at the centre [m], on the sphere of the Moon.
+    """A projection of the Moon's sphere: x to the east and y to the north at the centre [m].
 
     stereographic: (x, y) = 2 R scale (v1, v2) / (1 + v3); orthographic: (x, y) = R scale (v1, v2), v the direction in
     the frame east, north, up of the centre. equirectangular: (x, y) = R (scale longitude', scale_y latitude), the
@@ -65,7 +65,7 @@ class Projection:
 
     @property
     def name(self) -> str:
-        """Of the projection, for people."""
+        """Name of the projection, for people."""
         return PROJECTION_NAMES[self.kind]
 
     def units_per_m(self, latitude_rad: float) -> tuple[float, float]:
@@ -75,13 +75,13 @@ class Projection:
         return self.scale, self.scale
 
     def centred_at(self, x_m: float) -> Projection:
-        """The same map coordinates, of an equirectangular map with longitudes counted to half a turn from `x_m`."""
+        """Copy with the same coordinates, whose longitudes count to half a turn from `x_m`; of equirectangular maps."""
         turned = (x_m - self.false_x_m) / (self.radius_m * self.scale)
         return replace(self, longitude_rad=self.longitude_rad + turned, false_x_m=x_m)
 
     @property
     def proj_text(self) -> str:
-        """The projection as PROJ reads it; degrees are those of a map whose longitudes count from 0."""
+        """Text of the projection for PROJ; degrees are those of a map whose longitudes count from 0."""
         if self.is_in_degrees:
             return f"+proj=longlat +R={self.radius_m!r} +no_defs"
         latitude, longitude = (float(np.degrees(angle)) for angle in (self.latitude_rad, self.longitude_rad))
@@ -145,7 +145,7 @@ class Projection:
 
 
 def projection_of(p: Mapping[str, Any]) -> Projection:
-    """The Moon's projection of PROJ's parameters. Raises BadInput bad_terrain for one that is not known here."""
+    """Projection of the Moon with PROJ's parameters `p`. Raises BadInput bad_terrain for one that is not known here."""
     radius = float(p.get("R", p.get("a", MOON_RADIUS_M)))
     if is_earth(radius) or str(p.get("ellps", p.get("datum", ""))).upper() in ("WGS84", "GRS80"):
         raise BadInput("bad_terrain", "the map is of the Earth, not of the Moon")
@@ -182,7 +182,7 @@ def projection_of(p: Mapping[str, Any]) -> Projection:
 
 @dataclass(frozen=True, kw_only=True)
 class EarthProjection:
-    """x to the east and y to the north in the units of a reference system, from geodetic places of WGS 84.
+    """A projection of the Earth: from places of WGS 84 to x to the east and y to the north in a system's units.
 
     Where datums differ, PROJ's best transformation about the place `near` is taken; `transformation_warning` says what
     it lacks.
@@ -195,12 +195,12 @@ class EarthProjection:
 
     @property
     def name(self) -> str:
-        """Of the reference system, for people."""
+        """Name of the reference system, for people."""
         return _name_of(self.wkt) if self.wkt else "WGS 84 longitude and latitude"
 
     @property
     def crs(self) -> pyproj.CRS:
-        """The reference system."""
+        """Reference system of the map."""
         return reference_system(self.wkt)
 
     def units_per_m(self, latitude_rad: float) -> tuple[float, float]:
@@ -232,7 +232,7 @@ class EarthProjection:
 
     @property
     def transformation_warning(self) -> str:
-        """What is not known of the shift from the map's datum to WGS 84; empty where PROJ has all that it needs."""
+        """Warning of an unknown shift from the map's datum to WGS 84; empty where PROJ has all that it needs."""
         return self._transformation[1] if self.wkt else ""
 
     @cached_property
@@ -308,7 +308,7 @@ def _best_transformation(wkt: str, latitude_deg: int, longitude_deg: int) -> tup
 
 
 def _lacking(group: Any, name: str) -> str:
-    """One line on the transformations of `group` if the best is not there or not known."""
+    """Warning that the best transformation of a `group` is not there or not known; empty otherwise."""
     accuracy = group.transformers[0].accuracy
     known = "with an unknown accuracy, perhaps 100 m" if accuracy < 0 else f"to {length_text(accuracy)}"
     if group.best_available and accuracy >= 0:

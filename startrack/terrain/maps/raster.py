@@ -15,7 +15,7 @@ from startrack.terrain.maps.projections import EQUIRECTANGULAR, STEREOGRAPHIC, E
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Raster:
-    """Heights above the Moon's sphere, or the Earth's ellipsoid.
+    """A height map: heights above the Moon's sphere, or the Earth's ellipsoid.
 
     Post (row, column) stands at x = x0 + column dx, y = y0 + row dy.
     """
@@ -50,7 +50,7 @@ class Raster:
         return (np.abs([self.dx_m, self.dy_m]) * stretch)[::-1]
 
     def facts(self) -> dict[str, Any]:
-        """File, size, projection and range of the heights, as JSON values."""
+        """Facts about the map as JSON values: file, size, projection and range of the heights."""
         return {
             "file": self.source,
             "posts": list(self.heights_m.shape),
@@ -102,7 +102,7 @@ class Raster:
         ], dtype=np.float64)  # fmt: skip
 
     def heights_above_origin_m(self, site: Site) -> NDArray[np.float32]:
-        """Heights [m] above the sphere through the site, see `frames.sphere_radius_m`."""
+        """Heights (rows, columns) [m] above the sphere through the site, see `frames.sphere_radius_m`."""
         if isinstance(self.projection, EarthProjection):
             from startrack.terrain.maps.ellipsoid import heights_above_sphere
 
@@ -110,7 +110,7 @@ class Raster:
         return self.heights_m - np.float32(site.height_m) if site.height_m else self.heights_m
 
     def place_bytes(self, site: Site) -> bytes:
-        """What the places of the posts in the site's enu follow from."""
+        """Bytes that differ where the places of the posts in the site's enu do."""
         p = self.projection
         if isinstance(p, EarthProjection):
             return f"{p.wkt} {p.near} {[self.x0_m, self.y0_m, self.dx_m, self.dy_m]}".encode()

@@ -122,7 +122,7 @@ def _not_on(name: str, whole: Raster) -> BadInput:
 
 
 def _read_with_rasterio(path: Path, near: tuple[float, float] | None) -> Stored:
-    """The content, cut to a window about `near`. Raises BadInput bad_terrain."""
+    """Content of the file `path`, cut to a window about `near`. Raises BadInput bad_terrain."""
     from rasterio.io import DatasetReader
 
     hint = _hint_of(path)
@@ -135,6 +135,7 @@ def _read_with_rasterio(path: Path, near: tuple[float, float] | None) -> Stored:
 
 
 def _hint_of(path: Path) -> str:
+    """Advice for a file that cannot be read, by its suffix."""
     return HINTS.get(path.suffix.lower(), "").format(stem=path.stem)
 
 
@@ -229,7 +230,7 @@ def place_on(
     crs: Any, heights_m: np.ndarray, first_xy: tuple[float, float], steps: tuple[float, float],
     near: tuple[float, float] | None,
 ) -> Raster:  # fmt: skip
-    """Heights (rows, columns) in a reference system of pyproj, from the place of the first post and the steps dx, dy.
+    """Map of heights (rows, columns) in a system `crs` of pyproj, by the first post's place and the steps dx, dy.
 
     Raises BadInput bad_terrain for a system that is not known.
     """
@@ -298,7 +299,7 @@ def _label_units(label: dict[str, Any]) -> Iterator[str]:
 
 @contextmanager
 def one_line_refusal(what: str) -> Iterator[None]:
-    """Errors of a decoder as BadInput bad_terrain: damaged files make decoders raise errors of nearly any class."""
+    """Context that makes BadInput bad_terrain of a decoder's errors, which damaged files raise of nearly any class."""
     log = logging.getLogger("tifffile")
     log.disabled = True  # the exception has the cause
     try:
@@ -355,7 +356,7 @@ def _projection_of(keys: dict[str, float]) -> Projection:
 
 @dataclass(frozen=True, kw_only=True)
 class Grid:
-    """Where the posts of an array stand: the first row is the northern one, columns go to the east.
+    """Places of the posts of an array: the first row is the northern one, columns go to the east.
 
     post: distance between posts. crs: reference system as PROJ reads it; "" is the stereographic plane of the Moon
     about the origin. corner: x, y of the first post; None where the array's middle stands at the origin. Lengths are in
@@ -367,7 +368,7 @@ class Grid:
     corner: tuple[float, float] | None = None
 
     def place(self, heights_m: np.ndarray, near: tuple[float, float]) -> Raster:
-        """The array `heights_m` (rows, columns) in its place, `near` the latitude and longitude [rad] of the origin.
+        """Map of the array `heights_m` (rows, columns), `near` the latitude and longitude [rad] of the origin.
 
         Raises BadInput bad_terrain for a reference system that is not known.
         """

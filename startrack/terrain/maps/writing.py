@@ -22,7 +22,7 @@ UNIT = "metre"
 
 
 def can_write_maps() -> bool:
-    """Whether the extra `dem` is installed, which writes them."""
+    """Whether the extra `dem`, which writes maps, is installed."""
     return find_spec("rasterio") is not None
 
 

@@ -1,4 +1,4 @@
-"""Evidence and terrain to a position. Every method is one file and one line in LOCALIZERS."""
+"""Positions from evidence and terrain. Every method is one file and one line in LOCALIZERS."""
 
 from typing import Any, Protocol
 
@@ -22,7 +22,7 @@ from startrack.terrain import Terrain
 
 
 class Localizer(Protocol):
-    """Evidence and terrain to a fix; raises NotLocated.
+    """A function of evidence and terrain that gives a fix, or raises NotLocated.
 
     Any function will do. A fix whose `search` is "approximate" has a larger error than the evidence allows: its
     position is reported without the check that it explains the evidence.
@@ -52,7 +52,7 @@ def has_posterior(localizer: Localizer) -> bool:
 
 
 def require_localizer(given: Any) -> Localizer:
-    """`given`, if it is a localizer; that of LOCALIZERS, with its usual settings, if it is one of their names.
+    """The `given` localizer; where a name is given, that of LOCALIZERS, with its usual settings.
 
     Raises TypeError for a class instead of an object and for what cannot be called, ValueError for another name.
     """

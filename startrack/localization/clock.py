@@ -46,7 +46,7 @@ def clock_at(site: Site, time_utc: datetime, sigma_s: float, is_stated: bool = T
 
 
 def duration(seconds: float) -> str:
-    """`seconds` in words, to two digits."""
+    """Text of a time of `seconds` in a fitting unit, to two digits."""
     size = abs(seconds)
     units = (("days", 86400.0), ("hours", 3600.0), ("minutes", 60.0), ("s", 1.0))
     unit, factor = next(((unit, factor) for unit, factor in units if size >= 1.5 * factor), units[-1])
@@ -55,7 +55,7 @@ def duration(seconds: float) -> str:
 
 
 def turn_evidence(evidence: Evidence, later_s: float, air: Air | None) -> Evidence:
-    """The rows as they stand if the true time is later by that much, with the refraction in the `air` there.
+    """Rows of `evidence` as they stand if the true time is `later_s` later, with the refraction in the `air` there.
 
     Rows of the sky's light that have one azimuth keep one: they stand or fall together.
     """
@@ -86,7 +86,7 @@ class Scan:
     half_m: float
 
     def leads_to(self, other: Scan, step_s: float) -> bool:
-        """Whether the next time, of those `step_s` apart, fits better at nearly the same position."""
+        """Whether the next time, `other` of those `step_s` apart, fits better at nearly the same position."""
         is_next = 0 < abs(self.later_s - other.later_s) < 1.5 * step_s and self.fit < other.fit
         apart_m = np.abs(self.centres_m[0] - other.centres_m[0]).max() if is_next else np.inf
         return bool(apart_m <= BOXES_APART * self.half_m)
@@ -123,7 +123,7 @@ class Track:
 
     @property
     def step_s(self) -> float:
-        """Between two times."""
+        """Step [s] between two times."""
         return float(TIME_STEP_RAD / np.linalg.norm(self.clock.turn_rad_s))
 
     def _begin_places(self) -> list[Place]:
@@ -154,7 +154,7 @@ class Track:
         return Scan(later_s, fit + float(self.clock.log_prior(later_s)), centres, half)
 
     def _settle_time(self, begin: Place, found: list[Place]) -> Place | None:
-        """The place at the time that the rows show about that of another; None where it is among those `found`."""
+        """Place at the time that the rows show, from that of `begin`; None where it is one of `found` or none fits."""
         (low, high), place = self.limits_s, begin
         for _ in range(TIME_ROUNDS):
             if any(abs(place.later_s - one.later_s) < 0.5 * self.step_s for one in found):
@@ -170,6 +170,7 @@ class Track:
         return place
 
     def _model(self, later_s: float) -> BoxModel:
+        """Model of boxes with the rows turned to a time `later_s` later."""
         return BoxModel.of(turn_evidence(self.evidence, later_s, self.terrain.air), self.terrain)
 
 
@@ -186,7 +187,7 @@ def is_linear(clock: Clock, error_s: float) -> bool:
 
 
 def explore_times(evidence: Evidence, terrain: Terrain, clock: Clock) -> list[tuple[Evidence, Explored]]:
-    """The rows turned to each likely time that a wide clock allows, and the boxes there.
+    """Pairs of the rows turned to a likely time that a wide clock allows, and of the boxes there.
 
     Raises NotLocated as `Track` does.
     """
@@ -199,12 +200,12 @@ def explore_times(evidence: Evidence, terrain: Terrain, clock: Clock) -> list[tu
 
 
 def turned_model(model: SkylineModel, later_s: float) -> SkylineModel:
-    """The model with its rows turned to a later time."""
+    """Copy of the `model` with its rows turned to a time `later_s` later."""
     check_time()
     return model.with_rows(turn_evidence(model.seen.rows, later_s, model.terrain.air))
 
 
 def _peaks(later_s: Array, fits: Array, clock: Clock) -> list[int]:
-    """The likeliest times that are apart from each other."""
+    """Indices of the likeliest times that are apart from each other."""
     apart_s = TIME_STEP_RAD / float(np.linalg.norm(clock.turn_rad_s))
     return choose_apart(later_s[:, None], fits, apart_s, TIME_NATS, MOST_TIMES)

@@ -1,4 +1,4 @@
-"""From the sampled posterior to a fix or a refusal: everything is read off the same weighted points."""
+"""A fix or a refusal from the sampled posterior: everything is read off the same weighted points."""
 
 from __future__ import annotations
 
@@ -37,25 +37,25 @@ SUPPORT = 200  # points of a fix with which a later search of the same image beg
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """All hypotheses together, the heaviest first."""
+    """The posterior by all hypotheses together, the heaviest first."""
 
     hypotheses: Sequence[Hypothesis]
     terrain: Terrain
 
     @cached_property
     def positions_m(self) -> Array:
-        """(n, 2)."""
+        """Positions (n, 2) [m, enu] of the points of all hypotheses."""
         return np.concatenate([one.positions_m for one in self.hypotheses])
 
     @property
     def unscaled_radius95_m(self) -> float:
-        """Of the circle that holds 95 % in a crater of the stated width: rays do not show how wide it is."""
+        """Radius [m] that holds 95 % in a crater of the stated width: rays do not show how wide it is."""
         positions = np.concatenate([_positions_without_fact(one, DIAMETER.key) for one in self.hypotheses])
         return self.radii(positions, self.share, self.share @ positions)[0]
 
     @cached_property
     def share(self) -> Array:
-        """(n,) of the probability."""
+        """Shares (n,) of the points in the probability."""
         return shares(np.concatenate([one.log_weight for one in self.hypotheses]))
 
     @property
@@ -65,13 +65,13 @@ class Posterior:
 
     @cached_property
     def is_core(self) -> Array:
-        """(n,) points of hypotheses with the gross error of the best one, if it has any."""
+        """Whether points (n,) are of hypotheses with the gross error of the best one, if it has any."""
         gross = self.best.gross
         return np.concatenate([np.full(len(one.log_weight), one.gross == gross) for one in self.hypotheses])
 
     @cached_property
     def label(self) -> Ints:
-        """(n,) mode of each point; the heaviest is 0."""
+        """Mode (n,) of each point; the heaviest is 0."""
         points, share = self.positions_m[self.is_core], self.share[self.is_core]
         found = np.zeros(len(self.share), dtype=np.int64)
         found[self.is_core] = label_modes(points, share / share.sum())
@@ -79,7 +79,7 @@ class Posterior:
 
     @cached_property
     def main(self) -> Array:
-        """(n,) points of the main mode."""
+        """Whether points (n,) are in the main mode."""
         return self.is_core & (self.label == 0)
 
     def radii(self, positions_m: Array, share: Array, middle_m: Array) -> tuple[float, float]:
@@ -153,7 +153,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
 
 
 def _own_main(whole: Posterior) -> Array:
-    """Which points of the best hypothesis (n,) are in the main mode, with most of their copies; all where none is."""
+    """Whether points of the best hypothesis (n,) are in the main mode, with most of their copies; all if none is."""
     best = whole.best
     copies = whole.main[: len(best.log_weight)].reshape(-1, best.copies)
     own = copies.mean(axis=1) > 0.5
@@ -161,6 +161,7 @@ def _own_main(whole: Posterior) -> Array:
 
 
 def _useless_text(whole: Posterior) -> str:
+    """Text of the refusal of a posterior that leaves most of the search area open."""
     clock = whole.best.model.errors.clock
     if clock is not None and clock.sigma_s > 60.0:
         from startrack.localization.clock import duration
@@ -181,6 +182,7 @@ def _share_beyond_circle(whole: Posterior, middle: Array) -> float:
 
 
 def _list_modes(whole: Posterior) -> tuple[Mode, ...]:
+    """Modes of the posterior, the heaviest first."""
     core = whole.share[whole.is_core].sum()
     modes = []
     for i in range(int(whole.label.max()) + 1):
@@ -197,7 +199,7 @@ def _list_modes(whole: Posterior) -> tuple[Mode, ...]:
 
 
 def _clock(whole: Posterior) -> ClockError | None:
-    """The error of the clock by the points of the core."""
+    """Error of the clock by the points of the core; None where the rows have no clock."""
     stated = whole.best.model.seen.rows.clock
     if stated is None:
         return None

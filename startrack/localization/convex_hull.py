@@ -52,7 +52,7 @@ def hull_position(points_m: Array, wall_m: float, radius_m: float) -> Array:
 
 
 def _project_equidistant(points_m: Array, wall_m: float) -> Array:
-    """The stars (n, 2) as an ideal fisheye shows them: zenith distance [rad] times the horizontal direction.
+    """Images (n, 2) of the stars in an ideal fisheye: zenith distance [rad] times the horizontal direction.
 
     The plane decides which stars make the hull, and the thesis does not name it. Mean errors in its crater: rim plane
     380 m, stereographic 570 m, equidistant 630 m, orthographic 860 m; the thesis's is 637 m.

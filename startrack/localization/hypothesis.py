@@ -28,60 +28,60 @@ class Hypothesis:
     found: WeightedPoints  # the weights include the prior probability of the hypothesis
 
     def weighed(self, nats: float) -> Hypothesis:
-        """The same with weights that are greater by so many `nats`."""
+        """Copy of this hypothesis whose logarithms of weights are greater by so many `nats`."""
         return replace(self, found=replace(self.found, log_weight=self.found.log_weight + nats))
 
     @property
     def gross(self) -> str:
-        """The fact; "": none."""
+        """Fact with the gross error; "": none."""
         return self.model.gross
 
     @cached_property
     def copies(self) -> int:
-        """Of each point, with other values of the errors that the rows do not show."""
+        """Number of copies of each point, with other values of the errors that the rows do not show."""
         return HIDDEN_COPIES if self.model.basis.hidden.shape[1] else 1
 
     @cached_property
     def log_weight(self) -> Array:
-        """(n,) of all copies."""
+        """Logarithms (n,) of the weights of all copies."""
         return np.repeat(self.found.log_weight, self.copies) - np.log(self.copies)
 
     @cached_property
     def _hidden(self) -> Array:
-        """(n, b) coordinates of the errors that the rows do not show."""
+        """Coordinates (n, b) of the errors that the rows do not show."""
         count, b = len(self.found.log_weight) * self.copies, self.model.basis.hidden.shape[1]
         return normal_sequence(b, 0, count)[0][:, :b] if b else np.zeros((count, 0))
 
     @cached_property
     def values(self) -> Array:
-        """(n, k) of the shared errors."""
+        """Values (n, k) of the shared errors, each in its unit."""
         return self.model.basis.values(np.repeat(self.found.points[:, 2:], self.copies, axis=0), self._hidden)
 
     @cached_property
     def unturned_m(self) -> Array:
-        """(n, 2) positions before the turn by the clock's error in a round crater."""
+        """Positions (n, 2) [m, enu] before the turn by the clock's error in a round crater."""
         return np.asarray(
             np.repeat(self.found.points[:, :2], self.copies, axis=0) + self._hidden @ self.model.basis.drift_m
         )
 
     @cached_property
     def positions_m(self) -> Array:
-        """(n, 2)."""
+        """Positions (n, 2) [m, enu] of all copies."""
         return self.model.errors.true_positions(self.unturned_m, self.values)
 
 
 def first_group(found: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """The hypotheses about the reference of the first one."""
+    """Hypotheses of those `found` that have the reference of the first one."""
     return [one for one in found if one.model.around.reference_m is found[0].model.around.reference_m]
 
 
 def first_plain(found: Sequence[Hypothesis]) -> Hypothesis:
-    """The one of the first group without a gross error."""
+    """Hypothesis without a gross error among those with the reference of the first one."""
     return min(first_group(found), key=lambda one: one.gross != "")
 
 
 def sample_hypothesis(model: SkylineModel, references_m: Array, modes: Sequence[Gaussian], **how: Any) -> Hypothesis:
-    """A hypothesis sampled, as `sample` is told `how`, where its reference is the nearest of all (g, 2)."""
+    """Hypothesis that is sampled, as `sample` is told `how`, where its reference is the nearest of all (g, 2)."""
     near, basis, reference_m = model.seen.rows.near, model.basis, model.around.reference_m
     area = float(np.log(np.pi * model.terrain.reach_m**2))
 
@@ -119,7 +119,7 @@ def sample_gross_errors(plain: Hypothesis, references_m: Array) -> list[Hypothes
 def sample_gross_error(
     plain: Hypothesis, other: SkylineModel, references_m: Array, rounds: Sequence[int] = GROSS_ROUNDS
 ) -> Hypothesis:
-    """The hypothesis `other` of one gross error."""
+    """Hypothesis of one gross error, that of the model `other`, sampled from the points of a `plain` one."""
     modes = _gross_modes(plain, other)
     return sample_hypothesis(other, references_m, modes, rounds=[len(modes) * count for count in rounds], enough=FEW)
 
@@ -127,9 +127,9 @@ def sample_gross_error(
 def _gross_modes(plain: Hypothesis, other: SkylineModel) -> list[Gaussian]:
     """Modes with which the sampling of a gross error begins: the plain points, drawn out along what it does.
 
-    Of a second one the points are moved besides, by a Newton step from the prior of the plain hypothesis to the wider
-    one, if it leads far; too far where the skyline is not linear. How position and other errors follow is told by the
-    linear model, whose own solution may be far off.
+    A second mode has the points moved by a Newton step from the prior of the plain hypothesis to the wider one, if it
+    leads far; too far where the skyline is not linear. How position and other errors follow is told by the linear
+    model, whose own solution may be far off.
     """
     _, linear, _ = other.solve()
     points = plain.found.points

@@ -63,7 +63,7 @@ class TDistribution:
         return np.asarray(self.mean + (unit * size[:, None]) @ self.root.T)
 
     def log_density(self, points: Array) -> Array:
-        """(n,) at points (n, d)."""
+        """Logarithm (n,) of the density at points (n, d)."""
         return log_t_density(np.asarray(np.linalg.solve(self.root, (points - self.mean).T)), self.degrees) - float(
             np.log(np.diag(self.root)).sum()
         )
@@ -92,7 +92,7 @@ class BoxDistribution:
         return found
 
     def log_density(self, points: Array) -> Array:
-        """(n,) at points (n, d)."""
+        """Logarithm (n,) of the density at points (n, d)."""
         inside = np.abs(points[:, None, 0] - self.centres[:, 0]) <= self.half_m
         inside &= np.abs(points[:, None, 1] - self.centres[:, 1]) <= self.half_m
         point, box = np.nonzero(inside)
@@ -103,7 +103,7 @@ class BoxDistribution:
 
 
 def log_t_density(off: Array, degrees: float) -> Array:
-    """(n,) of a t distribution of unit size at offsets (d, n)."""
+    """Logarithm (n,) of the density of a t distribution of unit size at offsets (d, n)."""
     from scipy.special import gammaln
 
     d = len(off)
@@ -131,7 +131,7 @@ def normal_sequence(dimensions: int, first: int, count: int) -> tuple[Array, Arr
 class WeightedPoints:
     """Points of a posterior: parameters (n, d), the first two of which are the position, and logarithms of weights.
 
-    The mean of the weights is the evidence: the integral of the density.
+    The sum of the weights is the evidence: the integral of the density.
     """
 
     points: Array
@@ -140,24 +140,26 @@ class WeightedPoints:
 
     @property
     def log_evidence(self) -> float:
+        """Logarithm of the integral of the density."""
         return float(np.logaddexp.reduce(self.log_weight))
 
     @property
     def share(self) -> Array:
-        """(n,) parts of the whole."""
+        """Shares (n,) of the points in the whole."""
         return shares(self.log_weight)
 
     def likeliest(self, among: Array) -> Array:
-        """The point (d,) of the greatest density of those `among` (n,) them."""
+        """Point (d,) of the greatest density of those that `among` (n,) marks."""
         return np.asarray(self.points[np.argmax(np.where(among, self.log_weight + self.log_drawn, -np.inf))])
 
     @property
     def effective(self) -> float:
-        """How many independent points the weighted ones are worth."""
+        """Number of independent points that the weighted ones are worth."""
         return effective_points(self.log_weight)
 
 
 def effective_points(log_weight: Array) -> float:
+    """Number of independent points that points with these logarithms (n,) of weights are worth."""
     weight = np.exp(log_weight - log_weight.max())
     return float(weight.sum() ** 2 / np.square(weight).sum())
 
@@ -213,7 +215,7 @@ def sample(
 
 
 def _parts(modes: Sequence[Gaussian], count: int) -> list[Distribution]:
-    """The distributions of one round."""
+    """Distributions of one round: about each mode a near and a far one, of `count` points together."""
     each, parts = max(count // len(modes), 40), list[Distribution]()
     for mean, covariance in modes:
         order = np.r_[2 : len(mean), 0, 1]  # position last: it is drawn beside the other parameters
@@ -229,7 +231,7 @@ def _parts(modes: Sequence[Gaussian], count: int) -> list[Distribution]:
 
 
 def _triangular(root: Array) -> Array:
-    """The lower triangular root of the same covariance."""
+    """Lower triangular root (d, d) of the covariance of a `root` (d, d)."""
     return np.asarray(np.linalg.cholesky(root @ root.T))
 
 
@@ -243,7 +245,7 @@ def _draw(parts: Sequence[Distribution], first: int) -> Array:
 
 
 def _log_mixture(parts: Sequence[Distribution], points: Array) -> Array:
-    """Logarithm (n,) of how many points of the distributions are expected, a unit of the parameters, at each point."""
+    """Logarithm (n,) of the density at `points` (n, d) of all points that the distributions draw."""
     return np.asarray(np.logaddexp.reduce([log(part.count) + part.log_density(points) for part in parts], axis=0))
 
 

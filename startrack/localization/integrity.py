@@ -29,7 +29,7 @@ TINY_PART = 1e-9  # of the covariance, added so that one on a single point of a 
 def assess_integrity(
     model: SkylineModel, parameters: Array, covariance_m2: Array, clear: Array, whole_m2: Array, radius999_m: float
 ) -> Integrity:
-    """The integrity of a fix.
+    """Integrity of a fix: its separations without each group of directions, and its protection level.
 
     Args:
         model: the likelihood near it.
@@ -56,14 +56,14 @@ def assess_integrity(
 
 
 def _divide() -> Array:
-    """Which sectors of azimuth are in each group (DIVISIONS * GROUPS, SECTORS): 1 or 0."""
+    """Membership (DIVISIONS * GROUPS, SECTORS), 1 or 0, of each sector of azimuth in each group."""
     first = np.arange(DIVISIONS)[:, None] * SECTORS // (DIVISIONS * GROUPS)
     group = (np.arange(SECTORS) - first) % SECTORS * GROUPS // SECTORS
     return np.asarray(group[:, None] == np.arange(GROUPS)[:, None], dtype=np.float64).reshape(-1, SECTORS)
 
 
 def _grid(model: SkylineModel, middle_m: Array, covariance_m2: Array, reach: float, across: int) -> tuple[Array, Bools]:
-    """Offsets (n, 2) [m] in an ellipse where a camera can stand, or all if none can; which are at its rim (n,)."""
+    """Offsets (n, 2) [m] in an ellipse where a camera can stand, or all if none can; whether they are at its rim."""
     line = reach * np.linspace(-1.0, 1.0, across)
     points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     radius = np.linalg.norm(points, axis=1)
@@ -81,7 +81,7 @@ def _sector_logs(model: SkylineModel, parameters: Array, offsets: Array, clear: 
 
 
 def clear_logs(profiles: Profiles, shifts: Array, clear: Array) -> Array:
-    """(n, SECTORS) log-likelihoods where sectors show the map's skyline with probabilities `clear` (SECTORS,).
+    """Log-likelihoods (n, SECTORS) where sectors show the map's skyline with probabilities `clear` (SECTORS,).
 
     `shifts` (n, SECTORS) [rad] are of the skyline, which has the `profiles`.
     """

@@ -75,7 +75,7 @@ def sample_posterior(
 def _begin_group(
     terrain: Terrain, rows: Evidence, errors: SharedErrors, centres_m: Array, reach_m: float, half_m: float
 ) -> Start | None:
-    """Where the sampling of boxes (n, 2) begins, which lie within `reach_m` of the first one.
+    """Start of the sampling of boxes (n, 2) that lie within `reach_m` of the first; None where none is allowed.
 
     In a round crater, where a model serves any distance, the reference is near the best point: rows of a sector stand
     above the skyline that has the shape of the reference's. On a height map the last rounds have a reference of their
@@ -92,7 +92,7 @@ def _begin_group(
 
 
 def _sample_own_edge(plain: Hypothesis, half_m: float, explored: Explored, references_m: Array) -> list[Hypothesis]:
-    """The hypothesis that the sky's light has an edge of its own, within `half_m` of the plain one's reference."""
+    """Hypothesis that the sky's light has an edge of its own, within `half_m` of the plain one's reference; or none."""
     model = with_own_edge(plain, half_m)
     start = None if model is None else Start.among_boxes(model, explored.centres_m, explored.half_m)
     if start is None:
@@ -116,7 +116,7 @@ def _group_boxes(explored: Explored, reach_m: float) -> list[tuple[Array, float]
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where the sampling of a group of boxes begins: its model, likely modes, and the boxes."""
+    """Start of the sampling of a group of boxes: its model, likely modes, and the boxes."""
 
     model: SkylineModel
     modes: list[Gaussian]
@@ -125,7 +125,7 @@ class Start:
 
     @classmethod
     def among_boxes(cls, model: SkylineModel, centres_m: Array, half_m: float) -> Start | None:
-        """At the best of boxes (n, 2) by the chain, with the errors that suit each; None where none is allowed."""
+        """Start at the best of boxes (n, 2) by the chain, with errors that suit each; None where none is allowed."""
         if len(centres_m) > MOST_BOXES:
             step = len(centres_m) / MOST_BOXES
             centres_m, half_m = centres_m[(np.arange(MOST_BOXES) * step).astype(int)], half_m * np.sqrt(step)

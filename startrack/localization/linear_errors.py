@@ -36,7 +36,7 @@ class LinearErrors:
 
     @classmethod
     def of(cls, seen: SectorRows, errors: SharedErrors, gross: str, clear: Array) -> LinearErrors:
-        """Of the image whose rows are `seen`, and of the waves among the shared `errors`.
+        """Linear errors of the image whose rows are `seen`, and of the waves among the shared `errors`.
 
         `gross` names the fact with a gross error, "" none. `clear` (SECTORS,) is how much each sector counts.
         """
@@ -55,28 +55,28 @@ class LinearErrors:
 
     @property
     def sigma_of_waves_rad(self) -> Array:
-        """(SECTORS, w) rise of the skyline by one standard deviation of each wave."""
+        """Rise (SECTORS, w) [rad] of the skyline by one standard deviation of each wave."""
         own = slice(len(self) - self.waves, None)
         return np.asarray(self.rise_rad[:, own] * np.sqrt(np.diag(self.covariance)[own]))
 
     @cached_property
     def inverse(self) -> Array:
-        """(j, j) of the covariance."""
+        """Inverse (j, j) of the covariance."""
         return np.asarray(np.linalg.inv(self.covariance))
 
     @cached_property
     def expected_rad(self) -> Array:
-        """(SECTORS,) rise of the skyline by the expected errors."""
+        """Rise (SECTORS,) [rad] of the skyline by the expected errors."""
         return np.asarray(self.rise_rad @ self.mean)
 
     @cached_property
     def _information(self) -> Array:
-        """(j, j) by the sectors and the prior."""
+        """Information (j, j) on the errors by the sectors and the prior."""
         return np.asarray((self.rise_rad.T * self.weight) @ self.rise_rad + self.inverse)
 
     @cached_property
     def gain(self) -> Array:
-        """(j, SECTORS) from heights that are left to the likeliest errors."""
+        """Matrix (j, SECTORS) from heights that are left to the likeliest errors."""
         return np.asarray(np.linalg.solve(self._information, self.rise_rad.T * self.weight))
 
     @cached_property
@@ -91,10 +91,10 @@ class LinearErrors:
         return score, 1.0 + np.sum(self.seams_rad * score, axis=0)
 
     def fit(self, left_rad: Array) -> tuple[Array, Array]:
-        """Rise (n, SECTORS) by the likeliest errors, less the expected, and the logarithm (n,) of a ratio.
+        """Rise (n, SECTORS) [rad] by the likeliest errors, less the expected, and the logarithm (n,) of a ratio.
 
-        It is that of the integral to the likelihood at these errors. `left_rad` (n, SECTORS) are the heights that the
-        sectors see above the skyline with the expected errors.
+        The ratio is that of the integral to the likelihood at these errors. `left_rad` (n, SECTORS) are the heights
+        that the sectors see above the skyline with the expected errors.
         """
         errors, seam_rad, log = self._fit(left_rad)
         return errors @ self.rise_rad.T + seam_rad, log
@@ -116,13 +116,13 @@ class LinearErrors:
         return errors, seam_rad, log - 0.5 * np.einsum("ni,ij,nj->n", errors, self.inverse, errors)
 
     def waves_rad(self, left_rad: Array) -> Array:
-        """(SECTORS,) rise of the skyline by the likeliest waves and seam at `left_rad` (SECTORS,); see `fit`."""
+        """Rise (SECTORS,) [rad] of the skyline by the likeliest waves and seam at `left_rad` (SECTORS,); see `fit`."""
         own, (errors, seam_rad, _) = slice(len(self) - self.waves, None), self._fit(left_rad[None])
         return np.asarray(self.rise_rad[:, own] @ errors[0, own] + seam_rad[0])
 
 
 def list_seams() -> Array:
-    """(SECTORS, c) which sectors are in each seam; the rest of the circle is another one, less a bias."""
+    """Membership (SECTORS, c), 1 or 0, of sectors in each seam; the rest of the circle is another, less a bias."""
     end = SECTORS // SEAM_ENDS * np.transpose(np.triu_indices(SEAM_ENDS, 1))
     sector = np.arange(SECTORS)[:, None]
     return np.asarray((sector >= end[:, 0]) & (sector < end[:, 1]), dtype=float)

@@ -42,44 +42,44 @@ class Neighbourhood:
 
     @cached_property
     def ground(self) -> Terrain:
-        """The terrain, prepared for the neighbourhood."""
+        """Terrain that is prepared for the neighbourhood."""
         if self.half_m == 0.0:
             return self.terrain
         return self.terrain.near(self.reference_m, self.half_m, MIDDLES_RAD, NODES_ACROSS)
 
     @cached_property
     def horizon_rad(self) -> Array:
-        """(SECTORS,) of the map at the reference."""
+        """Horizon (SECTORS,) [rad] of the map at the reference."""
         return self.horizons_rad(self.reference_m[None])[0]
 
     def horizons_rad(self, points_m: Array) -> Array:
-        """(n, SECTORS) of the map at points (n, 2)."""
+        """Horizons (n, SECTORS) [rad] of the map at points (n, 2)."""
         return np.asarray(self.ground.horizon_rad(np.ascontiguousarray(points_m)[:, None], MIDDLES_RAD))
 
     @cached_property
     def slopes(self) -> Array:
-        """(2, SECTORS) rise of the skyline by a metre east and north [rad/m]."""
+        """Rise (2, SECTORS) [rad/m] of the skyline by a metre east and north."""
         step = max(0.02 * self.half_m, 1.0)
         horizon = self.horizons_rad(self.reference_m + step * np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]]))
         return np.stack([horizon[0] - horizon[1], horizon[2] - horizon[3]]) / (2 * step)
 
     def error_slopes_rad(self, errors: SharedErrors) -> Array:
-        """(k, SECTORS) rise of the skyline by one unit of each of the shared `errors`."""
+        """Rise (k, SECTORS) [rad] of the skyline by one unit of each of the shared `errors`."""
         return errors.slopes_rad(self.terrain, self.reference_m, MIDDLES_RAD, self.horizon_rad, self._shape_slopes_rad)
 
     def wave_slopes_rad(self, errors: SharedErrors) -> Array:
-        """(w, SECTORS) rise of the skyline by one unit of each of the waves among the shared `errors`."""
+        """Rise (w, SECTORS) [rad] of the skyline by one unit of each of the waves among the shared `errors`."""
         return np.array([self._shape_slopes_rad[one.name] for one in errors.waves]).reshape(-1, SECTORS)
 
     @cached_property
     def _shape_slopes_rad(self) -> dict[str, Array]:
-        """Rise (SECTORS,) of the skyline by one unit of each error of the terrain's shape, by name."""
+        """Rise (SECTORS,) [rad] of the skyline by one unit of each error of the terrain's shape, by name."""
         slopes = np.reshape(self.terrain.errors.slopes_rad(self.reference_m, MIDDLES_RAD), (-1, SECTORS))
         return {one.name: slope for one, slope in zip(self.terrain.errors.shape, slopes, strict=True)}
 
     @cached_property
     def skyline_rad(self) -> Array:
-        """(SAMPLES,) of the map at the reference, from north eastward."""
+        """Skyline (SAMPLES,) [rad] of the map at the reference, from north eastward."""
         around = np.linspace(0.0, 2 * np.pi, SAMPLES, endpoint=False)
         horizon = np.asarray(self.terrain.horizon_rad(self.reference_m[None], around)).ravel()
         require_horizons(self.terrain, self.reference_m[None], horizon)
@@ -87,17 +87,17 @@ class Neighbourhood:
 
     @cached_property
     def crests(self) -> ExpectedCrests | None:
-        """The skyline at the reference with all errors of posts; None of a ground without them."""
+        """Skyline at the reference with all errors of posts; None of a ground without them."""
         return self.terrain.errors.expected_crests(self.reference_m, MIDDLES_RAD)
 
     @cached_property
     def expected_rise_rad(self) -> Array:
-        """(SECTORS,) by which errors of posts raise the skyline of the map in the mean: the highest place is seen."""
+        """Mean rise (SECTORS,) [rad] of the map's skyline by errors of posts: the highest place is seen."""
         return np.zeros(SECTORS) if self.crests is None else self.crests.rise_rad
 
     @cached_property
     def map_sigma_rad(self) -> Array:
-        """(SECTORS,) error of the map's skyline, as if independent between the sectors.
+        """Sigma (SECTORS,) [rad] of the map's skyline, as if independent between the sectors.
 
         Posts that make the skyline at several azimuths err there together: see `independent_sigma`. What follows no
         post is common to neighbours as the square of their correlation by posts; where the skyline follows none at all
@@ -114,11 +114,11 @@ class Neighbourhood:
 
     @cached_property
     def post_sigma_rad(self) -> Array | None:
-        """(SECTORS,) the part of `map_sigma_rad` that follows the posts; None of a ground without their errors."""
+        """Part (SECTORS,) [rad] of `map_sigma_rad` that follows the posts; None of a ground without their errors."""
         return None if self.crests is None else independent_sigma(self._covariance_by_posts(self.crests))
 
     def _covariance_by_posts(self, crests: ExpectedCrests) -> Array:
-        """(SECTORS, SECTORS) of the skyline's elevations, as far as they follow the posts."""
+        """Covariance (SECTORS, SECTORS) [rad^2] of the skyline's elevations, as far as they follow the posts."""
         used = crests.post != NO_POST
         numbers, of = np.unique(crests.post[used], return_inverse=True)
         response = np.zeros((SECTORS, len(numbers)))
@@ -145,7 +145,7 @@ def independent_sigma(covariance: Array) -> Array:
 
 
 class OwnEdge(NamedTuple):
-    """What the rows tell where the sky's light has an edge of its own, and the stars alone show the skyline."""
+    """Likelihoods where the sky's light has an edge of its own, and the stars alone show the skyline."""
 
     stars: Profiles
     light: Array  # (SECTORS,) likelihood of the light, in which the two profiles' offsets are made up for
@@ -162,7 +162,7 @@ class SectorRows:
 
     @cached_property
     def above_rad(self) -> Array:
-        """(n,) how far the rows stand above the skyline at the reference."""
+        """Heights (n,) [rad] of the rows above the skyline at the reference."""
         rows, terrain = self.rows, self.around.terrain
         above = rows.elevation_rad - interpolate_circle(self.around.skyline_rad, rows.azimuth_rad)
         if not terrain.axisymmetric:  # crests are narrower than the samples
@@ -173,7 +173,7 @@ class SectorRows:
 
     @cached_property
     def profiles(self) -> Profiles:
-        """How well each height of the skyline explains the rows of each sector."""
+        """Log-likelihoods of the rows of each sector by the height of the skyline."""
         return profiles_of(self.rows, self.above_rad, self.around.map_sigma_rad)
 
     @cached_property
@@ -183,7 +183,7 @@ class SectorRows:
 
     @cached_property
     def log_offset(self) -> float:
-        """What makes log-likelihoods of different references and times comparable: they see other windows of rows."""
+        """Term that makes log-likelihoods of other references and times comparable: they see other windows of rows."""
         return float(self.profiles.offset.sum())
 
     @property
@@ -192,7 +192,7 @@ class SectorRows:
         return MOVES if self.edge is None else LIT_MOVES
 
     def emissions(self, shift: Array) -> Array:
-        """Likelihoods (SECTORS, STATES) at shifts (SECTORS,) of the map's skyline."""
+        """Likelihoods (SECTORS, STATES) of the chain's states at shifts (SECTORS,) [rad] of the map's skyline."""
         found = emissions(self.profiles, shift)
         if self.edge is not None:
             at_skyline = clear_emissions(self.edge.stars, np.ascontiguousarray(shift)[:, None])
@@ -206,7 +206,7 @@ class SectorRows:
 
     @cached_property
     def image_rise(self) -> Array:
-        """(SECTORS, j) rise of the skyline that stars and sky's light show together, by one unit of each image error.
+        """Rise (SECTORS, j) [rad] of the skyline by stars and sky's light together, by one unit of each image error.
 
         The share of the sky's light must not vary with its noise: errors that look like a displacement would not.
         """

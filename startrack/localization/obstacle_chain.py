@@ -54,11 +54,13 @@ class Moves(NamedTuple):
 
 
 def _group(first: int, last: int, start: float) -> Group:
+    """Group of the states `first` to `last`, of which one begins with the probability `start`."""
     count = last - first + 1
     return Group(first, last, start / count, (1 - STOP) * (1 - KEEP - NEAR) / count)
 
 
 def _moves(sunk_start: float) -> Moves:
+    """Moves of the chain, in which a state below the map's skyline begins with the probability `sunk_start`."""
     risen, sunk = _group(1, RISEN, START), _group(RISEN + 1, STATES - 1, sunk_start)
     return Moves(risen, sunk, STOP, (1 - STOP) * KEEP, 0.5 * (1 - STOP) * NEAR)
 
@@ -90,7 +92,7 @@ def prepare_levels(profiles: Profiles, reach: Array) -> NDArray[np.float32]:
 
 
 def clear_emissions(profiles: Profiles, shifts: Array) -> Array:
-    """Likelihoods (SECTORS, n) of sectors whose skyline is the map's, at shifts (SECTORS, n)."""
+    """Likelihoods (SECTORS, n) of sectors whose skyline is the map's, at shifts (SECTORS, n) [rad]."""
     found = np.empty(shifts.shape)
     _clear_emissions(*take(profiles, _VALUES), HIGH_RAD, WRONG_SECTOR, np.ascontiguousarray(shifts), found)
     return found
@@ -107,7 +109,7 @@ def log_clear_emissions(profiles: Profiles, shifts: Array, clear: Array) -> Arra
 
 
 def emissions(profiles: Profiles, shift: Array) -> Array:
-    """Likelihoods (SECTORS, STATES) at shifts (SECTORS,) of the map's skyline."""
+    """Likelihoods (SECTORS, STATES) of the states at shifts (SECTORS,) [rad] of the map's skyline."""
     found = np.empty((len(shift), STATES))
     _emissions(
         *take(profiles, _ALL), HIGH_RAD, WRONG_SECTOR, np.ascontiguousarray(shift), FROM_RAD, TO_RAD, RISEN, found
@@ -163,7 +165,7 @@ CLEAR = 1e-3  # least probability of a state over which the circle is closed
 
 
 def transitions(moves: Moves = MOVES) -> Array:
-    """The transitions (STATES, STATES) of the chain, from rows to columns."""
+    """Probabilities (STATES, STATES) of the chain's transitions, from rows to columns."""
     T = np.zeros((STATES, STATES))
     T[0, 0], T[1:, 0] = 1.0, moves.stop
     for group in (moves.risen, moves.sunk):

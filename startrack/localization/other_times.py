@@ -66,18 +66,18 @@ class OtherTimes:
 
     @property
     def step_s(self) -> float:
-        """Between two times."""
+        """Step [s] between two times."""
         return float(TIME_STEP_RAD / np.linalg.norm(self.clock.turn_rad_s))
 
     @cached_property
     def times_s(self) -> Array:
-        """(2 n + 1,) [s later than stated], the stated one in the middle."""
+        """Times (2 n + 1,) [s later than stated], the stated one in the middle."""
         count = min(int(np.ceil(GROSS_REACH_SIGMAS * self.clock.gross_sigma_s / self.step_s)), MOST_TIME_STEPS)
         return self.step_s * np.arange(-count, count + 1.0)
 
     @cached_property
     def log_part(self) -> Array:
-        """(2 n + 1,) logarithms of the parts of the gross error's distribution that the times have."""
+        """Logarithms (2 n + 1,) of the parts of the gross error's distribution that the times have."""
         sigmas = self.times_s / self.clock.gross_sigma_s
         norm = float(np.log(self.step_s / self.clock.gross_sigma_s / np.sqrt(2 * np.pi)))
         return np.asarray(norm - 0.5 * np.square(sigmas), dtype=np.float64)
@@ -97,7 +97,7 @@ class OtherTimes:
         return list(found.values())
 
     def _first(self) -> list[int]:
-        """The stated time, the next ones and the likeliest others that are apart where the heights allow them."""
+        """Indices of the stated time, of the likeliest others apart, and of its neighbours where heights allow them."""
         fits = np.array([self._fit(later_s) for later_s in self.times_s]) + self.log_part
         likely = choose_apart(self.times_s[:, None], fits, 1.5 * self.step_s, FIRST_NATS, MOST_FIRST)
         stated = len(self.times_s) // 2
@@ -135,7 +135,7 @@ class OtherTimes:
         return one
 
     def _model_at(self, later_s: float) -> SkylineModel:
-        """The model with its rows turned to a time, and the prior of an error about that."""
+        """Copy of the model with its rows turned to a time [s later], and the prior of an error about that."""
         model = turned_model(self.model, later_s - self.model.errors.later_s)
         *others, clock = model.errors.listed
         about = replace(clock, mean=later_s, gross_sigma=0.5 * self.step_s, gross_probability=self.probability)

@@ -63,7 +63,7 @@ def square_grid(half_m: float, across: int) -> Array:
 
 
 def choose_apart(points: Array, score: Array, apart: float, nats: float = np.inf, most: int | None = None) -> list[int]:
-    """The best of points (n, d) with a score (n,) that are farther `apart` from each other along an axis.
+    """Indices of the best points (n, d) by a score (n,) that are farther than `apart` from each other on an axis.
 
     Those that are worse than the best by more than `nats` do not count; `most` of them are chosen.
     """
@@ -78,7 +78,7 @@ def choose_apart(points: Array, score: Array, apart: float, nats: float = np.inf
 
 @dataclass(frozen=True, eq=False)
 class BoxModel:
-    """The likelihood of `rows` on a `terrain`: over boxes of positions that of the search, at places the published."""
+    """Model of the likelihood of `rows` on a `terrain`: over boxes that of the search, at places the published one."""
 
     rows: Evidence
     terrain: Terrain
@@ -88,11 +88,11 @@ class BoxModel:
 
     @classmethod
     def of(cls, rows: Evidence, terrain: Terrain) -> BoxModel:
-        """With the errors at zero."""
+        """Model of `rows` on a `terrain` with the shared errors at zero."""
         return cls(rows, terrain, SearchProfiles.of(rows), SharedErrors.of(terrain, rows.clock))
 
     def raised_as(self, places: list[Place]) -> BoxModel:
-        """The same with the errors that the best of `places` shows, the first one."""
+        """Copy of this model with the errors that the first and best of `places` shows; itself without places."""
         return replace(self, raised_rad=places[0].raised_rad) if places else self
 
     def bounds(self, centres_m: Array, half_m: float) -> Array:
@@ -114,10 +114,10 @@ class BoxModel:
         return self.profiles.score(sum_contributions(rows, rows.elevation_rad - horizon))
 
     def averages(self, centres_m: Array, half_m: float, is_traced: bool = False) -> Array:
-        """Log-likelihoods (n,) of the search of boxes (n, 2), on average.
+        """Mean log-likelihoods (n,) of the search over boxes (n, 2).
 
-        With bounds of the horizon, or, if it `is_traced`, its estimated spread about that of each centre in every third
-        sector.
+        By bounds of the horizon, or, if it `is_traced`, by its estimated spread about that of each centre in every
+        third sector.
         """
         azimuth, boxes = MIDDLES_RAD[:: TRACED_EVERY if is_traced else 1], centres_m[:, None, :]
         if is_traced:
@@ -154,7 +154,7 @@ class BoxModel:
         return sorted((one for one in found if one is not None), key=lambda one: -one.log_likelihood)
 
     def _fit(self, centre_m: Array, half_m: float) -> Place | None:
-        """The likeliest place that linear solutions lead to from a box."""
+        """The likeliest place that linear solutions lead to from a box; None where no ground of it is allowed."""
         points = centre_m + square_grid(half_m, 5)
         points = points[np.asarray(self.terrain.allowed(points))]
         if not len(points):
@@ -174,7 +174,7 @@ class BoxModel:
 
 
 def _place_of(model: SkylineModel) -> Place:
-    """The likelier one of the reference of a model and the linear solution about it, if that is allowed."""
+    """Place at the likelier of a model's reference and the linear solution about it, if that is allowed."""
     linear, covariance, weight = model.solve()
     tried = model.with_likely_errors(model.around.reference_m[None], weight)
     if bool(model.terrain.allowed(linear[None, :2])[0]):

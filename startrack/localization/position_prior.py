@@ -25,11 +25,11 @@ class SearchedNear(ForwardingTerrain):
 
     @property
     def searched(self) -> tuple[float, float, float]:  # type: ignore[override]
-        """The disk of the prior: east, north and radius [m]."""
+        """Disk of the prior: east and north of its middle, and its radius [m]."""
         return float(self.near_prior.east_m), float(self.near_prior.north_m), float(self.radius_m)
 
     def allowed(self, points_m: Array) -> Bools:
-        """As of the whole terrain, within the disk."""
+        """Whether a camera could stand at the points (..., 2), within the disk."""
         east, north, reach = self.searched
         inside = np.hypot(points_m[..., 0] - east, points_m[..., 1] - north) <= reach
         return np.asarray(inside & self.whole.allowed(points_m))
@@ -41,12 +41,12 @@ class SearchedNear(ForwardingTerrain):
         return bool(np.linalg.norm(places[0].position_m - self.near_prior.mean_m) > EDGE_PART * self.radius_m)
 
     def enlarged(self) -> SearchedNear:
-        """The same with a larger disk."""
+        """Copy of this terrain with a larger disk."""
         return SearchedNear(self.whole, self.near_prior, ENLARGED * self.radius_m)
 
 
 def require_prior_inside(nearby: SearchedNear) -> None:
-    """Raises NotLocated (outside_search_area) where no part of the disk of a prior is in the search area."""
+    """Raise NotLocated (outside_search_area) where no part of the disk of a prior is in the search area."""
     east_m, north_m, radius_m = nearby.searched
     away_m = float(np.hypot(east_m, north_m))
     if away_m > nearby.reach_m + radius_m:
@@ -58,7 +58,7 @@ def require_prior_inside(nearby: SearchedNear) -> None:
 
 
 def require_agreement(places: list[Place], near: PositionPrior) -> None:
-    """Raises NotLocated (inconsistent_evidence) where the prior contradicts the likely `places`, the best first.
+    """Raise NotLocated (inconsistent_evidence) where the prior contradicts the likely `places`, the best first.
 
     Of two normal distributions the maximum of the product lies chi^2 / 2 below the product of the maxima.
     """

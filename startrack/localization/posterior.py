@@ -54,7 +54,7 @@ class ExactPosterior:
             raise name_prior(refusal, rows.near) from refusal
 
     def _explore_times(self, rows: Evidence, terrain: Terrain) -> list[tuple[Evidence, Explored]]:
-        """The rows at each likely time, and the boxes that may matter there."""
+        """Pairs of the rows at a likely time, and of the boxes that may matter there."""
         if rows.support is not None:
             return [(rows, rows.support)]
         if rows.near is not None:
@@ -68,7 +68,7 @@ class ExactPosterior:
         return explore(evidence, terrain, self.prune_nats, self.budget_horizons)[0]
 
     def _explore_near(self, evidence: Evidence, terrain: Terrain, near: PositionPrior) -> Explored:
-        """As `explore`, in the neighbourhood of the prior.
+        """Boxes that may matter in the neighbourhood of the prior `near`, with its log-density added.
 
         The searched disk is enlarged until the likeliest place is not at its edge: else nothing would show how far off
         the prior the evidence is. Raises NotLocated: inconsistent_evidence where the two contradict each other,

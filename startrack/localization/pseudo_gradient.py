@@ -16,7 +16,7 @@ GAIN, MOST_STEPS = 1.0, 200
 
 @dataclass(frozen=True)
 class PseudoGradient:
-    """Repeats p <- p + gain (mean of the stars expected at p - mean of the stars seen) until both sets are the same.
+    """Steps p <- p + gain (mean of the stars expected at p - mean of the stars seen) until both sets are the same.
 
     Stars are points on the plane of the rim; those expected at p are the ones with |p + point| < R. Source: Kua 2008,
     Algorithm 1. Weak when few stars differ: it may wander until the steps run out. Of a list with mistakes no position
@@ -72,5 +72,5 @@ def descend(
 
 
 def _expected_stars(x_m: Array, y_m: Array, east_m: float, north_m: float, radius_m: float) -> Bools:
-    """Which of the stars at x and y (n,) on the rim's plane are visible from a position."""
+    """Whether stars at x and y (n,) [m] on the rim's plane are visible from a position."""
     return np.asarray(np.square(x_m + east_m) + np.square(y_m + north_m) < radius_m**2)

@@ -1,4 +1,4 @@
-"""What the thesis's methods need of the evidence: a list of seen and of missing stars, on the plane of the rim."""
+"""Evidence as the thesis's methods need it: a list of seen and of missing stars, on the plane of the rim."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def stars_on_rim_plane(evidence: Evidence, terrain: Terrain) -> RimPlane:
 
 
 def points_of_rays(wall_m: float, azimuths_rad: Array, elevations_rad: Array) -> Array:
-    """Where rays (n,) pierce a plane `wall_m` above the camera: rho u (n, 2) [m], rho = wall / tan e, u horizontal.
+    """Points (n, 2) [m] where rays (n,) pierce a plane `wall_m` above the camera: rho u, rho = wall / tan e, u level.
 
     A ray is visible from p exactly where |p + rho u| is below the radius of the rim in that plane; rays at or below
     the horizontal pierce it infinitely far away.

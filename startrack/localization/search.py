@@ -112,7 +112,7 @@ def merge_places(*parts: list[Place]) -> list[Place]:
 
 @dataclass
 class Proof:
-    """One run of branch and bound: the work done, and how much probability was dropped."""
+    """A run of branch and bound: the work done, and how much probability was dropped."""
 
     model: BoxModel
     prune_nats: float  # boxes that are less likely than the best by more are dropped
@@ -180,5 +180,5 @@ class Proof:
         return self.model.terrain.horizon_cost * LOOK_UP_COST * SECTORS * boxes
 
     def _with_dropped(self, log_likelihood: Array, half: float) -> float:
-        """`log_dropped` with boxes of bounds (n,) besides."""
+        """Logarithm of `log_dropped` [m2] with boxes added whose log-likelihoods have the bounds (n,)."""
         return float(np.logaddexp(self.log_dropped, log_sum(log_likelihood) + 2.0 * float(np.log(2 * half))))

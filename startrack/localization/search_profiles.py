@@ -41,7 +41,7 @@ class SearchProfiles:
 
     @classmethod
     def of(cls, rows: Evidence) -> SearchProfiles:
-        """Of rows (n,)."""
+        """Profiles of the `rows` (n,) of an image."""
         sector, margin = sector_of(rows.azimuth_rad), EDGE_SIGMAS * rows.edge_sigma_rad
         hard = replace(rows, edge_sigma_rad=np.where(rows.extended_nats > 0.0, rows.edge_sigma_rad, 0.0))
         profiles = profiles_of(hard, rows.elevation_rad, np.zeros(SECTORS), (LOWEST_RAD, HIGHEST_RAD))
@@ -83,7 +83,7 @@ class SearchProfiles:
 def sum_contributions(rows: Evidence, margin_rad: Array) -> Array:
     """Sums (SECTORS,) of the contributions of rows that stand `margin_rad` (n,) above the skyline.
 
-    Of stars as far as one counts, with hard edges.
+    Stars have hard edges, and count for at most ROW_NATS.
     """
     from scipy.special import ndtr
 
@@ -95,7 +95,7 @@ def sum_contributions(rows: Evidence, margin_rad: Array) -> Array:
 
 
 def _counted_llr(rows: Evidence) -> Array:
-    """The llr (n,) of rows; of a star as far as one counts."""
+    """Log-likelihood ratios (n,) of rows; those of stars are cut off at ROW_NATS."""
     return np.where(rows.extended_nats > 0.0, rows.llr, np.clip(rows.llr, -ROW_NATS, ROW_NATS))
 
 

@@ -46,7 +46,7 @@ class SharedErrors:
 
     @classmethod
     def of(cls, terrain: Terrain, clock: Clock | None, doubted: str = "") -> SharedErrors:
-        """Those of a `terrain` and a `clock` that may be other than zero.
+        """Shared errors of a `terrain` and a `clock` that may be other than zero.
 
         What is stated of the fact `doubted` does not count: its errors are gross.
         """
@@ -70,7 +70,7 @@ class SharedErrors:
 
     @property
     def every(self) -> tuple[ShapeError, ...]:
-        """(k + w,) the listed errors and the waves."""
+        """Listed errors and waves (k + w,)."""
         return (*self.listed, *self.waves)
 
     @cached_property
@@ -80,41 +80,41 @@ class SharedErrors:
 
     @property
     def unstated_facts(self) -> tuple[str, ...]:
-        """Those of the `facts` that no file states."""
+        """Facts with a gross part that no file states."""
         stated = {one.fact for one in self.every if one.is_stated}
         return tuple(fact for fact in self.facts if fact not in stated)
 
     def is_of_fact(self, fact: str) -> Bools:
-        """(k,) which errors are those of a fact."""
+        """Whether errors (k,) are those of a `fact`."""
         return np.array([one.fact == fact for one in self.listed], dtype=bool)
 
     def are_waves(self, fact: str) -> bool:
-        """Whether the errors of a fact are the waves."""
+        """Whether the errors of a `fact` are the waves."""
         return any(one.fact == fact for one in self.waves)
 
     def sigma(self, gross: str = "") -> Array:
-        """Standard deviations (k,); those of the fact `gross` as of a gross error."""
+        """Standard deviations (k,), each in its error's unit; those of the fact `gross` are of a gross error."""
         return _sigma(self.listed, gross)
 
     def waves_sigma_rad(self, gross: str = "") -> Array:
-        """Standard deviations (w,) of the waves; those of the fact `gross` as of a gross error."""
+        """Standard deviations (w,) [rad] of the waves; those of the fact `gross` are of a gross error."""
         return _sigma(self.waves, gross)
 
     @property
     def later_s(self) -> float:
-        """How much later than stated the time is that the rows are turned to."""
+        """Time [s] by which the time that the rows are turned to is later than stated."""
         return 0.0 if self.clock is None else self.clock.offset_s
 
     @cached_property
     def mean(self) -> Array:
-        """(k,) expected values: not zero for rows turned to another time, or a ground of another shape, than stated."""
+        """Expected values (k,): not zero for rows turned to another time, or ground of another shape, than stated."""
         found = np.array([one.mean for one in self.listed])
         found[-1:] -= self.later_s
         return found
 
     @property
     def stated_values(self) -> Array:
-        """(k,) `mean`, that of the clock as stated, also where another time is expected."""
+        """Expected values (k,), with that of the clock as stated, also where another time is expected."""
         found = self.mean.copy()
         if self.clock is not None:
             found[-1] = -self.later_s
@@ -155,11 +155,11 @@ class SharedErrors:
 
     @cached_property
     def _scales(self) -> Ints:
-        """Which errors scale a round crater, and the position with it."""
+        """Indices of the errors that scale a round crater, and the position with it."""
         return np.flatnonzero([one.scales and self.axisymmetric for one in self.listed])
 
     def true_positions(self, points: Array, values: Array) -> Array:
-        """The positions `points` (n, 2) turned and scaled by the `values` (n, k) of the errors, in a round crater."""
+        """Positions (n, 2) [m]: `points` (n, 2) turned and scaled by the errors' `values` (n, k) in a round crater."""
         points = points * np.maximum(1.0 + values[:, self._scales].sum(axis=1, keepdims=True), LEAST_SIZE)
         if self.clock is None or not self.axisymmetric:
             return points
@@ -169,7 +169,7 @@ class SharedErrors:
 
 
 def _sigma(errors: Sequence[ShapeError], gross: str) -> Array:
-    """Standard deviations (k,) of `errors`; those of the fact `gross` as of a gross error."""
+    """Standard deviations (k,) of `errors`; those of the fact `gross` are of a gross error."""
     wide = np.array([one.gross_sigma for one in errors])
     least = np.maximum([one.sigma for one in errors], RESIDUAL_PART * wide)
     return np.where([one.fact == gross for one in errors], wide, least)
@@ -215,7 +215,7 @@ class ErrorBasis:
         moments: SectorMoments,
         reach_m: float,
     ) -> ErrorBasis:
-        """Of errors that raise the skyline by `slopes_rad` (k, n), a position that does by `position_slopes` (2, n).
+        """Basis of `errors` that raise the skyline by `slopes_rad` (k, n), as a position by `position_slopes` (2, n).
 
         The position is known to `reach_m` before. `gross` names the fact with a gross error, "" none. `moments` are
         those of the skyline that the rows show.
@@ -236,7 +236,7 @@ class ErrorBasis:
 
     @classmethod
     def whole(cls, errors: SharedErrors) -> ErrorBasis:
-        """All `errors` in their own units, as directions of their own, about zero."""
+        """Basis of all `errors` in their own units, as directions of their own, about zero."""
         k = len(errors)
         return cls("", 0.0, np.zeros(k), np.eye(k), np.zeros((k, 0)), np.zeros((0, 2)))
 
@@ -248,9 +248,9 @@ class ErrorBasis:
         return np.asarray(self.mean + shown @ self.shown.T + hidden @ self.hidden.T)
 
     def parameters(self, positions_m: Array, off: Array) -> Array:
-        """Parameters (n, 2 + a) of `positions_m` (n, 2), before the turn of a round crater, with errors `off` the mean.
+        """Parameters (n, 2 + a) of `positions_m` (n, 2) [m] with errors that are `off` (n, k) the mean.
 
-        `off` is (n, k).
+        The positions are those before the turn of a round crater.
         """
         at = np.linalg.solve(np.hstack([self.shown, self.hidden]), off.T).T
         shown, hidden = np.split(at, [len(self)], axis=1)

@@ -33,7 +33,7 @@ class PreparedLevels:
     _known: Levels | None = None
 
     def at_least(self, seen: SectorRows, shifts: Array) -> Levels:
-        """For the rows `seen`, at shifts (n, SECTORS) and smaller ones."""
+        """Emissions of the levels for the rows `seen`, at shifts (n, SECTORS) and smaller ones."""
         most = np.maximum(shifts.max(axis=0), -shifts.min(axis=0))
         if self._known is None or (most > self._known.reach).any():
             reach = np.maximum(MARGIN * most, LEAST_REACH_RAD)
@@ -68,7 +68,7 @@ class SkylineModel:
         image_errors: ImageErrors | None = None,
         basis: ErrorBasis | None = None,
     ) -> SkylineModel:
-        """Of `rows` on a `terrain`, for positions within `half_m` of `reference_m` (2,).
+        """Model of `rows` on a `terrain`, for positions within `half_m` [m] of `reference_m` (2,).
 
         The `errors` are shared, the `image_errors` those of the rows of extended light. `basis`: directions of the
         shared errors; None: those that the rows show.
@@ -98,40 +98,41 @@ class SkylineModel:
 
     @cached_property
     def slopes_rad(self) -> Array:
-        """(a, SECTORS) rise of the skyline by one unit of each direction that the rows show."""
+        """Rise (a, SECTORS) [rad] of the skyline by one unit of each direction that the rows show."""
         return np.asarray(self.basis.shown.T @ self.error_slopes_rad)
 
     def with_gross(self, gross: str) -> SkylineModel:
-        """The same where a fact has a gross error, whatever is stated of it."""
+        """Copy of this model where a fact has a gross error, whatever is stated of it."""
         if gross in self.errors.facts:
             return replace(self, gross=gross)
         errors = SharedErrors.of(self.terrain, self.seen.rows.clock, gross)
         return replace(self, gross=gross, errors=errors, error_slopes_rad=self.around.error_slopes_rad(errors))
 
     def with_rows(self, rows: Evidence) -> SkylineModel:
-        """The same neighbourhood with other `rows` and their clock."""
+        """Model of the same neighbourhood with other `rows` and their clock."""
         seen = replace(self.seen, rows=rows)
         errors = replace(self.errors, clock=rows.clock)
         return SkylineModel(seen, errors, self.error_slopes_rad, self.gross, self.stated_basis)
 
     def with_closing(self, states: Array) -> SkylineModel:
-        """The same with the circle cut where the chain is surest of its state by `states` (SECTORS, STATES)."""
+        """Copy with the circle cut where the chain is surest of its state by `states` (SECTORS, STATES)."""
         return replace(self, closing=closing_of(states))
 
     def shifts(self, parameters: Array) -> Array:
-        """(n, SECTORS) by how much the map's skyline at `parameters` (n, 2 + a) stands higher than at the reference."""
+        """Rise (n, SECTORS) [rad] of the map's skyline from the reference to `parameters` (n, 2 + a)."""
         moved = self.around.horizons_rad(parameters[:, :2]) - self.around.horizon_rad
         return np.asarray(moved + parameters[:, 2:] @ self.slopes_rad + self._expected_rise)
 
     @cached_property
     def _expected_rise(self) -> Array:
-        """(SECTORS,) by the expected values of the shared errors, and by errors of posts."""
+        """Rise (SECTORS,) [rad] by the expected values of the shared errors, and by errors of posts."""
         return np.asarray(self.basis.mean @ self.error_slopes_rad + self.around.expected_rise_rad)
 
     def rise_rad(self, parameters: Array) -> Array | None:
-        """Rise (SECTORS,) of the skyline above the map's by errors of the ground at parameters (2 + a,); None of none.
+        """Rise (SECTORS,) [rad] of the skyline above the map's by errors of the ground at parameters (2 + a,), or None.
 
-        On real ground without that of the clock: the sky is turned to the time that it shows.
+        None where there are no errors. On real ground without that of the clock: the sky is turned to the time that it
+        shows.
         """
         if not len(self.errors) and not self.errors.waves:
             return None
@@ -143,12 +144,12 @@ class SkylineModel:
         return np.asarray(values @ self.error_slopes_rad + by_waves + self.around.expected_rise_rad)
 
     def log_likelihood(self, parameters: Array) -> Array:
-        """(n,) of parameters (n, 2 + a): position [m], and coordinates of the shared errors; see `basis`."""
+        """Log-likelihoods (n,) of parameters (n, 2 + a): position [m], and coordinates of the errors in `basis`."""
         shifts, prior = self.with_linear_errors(self.shifts(parameters))
         return self.log_likelihood_of(shifts) + prior
 
     def log_likelihood_of(self, shifts: Array) -> Array:
-        """(n,) of shifts (n, SECTORS) of the map's skyline."""
+        """Log-likelihoods (n,) of shifts (n, SECTORS) [rad] of the map's skyline."""
         seen, found = self.seen, np.empty(len(shifts))
         cut, closing = self._closing
         levels = self.levels.at_least(seen, shifts)
@@ -157,12 +158,13 @@ class SkylineModel:
 
     @cached_property
     def _closing(self) -> Closing:
+        """Sector where the circle is cut, and the states over which it is closed: as at the reference, if not given."""
         if self.closing is not None:
             return self.closing
         return closing_of(self._states_at(np.zeros(SECTORS)))
 
     def shift_of(self, parameters: Array) -> Array:
-        """(SECTORS,) by how much the skyline of the map at parameters (2 + a,) stands higher than at the reference."""
+        """Rise (SECTORS,) [rad] of the map's skyline from the reference to parameters (2 + a,), with linear errors."""
         return np.asarray(self.with_linear_errors(self.shifts(parameters[None]))[0][0])
 
     def states(self, parameters: Array) -> Array:
@@ -170,10 +172,11 @@ class SkylineModel:
         return self._states_at(self.shift_of(parameters))
 
     def lit(self, states: Array) -> Array:
-        """(SECTORS,) probabilities that the light has an edge of its own, by those of the `states`."""
+        """Probabilities (SECTORS,) that the light has an edge of its own, by those of the `states`."""
         return states[:, RISEN + 1 :].sum(axis=1) if self.seen.edge is not None else np.zeros(SECTORS)
 
     def _states_at(self, shift: Array) -> Array:
+        """Probabilities (SECTORS, STATES) of the chain's states at a shift (SECTORS,) of the map's skyline."""
         return state_probabilities(self.seen.emissions(shift), self.seen.moves)
 
     @cached_property
@@ -182,9 +185,9 @@ class SkylineModel:
         return LinearErrors.of(self.seen, self.errors, self.gross, self.clear)
 
     def with_linear_errors(self, shifts: Array) -> tuple[Array, Array]:
-        """The `shifts` (n, SECTORS) with the likeliest linear errors, and a logarithm (n,).
+        """Shifts (n, SECTORS) [rad] with the likeliest linear errors added, and a logarithm (n,).
 
-        It is that of the integral of the likelihood over these errors, in the likelihood at the shifts.
+        The logarithm is that of the integral of the likelihood over these errors, in the likelihood at the shifts.
         """
         linear = self.linear
         if not len(linear):

@@ -58,25 +58,25 @@ class SkylinePoints(Rows):
 
     @property
     def attitude_sigma_rad(self) -> Array:
-        """(3,) of heading and of the tilts about east and north."""
+        """Standard deviations (3,) [rad] of heading and of the tilts about east and north."""
         return np.array([self.heading_sigma_rad, self.tilt_sigma_rad, self.tilt_sigma_rad])
 
     def turned(self, attitude_rad: Array) -> SkylinePoints:
-        """The directions with a heading (azimuths grow) and tilts about east and north, `attitude_rad` (3,)."""
+        """Copy turned by a heading (azimuths grow) and tilts about east and north, `attitude_rad` (3,)."""
         heading, east, north = attitude_rad
         R = R_from_rotvec([0.0, 0.0, -heading]) @ R_from_rotvec([east, north, 0.0])
         azimuth, elevation = turn_azel(self.azimuth_rad, self.elevation_rad, R)
         return replace(self, azimuth_rad=azimuth, elevation_rad=elevation)
 
     def thinned(self) -> SkylinePoints:
-        """Every so manieth point, so that a sector holds some SEARCHED at most: enough for a search."""
+        """Copy with every so manieth point, so that a sector holds some SEARCHED at most: enough for a search."""
         order = np.argsort(self.azimuth_rad, kind="stable")
         most = int(np.bincount(self.sector, minlength=SECTORS).max(initial=0))
         return self.take(np.sort(order[:: max(most // SEARCHED, 1)]))
 
     @cached_property
     def sector(self) -> Ints:
-        """(n,) of azimuth."""
+        """Sector of azimuth (n,) of each point."""
         return sector_of(self.azimuth_rad)
 
     def mean(self, values: Array) -> Array:
@@ -87,7 +87,7 @@ class SkylinePoints(Rows):
 
     @cached_property
     def variance_rad2(self) -> Array:
-        """(SECTORS,) of the means, with their covariances with those of all other sectors; infinite where none is."""
+        """Variances (SECTORS,) of the means, with covariances with all other sectors; infinite where no point is."""
         weight = self.sigma_rad**-2.0
         share = weight / np.bincount(self.sector, weight, SECTORS)[self.sector] * self.sigma_rad
         found = np.full(SECTORS, np.inf)
@@ -112,50 +112,50 @@ class SeenSkyline:
 
     @classmethod
     def at(cls, stated: SkylinePoints, terrain: Terrain, position_m: Array, attitude_rad: Array) -> SeenSkyline:
-        """With the errors of the map as seen from there."""
+        """Seen skyline with the errors of the map as seen from the position."""
         return cls(stated, terrain, position_m, attitude_rad, Neighbourhood(terrain, position_m, 0.0).map_sigma_rad)
 
     @cached_property
     def points(self) -> SkylinePoints:
-        """Those that the terrain decides about, turned."""
+        """Points that the terrain decides about, turned."""
         turned = self.stated.turned(self.attitude_rad)
         return turned.take(np.asarray(self.terrain.is_informative(turned.azimuth_rad, turned.elevation_rad)))
 
     def _map_rad(self, east_m: float = 0.0, north_m: float = 0.0, later_rad: float = 0.0) -> Array:
-        """(n,) of the map beside the points, from as far off the position and at azimuths greater by so much."""
+        """Horizon (n,) [rad] beside the points, from so far off the position and at azimuths greater by so much."""
         azimuth = np.mod(self.points.azimuth_rad + later_rad, 2 * np.pi)
         return np.asarray(self.terrain.horizon_rad(self.position_m[None] + [east_m, north_m], azimuth)).ravel()
 
     @cached_property
     def above_rad(self) -> Array:
-        """(SECTORS,) by how much the points stand above the map, in the mean; 0 where none is."""
+        """Mean height (SECTORS,) [rad] of the points above the map; 0 where no point is."""
         return self.points.mean(self.points.elevation_rad - self._map_rad())
 
     @cached_property
     def elevation_rad(self) -> Array:
-        """(SECTORS,) of the skyline at the middles of the sectors; the map's where no point is."""
+        """Elevation (SECTORS,) [rad] of the skyline in the middle of the sectors; the map's where no point is."""
         return np.asarray(np.ravel(self.terrain.horizon_rad(self.position_m[None], MIDDLES_RAD)) + self.above_rad)
 
     @cached_property
     def used(self) -> Bools:
-        """(SECTORS,) which have points."""
+        """Whether sectors (SECTORS,) have points."""
         return np.bincount(self.points.sector, minlength=SECTORS) > 0
 
     @cached_property
     def variance_rad2(self) -> Array:
-        """(SECTORS,) of `above_rad`, the errors of the map included; infinite where no point is."""
+        """Variances (SECTORS,) of `above_rad`, the errors of the map included; infinite where no point is."""
         return np.asarray(self.points.variance_rad2 + np.square(self.map_sigma_rad))
 
     @cached_property
     def position_slopes(self) -> Array:
-        """(2, SECTORS) rise of the map by a metre east and north [rad/m], in the mean over the points."""
+        """Rise (2, SECTORS) [rad/m] of the map by a metre east and north, in the mean over the points."""
         step = POSITION_STEP_M
         east, north = self._map_rad(step) - self._map_rad(-step), self._map_rad(0, step) - self._map_rad(0, -step)
         return np.stack([self.points.mean(one) for one in (east, north)]) / (2 * step)
 
     @cached_property
     def attitude_slopes(self) -> Array:
-        """(3, SECTORS) by how much the points stand higher above the map by one radian that the attitude lacks."""
+        """Rise (3, SECTORS) [rad/rad] of the points above the map with what the attitude lacks."""
         points, step = self.points, SLOPE_STEP_RAD
         slope = (self._map_rad(later_rad=step) - self._map_rad(later_rad=-step)) / (2 * step)
         c, s, tan = np.cos(points.azimuth_rad), np.sin(points.azimuth_rad), np.tan(points.elevation_rad)
@@ -164,13 +164,13 @@ class SeenSkyline:
 
     @cached_property
     def lacking_rad(self) -> Array:
-        """(3,) expected value of what the attitude lacks, tilts about the true east and north."""
+        """Expected values (3,) [rad] of what the attitude lacks, tilts about the true east and north."""
         heading = self.attitude_rad[TURN]
         c, s = np.cos(heading), np.sin(heading)
         return -np.r_[heading, np.array([[c, s], [-s, c]]) @ self.attitude_rad[TILT]]
 
     def solve(self, reach_m: float | None = None) -> tuple[Array, Array, Array]:
-        """The position (2,) and attitude (3,) of a linear solution, and their covariance (5, 5).
+        """Position (2,) [m] and attitude (3,) [rad] of a linear solution, and their covariance (5, 5).
 
         `reach_m` is the sigma of the position about this one before (None: of the search area).
         """
@@ -186,7 +186,7 @@ class SeenSkyline:
 
     @property
     def image_errors(self) -> ImageErrors:
-        """What the attitude lacks, as far as it errs; in a round crater a heading is none, see `clock`."""
+        """Errors of the attitude, as far as it errs; in a round crater without the heading, see `clock`."""
         errs = self.stated.attitude_sigma_rad > 0.0
         errs[TURN] &= not self.terrain.axisymmetric
         return ImageErrors(
@@ -197,7 +197,7 @@ class SeenSkyline:
 
     @property
     def clock(self) -> Clock | None:
-        """The heading of ground that is the same after a turn, as a clock of one radian a second; None elsewhere."""
+        """Heading of ground that is the same after a turn, as a clock of one radian a second; None elsewhere."""
         sigma = self.stated.heading_sigma_rad
         if not self.terrain.axisymmetric or sigma == 0.0:
             return None

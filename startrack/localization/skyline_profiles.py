@@ -1,4 +1,4 @@
-"""How well each height of the skyline explains the rows of each sector of azimuth: stars and the sky's light alike.
+"""Log-likelihoods of the rows of each sector of azimuth by the height of the skyline: stars and sky's light alike.
 
 A height x is measured from the skyline that the map gives at a reference position, which the skyline follows within a
 sector. A star above the skyline contributes its llr, one below it nothing; light of the sky contributes as in
@@ -105,7 +105,7 @@ class SkyProfiles:
 
     @classmethod
     def from_rows(cls, evidence: Evidence, rows: Ints) -> SkyProfiles:
-        """From those `rows` (k,) of the evidence that hold extended light."""
+        """Profiles by those `rows` (k,) of the evidence that hold extended light."""
         rows = rows[np.lexsort((evidence.elevation_rad[rows], evidence.azimuth_rad[rows]))]
         azimuth, elevation = evidence.azimuth_rad[rows], evidence.elevation_rad[rows]
         first = np.flatnonzero(np.diff(azimuth, prepend=-1.0) > 0)
@@ -135,7 +135,7 @@ _fill_profiles = kernel(
 def profiles_of(
     rows: Evidence, above_rad: Array, map_sigma_rad: Array, window_rad: tuple[float, float] = (LOW_RAD, HIGH_RAD)
 ) -> Profiles:
-    """Profiles of rows (n,) that stand `above_rad` (n,) the skyline; map errors (SECTORS,) are averaged over.
+    """Profiles of rows (n,) that stand `above_rad` (n,) [rad] above the skyline, averaged over map errors (SECTORS,).
 
     `window_rad`: lowest and highest height.
     """
@@ -251,7 +251,7 @@ class SectorMoments(NamedTuple):
 
     @property
     def information(self) -> Array:
-        """(SECTORS,) part of the window's variance that the rows take away; next to 0 where they show nothing."""
+        """Part (SECTORS,) of the window's variance that the rows take away; next to 0 where they show nothing."""
         return np.clip(1.0 - 3.0 * self.variance_rad2 / REACH_RAD**2, LEAST_SHOWN_PART, 1.0)
 
 

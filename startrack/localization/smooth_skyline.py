@@ -61,7 +61,7 @@ _pass_curve = kernel(
 
 
 def with_own_edge(plain: Hypothesis, half_m: float) -> SkylineModel | None:
-    """The model of a hypothesis without gross error where the light has an edge of its own; None without both.
+    """Model of a hypothesis without gross error where the light has an edge of its own; None without stars or light.
 
     It serves positions within `half_m` of the same reference.
     """

@@ -20,7 +20,7 @@ MOST_STEEPNESSES = 3  # that the likelihood is followed from
 
 
 def settle_steepness(evidence: Evidence, terrain: Terrain) -> Terrain:
-    """The `terrain`, or where its steepness is not known the one of the steepness that `evidence` shows.
+    """The `terrain`, or where its steepness is not known, that of the steepness that `evidence` shows.
 
     Raises NotLocated (outside_search_area, insufficient_geometry) where there is none, or more than one.
     """

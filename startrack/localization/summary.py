@@ -9,7 +9,7 @@ from startrack.terrain import Terrain
 
 
 def require_inside(points_m: Array, weight: Array, terrain: Terrain) -> Bools:
-    """Which of the points (n, 2) [m] of these weights (n,) are within the search radius of the `terrain`.
+    """Whether points (n, 2) [m] of these weights (n,) are within the search radius of the `terrain`.
 
     Raises NotLocated outside_search_area where most of the weight is beyond it.
     """

@@ -47,7 +47,7 @@ class Ranked(NamedTuple):
     score: Array
 
     def best(self, count: int) -> Ranked:
-        """The `count` best ones."""
+        """The `count` best boxes, the best first."""
         order = np.argsort(-self.score, kind="stable")[:count]
         return Ranked(self.centres_m[order], self.heading[order], self.score[order])
 
@@ -100,13 +100,13 @@ class Peak(NamedTuple):
         return bool(off @ np.linalg.solve(spread, off) < SAME_SIGMAS**2)
 
     def reaches(self, position_m: Array, heading_rad: float) -> bool:
-        """Whether that holds for a box with about this heading too."""
+        """Whether a box about a position (2,) with about this heading is in reach of the linear solution."""
         turned = abs(heading_rad - self.seen.attitude_rad[TURN])
         return turned < 2 * HEADING_STEP_RAD and self.covers(position_m)
 
     @property
     def place(self) -> Place:
-        """The position, as the search has it."""
+        """Place at the position, in the search's form."""
         return Place(self.seen.position_m, self.covariance[:2, :2], self.fit, np.zeros(SECTORS), 0.0)
 
 
@@ -197,7 +197,7 @@ def score_boxes(points: SkylinePoints, terrain: Terrain, found: Ranked, half_m: 
 
 
 def follow(begin: SeenSkyline) -> Peak:
-    """Where linear solutions lead to; a step that gains nothing is shortened."""
+    """Peak to which linear solutions lead; a step that gains nothing is shortened."""
     seen, best = begin, log_fit(begin)
     for _ in range(LINEAR_STEPS):
         check_time()

@@ -1,4 +1,4 @@
-"""What contradicts an image's files: a stated fact that is grossly wrong, or any other smooth skyline, fits better."""
+"""Contradiction of an image's files: a stated fact that is grossly wrong, or any other smooth skyline, fits better."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ WIDE_SHAPE = 0.4  # relative range of a wrong map's steepness: a free skyline is
 
 
 def require_map_in_view(model: SkylineModel, clear: Array) -> None:
-    """Raises NotLocated (inconsistent_evidence) where most of the skyline of a `model` is on no map.
+    """Raise NotLocated (inconsistent_evidence) where most of the skyline of a `model` is on no map.
 
     `clear` (SECTORS,) is the probability that the map's skyline shows.
     """
@@ -40,7 +40,7 @@ def require_map_in_view(model: SkylineModel, clear: Array) -> None:
 
 
 def require_files(found: Sequence[Hypothesis], parameters: Array) -> None:
-    """Raises NotLocated (inconsistent_evidence) where something else explains the rows better than the files.
+    """Raise NotLocated (inconsistent_evidence) where something else explains the rows better than the files.
 
     Args:
         found: the hypotheses, the heaviest first.
@@ -89,7 +89,7 @@ def _log_map(best: Hypothesis, parameters: Array) -> float:
 
 
 def weigh_wrong_facts(found: Sequence[Hypothesis]) -> Iterator[tuple[str, float]]:
-    """Stated facts of the terrain, and by how many nats a gross error of each explains the rows better than the files.
+    """Stated facts of the terrain, each with the nats by which its gross error explains the rows better.
 
     Both are integrals over position and errors. Facts that are certainly right are left out.
     """

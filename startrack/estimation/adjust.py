@@ -66,7 +66,7 @@ class State:
         return points.xy_px - self.camera.project_unlimited(rays_cam)
 
     def terms(self, points: Observations, rays_cam: Array, free: tuple[str, ...]) -> Terms:
-        """Derivatives of the predicted pixels by the free lens parameters and the attitudes."""
+        """Derivatives of the predicted pixels by the free lens parameters and by the attitudes [rad]."""
         lens = lens_jacobian(self.camera, rays_cam, free) if free else np.zeros((len(rays_cam), 2, 0))
         return Terms(lens, self.camera.jacobian_px_per_rad(rays_cam), points.image, len(self.R_cam_icrs))
 
@@ -77,7 +77,7 @@ class State:
 
     @property
     def rotations(self) -> Array:
-        """R_cam_icrs (images, 3, 3)."""
+        """Attitudes R_cam_icrs (images, 3, 3) of the images."""
         return self.R_cam_icrs
 
     @property
@@ -87,7 +87,7 @@ class State:
 
 
 class Loss(NamedTuple):
-    """A loss as a function of an observation's chi-square, and the factor by which it changes the weight."""
+    """A loss: functions of an observation's chi-square for the cost, and for the factor on the weight."""
 
     cost: Callable[[Array], Array]
     weight_factor: Callable[[Array], Array]
@@ -114,7 +114,7 @@ class Prior:
 
     @property
     def precision(self) -> Array:
-        """(m,)"""
+        """Inverse variances (m,) of the parameters."""
         return np.asarray(self.sigma**-2.0)
 
 

@@ -22,7 +22,7 @@ MIN_EXPECTED = 1e-6
 
 
 def probability(log_probability: float) -> float:
-    """exp of a log-probability, at least exp(-690)."""
+    """Probability from its logarithm, at least exp(-690)."""
     return float(np.exp(max(log_probability, SMALLEST_LOG_PROBABILITY)))
 
 
@@ -40,14 +40,14 @@ def coincidence_probability(expected: Array | float) -> Array:
 
 
 def binomial_tail(at_least: Ints | int, trials: Ints | int, each: Array | float) -> Array:
-    """P(X >= k) of a binomial variable, k >= 1: the incomplete beta function I_p(k, n - k + 1)."""
+    """Probability that a binomial variable is k or more, k >= 1: the incomplete beta function I_p(k, n - k + 1)."""
     from scipy.special import betainc
 
     return np.asarray(betainc(at_least, np.maximum(trials - at_least, 0) + 1, each))
 
 
 def log_p_value(matched: Ints | int, predicted: Ints | int, each: Array | float, free: int = PATTERN_MATCHES) -> Array:
-    """log P(at least `matched` of `predicted` stars coincide by chance).
+    """Logarithm of P(at least `matched` of `predicted` stars coincide by chance).
 
     `each`: probability that one star does. `free`: matches that the hypothesis itself produces (the stars of
     its pattern, the parameters of a fit); they are taken from both numbers.
@@ -58,7 +58,7 @@ def log_p_value(matched: Ints | int, predicted: Ints | int, each: Array | float,
 
 
 def log_p_value_poisson(found: int, expected: float) -> float:
-    """log P(at least `found` coincidences) where `expected` are expected, from the Poisson distribution."""
+    """Logarithm of P(at least `found` coincidences) where `expected` are expected, from the Poisson distribution."""
     from scipy.special import gammainc
 
     tail = float(gammainc(max(found, 1), expected))

@@ -1,4 +1,4 @@
-"""Which pictures of a fixed camera agree: in the local frame it has one attitude, if times and site are right."""
+"""Agreement of the pictures of a fixed camera: in the local frame it has one attitude, if times and site are right."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ALL_DIRECTIONS_SR = 4.0 * np.pi
 
 
 def turns_rad(R: Array) -> Array:
-    """(n, n) angles between rotations (n, 3, 3)."""
+    """Angles (n, n) [rad] between rotations (n, 3, 3)."""
     sine = np.sqrt(np.square(R[:, None] - R).sum(axis=(2, 3)) / 8.0)  # of half the angle
     return np.asarray(2.0 * np.arcsin(np.minimum(sine, 1.0)))
 
@@ -42,7 +42,7 @@ def log_odds_kept(apart_rad: Array) -> Array:
 
 
 def are_shifted_in_time(R_cam_icrs: Array, R_cam_enu: Array, site: Site) -> Bools:
-    """(n, n) pairs of pictures that are turned about the celestial pole, as a wrong time turns them.
+    """Whether pairs (n, n) of pictures are turned about the celestial pole, as a wrong time turns them.
 
     `R_cam_icrs` and `R_cam_enu` (n, 3, 3) are rotations to the camera; the latter by the stated times at the `site`. A
     camera that follows the stars, and one that is turned about the vertical near a pole, turn so by themselves.
@@ -61,7 +61,7 @@ def are_shifted_in_time(R_cam_icrs: Array, R_cam_enu: Array, site: Site) -> Bool
 def find_disagreeing(
     exposures: Sequence[Exposure], R_cam_icrs: Array, site: Site, *, may_move: bool = False
 ) -> dict[int, str]:
-    """Which of the `exposures` disagree with most others by their times at the `site`, with the reason as text.
+    """Indices of the `exposures` that disagree with most others by their times at the `site`, each with the reason.
 
     `R_cam_icrs` (n, 3, 3) are their attitudes. Where the camera `may_move` between pictures, only those disagree that a
     wrong time turns against others. Raises BadInput (no_time; inconsistent_evidence where no more than half agree).

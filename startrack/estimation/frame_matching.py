@@ -141,7 +141,7 @@ def match_frame(frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: flo
 def match_frames(
     frames: Sequence[Frame], camera: Camera, R_cam_icrs: Array, within_rad: float, gate_px: float
 ) -> tuple[FrameMatches, ...]:
-    """`match_frame` for each of the `frames` with its attitude of `R_cam_icrs` (frames, 3, 3)."""
+    """Matches of each of the `frames` with its attitude of `R_cam_icrs` (frames, 3, 3), as by `match_frame`."""
 
     def match(frame: Frame, R: Array) -> FrameMatches:
         return match_frame(frame, camera, R, within_rad, gate_px)

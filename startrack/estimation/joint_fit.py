@@ -1,4 +1,4 @@
-"""One lens for several frames: from the stars that a rough camera identifies to all stars of the frames."""
+"""A lens for several frames: from the stars that a rough camera identifies to all stars of the frames."""
 
 from __future__ import annotations
 
@@ -96,6 +96,7 @@ def fit_frames(
 
 
 def _fit_points(points: Observations, camera: Camera, R_cam_icrs: Array, coefficients: int | None) -> LensFit:
+    """Lens and attitudes that fit the observations. Raises NotIdentified where there are none."""
     if not len(points):
         raise NotIdentified("no star lies where the camera predicts it")
     start = replace(camera, covariance=None, covariance_order=())
@@ -103,7 +104,7 @@ def _fit_points(points: Observations, camera: Camera, R_cam_icrs: Array, coeffic
 
 
 def _points(frames: tuple[Frame, ...], matches: list[tuple[Ints, Ints]]) -> Observations:
-    """The sources and stars of the `frames` that are matched: indices of both, frame by frame."""
+    """Observations of the sources and stars of the `frames` that are matched: indices of both, frame by frame."""
     pairs = [(f.sources.take(detection), f.sky.stars.rays_icrs[star])
              for f, (detection, star) in zip(frames, matches, strict=True)]  # fmt: skip
     return observations(

@@ -64,7 +64,7 @@ def _prior_root(length: float, size_px: float) -> Array:
 def solve_with_misfit(
     camera: Camera, xy_px: Array, covariance_px2: Array, rays_icrs: Array, R_cam_icrs: Array
 ) -> tuple[Camera, AttitudeFit]:
-    """The camera, fitted to these very stars, and their attitude, with the covariances of its misfit added.
+    """Camera that was fitted to these very stars, and their attitude, with the covariances of its misfit added.
 
     The rest is that of `solve_attitude`, which also has the arguments and errors. With fewer than 30 stars, or a camera
     without covariance, nothing is added.
@@ -145,7 +145,7 @@ def correct_lens(
 def _solve(
     corrected: Camera, order: tuple[str, ...], rays_cam: Array, fit: AttitudeFit, change: Array, roots: Sequence[Array]
 ) -> PriorChoice:
-    """The change (m,) of the camera file, about the `change` that made the camera `corrected`."""
+    """Likeliest change (m,) of the camera file's parameters, about the `change` that made the camera `corrected`."""
     jacobian = lens_jacobian(corrected, rays_cam, order)
     terms = Terms(jacobian, corrected.jacobian_px_per_rad(rays_cam), np.zeros(len(rays_cam), dtype=np.int64), 1)
     blocks = terms.normal_equations(fit.weight, fit.residual_px[fit.used] + jacobian @ change)

@@ -88,7 +88,7 @@ class LensModel:
 
     @property
     def text(self) -> str:
-        """Name in reports."""
+        """Name of the model in reports."""
         added = (", fx and fy apart" if self.aspect else "") + (", decentred" if self.decentred else "")
         return self.lens.fit_text(self.size) + added
 
@@ -117,7 +117,7 @@ def extensions_of(camera: Camera) -> tuple[bool, bool]:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelScore:
-    """Result of one lens model."""
+    """The score of a lens model by stars that its fit did not contain."""
 
     name: str
     parameters: int
@@ -228,7 +228,7 @@ def fit_lens(
 def fit_state(
     state: CameraState, points: Observations, *, coefficients: int | None = None, square: bool = False
 ) -> LensFit:
-    """The same as fit_lens, from a state; that of boards has positions beside the attitudes."""
+    """Lens and attitudes that fit `points` best, as by `fit_lens`; a `state` of boards has positions besides."""
     if len(points) < MIN_LENS_STARS:
         raise NotIdentified(
             f"{len(points)} matched stars cannot determine a lens: at least {MIN_LENS_STARS} are needed"
@@ -293,7 +293,7 @@ def is_chance(chi2: float, freedom: int) -> bool:
 
 
 def calibrated_radius_rad(off_axis_rad: Array) -> float:
-    """Calibrated angle of stars at the angles (n,) off the axis: at least three of them, and 1 %, lie beyond it.
+    """Calibrated angle [rad] of stars at angles (n,) off the axis: at least three of them, and 1 %, lie beyond it.
 
     It also ends at a gap of more than 8 degrees without stars: beyond that the lens would be extrapolated.
     """

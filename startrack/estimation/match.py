@@ -30,7 +30,7 @@ PX_PER_MAG = 0.6  # distance with the same cost as a difference of one magnitude
 
 
 def instrumental_mag(flux: Array) -> Array:
-    """-2.5 log10 of fluxes (n,), in any unit; fluxes that are not positive count as very faint."""
+    """Magnitudes (n,), -2.5 log10 of fluxes (n,) in any unit; fluxes that are not positive count as very faint."""
     return np.asarray(-2.5 * np.log10(np.maximum(flux, SMALLEST_FLUX)))
 
 
@@ -46,7 +46,7 @@ def select_closest(detection: Ints, distance: Array) -> Ints:
 
 
 def match_nearest(tree: Any, px: Array, gate_px: float) -> tuple[Ints, Ints, Array]:
-    """(detection, star, distance [px]), one-to-one: of the stars nearest to a detection the closest one.
+    """Detections, stars and distances [px] (k,), one-to-one: of the stars nearest to a detection the closest one.
 
     `tree`: cKDTree of the detections' pixels. `px` (n, 2): predicted pixels. Pairs are sorted by detection.
     """
@@ -76,7 +76,7 @@ def match_by_brightness(
     tree: Any, px: Array, star: Ints, gate_px: float, *, star_mag: Array, star_sigma_mag: Array, detection_mag: Array,
     saturated: Bools, limit_mag: float, tolerance_mag: float,
 ) -> tuple[Ints, Ints, Array]:  # fmt: skip
-    """(detection, star, distance [px]) of the nearest pairs of equal brightness, one-to-one, blends included.
+    """Detections, stars and distances [px] (k,) of the nearest pairs of equal brightness, one-to-one, with blends.
 
     `px` (m, 2): predicted pixels of the catalogue; `star` (n,): its stars in the frame. `star_mag`, `star_sigma_mag`
     (m,) and `detection_mag` (d,) are on one scale. Stars fainter than `limit_mag` are not matched. A saturated
@@ -169,6 +169,7 @@ class CandidatePairs:
 
     @cached_property
     def _compared(self) -> tuple[Array, Ints]:
+        """Differences in brightness (k,), and indices of the one-to-one pairs."""
         k = len(self.star)
         slots = max(4, 1 << (2 * k - 1).bit_length())
         misfit, kept = np.empty(k), np.empty(k, np.int64)

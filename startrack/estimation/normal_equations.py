@@ -77,18 +77,18 @@ class NormalEquations:
     pose_right: Array  # (images, q)
 
     def subtract(self, part: NormalEquations) -> NormalEquations:
-        """These equations without a part of their observations."""
+        """Copy of these equations without a part of their observations."""
         return NormalEquations(
             self.lens - part.lens, self.lens_pose - part.lens_pose, self.pose - part.pose,
             self.lens_right - part.lens_right, self.pose_right - part.pose_right,
         )  # fmt: skip
 
     def with_prior(self, precision: Array, offset: Array) -> NormalEquations:
-        """With a prior of the lens parameters: precisions (m,) and expected minus current values (m,)."""
+        """Copy with a prior of the lens parameters: precisions (m,) and expected minus current values (m,)."""
         return replace(self, lens=self.lens + np.diag(precision), lens_right=self.lens_right + precision * offset)
 
     def with_damping(self, damping: float) -> NormalEquations:
-        """The equations with the diagonals multiplied by 1 + damping. Source: Marquardt 1963, J. SIAM 11, 431."""
+        """Copy with the diagonals multiplied by 1 + damping. Source: Marquardt 1963, J. SIAM 11, 431."""
         return replace(
             self,
             lens=self.lens + damping * np.diag(np.diag(self.lens)),
@@ -130,7 +130,7 @@ class NormalEquations:
         return lens, np.einsum("nab,nb->na", self.pose_inverse, self.pose_right) + self.pose_by_lens @ lens
 
     def _solve_dense(self) -> tuple[Array, Array]:
-        """`solve` for a single image: one small system, with the units of the parameters divided out."""
+        """Steps (m,) and (1, q) for a single image, by one small system with the parameters' units divided out."""
         m = len(self.lens)
         size = m + self.pose.shape[1]
         full = np.empty((size, size))
@@ -159,7 +159,7 @@ class Terms:
     images: int
 
     def take(self, which: Ints) -> Terms:
-        """The terms of the observations with these ascending indices."""
+        """Terms of the observations with these ascending indices."""
         return Terms(self.lens.T[..., which].T, self.pose.T[..., which].T, self.image[which], self.images)
 
     def shift_px(self, lens: Array, poses: Array) -> Array:
@@ -167,7 +167,7 @@ class Terms:
         return self.lens @ lens + np.einsum("nij,nj->ni", self.pose, poses[self.image])
 
     def normal_equations(self, weight: Array, residual_px: Array) -> NormalEquations:
-        """Sums over the observations with weights (n, 2, 2) and residuals (n, 2), measured minus predicted."""
+        """Normal equations by weights (n, 2, 2) and residuals (n, 2), measured minus predicted, of the observations."""
         m = self.lens.shape[2]
         q = m + self.pose.shape[2]
         ends = np.searchsorted(self.image, np.arange(self.images + 1))

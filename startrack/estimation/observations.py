@@ -28,17 +28,17 @@ class FrameEstimate:
 
     @property
     def parameters(self) -> int:
-        """2 + k."""
+        """Number of the parameters, 2 + k."""
         return len(self.mean)
 
     @cached_property
     def without_posts(self) -> FrameEstimate:
-        """The same with the errors by posts as the frame's own."""
+        """Copy of this estimate with the errors by posts as the frame's own."""
         noise = self.noise + self.by_post @ self.by_post.T
         return replace(self, noise=noise, post=self.post[:0], by_post=self.by_post[:, :0])
 
     def transform(self, to: Array, moved: Array | float = 0.0, unseen: Array | float = 0.0) -> FrameEstimate:
-        """Of parameters after the linear map `to` (p, p), and `moved` (p,) besides.
+        """Estimate of the parameters after the linear map `to` (p, p), with `moved` (p,) added.
 
         What `moved` holds are positions, to which the mean responds wholly. Of what `unseen` (p, p) projects on, the
         prior is all that is known.
@@ -93,5 +93,5 @@ class Steps:
 
     @classmethod
     def unknown(cls, frames: int) -> Steps:
-        """No move is known."""
+        """Steps between so many `frames` of which no move is known."""
         return cls(np.zeros((max(frames - 1, 0), 2)), np.full(max(frames - 1, 0), np.inf))

@@ -46,13 +46,14 @@ def largest_angle_rad(bend: float) -> float:
 
 
 def _argument_scale(bend: float) -> float:
+    """Scale q of the angle in the tangent or the sine of a lens of this bend."""
     return math.sqrt(3.0 * bend) if bend > 0 else math.sqrt(-6.0 * bend)
 
 
 def project_radial(
     rays_icrs: Array, R: Array, lens: Array, mirror: float, width: int, height: int
 ) -> tuple[Array, Bools]:
-    """Pixels (n, 2) of rays (n, 3), and which lie in the frame and in the image circle."""
+    """Pixels (n, 2) of rays (n, 3), and whether they lie in the frame and in the image circle."""
     px, inside = np.empty((len(rays_icrs), 2)), np.empty(len(rays_icrs), bool)
     _project_radial(*map(np.ascontiguousarray, (rays_icrs, R)), lens, mirror, width, height, px, inside)
     return px, inside
@@ -62,9 +63,9 @@ def fit_radial(
     xy_px: Array, rays_icrs: Array, mirror: float, sigma_px: float, steps: int, free: Bools, expected: Array,
     expected_sigma: Array, R: Array, lens: Array,
 ) -> None:  # fmt: skip
-    """Gauss-Newton steps of the attitude `R` (3, 3) and of `lens` (5,), which are changed.
+    """Change the attitude `R` (3, 3) and the `lens` (5,) in place by Gauss-Newton steps.
 
-    Of matches of pixels (n, 2) and rays (n, 3), some of them wrong: `sigma_px` is the scale of the loss. `mirror` is
+    The matches are pixels (n, 2) and rays (n, 3), some of them wrong: `sigma_px` is the scale of the loss. `mirror` is
     -1 for a mirror image, else 1. `free` (5,): which lens parameters change; `expected` (5,) and `expected_sigma` (5,)
     are known of them before. The sigmas of the centre are in focal lengths.
     """

@@ -35,11 +35,11 @@ class Followers:
 
     @classmethod
     def none(cls, count: int, size: int) -> Self:
-        """Before the second frame, for a `count` of explanations with a state of this `size`."""
+        """Followers before the second frame: none, for a `count` of explanations with a state of this `size`."""
         return cls(np.zeros((count, 0)), np.zeros((count, 0, 2, 2)), np.zeros((count, 0, size)))
 
     def append(self, mean: Array, covariance: Array) -> None:
-        """One more position, the first of a state with this mean (b, s) and covariance (b, s, s)."""
+        """Append one more position, the first of a state with this mean (b, s) and covariance (b, s, s)."""
         self.mean = np.hstack([self.mean, mean[:, :2]])
         self.own = np.concatenate([self.own, covariance[:, None, :2, :2]], axis=1)
         self.cross = np.concatenate([self.cross, covariance[:, :2]], axis=1)
@@ -80,7 +80,7 @@ class TrackFilter:
         cls, shared_count: int, moves_count: int = 0, leg_count: int = 0, *, count: int = 1,
         unknown_m: float = UNKNOWN_M, follows: bool = False,
     ) -> Self:  # fmt: skip
-        """Before the first frame, for a `count` of explanations; `follows`: with the positions of earlier frames."""
+        """Filter before the first frame, for a `count` of explanations; `follows`: with positions of earlier frames."""
         size = 2 + shared_count + moves_count + leg_count
         prior = np.diag([unknown_m**2] * 2 + [1.0] * (size - 2))
         return cls(
@@ -90,34 +90,34 @@ class TrackFilter:
 
     @property
     def position_m(self) -> Array:
-        """(2,) of the last frame, by the first explanation."""
+        """Position (2,) [m] of the last frame, by the first explanation."""
         return self.mean[0, :2].copy()
 
     @property
     def covariance_m2(self) -> Array:
-        """(2, 2) of the last frame, by the first explanation."""
+        """Covariance (2, 2) [m^2] of the last frame's position, by the first explanation."""
         return self.covariance[0, :2, :2].copy()
 
     def positions(self) -> tuple[Array, Array]:
-        """Positions (n, 2) and covariances (n, 2, 2) of all frames that follow, and of the last one, by the first."""
+        """Positions (n, 2) and covariances (n, 2, 2) of all following frames and the last, by the first explanation."""
         last = self.followers or Followers.none(1, 0)
         settled, before = [mean[0] for mean, _ in last.settled], last.mean[0].reshape(-1, 2)
         mean = np.vstack([*settled, before, self.mean[0, :2]])
         return mean, np.stack([*(own[0] for _, own in last.settled), *last.own[0], self.covariance[0, :2, :2]])
 
     def __getitem__(self, which: Ints | Bools | slice) -> Self:
-        """A copy of the explanations of an index, without followers."""
+        """Copy of the explanations of an index, without followers."""
         mean, covariance = self.mean[which].copy(), self.covariance[which].copy()
         return replace(self, mean=mean, covariance=covariance, posts=self.posts.copy(), followers=None)
 
     @staticmethod
     def join(parts: Sequence[TrackFilter]) -> TrackFilter:
-        """All explanations of several, which have the same posts."""
+        """Filter with all explanations of several filters, which have the same posts."""
         mean, covariance = (np.concatenate([getattr(one, name) for one in parts]) for name in ("mean", "covariance"))
         return replace(parts[0], mean=mean, covariance=covariance)
 
     def predict(self, steps: Steps, number: int) -> None:
-        """The camera made the move of this `number`, by all explanations; one that is not known leads anywhere."""
+        """Make the move of this `number` of the `steps`, by all explanations; one that is not known leads anywhere."""
         count, one = len(self.mean), slice(number, number + 1)
         by_shared_m = steps.by_shared_m[one] if self.moves_count else np.zeros((1, 2, 0))
         self.move(*(np.repeat(of, count, axis=0) for of in (steps.move_m[one], steps.sigma_m[one], by_shared_m)))
@@ -143,7 +143,7 @@ class TrackFilter:
         self.add_noise(np.where(lost, self.unknown_m, sigma_m))
 
     def add_noise(self, sigma_m: Array | float) -> None:
-        """More uncertain by errors of `sigma_m` (b,) on each axis."""
+        """Add errors of `sigma_m` (b,) [m] on each axis to the uncertainty of the position."""
         self.covariance[:, [0, 1], [0, 1]] += np.square(np.broadcast_to(sigma_m, len(self.mean)))[:, None]
 
     def move_by_leg(self, by_m: Array, *, is_new: bool) -> None:
@@ -155,12 +155,12 @@ class TrackFilter:
         self._shift(by_m, leg)
 
     def forget_moves(self) -> None:
-        """The errors that all moves share are not known: those of another kind of odometry, in its sigmas."""
+        """Forget the errors that all moves share: another kind of odometry has others, in its sigmas."""
         first = 2 + self.shared_count
         self._forget(slice(first, first + self.moves_count))
 
     def _forget(self, part: slice) -> None:
-        """Of the errors in a `part` of the state, their prior is all that is known."""
+        """Forget the errors in a `part` of the state: their prior is all that is known."""
         self.mean[:, part], self.covariance[:, part], self.covariance[:, :, part] = 0.0, 0.0, 0.0
         self.covariance[:, part, part] = np.eye(part.stop - part.start)
         if self.followers is not None:
@@ -199,13 +199,13 @@ class TrackFilter:
         return estimate.mean - predicted, 0.5 * (covariance + covariance.swapaxes(1, 2)), cross
 
     def _with(self, values: Array, estimate: FrameEstimate) -> Array:
-        """(b, n, p) of `values` (b, n, s): their products with the response of the observation to the state."""
+        """Products (b, n, p) of `values` (b, n, s) with the response of the observation to the state."""
         place = [self.posts[number] for number in estimate.post.tolist()]
         found = values[..., : estimate.parameters] @ estimate.response.T
         return found + values[..., place] @ estimate.by_post.T if place else found
 
     def _add_posts(self, numbers: Sequence[int]) -> None:
-        """The errors of more posts, of which nothing is known but their prior."""
+        """Add the errors of more posts, of which nothing is known but their prior."""
         if not numbers:
             return
         (count, size), more = self.mean.shape, len(numbers)
@@ -261,7 +261,7 @@ def smooth(estimates: Sequence[FrameEstimate | None], steps: Steps) -> Smoothed:
 
 
 def mix_smoothed(parts: Sequence[Smoothed], share: Array) -> Smoothed:
-    """The estimate by several explanations of the same observations, with their shares (m,)."""
+    """Estimate by several explanations of the same observations, with their shares (m,)."""
     position = mixed_normal([one.position_m for one in parts], [one.covariance_m2 for one in parts], share)
     shared = mixed_normal([one.shared for one in parts], [one.shared_covariance for one in parts], share)
     return Smoothed(*position, *shared)

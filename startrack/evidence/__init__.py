@@ -1,4 +1,4 @@
-"""Exposure, attitude and catalogue to rays, each with the log-likelihood ratio of sky against ground."""
+"""Rays from exposure, attitude and catalogue, each with the log-likelihood ratio of sky against ground."""
 
 from startrack.evidence.double_exposure import check_single_skyline
 from startrack.evidence.expected_stars import expect_stars

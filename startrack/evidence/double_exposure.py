@@ -87,7 +87,7 @@ class _Rows:
         return np.logaddexp(self.hidden, self.visible) - np.log(2.0)
 
     def find_above(self, terrain: Terrain, points_m: Array) -> Array:
-        """1 where a star is above the skyline of a point (m, 2), else 0: (m, n)."""
+        """Flags (m, n): 1 where a star is above the skyline of a point (m, 2), else 0."""
         return np.where(self.find_height(terrain, points_m) > 0.0, 1.0, 0.0)
 
     def find_height(self, terrain: Terrain, points_m: Array) -> Array:

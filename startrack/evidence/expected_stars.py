@@ -117,7 +117,7 @@ def expect_stars(
 def _causes(
     xy_px: Array, angle_rad: Array, camera: Camera, bodies: list[Body], R_cam_icrs: Array, margin: int
 ) -> NDArray[np.int8]:
-    """Why stars (n) cannot be used: indices into CAUSES, followed by the bodies; USABLE where they can."""
+    """Causes (n,) why stars cannot be used: indices into CAUSES, followed by the bodies; USABLE where they can."""
     cause = np.full(len(xy_px), USABLE, dtype=np.int8)
     x, y = np.ascontiguousarray(xy_px.T)
     for number, body in enumerate(bodies):

@@ -34,7 +34,7 @@ WEIGHT_ROUNDS = 10  # of the robust weights
 
 @dataclass(frozen=True, kw_only=True)
 class FluxScale:
-    """Expected flux of a star: 10^(-0.4 (V - zero_mag)) times the lens's throughput and exp(columns @ response)."""
+    """Scale of fluxes: a star has 10^(-0.4 (V - zero_mag)) times the lens's throughput and exp(columns @ response)."""
 
     zero_mag: float  # V of a star of one electron (or ADU), above the air
     scatter: float  # relative scatter of bright stars about the scale

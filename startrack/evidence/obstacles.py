@@ -41,14 +41,14 @@ def add_obstacles(
 
 
 def leave_out_obstacles(detections: Detections, mask: Mask | None) -> Detections:
-    """The `detections` with another `mask`, whose pixels count as dead."""
+    """Copy of the `detections` with another `mask`, whose pixels count as dead."""
     if mask is detections.mask or mask is None:
         return detections
     return replace(detections, mask=mask, dead=detections.dead | mask.masked)
 
 
 def _hidden_pixels(obstacles: Obstacles, camera: Camera, R_frame_cam: Array) -> Bools:
-    """(H, W) of the pixels whose directions obstacles hide, and of those up to HIDDEN_BLOCK_PX beside them."""
+    """Whether pixels (H, W), or others up to HIDDEN_BLOCK_PX beside them, have directions that obstacles hide."""
     import cv2
 
     width, height = camera.size_px

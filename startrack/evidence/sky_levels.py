@@ -38,7 +38,7 @@ GROUND, SKY = range(2)
 
 
 def patch_levels(own_e: Array, variance_e2: Array) -> Array:
-    """Levels (n,) of the ground in sectors round the circle that show `own_e` (n,) with errors `variance_e2` (n,).
+    """Levels (n,) [e] of the ground in sectors round the circle that show `own_e` with errors `variance_e2` (n,).
 
     The variance is infinite where a sector shows nothing.
     """
@@ -96,12 +96,12 @@ class SkyLevels:
 
     @property
     def step_e(self) -> Array:
-        """(SECTORS,) sky less ground."""
+        """Step (SECTORS,) [e] of the light: sky less ground."""
         return np.asarray(self.level_e[SKY] - self.level_e[GROUND])
 
     @property
     def step_sigma_e(self) -> Array:
-        """(SECTORS,) standard deviation of `step_e`."""
+        """Standard deviation (SECTORS,) [e] of `step_e`."""
         averaged = 2 * sqrt(np.pi) * LEVEL_SECTORS  # sectors in one smoothed level
         return np.asarray(np.hypot(*(self.own_sigma_e * sqrt(self.correlation / averaged))))
 
@@ -110,7 +110,7 @@ class SkyLevels:
         return sqrt(float(np.sum(np.square(self.step_e[sectors] / self.step_sigma_e[sectors]))) / LEVEL_SECTORS)
 
     def mean_step_e(self, sectors: Bools) -> tuple[float, float]:
-        """The mean step of some `sectors` (SECTORS,) and its standard deviation; 0 of none."""
+        """Mean step [e] of some `sectors` (SECTORS,) and its standard deviation; 0 of none."""
         count = max(int(np.count_nonzero(sectors)), 1)
         sigma = sqrt(float(np.sum(np.square(self.step_sigma_e[sectors]))) * LEVEL_SECTORS) / count
         return float(self.step_e[sectors].sum()) / count, sigma
@@ -203,7 +203,7 @@ def _first_levels(side: Ints, sector: Ints, light_e: Array) -> tuple[Array, Arra
 
 
 def _significant_slopes(sums: Array, slope_e: Array, noise_e: Array) -> tuple[Array, Array]:
-    """What is to be added to slopes (2, SECTORS) by sums (2, 6, SECTORS) of residuals; the parts that are kept (2, 1).
+    """Changes of slopes (2, SECTORS) by sums (2, 6, SECTORS) of residuals, and the parts that are kept (2, 1).
 
     Slopes are shrunk towards no slope at all: one that the noise alone explains would only make the levels at the
     skyline uncertain, by 0.5 e of 7 e. What wide slopes leave is treated in the same way.

@@ -58,17 +58,17 @@ class SkyLight:
 
     @property
     def edge_px(self) -> float:
-        """Width of the edge in cells."""
+        """Width [px] of the edge in cells."""
         return float(_widened(self.width_px))
 
     @cached_property
     def variance_px2(self) -> Array:
-        """(SECTORS,) of the skyline's height with the errors of both levels; infinite where it is not covered."""
+        """Variances (SECTORS,) of the skyline's height with the errors of both levels; infinite if not covered."""
         return np.asarray(np.sum(self._variances_px2, axis=0))
 
     @cached_property
     def _variances_px2(self) -> tuple[Array, Array]:
-        """(SECTORS,) by the noise, and by the levels. One too high by d moves the edge of a step t by about 2 d / t px.
+        """Variances (SECTORS,) by the noise, and by levels: one too high by d moves the edge of a step t by 2 d / t px.
 
         Levels are smoothed over sectors, whose errors then agree; over wider ranges that is as if each sector had the
         whole error of its own level. A sector that excludes hardly any height has the variance of its information.
@@ -138,7 +138,7 @@ def measure_sky_light(pixels: SkyPixels, horizon: Horizon) -> SkyLight:
 def _sum_pixels(
     pixels: SkyPixels, sector: Ints, levels: SkyLevels, width_px: float, cells: int
 ) -> tuple[tuple[Array, Array, Array], Array]:
-    """Heights, l and c (SECTORS, cells) of `pixels` (n,) beside an edge of that width; see `_sum_cells`."""
+    """Heights, l and c (SECTORS, cells) of `pixels` (n,) beside an edge of that width; pixel counts and scales."""
     sums, scale = np.zeros((SECTORS, cells, 3)), np.zeros((SECTORS, 2))
     _sum_cells(
         sector, pixels.height_px, pixels.light_e, pixels.px_per_rad, levels.covered, levels.level_e, levels.slope_e,
@@ -165,7 +165,7 @@ def _nats(height_px: Array, llr: Array, extended: Array, edge_px: float) -> floa
 def _shifts(
     height_px: Array, llr: Array, extended: Array, edge_px: float, most_px: float
 ) -> tuple[Array, Array, Array]:
-    """Mean and standard deviation (SECTORS,) of the skyline's height above the predicted one, and the misfit."""
+    """Mean and standard deviation (SECTORS,) [px] of the skyline's height above the predicted one, and the misfit."""
     shifts_px = np.linspace(-most_px, most_px, 2 * ceil(most_px / SHIFT_STEP_PX) + 1)
     log = np.empty((SECTORS, len(shifts_px)))
     cells = (np.ascontiguousarray(one) for one in (height_px, llr, extended))
@@ -189,7 +189,7 @@ def average_shifts(log_weights: Array, shifts: Array) -> tuple[Array, Array, Arr
 
 
 def sectors_with_step(sky: SkyLight) -> Bools:
-    """Sectors (SECTORS,) where the light steps, up or down, from a ground to a sky that continues that beside them.
+    """Whether in sectors (SECTORS,) the light steps, up or down, from a ground to a sky that goes on beside them.
 
     Of a weak step the rows say little. None at all where the step as a whole is too weak, or fades instead of stepping.
     """

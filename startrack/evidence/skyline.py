@@ -1,4 +1,4 @@
-"""Where a predicted skyline is in an image: its elevations, its scale in pixels, and the pixels beside it."""
+"""A predicted skyline in an image: its elevations, its scale in pixels, and the pixels beside it."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Skyline:
         return interpolate_circle(self.elevation_rad, azimuth_rad)
 
     def raised(self, by_rad: Array) -> Skyline:
-        """The skyline higher by `by_rad` (n,) [rad], at the middles of n equal sectors from north eastward."""
+        """Copy of this skyline that is higher by `by_rad` (n,) [rad] in the middle of n sectors from north eastward."""
         azimuth = np.linspace(0.0, 2 * np.pi, len(self.elevation_rad), endpoint=False)
         middle = (np.arange(len(by_rad)) + 0.5) * 2 * np.pi / len(by_rad)
         return Skyline(self.elevation_rad + np.interp(azimuth, middle, by_rad, period=2 * np.pi))
@@ -53,14 +53,14 @@ class Skyline:
 
 @dataclass(frozen=True, eq=False)
 class SkylineEstimate:
-    """Where the skyline stands by a first fix, and how well that is known."""
+    """The skyline by a first fix, and how well it is known."""
 
     skyline: Skyline
     sigma_rad: Array  # (SECTORS,) of its elevation
 
     @classmethod
     def of(cls, position_m: Array, covariance_m2: Array, terrain: Terrain, raised_rad: Array | None) -> SkylineEstimate:
-        """That of a `terrain` at `position_m` (2,), raised by `raised_rad` (SECTORS,); None: by nothing.
+        """Estimate for a `terrain` at `position_m` (2,), raised by `raised_rad` (SECTORS,); None: by nothing.
 
         Its sigma is by the covariance `covariance_m2` (2, 2) of the position and by the errors of the map.
         """
@@ -76,7 +76,7 @@ class SkylineEstimate:
         return cls(skyline if raised_rad is None else skyline.raised(raised_rad), sigma)
 
     def is_level(self, azimuth_rad: Array) -> Bools:
-        """Whether (n,) the skyline is so level at azimuths `azimuth_rad` (n,) that a small shift does not turn it."""
+        """Whether the skyline at `azimuth_rad` (n,) is so level that a small shift does not turn it."""
         azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_POINTS, endpoint=False)
         here = self.skyline(azimuth)
         run = 2 * np.pi / SKYLINE_POINTS * np.cos(here)

@@ -47,7 +47,7 @@ class StarPhotometry(ExpectedStars):
 
     @property
     def cause(self) -> NDArray[np.str_]:
-        """Why each star (n,) is unusable; "" where it is usable."""
+        """Cause (n,) why each star is unusable; "" where it is usable."""
         return np.array(self.causes)[self.cause_code]
 
     @property
@@ -56,7 +56,7 @@ class StarPhotometry(ExpectedStars):
         return np.asarray(self.cause_code == USABLE)
 
     def mask_stars(self, reason: NDArray[np.str_]) -> StarPhotometry:
-        """The same with no evidence where there is a reason (n,) against it; an earlier cause stays."""
+        """Copy without evidence where there is a `reason` (n,) against it; an earlier cause stays."""
         texts = tuple(np.unique(reason[self.usable & (reason != "")]).tolist())
         code = self.cause_code.copy()
         for number, text in enumerate(texts, start=len(self.causes)):
@@ -64,12 +64,12 @@ class StarPhotometry(ExpectedStars):
         return replace(self, cause_code=code, causes=self.causes + texts, llr=np.where(code == USABLE, self.llr, 0.0))
 
     def turn_frame(self, R: Array, air: Air | None) -> StarPhotometry:
-        """The same under a sky that a rotation `R` (3, 3) in enu has turned beyond the `air`."""
+        """Copy under a sky that a rotation `R` (3, 3) in enu has turned beyond the `air`."""
         azimuth, elevation = turn_sky(self.azimuth_rad, self.elevation_rad, R, air)
         return replace(self, azimuth_rad=azimuth, elevation_rad=elevation)
 
     def replace_stars(self, newer: StarPhotometry, which: Ints) -> StarPhotometry:
-        """Replace the rows of the stars `which` by the newer measurement, where both contain the star."""
+        """Copy with the rows of the stars `which` by the `newer` measurement, where both contain the star."""
         there = np.flatnonzero(np.isin(newer.star, which))
         here = np.searchsorted(self.star, newer.star[there])
         causes = self.causes + tuple(text for text in newer.causes if text not in self.causes)
@@ -82,7 +82,7 @@ class StarPhotometry(ExpectedStars):
         return replace(self, **changed, causes=causes)
 
     def evidence(self) -> Evidence:
-        """The rays for the localizer."""
+        """Evidence of the usable stars, for the localizer."""
         use = self.usable
         return Evidence(azimuth_rad=self.azimuth_rad[use], elevation_rad=self.elevation_rad[use], llr=self.llr[use])
 
@@ -156,7 +156,7 @@ def _guess_visibility(detections: Detections, sources: Sources) -> Array:
 
 
 def _ratios(light: Photometry, expected_e: Array, fraction: Array) -> tuple[Array, Array]:
-    """Log-likelihood ratios and the standard deviations of the fluxes without a star."""
+    """Log-likelihood ratios (n,) and the standard deviations (n,) [e] of the fluxes without a star."""
     hidden = light.variance_e2 + light.neighbour_variance_e2
     shining = hidden + light.own_shot * expected_e + np.square(fraction * expected_e)
     sigma = np.sqrt(hidden)
@@ -164,7 +164,7 @@ def _ratios(light: Photometry, expected_e: Array, fraction: Array) -> tuple[Arra
 
 
 def visibility_llr(flux_e: Array, expected_e: Array, sigma_hidden_e: Array, sigma_shining_e: Array) -> Array:
-    """ln p(flux | visible) - ln p(flux | hidden) (n,), capped.
+    """Log-likelihood ratios (n,), ln p(flux | visible) - ln p(flux | hidden), capped.
 
     Visible: Gaussian about the expected flux, or with a small probability about nothing. Hidden: Gaussian about
     nothing, or with a small probability any flux up to twice the expected one.
@@ -185,7 +185,7 @@ def _log_normal(x: Array, sigma: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class DamagedResponse:
-    """What a damaged frame makes of groups (k,) of stars by expected snr; fluxes in units of the stated noise."""
+    """The response of a damaged frame to groups (k,) of stars by expected snr; fluxes in units of the stated noise."""
 
     snr: Array  # (k,) typical
     gain: Array  # (k,) measured light per expected light; 0: lost

@@ -1,4 +1,4 @@
-"""How much higher the image shows the sky near the skyline than camera and attitude state, by the stars near it.
+"""Offset of the sky near the skyline in the image from what camera and attitude state, by the stars near it.
 
 Pixels of the sky get their direction from the camera and the attitude, stars theirs from the catalogue. What the stars
 near the skyline show of the difference is taken out of the pixels' heights; its uncertainty stays with the position.

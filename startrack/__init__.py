@@ -4,11 +4,10 @@
     print(startrack.locate("image.png"))
 
 `locate` takes a path or an array and returns a `Solution`; `identify` and `detect` stop earlier; `locate_skyline` takes
-a skyline that was measured elsewhere. `track` makes a
-trajectory of many images, `calibrate` a camera, `render` an image, `predict` the expected accuracy, `measure_horizon`
-the skyline of a fixed camera. The packages (`startrack.detection`, `startrack.identification`,
-`startrack.localization`, ...) have the stages one by one. Every name is loaded at its first use: importing startrack
-costs nothing.
+a skyline that was measured elsewhere. `track` makes a trajectory of many images, `calibrate` a camera, `render` an
+image, `predict` the expected accuracy, `measure_horizon` the skyline of a fixed camera. The packages
+(`startrack.detection`, `startrack.identification`, `startrack.localization`, ...) have the stages one by one. Every
+name is loaded at its first use: importing startrack costs nothing.
 """
 
 import importlib
@@ -48,7 +47,7 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    """The public names, each from its module at the first use."""
+    """Public name of startrack, from its module at the first use."""
     if name not in _MODULES:
         raise AttributeError(f"module 'startrack' has no attribute {name!r}")
     return getattr(importlib.import_module(f"startrack.{_MODULES[name]}"), name)

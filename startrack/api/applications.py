@@ -1,4 +1,4 @@
-"""Photographs of the sky to a camera and to a skyline; a pose to a synthetic image; the accuracy on a terrain."""
+"""Calibration and skyline by photographs of the sky; a synthetic image of a pose; the accuracy on a terrain."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def calibrate(
         images: as for `locate`, each with its time.
         camera: an approximate camera; or give `fov`.
         fov: field of view, as for `identify`.
-        site: on the Earth, where the camera stood: refraction is then taken out of the lens.
-        name: of the camera.
+        site: place on the Earth where the camera stood: refraction is then taken out of the lens.
+        name: name of the camera.
 
     Returns:
         The calibration. Use its `camera` only where `accepted` is true; `checks` lists the conditions.
@@ -68,7 +68,7 @@ def measure_horizon(
 
     Args:
         images: as for `locate`, each with its time; those whose stars cannot be identified are left out.
-        site: on the Earth, where the camera stands.
+        site: place on the Earth where the camera stands.
         camera: as for `locate`; None: `fov`, or the camera that the first image names.
         fov: field of view, as for `identify`.
 
@@ -111,8 +111,8 @@ def render(
         time: middle of the exposure, as for `locate`. None: drawn from the seed, like all that is not given.
         position_m: (east, north) from the terrain's origin [m].
         heading: azimuth of the rover's nose: an angle, or degrees.
-        seed: of sky, sensor and noise.
-        number: of the exposure within the series of this seed.
+        seed: seed of sky, sensor and noise.
+        number: number of the exposure within the series of this seed.
         settings: further fields of `startrack.rendering.Series`, such as `exposure_s` or `sky_v_mag_arcsec2`.
 
     Raises:
@@ -159,12 +159,12 @@ def predict(
         terrain: as for `locate`.
         time: middle of the exposures, as for `locate`; of a pair the draws are evenly spaced between both.
         positions_m: (k, 2) east and north from the terrain's origin [m]. None: cells of the search area.
-        spacing_m: of the cells [m]. None: a tenth of the search area, or a little less.
+        spacing_m: distance of the cells [m]. None: a tenth of the search area, or a little less.
         exposure: an astropy duration, or seconds. None: a V 6 star on the axis reaches 5 sigma.
         sky_v_mag_arcsec2: diffuse light of the sky.
-        draws: at each place.
-        seed: of the draws.
-        localizer: as `--localizer`.
+        draws: number of draws at each place.
+        seed: seed of the draws.
+        localizer: name of the method of localization, as for `--localizer`.
 
     Returns:
         The prediction: `positions_m` (k, 2), `cells` (arrays (k,) by name, as the columns of predict.ecsv), `summary`.

@@ -32,13 +32,13 @@ class IdentifiedCentroids:
     has_time: bool  # whether `stars` are those at the time of the exposure
 
     def __repr__(self) -> str:
-        """Number of stars, residual and camera: the arrays fill pages."""
+        """Text of the number of stars, the residual and the camera: the arrays fill pages."""
         rms_px = self.attitude_fit.rms_px
         return f"<IdentifiedCentroids: {len(self.star)} stars, rms {rms_px:.3f} px, camera {self.camera.name!r}>"
 
     @property
     def attitude(self) -> Attitude:
-        """R_cam_icrs with its covariance, without a time with what that leaves unknown."""
+        """Attitude R_cam_icrs with its covariance; without a time, with the error that this adds."""
         return self.attitude_fit.attitude_of(has_time=self.has_time)
 
     @property
@@ -48,7 +48,7 @@ class IdentifiedCentroids:
 
     @property
     def star(self) -> Ints:
-        """Indices (n,) of their stars in `stars`."""
+        """Indices (n,) in `stars` of the stars of the identified centroids."""
         return self.identification.star
 
     @property
@@ -131,7 +131,7 @@ def identify_centroids(
 
 @contextmanager
 def _stating_order(is_assumed: bool) -> Iterator[None]:
-    """In the block a refusal also states that the order of the centroids is assumed, if it is."""
+    """Context in which a refusal also states that the order of the centroids is assumed, if it is."""
     try:
         yield
     except NotIdentified as cause:

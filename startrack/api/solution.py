@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 class Shown:
-    """Prints itself as rows of a name and a text, in a notebook as a table."""
+    """Base of values that print themselves as rows of a name and a text, in a notebook as a table."""
 
     shown: output.Rows
 
@@ -72,7 +72,7 @@ class Section(Shown):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Ellipse(Shown):
-    """One sigma of a position; 39 % of a Gaussian lie within."""
+    """Ellipse of one sigma of a position; 39 % of a Gaussian lie within."""
 
     semi_major: Quantity  # [m]
     semi_minor: Quantity  # [m]
@@ -118,14 +118,14 @@ class Orientation(Section):
 
     @property
     def rotation(self) -> Rotation:
-        """From icrs to cam: rotation.apply(rays_icrs) are rays_cam."""
+        """Rotation from icrs to cam: rotation.apply(rays_icrs) are rays_cam."""
         from scipy.spatial.transform import Rotation
 
         return Rotation.from_quat(self.quat_xyzw_cam_icrs)
 
     @property
     def body(self) -> Rotation | None:
-        """From enu to the rover's body; None without a terrain or a time."""
+        """Rotation from enu to the rover's body; None without a terrain or a time."""
         from scipy.spatial.transform import Rotation
 
         quaternion = self.quat_xyzw_body_enu
@@ -151,14 +151,17 @@ class Solution:
 
     @property
     def status(self) -> str:
+        """Status: ok, ambiguous or refused."""
         return self.result.status
 
     @property
     def reason(self) -> str | None:
+        """Code of the reason where the status is not ok, else None."""
         return self.result.reason
 
     @property
     def message(self) -> str:
+        """Text of one line about the status; empty where it is ok."""
         return self.result.message
 
     def __bool__(self) -> bool:
@@ -284,7 +287,7 @@ class Solution:
         """Write the files of the command (record, star table, world coordinates, picture); returns the record's path.
 
         Args:
-            folder: of the files; it is made where it is missing.
+            folder: place of the files; it is made where it is missing.
             plots: whether the picture is written.
             overwrite: whether the record of another image of this name may be replaced.
 
@@ -313,7 +316,7 @@ class Solution:
 
 
 def _with_unit(value: Any, quantity: output.Quantity) -> Any:
-    """A `value` of a `quantity` as astropy's Angle or Quantity; as it is where it has no unit, or is not known."""
+    """Value of a `quantity` as an Angle or Quantity of astropy; as it is where it has no unit, or is not known."""
     if value is None or quantity.astropy_unit is None:
         return value
     from astropy.coordinates import Angle

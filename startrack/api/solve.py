@@ -1,4 +1,4 @@
-"""Images to solutions, and many images to a track."""
+"""Functions from images to solutions, and from many images to a track."""
 
 from __future__ import annotations
 
@@ -82,13 +82,13 @@ def locate_skyline(
         skyline: a file with the columns azimuth_deg, elevation_deg and sigma_deg (as NAME.skyline.ecsv of `locate`),
             or a polyline x_px, y_px[, sigma_px] on a picture; or rows (n, 3) of azimuth, elevation and sigma [deg].
         terrain: as for `locate`.
-        camera: of a polyline, as for `locate`.
+        camera: camera of a polyline, as for `locate`.
         attitude: of a polyline: a result file of startrack; or azimuth and elevation of the optical axis, and a
             clockwise turn of the camera about it [deg].
         heading_sigma: standard deviation of the attitude's error about the vertical: an angle or degrees; 180: it is
             not known at all.
-        tilt_sigma: likewise of the vertical, about each of two level axes.
-        correlation: of azimuth, over which errors of heights are alike: an angle or degrees. None: 1 degree.
+        tilt_sigma: standard deviation of the attitude's error about each of two level axes.
+        correlation: range of azimuth over which errors of heights are alike: an angle or degrees. None: 1 degree.
         near: east, north and sigma (3,) [m] of a prior of the position. None: anywhere in the search area.
         time: only for an `attitude` file without a time.
 
@@ -132,8 +132,8 @@ def track(
         terrain: as for `locate`; one for all images.
         odometry: a file (TUM text or a ROS bag), or the object. None: the moves between the images are not known.
         odometry_sigma: standard deviation of a move on each horizontal axis, relative to its length.
-        odometry_floor_m: the same, beside that.
-        max_speed_m_s: of the rover; odometry with a faster move is refused.
+        odometry_floor_m: standard deviation [m] that is added to that, whatever the length of the move.
+        max_speed_m_s: highest speed of the rover; odometry with a faster move is refused.
         odometry_time_sigma_s: standard deviation of the offset of the odometry's clock from that of the images.
         at_rest: the camera did not move.
         settings: stages to use instead of the usual ones.
@@ -236,7 +236,7 @@ def identify(
 
 
 def detect(image: Image, *, camera: str | Camera | None = None) -> Solution:
-    """Point sources only.
+    """Point sources of an image, without their names.
 
     Args:
         image: as for `locate`.
@@ -252,7 +252,7 @@ def detect(image: Image, *, camera: str | Camera | None = None) -> Solution:
 
 
 def _solution(outcome: Outcome, kind: str) -> Solution:
-    """Raises BadInput where the input was at fault, whichever stage found that."""
+    """Solution of an `outcome`. Raises BadInput where the input was at fault, whichever stage found that."""
     if isinstance(outcome, Refused) and outcome.reason in BAD_INPUT_REASONS:  # the stages name flags of the commands
         raise BadInput(outcome.reason, outcome.message.replace("--time UTC", "time="))
     return Solution(outcome, kind)

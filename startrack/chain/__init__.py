@@ -1,4 +1,4 @@
-"""From one image to the position: the chain of the stages, and the values that they return."""
+"""Chain of the stages from one image to the position, and the values that they return."""
 
 from startrack.chain.fingerprint import MISSING, are_unchanged, content_sha256, input_hashes, job_sha256
 from startrack.chain.inputs import (

@@ -29,7 +29,7 @@ LOCAL_PART = 0.05  # of the frame's longer side: radius within which other blobs
 
 
 class _FoundBodies(NamedTuple):
-    """Bodies that have a source, and what is at their places."""
+    """Bodies that have a source, and the detections and blobs at their places."""
 
     seen: tuple[Body, ...]
     detection: Ints  # of these, without those of brighter stars
@@ -64,8 +64,7 @@ class _BrightSources:
         return found
 
     def light_bounds(self, v_mag: Array) -> tuple[Array, Array]:
-        """Least and most light (n,) of stars of `v_mag` (n,): that of named ones DIMMED_MAG fainter, BRIGHTER_MAG
-        brighter.
+        """Least and most light (n,) [e] of stars of `v_mag` (n,): named ones DIMMED_MAG fainter, BRIGHTER_MAG brighter.
 
         Where stars saturate light grows less than in proportion to the flux; in proportion it is a bound.
         """
@@ -75,19 +74,19 @@ class _BrightSources:
         return np.median(least, axis=1), np.median(most, axis=1)
 
     def _alike(self, v_mag: Array) -> tuple[Array, Array]:
-        """Light and magnitudes (n, ALIKE) of the named stars about each of `v_mag` (n,)."""
+        """Light [e] and magnitudes, both (n, ALIKE), of the named stars about each of `v_mag` (n,)."""
         first = np.clip(np.searchsorted(self.known_mag, v_mag) - ALIKE // 2, 0, len(self.known_mag) - ALIKE)
         which = first[:, None] + np.arange(ALIKE)
         return self.known_light_e[which], self.known_mag[which]
 
     @property
     def depth_mag(self) -> float:
-        """Down to here half of the named stars and more have a blob; at least to the brightest of them."""
+        """Magnitude down to which half of the named stars and more have a blob; at least that of the brightest one."""
         part = np.cumsum(self.known_blob >= 0) / np.arange(1, len(self.known_blob) + 1)
         return float(self.known_mag[np.flatnonzero(part >= 0.5)[-1:]].max(initial=self.known_mag[0]))
 
     def find_bodies(self, bodies: tuple[Body, ...], parallax_rad: float) -> _FoundBodies:
-        """Which of the `bodies` have a source: a blob, or a detection, with the light of a star as bright.
+        """Bodies among `bodies` that have a source: a blob, or a detection, with the light of a star as bright.
 
         The directions of Moon and Earth are known to `parallax_rad`.
         """
@@ -145,10 +144,10 @@ class _BrightSources:
         return NamedStars(star=star, xy_px=blobs.xy_px[at], saturated=blobs.saturated[at]), at
 
     def _chances(self, at: Ints, least: Array, most: Array, clutter: Bools) -> Array:
-        """Probability that one of the blobs that are `clutter`, with light from `least` to `most` (n,), coincides by
-        chance with a star as the blobs `at` (n,) do.
+        """Probability (n,) that a `clutter` blob with light from `least` to `most` (n,) is at a star by chance.
 
-        By their density about the blob, or in the image circle where it is higher there.
+        It is as near to the star as the blob `at` (n,) is. The density of such blobs is that about this one, or that in
+        the image circle where it is higher there.
         """
         place, light = self.blobs.xy_px[clutter], self.blobs.light_e[clutter]
         local_px = LOCAL_PART * max(self.camera.size_px)
@@ -164,7 +163,7 @@ def name_bright_sources(
     sources: Detections, camera: Camera, stars: Stars, known: Identification, R_cam_icrs: Array,
     bodies: tuple[Body, ...], time_utc: datetime | None,
 ) -> SourceNames:  # fmt: skip
-    """What the `sources` of an image are whose `known` stars gave `R_cam_icrs` (3, 3), the brightest included.
+    """Names of the `sources` of an image whose `known` stars gave `R_cam_icrs` (3, 3), the brightest included.
 
     `bodies` are those over the site. Without one they are those at `time_utc` that have a source, as seen from the
     Earth or from the Moon, from where more of them have one.

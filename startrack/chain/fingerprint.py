@@ -39,6 +39,7 @@ def sha256_of(path: str | os.PathLike[str]) -> str:
 
 @lru_cache(maxsize=64)
 def _sha256_at_stamp(path: str, stamp: tuple[int, ...]) -> str:
+    """SHA-256 in hex of the file at `path`, computed once for each `stamp` of its state."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

@@ -104,7 +104,7 @@ def duration_s(duration: Any) -> float | None:
 
 
 def _iso_text(time: Any) -> Any:
-    """An astropy Time in UTC, to the microsecond: its own text ends at the millisecond. None for anything else."""
+    """Text of an astropy Time in UTC to the microsecond: its own ends at the millisecond. None for anything else."""
     try:
         moment = getattr(time, "utc", None)
     except Exception as cause:  # astropy's own, such as of a local time or of UT1 beyond its tables
@@ -160,7 +160,7 @@ def settings_input(settings: Settings | None) -> Settings | None:
 
 
 def field_of_view_rad(fov: Any) -> float:
-    """The argument `fov`, an astropy angle or degrees [rad]. Raises BadInput (no_calibration)."""
+    """Field of view [rad] of the argument `fov`, an astropy angle or degrees. Raises BadInput (no_calibration)."""
     try:
         size = angle_rad(fov, "fov")
     except ValueError as cause:
@@ -171,7 +171,7 @@ def field_of_view_rad(fov: Any) -> float:
 
 
 def angle_rad(angle: Any, argument: str) -> float:
-    """An astropy `angle`, or a number of degrees [rad]. Raises ValueError naming the `argument` where it is neither."""
+    """Angle [rad] of an astropy `angle` or of degrees. Raises ValueError naming the `argument` where it is neither."""
     try:
         size = float(angle.to_value("rad")) if hasattr(angle, "to_value") else math.radians(angle)
     except (TypeError, ValueError) as cause:

@@ -43,7 +43,7 @@ class StatedAttitude:
 
     @classmethod
     def of_angles(cls, azimuth_rad: float, pitch_rad: float, roll_rad: float) -> StatedAttitude:
-        """Of the optical axis at `azimuth_rad` from north through east and the elevation `pitch_rad`.
+        """Attitude with the optical axis at `azimuth_rad` from north through east and the elevation `pitch_rad`.
 
         With the roll about it, `roll_rad`, at 0 the image's top is up; a positive one turns the camera clockwise as
         seen from behind it, its right side down. Raises BadInput (bad_image).
@@ -58,7 +58,7 @@ class StatedAttitude:
     def of_input(
         cls, given: FilePath | Sequence[Any] | None, site: Site | None, when: datetime | None
     ) -> StatedAttitude | None:
-        """Of a file, or of azimuth, pitch and roll (3,), angles or degrees; None where nothing is `given`.
+        """Attitude of a file, or of azimuth, pitch and roll (3,), angles or degrees; None where nothing is `given`.
 
         See `of_file`, for `site` and `when` too, and `of_angles`. Raises ValueError for what are no angles.
         """
@@ -71,7 +71,7 @@ class StatedAttitude:
 
     @classmethod
     def of_file(cls, path: FilePath, site: Site | None, when: datetime | None) -> StatedAttitude:
-        """Of the NAME.fix.json or NAME.identification.json at `path`, on the ground of a `site`.
+        """Attitude in the NAME.fix.json or NAME.identification.json at `path`, on the ground of a `site`.
 
         `when` is the time of a file without one. Raises BadInput: bad_image, bad_terrain, no_time.
         """
@@ -86,7 +86,7 @@ class StatedAttitude:
 
 @dataclass(frozen=True)
 class SkylineErrors:
-    """What is stated of a skyline's attitude and of the correlation of its heights [rad].
+    """Stated errors of a skyline [rad]: of its attitude, and the correlation of its heights.
 
     Raises BadInput (bad_image) for numbers that are negative, not finite, or larger than a half turn.
     """
@@ -97,7 +97,7 @@ class SkylineErrors:
 
     @classmethod
     def of_inputs(cls, **stated: Any) -> SkylineErrors:
-        """Of heading_sigma, tilt_sigma and correlation, angles or degrees; None: not stated.
+        """Errors of the `stated` heading_sigma, tilt_sigma and correlation, angles or degrees; None: not stated.
 
         Raises ValueError for what is no angle.
         """
@@ -121,12 +121,12 @@ class PlacedBySkyline(Positioned, Inputs):
 
     @property
     def warnings(self) -> list[str]:
-        """What the terrain does not cover or state, and those of the position."""
+        """Warnings of the exposure, what the terrain does not cover or state, and warnings of the position."""
         return [*super().warnings, *self.terrain.warnings(), *self.position_warnings]
 
     @property
     def evidence_source(self) -> str:
-        """Always skyline."""
+        """Source of the position: always skyline."""
         return "skyline"
 
 

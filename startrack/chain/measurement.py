@@ -103,7 +103,7 @@ def _flux_scale(oriented: Oriented, R_enu_icrs: Array, site: Site) -> FluxScale:
 
 
 def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
-    """The same stars in the deeper Gaia list, if that is installed and the frame is deep enough to need it.
+    """Copy with the stars of the deeper Gaia list, if that is installed and the frame is deep enough to need it.
 
     `site` is where the camera stands, for the aberration. Returns `oriented` itself where nothing changes: also with
     stars that are not the whole shipped catalogue, which are a choice of the caller's.
@@ -141,7 +141,7 @@ def _shows_deep_stars(light: StarPhotometry, stars: Stars) -> bool:
 
 
 def remeasure_stars(first: Located, band: SkylineBand, sky: SkyLight, photometry: StarEvidence) -> Located:
-    """The stars beside a skyline measured again, with the step of the `sky` brightness taken out of their background.
+    """Copy of `first` whose stars beside the skyline are measured without the step of the `sky` in their background.
 
     `band` has the pixels beside the skyline of the `first` fix, `photometry` the settings.
     """
@@ -215,7 +215,7 @@ def locate_rays(rays: StarRays, localizer: Localizer | None = None) -> StarFix:
 
 
 def fix_again(rays: R, first: Fix, localizer: Localizer, evidence: Evidence) -> tuple[R, Fix]:
-    """`fix_position` that begins at the points of a `first` fix; a method without a posterior says nothing new."""
+    """Rays and position by `evidence`, from the points of a `first` fix on; a method without posterior keeps that."""
     if first.search == "approximate":
         return rays, first
     support = None if first.ambiguous else first.samples
@@ -223,7 +223,7 @@ def fix_again(rays: R, first: Fix, localizer: Localizer, evidence: Evidence) -> 
 
 
 def fix_position(rays: R, localizer: Localizer, evidence: Evidence) -> tuple[R, Fix]:
-    """The position by `evidence`, and the `rays` under the sky of the time that it shows, on ground of its steepness.
+    """The `rays` under the sky of the time that `evidence` shows, on ground of its steepness, and the position by it.
 
     `rays` are those of the image that the evidence is from. Raises NotLocated as the `localizer` does.
     """

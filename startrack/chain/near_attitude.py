@@ -37,7 +37,7 @@ class NearAttitude:
     def R_cam_icrs_at(self, when: datetime | None, site: Site | None) -> Array:
         """The attitude (3, 3) at the time `when` of a camera that stands still on the ground of a `site`.
 
-        Where one of them is not known (None), the attitude as it is. Raises ValueError for a quaternion that is none.
+        With one of them not known (None) it is the attitude as it is. Raises ValueError for a quaternion that is none.
         """
         R = R_from_quat_xyzw(self.quat_xyzw_cam_icrs)
         if self.time_utc is None or when is None or site is None:
@@ -62,7 +62,7 @@ def read_near_attitude(path: FilePath) -> NearAttitude:
 
 
 def _attitude_in(record: Any) -> NearAttitude:
-    """The attitude of a result. Raises one of the exceptions above for anything else."""
+    """Attitude of a result. Raises an exception that `read_near_attitude` turns into BadInput for anything else."""
     time_text = record.get("provenance", {}).get("time_utc")
     quat = tuple(float(one) for one in record["attitude"]["quat_xyzw_cam_icrs"])
     camera = record.get("provenance", {}).get("camera")

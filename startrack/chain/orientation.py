@@ -1,4 +1,4 @@
-"""From an exposure to its stars and the attitude: the stages of the pipeline that need no terrain."""
+"""Stars and attitude of an exposure: the stages of the pipeline that need no terrain."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from startrack.terrain import Terrain, site_of_terrain
 
 
 def check_inputs(inputs: Inputs) -> None:
-    """Raises BadInput no_time, bad_terrain, bad_calibration, size_mismatch: `inputs` that do not go together."""
+    """Raise BadInput (no_time, bad_terrain, bad_calibration, size_mismatch) for `inputs` that do not go together."""
     exposure, camera = inputs.exposure, inputs.camera
     if inputs.terrain is not None:
         require_time_and_site(exposure, inputs.terrain)
@@ -53,7 +53,7 @@ def check_inputs(inputs: Inputs) -> None:
 
 
 def require_time_and_site(exposure: Exposure, terrain: Terrain) -> tuple[datetime, Site]:
-    """The time of an `exposure` and the site of a `terrain`. Raises BadInput no_time or bad_terrain without one."""
+    """Time of an `exposure` and site of a `terrain`. Raises BadInput no_time or bad_terrain without one."""
     if exposure.time_utc is None:
         raise BadInput("no_time", "; ".join([NO_TIME, *exposure.warnings]))
     if terrain.site is None:
@@ -79,7 +79,7 @@ def site_on_earth(exposure: Exposure) -> Site | None:
 
 
 def detect_sources(inputs: Inputs, camera: Camera | None, detector: Detector) -> Detected:
-    """The point sources. Raises BadInput bad_image for fractions where the camera's levels are in counts.
+    """Point sources of an exposure. Raises BadInput bad_image for fractions where the camera's levels are in counts.
 
     `detector` finds them in the exposure of `inputs`; the levels of a `camera` convert counts to electrons.
     """
@@ -108,9 +108,9 @@ def _on_moon(inputs: Inputs) -> bool:
 def identify_stars(
     detected: Detected, camera: Camera, catalog: StarCatalog, settings: Settings, site: Site | None
 ) -> Identified:
-    """Which of the point sources `detected` is which star of the `catalog`.
+    """Stars of the `catalog` that the point sources `detected` are.
 
-    It is found by the identifier of the `settings`, first near their rough attitude. `site` (None: not known) is where
+    The identifier of the `settings` finds them, first near their rough attitude. `site` (None: not known) is where
     the `camera` stands. Raises NotIdentified, TooFewStars.
     """
     when, near = detected.exposure.time_utc, settings.near_attitude
@@ -126,7 +126,7 @@ def _identified(
     detected: Detected, camera: Camera, stars: Stars, bodies: tuple[Body, ...], site: Site | None,
     found: Identification,
 ) -> Identified:  # fmt: skip
-    """The next value, with the names of the stars that were `found`."""
+    """Value after `detected`, with the stars that were `found` and the names of their sources."""
     return Identified(
         **vars(detected) | {"camera": camera}, stars=stars, bodies=bodies, site=site, identification=found,
         names=identified_names(detected.detections, found, bodies),
@@ -137,7 +137,7 @@ def identify_unknown_lens(
     detected: Detected, fov_rad: float | tuple[float, float], catalog: StarCatalog, near_sky: NearSky | None,
     site: Site | None,
 ) -> Identified:  # fmt: skip
-    """The same as `identify_stars`, with the camera found from an approximate field of view.
+    """Stars that the point sources `detected` are, and the camera, from an approximate field of view.
 
     `detected` has the point sources, `catalog` the stars. `fov_rad` is one field of view, or the smallest and the
     largest. `near_sky` (None: not known) is where the optical axis points, `site` (None: not known) where the camera
@@ -163,7 +163,7 @@ def identify_unknown_lens(
 
 
 def solve_orientation(identified: Identified, has_file: bool = True) -> Oriented:
-    """`fit_orientation` with the names of the brightest sources. Raises NotIdentified."""
+    """Attitude that fits the `identified` stars, with the names of the brightest sources. Raises NotIdentified."""
     oriented = fit_orientation(identified, has_file)
     names = name_bright_sources(
         oriented.detections, oriented.camera, oriented.stars, oriented.identification,
@@ -189,6 +189,6 @@ def fit_orientation(identified: Identified, has_file: bool = True) -> Oriented:
 
 
 def check_one_attitude(oriented: Oriented) -> None:
-    """Raises NotLocated (inconsistent_evidence) where the sources of `oriented` show a second attitude, too."""
+    """Raise NotLocated (inconsistent_evidence) where the sources of `oriented` show a second attitude, too."""
     known = replace(oriented.identification, R_cam_icrs=oriented.attitude_fit.attitude.R_cam_icrs)
     check_single_field(oriented.detections, oriented.camera, oriented.stars, known)

@@ -1,4 +1,4 @@
-"""From one image to the position: detect, identify, orient, measure, localize. Each stage returns a complete value."""
+"""Way of an image to the position: detect, identify, orient, measure, localize. Each stage returns a complete value."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def locate_measured(
 
 
 def locate_exposure(exposure: Exposure, settings: Settings | None = None) -> Located | Refused:
-    """`locate` with the camera and the terrain that `exposure` names, and `settings`; stage `read` is reading them.
+    """Position by `locate` with camera and terrain that `exposure` names, and `settings`; stage `read` is reading them.
 
     Raises BadInput (no_calibration, bad_calibration, bad_terrain) where one is not named or cannot be used.
     """

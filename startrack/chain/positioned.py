@@ -1,4 +1,4 @@
-"""What every value with a position states of it, whatever it is from."""
+"""Base of all values with a position: what they state of it, whatever it is from."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class Positioned:
 
     @property
     def status(self) -> str:
-        """ok, or ambiguous where several positions fit."""
+        """Status: ok, or ambiguous where several positions fit."""
         return "ambiguous" if self.fix.ambiguous else "ok"
 
     @property
     def reason(self) -> Reason | None:
-        """`ambiguous` where several positions fit."""
+        """Reason `ambiguous` where several positions fit, else None."""
         return Reason.AMBIGUOUS if self.fix.ambiguous else None
 
     @property
@@ -45,7 +45,7 @@ class Positioned:
 
     @property
     def position_warnings(self) -> list[str]:
-        """What blocks the view, and errors beyond the defaults of facts that no file states."""
+        """Warnings of what blocks the view, and of errors beyond the defaults of facts that no file states."""
         blocked = [f"not the map's skyline, and left out: {self.fix.blocked.text}"] if self.fix.blocked else []
         shown = [f"the image shows {one.text}, which no file states: it is estimated" for one in self.fix.shown]
         return [*blocked, *shown, *self.fix.cautions]

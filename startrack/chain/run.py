@@ -1,4 +1,4 @@
-"""One exposure on its way through the stages: the last complete value, the times of the stages, and the refusal."""
+"""Run of an exposure through the stages: the last complete value, the times of the stages, and the refusal."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Run:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """In the block the time counts as that of the stage."""
+        """Context whose time counts as that of the stage `name`."""
         start = time.perf_counter()
         try:
             with stating_work(lambda: f"it was at the stage {name}"):
@@ -65,12 +65,12 @@ class Run:
             self._times[name] = self._times.get(name, 0.0) + 1e3 * (time.perf_counter() - start)
 
     def finish(self, value: T) -> T:
-        """The last `value` with the times of the stages."""
+        """Copy of the last `value` with the times of the stages."""
         return replace(value, timing_ms=MappingProxyType(self._times))
 
 
 def add_timing(outcome: AnyOutcome, **more_ms: float) -> AnyOutcome:
-    """The same `outcome` with `more_ms`, wall times [ms] by stage, added to its stages' times."""
+    """Copy of an `outcome` with `more_ms`, wall times [ms] by stage, added to its stages' times."""
     times = dict(outcome.timing_ms)
     for stage, ms in more_ms.items():
         times[stage] = times.get(stage, 0.0) + ms

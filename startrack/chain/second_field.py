@@ -65,7 +65,7 @@ def check_single_field(centroids: Centroids, camera: Camera, stars: Stars, first
 def find_second_field(centroids: Centroids, camera: Camera, stars: Stars, first: Identification) -> SecondField | None:
     """The star field among the sources that an attitude leaves unexplained; None where there is none.
 
-    The arguments are those of `check_single_field`.
+    `first` has the matches of the `centroids` with the `stars`, and the attitude of the `camera`.
     """
     from scipy.spatial import cKDTree
 

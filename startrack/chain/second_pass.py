@@ -29,7 +29,7 @@ MOST_MOVED = 3.0  # of nine tenths of the skyline by the second fix, in its reac
 
 
 def fix_by_stars(measured: Measured, localizer: Localizer) -> Located:
-    """The first look: roughly the position by the stars, and what else they allow.
+    """First look: roughly the position by the stars, and the other positions that they allow.
 
     Raises NotLocated as the `localizer` does.
     """
@@ -38,7 +38,7 @@ def fix_by_stars(measured: Measured, localizer: Localizer) -> Located:
 
 
 def see_skyline(first: Located) -> SkylineEstimate | None:
-    """Where the skyline stands by a `first` fix; None where nothing can be measured there, see `why_unseen`."""
+    """Skyline as it stands by a `first` fix; None where nothing can be measured there, see `why_unseen`."""
     if why_unseen(first):
         return None
     fix, covariance = first.fix, first.fix.covariance_m2
@@ -48,7 +48,7 @@ def see_skyline(first: Located) -> SkylineEstimate | None:
 
 
 def why_unseen(first: Located) -> str:
-    """Why nothing can be measured at the skyline of a `first` fix; "" where it can."""
+    """Reason why nothing can be measured at the skyline of a `first` fix; "" where it can."""
     if first.damage is not None and not first.damage.has_levels:
         return "the image is damaged"
     if first.fix.ambiguous:
@@ -57,7 +57,7 @@ def why_unseen(first: Located) -> str:
 
 
 def measure_at(near: SkylineEstimate | None, first: Located, settings: Settings) -> Located:
-    """`first` with the light of the sky at the skyline `near`, and the stars beside it without the step of that light.
+    """Copy of `first` with the light of the sky at the skyline `near`, stars beside it without the step of that light.
 
     Without a skyline, or without such light, it is as it was, and `sky_unused` has the reason; where nothing but the
     light of the sky counts, raises NotLocated (insufficient_geometry).
@@ -81,7 +81,7 @@ def measure_at(near: SkylineEstimate | None, first: Located, settings: Settings)
 
 
 def fix_by_all(complete: Located, localizer: Localizer) -> Located:
-    """The position by all that was measured, beginning at the points of the first look.
+    """Position by all that was measured, found from the points of the first look.
 
     Raises NotLocated as the `localizer` does.
     """
@@ -102,7 +102,7 @@ def fix_by_all(complete: Located, localizer: Localizer) -> Located:
 
 
 def _require_near(located: Located, sky: SkyEvidence) -> None:
-    """Raises NotLocated (inconsistent_evidence) where the skyline of the fix is far from where the sky was measured."""
+    """Raise NotLocated (inconsistent_evidence) where the skyline of the fix is far from where the sky was measured."""
     skyline = located.terrain.horizon_rad(located.position_at_time_m[None], MIDDLES_RAD)
     if located.fix.raised_rad is not None:
         skyline = skyline + located.fix.raised_rad
@@ -133,7 +133,7 @@ def _image_errors(measured: Measured, sky: SkyLight, used: Bools) -> ImageErrors
 
 
 def _too_few_text(sky: SkyLight, used: Bools) -> str:
-    """Why too few sectors (SECTORS,) are `used`: the skyline is not in view, has no step, or is not in the map."""
+    """Reason for too few `used` sectors (SECTORS,): the skyline is not in view, has no step, or is not in the map."""
     counts = sky.levels.covered.sum(), sectors_with_step(sky).sum(), used.sum(), NEEDED_SECTORS
     in_view, clear, on_map, needed = (n * 360.0 / SECTORS for n in counts)
     if in_view < needed:

@@ -1,4 +1,4 @@
-"""What an image that is not identified shows of its sky, and what comes first: the sky, or the camera file."""
+"""Advice on an image that is not identified: what it shows of its sky, and whether sky or camera file comes first."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def stating_sky(
     exposure: Exposure, found: Centroids | None = None, camera: Camera | None = None, v_mag: Array | None = None, *,
     fov_rad: float = 0.0, on_moon: bool = False, more: str = "",
 ) -> Iterator[None]:  # fmt: skip
-    """In the block a refusal that no attitude fits also states what the `exposure` shows of its sky.
+    """Context in which a refusal that no attitude fits also states what the `exposure` shows of its sky.
 
     Its advice is that of the likely cause; that of a mirror image names the order of rows in its header. `found` are
     the point sources (None: there are none). `camera` (None: not known, then `fov_rad` is the field of view, if known)
@@ -120,9 +120,9 @@ def _rounding(exposure: Exposure, found: Centroids | None, camera: Camera | None
 def count_clear(
     exposure: Exposure, found: Centroids | None, camera: Camera | None, v_mag: Array, fov_rad: float
 ) -> float | None:
-    """How many stars a clear sky would show, on average; None where no field is known.
+    """Expected number of stars that a clear sky would show; None where no field is known.
 
-    Of stars of the magnitudes `v_mag` (n,), ascending, of the whole sky. By the zero point of the `camera`, the
+    The stars have the magnitudes `v_mag` (n,), ascending, of the whole sky. By the zero point of the `camera`, the
     exposure time and the noise of the `found` sources; where one is not known, down to ASSUMED_LIMIT_MAG. Without a
     camera `fov_rad` is the field of view.
     """
@@ -136,10 +136,10 @@ def count_clear(
 
 
 def count_expected_stars(exposure: Exposure, found: Detections, camera: Camera, v_mag: Array) -> float | None:
-    """How many stars a clear sky would show above the measured noise, on average.
+    """Expected number of stars that a clear sky would show above the measured noise.
 
-    Of stars of the magnitudes `v_mag` (n,), ascending, of the whole sky. None where the `camera` states no zero point
-    or the time of the `exposure` is not known; `found` has the noise.
+    Stars have the magnitudes `v_mag` (n,), ascending, of the whole sky. None where the `camera` states no zero point
+    or the exposure time is not known; `found` has the noise.
     """
     sensor, exposure_s = camera.sensor, exposure.exposure_s
     if sensor is None or exposure_s is None:

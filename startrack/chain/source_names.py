@@ -1,4 +1,4 @@
-"""What the sources of an image are: stars with names, planets, Sun, Moon and Earth, and sources without a name."""
+"""Names of the sources of an image: stars with names, planets, Sun, Moon and Earth, and sources without a name."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class NamedStars(Rows):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SourceNames:
-    """What the sources of an image are."""
+    """Names of the sources of an image."""
 
     stars: NamedStars
     bodies: tuple[Body, ...]  # planets, Sun, Moon, Earth; without a site those that have a source
@@ -29,7 +29,7 @@ class SourceNames:
 
 
 def identified_names(sources: Detections, known: Identification, bodies: tuple[Body, ...]) -> SourceNames:
-    """The names that the identification `known` gives to `sources`; `bodies` are those over the site."""
+    """Names that the identification `known` gives to `sources`; `bodies` are those over the site."""
     is_nameless = np.ones(len(sources), dtype=bool)
     is_nameless[known.detection] = False
     return SourceNames(

@@ -77,7 +77,7 @@ class Settings:
 
 @dataclass(frozen=True, kw_only=True, eq=False)  # eq: arrays have no single answer to ==
 class Inputs:
-    """One exposure and the inputs of its solution. Two values are equal only if they are one object."""
+    """Exposure and the inputs of its solution. Two values are equal only if they are one object."""
 
     exposure: Exposure
     camera: Camera | None = None  # None: not known; `detect` works without, `identify_blind` finds it
@@ -89,7 +89,7 @@ class Inputs:
 
     @property
     def status(self) -> str:
-        """The status of the result format: ok, ambiguous or refused."""
+        """Status of the result format: ok, ambiguous or refused."""
         return "ok"
 
     @property
@@ -99,12 +99,12 @@ class Inputs:
 
     @property
     def message(self) -> str:
-        """One line of text about the status; empty where it is ok."""
+        """Text of one line about the status; empty where it is ok."""
         return ""
 
     @property
     def warnings(self) -> list[str]:
-        """Facts in the files of image and camera that were not used, or derived."""
+        """Facts in the files of image and camera that were not used, or derived; and damage of the image."""
         notes = () if self.camera is None else self.camera.notes
         return [*self.exposure.warnings, *notes, *([self.damage.message] if self.damage is not None else [])]
 
@@ -117,7 +117,7 @@ class Detected(Inputs):
 
     @property
     def warnings(self) -> list[str]:
-        """As before, with the parts of the sensor that show no light."""
+        """Warnings of exposure and camera, and of a part of the image that holds one value."""
         mask = self.detections.mask
         if mask is None or not mask.dead_part:
             return super().warnings
@@ -145,7 +145,7 @@ class Oriented(Identified):
 
     @property
     def warnings(self) -> list[str]:
-        """Those of `Inputs`, and the difference of the lens from its file."""
+        """Warnings before the attitude was known, and the difference of the lens from its file."""
         px = f"{self.lens_change_px:.2f} px (RMS; without a site by refraction too)"
         text = f"the lens differs from the camera file by {px}: corrected by the stars"
         return [*super().warnings, *([text] if self.lens_change_px > SHOWN_CHANGE_PX else [])]
@@ -167,11 +167,11 @@ class StarRays:
     near: PositionPrior | None = None  # of the position
 
     def evidence(self) -> Evidence:
-        """The rays for the localizer."""
+        """Rays of the stars as evidence for the localizer."""
         return replace(self.light.evidence(), clock=self.clock, near=self.near)
 
     def later(self, seconds: float, reach_s: float) -> Self:
-        """The same under the sky of a time later by `seconds`, which is right to `reach_s`."""
+        """Copy under the sky of a time later by `seconds`, which is right to `reach_s` [s]."""
         R = R_from_rotvec(seconds * self.clock.turn_rad_s)
         clock = replace(self.clock, offset_s=self.clock.offset_s + seconds, reach_s=reach_s)
         light = self.light.turn_frame(R, self.terrain.air)
@@ -186,7 +186,7 @@ class StarFix(StarRays):
 
     @property
     def status(self) -> str:
-        """ok, or ambiguous where several positions fit."""
+        """Status: ok, or ambiguous where several positions fit."""
         return "ambiguous" if self.fix.ambiguous else "ok"
 
 
@@ -205,7 +205,7 @@ class Measured(StarRays, Oriented):
 
     @property
     def warnings(self) -> list[str]:
-        """Facts in the image's file that were not used; what the terrain does not cover or state; a Sun that is up."""
+        """Warnings before the terrain was used; what the terrain does not cover or state; a Sun that is up."""
         day = [] if self.exposure.time_utc is None else daylight_warnings(self.site, self.exposure.time_utc)
         return [*super().warnings, *self.terrain.warnings(), *day]
 
@@ -230,12 +230,12 @@ class Located(Positioned, StarFix, Measured):
 
     @property
     def warnings(self) -> list[str]:
-        """Those of `Measured`, what blocks the view, and errors beyond the defaults of facts that no file states."""
+        """Warnings before the position; what blocks the view; errors beyond the defaults of facts no file states."""
         return [*super().warnings, *self.position_warnings]
 
     @property
     def evidence_source(self) -> str:
-        """What the position is from: stars, sky (the light of the sky), or both."""
+        """Source of the position: stars, sky (the light of the sky), or both."""
         if self.sky is None:
             return "stars"
         return "both" if self.by_stars else "sky"
@@ -252,7 +252,7 @@ class Refused:
 
     @property
     def status(self) -> str:
-        """Always refused."""
+        """Status of the result format: always refused."""
         return "refused"
 
     @property
@@ -262,7 +262,7 @@ class Refused:
 
     @property
     def warnings(self) -> list[str]:
-        """The warnings of the value reached."""
+        """Warnings of the last complete value that was reached."""
         return self.reached.warnings
 
 

@@ -65,7 +65,7 @@ def block_side(sigma_px: float) -> int:
 def _measure_blocks(
     image: Image, side: int, quantum: float, measure: Callable[[Image], tuple[Image, ...]]
 ) -> list[Image]:
-    """The results (blocks,) of `measure` for the ordered pixels (n, BLOCK_PX^2) of square blocks, row by row.
+    """The results (blocks,) of `measure` for the ordered pixels (blocks, BLOCK_PX^2) of square blocks, row by row.
 
     Medians of whole numbers are whole numbers, and a spread would be wrong by up to half a step in 8-bit images: the
     same pattern of part-steps, of mean zero, is added to every block; its variance must be subtracted.
@@ -85,6 +85,7 @@ def _measure_blocks(
 
 
 def _median_and_spread(ordered: Image) -> tuple[Image, Image]:
+    """Medians (blocks,) of ordered pixels (blocks, n), and the standard deviations (blocks,) of their noise."""
     middle = ordered.shape[1] // 2
     return np.float32(0.5) * (ordered[:, middle - 1] + ordered[:, middle]), ordered @ _scale_weights()
 

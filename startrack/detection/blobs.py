@@ -29,7 +29,7 @@ class Blobs(Rows):
 
 
 def find_blobs(sources: Detections) -> Blobs:
-    """The groups of touching pixels brighter than HEIGHT_1 of the highest light in the frame of the `sources`."""
+    """Groups of touching pixels, saturated or brighter than HEIGHT_1 of the highest light in the frame of `sources`."""
     image, dead, background = sources.image_e, sources.dead, sources.background
     masked = np.zeros_like(dead) if sources.mask is None else sources.mask.masked
     top, lowest = float(image.max()), float(background.rows.min())
@@ -69,7 +69,7 @@ def disc_px(sources: Detections) -> Array:
 
 
 def _are_compact(sources: Detections, xy_px: Array, reach_px: Array, top: float) -> Bools:
-    """Which blobs (n,) that reach `reach_px` (n,) from their middles are dark around, and no hot pixels."""
+    """Whether blobs (n,) that reach `reach_px` (n,) from their middles are dark around, and no hot pixels."""
     turn = np.arange(LOOKS) * 2 * np.pi / LOOKS
     around_px = (reach_px + radius_for(sources.psf_sigma_px))[:, None, None] * np.stack(
         [np.cos(turn), np.sin(turn)], -1
@@ -89,6 +89,7 @@ def _light(sources: Detections, pixels: Array) -> Array:
 
 
 def _indices(sources: Detections, pixels: Array) -> tuple[Ints, Ints]:
+    """Columns and rows (...) of pixels (..., 2) (x, y), those beyond the border at the border."""
     height, width = sources.image_e.shape
     x, y = np.clip(pixels, 0, (width - 1, height - 1)).astype(np.int64).transpose(-1, *range(pixels.ndim - 1))
     return x, y

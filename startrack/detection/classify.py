@@ -63,7 +63,7 @@ def refit_saturated(fitted: Fitted, sigma: float) -> tuple[Fitted, Array]:
 
 
 def are_saturated(stamps: Stamps) -> Bools:
-    """Which sources (n,) have an unusable pixel at or beside their middle one."""
+    """Whether sources (n,) have an unusable pixel at or beside their middle one."""
     if stamps.usable is None:
         return np.zeros(len(stamps.data), dtype=bool)
     middle = stamps.usable.shape[1] // 2
@@ -95,7 +95,7 @@ def select_stars(fitted: Fitted, width_px: Array, threshold: float) -> Ints:
 
 
 def select_brightest_per_position(xy_px: Array, flux: Array, closer_px: float) -> Bools:
-    """Which sources (n,) to keep: of several that converged to one position the brightest."""
+    """Whether to keep sources (n,): of several that converged to one position the brightest."""
     from scipy.spatial import cKDTree
 
     one, later = cKDTree(xy_px).query_pairs(closer_px, output_type="ndarray").T
@@ -105,7 +105,7 @@ def select_brightest_per_position(xy_px: Array, flux: Array, closer_px: float) -
 
 
 def reject_wing_misfits(xy_px: Array, flux: Array, height: Array, sigma: float, threshold: float) -> Bools:
-    """Which sources (n,) to keep: sources near the threshold in the wing of a brighter one are rejected.
+    """Whether to keep sources (n,): those near the threshold in the wing of a brighter one are rejected.
 
     Such a source is a residual of the PSF or of a blend: two unresolved stars are fitted as one.
     """
@@ -120,7 +120,7 @@ def reject_wing_misfits(xy_px: Array, flux: Array, height: Array, sigma: float, 
 
 
 def peak_heights(fits: PointFits) -> Array:
-    """Height of each source (n) above its surroundings, in sigma.
+    """Heights (n,) of sources above their surroundings, in sigma.
 
     The level of the surroundings is more precise than that of the stamp; it is used up to 1 / OWN_LEVEL_FRACTION of the
     height from the stamp alone. If the two levels disagree (a slope, the skyline), the stamp alone is used.

@@ -43,14 +43,14 @@ ORIGINAL = "give the frame as the sensor recorded it"
 
 @dataclass(frozen=True)
 class Damage:
-    """What processing did to the noise of an exposure."""
+    """Damage that processing did to the noise of an exposure."""
 
     cause: str  # in words, with a number
     has_levels: bool  # the levels of extended light, and their errors, are as the pixels show them
 
     @property
     def message(self) -> str:
-        """The cause and what to give instead, one line."""
+        """Cause, and what to give instead, in one line."""
         return f"{self.cause}; {ORIGINAL}"
 
 

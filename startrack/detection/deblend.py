@@ -112,7 +112,7 @@ def _changed_signal(
 
 
 def _are_relevant(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> Array:
-    """Which pairs (m,) are relevant: the neighbour's signal at the stamp's nearest pixel exceeds the noise limit."""
+    """Whether pairs (m,) are relevant: the neighbour's signal at the stamp's nearest pixel exceeds the noise limit."""
     radius = s.data.shape[1] // 2
     beyond = np.maximum(np.abs(fits.xy_px[other] - s.centres[star]) - radius - 0.5, 0.0)
     wing = np.exp(-0.5 * np.sum(np.square(beyond), axis=1) / (sigma**2 + 0.1))

@@ -60,7 +60,7 @@ class Stamps:
         return self.data, self.variance, none if self.usable is None else self.usable
 
     def take(self, which: slice | Ints) -> Stamps:
-        """Some of them."""
+        """Stamps that the indices or the slice `which` select."""
         usable = None if self.usable is None else self.usable[which]
         return Stamps(self.data[which], self.variance[which], usable, self.centres[which], self.surround[which])
 
@@ -165,7 +165,7 @@ def measure_source_noise(s: Stamps, fits: PointFits, alone: Bools, sigma: float,
 
 
 def _median(values: Array) -> float:
-    """The same as numpy's, which takes five times as long for a few values."""
+    """Median of the values (n,), for a few of them in a fifth of the time that numpy takes."""
     ordered, half = np.sort(values), len(values) // 2
     return 0.5 * float(ordered[half] + ordered[~half])
 

@@ -31,7 +31,7 @@ class SourceNoise:
 
 @dataclass(frozen=True)
 class Frame:
-    """One exposure prepared for detection."""
+    """Exposure prepared for detection."""
 
     image: Image
     background: SmoothImage
@@ -43,7 +43,7 @@ class Frame:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(H, W)."""
+        """Shape (H, W) of the image."""
         return self.image.shape[0], self.image.shape[1]
 
     @property
@@ -116,7 +116,7 @@ def radius_for(sigma_px: float) -> int:
 
 
 def binning_factor(sigma_px: float) -> int:
-    """Side of the squares: a power of two; the binned PSF is 0.9 px or wider."""
+    """Side [px] of the squares that a frame is binned by: a power of two; the binned PSF is 0.9 px or wider."""
     return 1 if sigma_px < MIN_BINNED_SIGMA_PX else int(2 ** np.floor(np.log2(2.0 * sigma_px / MIN_BINNED_SIGMA_PX)))
 
 
@@ -143,6 +143,7 @@ def bin_frame(frame: Frame, side: int) -> Frame:
 
 
 def _sums(image: Image, side: int) -> Image:
+    """Sums (H / side, W / side) of an image (H, W) over squares."""
     size = image.shape[1] // side, image.shape[0] // side
     small: Any = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     return np.asarray(small * np.float32(side * side), dtype=np.float32)

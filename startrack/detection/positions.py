@@ -1,4 +1,4 @@
-"""A detector of one's own that finds positions and fluxes alone: the rest of `Detections` is measured here."""
+"""Detector of one's own that finds positions and fluxes alone: the rest of `Detections` is measured here."""
 
 from __future__ import annotations
 

@@ -59,9 +59,9 @@ def measure_psf_width(frame: Frame, centres: Ints, fits: PointFits, sigma: float
 def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array) -> tuple[Array, Bools, Array]:
     """Best-fitting PSF sigma (n,) [px] of each stamp among `widths_px` (m,), a geometric series.
 
-    Also returns whether the best width is not the last one, and the fraction of the stamp's variance beyond the noise
-    that the fit explains, about 1 for a star. Refined by a parabola through chi^2; flux and level are free, the
-    position is `offset_px` from the middle pixel.
+    Then whether the best width is neither the first nor the last one (n,), and the fraction (n,) of a stamp's variance
+    beyond the noise that the fit explains, about 1 for a star. Refined by a parabola through chi^2; flux and level are
+    free, the position is `offset_px` from the middle pixel.
     """
     size, explained, variance = data[0].size, np.empty((len(data), len(widths_px))), np.empty(len(data))
     _explain_by_widths(data, weights, offset_px, widths_px, profile_scratch(data.shape[1]), explained, variance)

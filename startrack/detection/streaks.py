@@ -132,7 +132,7 @@ def _moments(label: Ints, xy: Array, signal: Array, variance: Array, count: int)
 
 
 def _resemble_neighbours(xy: Array, along: Array, length: Array) -> Bools:
-    """Which streaks (n,) have the direction and length of one of the three nearest others."""
+    """Whether streaks (n,) have the direction and length of one of the three nearest others."""
     from scipy.spatial import cKDTree
 
     _, near = cKDTree(xy).query(xy, k=min(4, len(xy)))

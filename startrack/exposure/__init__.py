@@ -1,4 +1,4 @@
-"""One image with the facts that travel with it: read, validate, write.
+"""Image with the facts that travel with it: read, validate, write.
 
 `decoding.py` opens a file and picks its decoder (`png.py`, `tiff.py`, `jpeg.py`, `fits.py`, `mosaic.py` for camera
 raw files); `bag.py` reads images from ROS bags; `correction.py` reads which pixels count and applies

@@ -34,7 +34,7 @@ BAYER_IN_FORMAT = re.compile(r"\s*bayer_(?P<pattern>rggb|bggr|gbrg|grbg)(?:8|16)
 
 
 class Message(NamedTuple):
-    """One message of a topic."""
+    """Message of a topic."""
 
     topic: str
     stamp_ns: int  # of its header: nanoseconds since 1970, UTC
@@ -43,7 +43,7 @@ class Message(NamedTuple):
 
 
 class StoredMessage(NamedTuple):
-    """Where one message of a topic is in its bag."""
+    """Place of one message of a topic in its bag."""
 
     topic: str
     log_time_ns: int  # when it was recorded; several messages may have the same
@@ -52,7 +52,7 @@ class StoredMessage(NamedTuple):
 
 @dataclass(frozen=True)
 class BagImage:
-    """One image message of a bag; small, so that it is cheap to send to another process."""
+    """Image message of a bag; small, so that it is cheap to send to another process."""
 
     bag: str  # path of the file or folder
     number: int  # among the images of its topic, from 0, in the bag's order
@@ -163,7 +163,7 @@ def exposure_of_message(content: Any, name: str, **given: Any) -> Exposure:
 
     Args:
         content: a sensor_msgs/Image or CompressedImage of rclpy or rosbags.
-        name: of the exposure.
+        name: name of the exposure.
         given: facts that the message does not have: `camera`, `exposure_s` and the like, as in `read_exposure`.
 
     Raises:

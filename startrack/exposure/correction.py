@@ -1,4 +1,4 @@
-"""Which pixels of an image count (masks), and counts without the sensor's own charge, at one sensitivity.
+"""Masks of the pixels that count, and counts without the sensor's own charge, at one sensitivity.
 
     corrected = (recorded - dark) / flat + black        black: median of the dark; flat: 1 at its median
 

@@ -1,4 +1,4 @@
-"""From a file to its pixels and header: open, find the type from its first bytes, decode strictly.
+"""Decoding of a file to its pixels and header: open, find the type from its first bytes, decode strictly.
 
 The decoders, one module each, return the value `Decoded` and share the checks here.
 """
@@ -115,7 +115,7 @@ def orientation_warnings(orientation: object) -> tuple[str, ...]:
 
 
 def exif_warnings(read_exif: Callable[[], Any]) -> tuple[str, ...]:
-    """`orientation_warnings` of what `read_exif` returns (`PIL.Image.Exif`); unreadable EXIF costs only a warning."""
+    """Warnings of the orientation in what `read_exif` returns (`PIL.Image.Exif`); unreadable EXIF gives a warning."""
     try:
         return orientation_warnings(read_exif().get(0x0112))
     except (OSError, SyntaxError, ValueError, TypeError, LookupError, struct.error) as error:
@@ -132,7 +132,7 @@ def decode_file(path: FilePath) -> tuple[bytes, Decoded]:
 
 
 def read_stamped(path: FilePath, read: Callable[[str, Stamp], T], kind: str, reason: str | None = None) -> T:
-    """What `read` gives for the file at `path` and a stamp of its present state, by which it may keep results.
+    """Result of `read` for the file at `path` and a stamp of its present state, by which it may keep results.
 
     Raises BadInput `reason` (None: that of the cause) with the `kind` of file and the cause.
     """

@@ -102,7 +102,7 @@ def is_other_time(one: datetime, other: datetime | None) -> bool:
 
 
 def apart_text(one: datetime, other: datetime) -> str:
-    """How long `one` is after or before the `other`, such as "1:59:30 (h:mm:ss) before"."""
+    """Text that tells how long `one` is after or before the `other`, such as "1:59:30 (h:mm:ss) before"."""
     late_s = (as_utc(one) - as_utc(other)).total_seconds()
     return f"{timedelta(seconds=round(abs(late_s)))} (h:mm:ss) {'after' if late_s > 0 else 'before'}"
 
@@ -139,7 +139,7 @@ def _moment(header: Mapping[str, Any], key: str) -> datetime:
 def _middles(
     times: Mapping[str, datetime], ways: Sequence[tuple[str, ...]], exposure_s: float | None
 ) -> Iterator[tuple[tuple[str, ...], datetime, bool]]:
-    """Each of the `ways` that the `times` allow, the middle by it, and whether that is known.
+    """Triples for the `ways` that the `times` allow: the way, the middle by it, and whether that is known.
 
     Without a duration it is not known from a start or an end, which then stands in its place.
     """
@@ -251,7 +251,7 @@ def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts
 def _other_time_notes(
     stated: datetime, sidecar: Sidecar, header: Mapping[str, Any], exposure_s: float | None
 ) -> list[str]:  # fmt: skip
-    """What the time in the sidecar, else in the header, differs by from the `stated` one that is used."""
+    """Note of how the time in the sidecar, else in the header, differs from the `stated` one; none if not."""
     with suppress(BadInput):  # a time that cannot be read is none
         other = sidecar.value("time_utc") or middle_of_exposure(header, exposure_s, [])
         if other is not None and is_other_time(stated, other):

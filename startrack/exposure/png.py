@@ -85,7 +85,7 @@ def insert_png_chunks(png: bytes, added: Iterable[tuple[bytes, bytes]]) -> bytes
 
 
 def png_chunks(raw: bytes) -> Iterator[tuple[bytes, memoryview]]:
-    """(kind, body) of each chunk of the PNG file `raw` up to IEND, lengths and checksums verified."""
+    """Kind and body of each chunk of the PNG file `raw` up to IEND, lengths and checksums verified."""
     view = memoryview(raw)
     at = len(SIGNATURE)
     for _ in range(MAX_CHUNKS):
@@ -184,7 +184,7 @@ def _text_chunk(keyword: str, text: str) -> tuple[bytes, bytes]:
 
 
 def chunk(kind: bytes, body: bytes) -> bytes:
-    """One PNG chunk: length, kind, body, checksum of kind and body."""
+    """PNG chunk: length, kind, body, checksum of kind and body."""
     checksum = zlib.crc32(body, zlib.crc32(kind))
     return b"".join((struct.pack(">I", len(body)), kind, body, struct.pack(">I", checksum)))
 

@@ -1,4 +1,4 @@
-"""From a file to an `Exposure`: its pixels and its metadata."""
+"""Reader of a file as an `Exposure`: its pixels and its metadata."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ def _candidates(image: Path) -> Iterator[Path]:
 
 
 def _stems(image: Path) -> list[str]:
-    """["a.fits.bz2", "a.fits", "a"]."""
+    """Names of the file without its suffixes of packing and picture, longest first: ["a.fits.bz2", "a.fits", "a"]."""
     names = [image.name]
     while Path(names[-1]).suffix.lower() in PACKING_SUFFIXES:
         names.append(Path(names[-1]).stem)
@@ -152,5 +152,5 @@ class Sidecar:
 
 
 def resolve_path(file: Path, reference: str) -> str:
-    """A path in `file` is relative to the folder of `file`; a name stays a name."""
+    """Path that `reference` is in `file`: relative to the folder of `file`; a name stays a name."""
     return os.path.join(file.parent, reference) if is_path(reference) else reference

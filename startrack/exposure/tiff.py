@@ -139,7 +139,7 @@ def _check_packed_strips(page: Any, raw: bytes) -> None:
 
 
 def _pixels(page: Any, raw: bytes) -> NDArray[Any]:
-    """(H, W) or (H, W, 3) as stored, native byte order."""
+    """Pixels (H, W) or (H, W, 3) as stored, in native byte order."""
     if page.compression in COMPRESSIONS and page.predictor in PREDICTORS:
         stored = page.asarray()
         if page.axes == "SYX":  # channels in separate planes

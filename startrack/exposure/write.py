@@ -1,4 +1,4 @@
-"""From an `Exposure` to a file: PNG, TIFF or FITS with its metadata, written atomically; and sidecars."""
+"""Writer of an `Exposure` to a file: PNG, TIFF or FITS with its metadata, written atomically; and sidecars."""
 
 from __future__ import annotations
 

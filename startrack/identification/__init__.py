@@ -1,4 +1,4 @@
-"""Which detection is which catalogue star, with a camera file or from a field of view alone."""
+"""Identification of the stars among the detections, with a camera file or from a field of view alone."""
 
 from startrack.identification.attitude_search import INLIER_PX, MIN_MATCHES
 from startrack.identification.lens_guesses import WIDE_FIELD_RAD

@@ -79,7 +79,7 @@ def distances_in_gate(xy_px: Array, px: Array, inside: Bools) -> Array:
 def rotate_by_inliers(
     which: Ints, detection: Ints, distance: Array, variance_px2: Array, rays_cam: Array, rays_icrs: Array, R: Array
 ) -> tuple[Bools, Array, Array, float]:
-    """Which of the pairs `which` (m,) are no outliers (m,), their variance (m,), their attitude, its change from `R`.
+    """Whether the pairs `which` (m,) are no outliers, variances (m,), their attitude (3, 3), and its change from `R`.
 
     The variance is per axis [px^2], the common error added. This is estimated as in `extra_variance_px2`, but in closed
     form: for one variance per star. `detection`, `distance` (k,) and `rays_icrs` (k, 3) are of all pairs.
@@ -96,7 +96,7 @@ def rotate_by_inliers(
 def name_matches(
     squared_px2: Array, stated_px2: Array, misfit: Array, agree: Bools, variance_px2: Array
 ) -> tuple[Bools, Bools]:
-    """`inlier` and `named` (m,) of AttitudeMatch, of pairs of a squared distance and a stated variance (m,)."""
+    """Whether pairs (m,) are inliers, and whether these get a name, by their distances and variances (m,) [px^2]."""
     inlier = squared_px2 < np.maximum(INLIER_PX**2, STAR_OUTLIER_CHI2 * stated_px2)
     # Position and brightness may not both be at the edge of what is allowed.
     edge = squared_px2 / (STAR_OUTLIER_CHI2 * variance_px2) + np.square(misfit)

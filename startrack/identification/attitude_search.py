@@ -132,7 +132,7 @@ class Sources:
         return (max(GATE_PX, ONE_SOURCE_SIGMAS * self.centroids.psf_sigma_px) + 1.0) * self.scale.largest_rad_per_px
 
     def mirror_image(self) -> Sources:
-        """The same detections seen by the mirror-image camera."""
+        """Copy with the same detections seen by the mirror-image camera."""
         camera = replace(self.camera, mirrored=not self.camera.mirrored)
         return replace(self, camera=camera, rays_cam=camera.unproject(self.centroids.xy_px))
 
@@ -199,7 +199,7 @@ class AttitudeSearch:
     def _attitudes_from_triangles(
         self, index: PatternIndex, first: int, fresh: int, end: int, tolerance: float
     ) -> Iterator[AttitudeHypothesis]:
-        """From triangles of the detections `first` to `end` that have a vertex from the `fresh`-th of them on."""
+        """Attitudes from triangles of the detections `first` to `end` with a vertex from the `fresh`-th of them on."""
         check_time()
         some = self.rays_cam[first:end]
         vertices, sides = sides_of_few(some, fresh, index.longest_chord)
@@ -239,7 +239,7 @@ class AttitudeSearch:
         yield from self._test_attitudes(supported, first, 2.0 * tolerance)
 
     def _matches_each(self, most: int) -> int:
-        """`most`, or more where only those that point into a part of the sky are tried."""
+        """Limit of matches of one triangle: `most`, or more where only a part of the sky is tried."""
         return most if self.sources.near_sky is None else MATCHES_EACH_NEAR_SKY
 
     def _depth(self, first: int) -> int:

@@ -69,6 +69,7 @@ def fit_found_lens(
 
 
 def _fit(camera: Camera, R_cam_icrs: Array, points: Observations, free: tuple[str, ...], expected: Camera) -> Solution:
+    """Adjustment of the `free` parameters and the attitude to `points`, with the prior of the camera `expected`."""
     start = State(camera=camera, R_cam_icrs=R_cam_icrs[None])
     return adjust(start, points, free, SCHEME, prior=prior_of(camera, expected, free))
 

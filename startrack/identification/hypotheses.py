@@ -52,7 +52,7 @@ class HypothesisSearch:
         return log_trials(self.tried, 1.0 if self.near_sky is None else self.near_sky.part)
 
     def voted_hypotheses(self, patterns: ShapePatterns, guess: LensGuess, window: Window) -> list[LensHypothesis]:
-        """One hypothesis for each of the largest groups of the window's triangles that agree in attitude and scale.
+        """Hypotheses, one for each of the largest groups of the window's triangles that agree in attitude and scale.
 
         Triangles vote for their pairs of a detection and a star: a pair of a wrong one occurs once, a right one often.
         """

@@ -29,7 +29,7 @@ Computed = TypeVar("Computed")
 
 
 class PerObject(Generic[Computed]):
-    """`compute(thing)`, computed once per object and kept as long as the object lives.
+    """Cache of `compute(thing)`: computed once per object and kept as long as the object lives.
 
     The key is the object, not its value: comparing catalogues would take longer than the computation saves.
     """
@@ -87,23 +87,23 @@ class CatalogPatterns:
     """The indexes for a camera that sees `field_sr`, each built when it is first used."""
 
     def __init__(self, stars: Stars, field_sr: float) -> None:
-        """`stars` are sorted, brightest first."""
+        """Take `stars` that are sorted, brightest first."""
         self.stars, self.field_sr = stars, field_sr
         self._grids: dict[int, StarGrid] = {}
 
     @cached_property
     def bright_index(self) -> PatternIndex:
-        """Triangles of the brightest few stars."""
+        """Index of the triangles of the brightest few stars."""
         return build_index(self.stars, self.field_sr, BRIGHT)
 
     @cached_property
     def deep_index(self) -> PatternIndex:
-        """Triangles of more stars."""
+        """Index of the triangles of more stars."""
         return build_index(self.stars, self.field_sr, DEEP)
 
     @cached_property
     def pairs(self) -> PairIndex:
-        """Pairs of bright stars."""
+        """Index of the pairs of bright stars."""
         return build_pairs(self.stars, self.field_sr)
 
     def neighbours(self, rays_icrs: Array, radius_rad: float, count: int) -> Neighbours:

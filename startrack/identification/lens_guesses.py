@@ -1,4 +1,4 @@
-"""What an unknown lens may be before any star is known: its bend, focal length, centre and pixel aspect.
+"""Guesses of an unknown lens before any star is known: its bend, focal length, centre and pixel aspect.
 
 A small angle of any lens is that of a pinhole: narrow fields have one guess of the bend, wide ones several. The focal
 length follows from the field of view and the frame, or from the image circle of a fisheye lens; where a range of fields
@@ -40,13 +40,13 @@ class LensGuess:
     aspect: float = 1.0  # fx / fy
 
     def with_aspect(self, aspect: float, keeps_width: bool) -> LensGuess:
-        """The guess with other pixels, fx as it is where the field of view is that across the width."""
+        """Copy with other pixels, fx as it is where the field of view is that across the width."""
         focal_px = self.focal_px * (aspect**-0.5 if keeps_width else 1.0)
         return replace(self, aspect=aspect, focal_px=focal_px)
 
     @property
     def scale_px(self) -> Array:
-        """(fx, fy) over the focal length: (2,)"""
+        """Ratios (2,) of fx and fy to the focal length."""
         return np.array([self.aspect**0.5, self.aspect**-0.5])
 
 
@@ -100,7 +100,7 @@ def _plane_field(size_px: tuple[int, int], low_rad: float, high_rad: float) -> F
 
 
 def _guess(focal_px: Array, bend: float, centre_px: tuple[float, float]) -> LensGuess:
-    """The guess of focal lengths between two (2,)."""
+    """Guess of a lens whose focal length lies between two (2,) [px]."""
     low, high = np.log(focal_px).tolist()
     return LensGuess(float(np.exp(0.5 * (low + high))), 0.5 * (high - low) + SLACK, bend, centre_px)
 
@@ -129,4 +129,5 @@ def _wide_field(size_px: tuple[int, int], low_rad: float, high_rad: float, circl
 
 
 def _rounded(solid_sr: float) -> float:
+    """Solid angle [sr] rounded to a fourth part of a factor e, so that similar fields share their patterns."""
     return float(np.exp(np.round(FIELD_STEPS_PER_E * np.log(solid_sr)) / FIELD_STEPS_PER_E))

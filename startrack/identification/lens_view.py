@@ -44,7 +44,7 @@ class LensView:
 
     @property
     def focal_px(self) -> float:
-        """The geometric mean of fx and fy."""
+        """Geometric mean of fx and fy [px]."""
         return float(np.exp(self.lens[0]))
 
     @property
@@ -56,7 +56,7 @@ class LensView:
 
     @property
     def handedness(self) -> float:
-        """-1 for a mirror image, else 1."""
+        """Sign of the x axis: -1 for a mirror image, else 1."""
         return -1.0 if self.mirrored else 1.0
 
     def project(self, rays_icrs: Array) -> tuple[Array, Bools]:
@@ -102,7 +102,7 @@ class LensHypothesis:
 
 @dataclass(frozen=True)
 class GrowthStage:
-    """One step of the growth: which stars take part, the gate, and what of the lens is fitted."""
+    """Step of the growth: which stars take part, the gate, and what of the lens is fitted."""
 
     region_1: float  # about the triangle of the hypothesis, over the field's diameter; 0: the whole field
     gate_1: float  # over the field's diameter
@@ -166,7 +166,7 @@ def _stars_wanted(detections: int) -> int:
 
 
 def _free(stage: GrowthStage, matches: int, is_narrow: bool) -> Bools:
-    """Which lens parameters the stage fits (5,)."""
+    """Whether the stage fits each of the lens parameters (5,)."""
     if not stage.whole_lens:
         return np.array([True, False, False, False, False])
     if not is_narrow:

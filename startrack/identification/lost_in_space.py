@@ -177,9 +177,9 @@ class Identifier:
 
 
 def _describe_few(inside: int, given: int, camera: Camera, needed: int) -> tuple[str, str]:
-    """Why the `inside` of the `given` point sources, those within the camera's image circle, are not the `needed`.
+    """Reason why the `inside` of the `given` point sources, those in the camera's image circle, are not the `needed`.
 
-    With the advice.
+    The advice comes second.
     """
     if given < needed:
         return f"{given} point source{'s' * (given != 1)}: too few to identify, which takes {needed}", (

@@ -42,7 +42,7 @@ class NearSky:
 
     @property
     def part(self) -> float:
-        """Of the whole sky: the probability that an attitude which only chance proposes points here."""
+        """Part of the whole sky: the probability that an attitude which only chance proposes points here."""
         return float(np.sin(0.5 * self.radius_rad) ** 2)
 
     def contains(self, R_cam_icrs: Array, margin_rad: float = 0.0) -> Bools:
@@ -51,6 +51,6 @@ class NearSky:
         return np.asarray(angle_between_rad(R_cam_icrs[..., 2, :], axis) <= self.radius_rad + margin_rad)
 
     def __str__(self) -> str:
-        """For messages."""
+        """Text of radius and centre [deg] for messages."""
         ra, dec, radius = np.degrees([self.ra_rad, self.dec_rad, self.radius_rad])
         return f"{radius:.4g} degrees about RA {ra:.4g}, DEC {dec:.4g}"

@@ -97,7 +97,7 @@ def _features(found: Triangles) -> tuple[Array, Array]:
 
 
 def _key(cell: Ints, log_size: Array, shape_tolerance: float) -> Array:
-    """Cells (..., 2) first, sizes (...) within them."""
+    """Numbers (...) that sort by cell (..., 2) first, by the logarithm of the size (...) within a cell."""
     cells_in_row = int(1.0 / (2 * shape_tolerance)) + 3
     size = np.clip(log_size - SMALLEST_LOG, 1.0, CELL_LENGTH - 1.0)
     return (cell[..., 0] * cells_in_row + cell[..., 1]) * CELL_LENGTH + size

@@ -30,7 +30,7 @@ class StarGrid:
     """The brightest stars of a sky, by cells."""
 
     def __init__(self, rays_icrs: Array) -> None:
-        """`rays_icrs` (n, 3): unit vectors."""
+        """Sort the stars with unit vectors `rays_icrs` (n, 3) into cells."""
         cells = int(min(max(CELLS_OF_ROOT_1 * np.sqrt(len(rays_icrs)), FEWEST_CELLS), MOST_CELLS))
         first, star = np.empty(cells**3 + 1, np.int32), np.empty(len(rays_icrs), np.int64)
         _bin_stars(np.ascontiguousarray(rays_icrs), cells, first, star)

@@ -60,7 +60,7 @@ def triangles(rays: Array, longest_rad: float, most: int = 2_000_000) -> Triangl
 def sides_of_few(rays: Array, fresh: int, longest: float) -> tuple[Ints, Array]:
     """Triples (m, 3) of a few dozen rays (n, 3) with sides below `longest` and a vertex from index `fresh` on.
 
-    And their sides (m, 3), which are chords, ascending. Vertices are in the order of the opposite side, as in
+    Then their sides (m, 3), which are chords, ascending. Vertices are in the order of the opposite side, as in
     Triangles.
     """
     n = len(rays)
@@ -71,7 +71,7 @@ def sides_of_few(rays: Array, fresh: int, longest: float) -> tuple[Ints, Array]:
 
 
 def are_same_handed(one: Array, other: Array) -> Bools:
-    """Which of the triples of rays (m, 3, 3) have triple products of the same sign."""
+    """Whether triples of rays (m, 3, 3) have triple products of the same sign."""
     same = np.empty(len(one), bool)
     _are_same_handed(np.ascontiguousarray(one), np.ascontiguousarray(other), same)
     return same

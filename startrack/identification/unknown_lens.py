@@ -63,11 +63,10 @@ def identify_unknown_lens(
 
     `fov_rad`: a field of view, known to `tolerance`, or the smallest and the largest that it may have. Below 100
     degrees it is the angle across the frame's width, from there up that of the whole image circle, whether the frame
-    clips it or not. `stars` are sorted, brightest first. `circle`: the image circle of a fisheye lens as it
-    shows in the frame; it narrows the search. `near_sky`: part of the sky into which the
-    optical axis points; attitudes elsewhere are not tried. An answer is accepted where chance would give as many
-    coincidences with a probability below 1e-9, all trials included. Raises NotIdentified, and ValueError for an
-    impossible field of view.
+    clips it or not. `stars` are sorted, brightest first. `circle`: the image circle of a fisheye lens as it shows in
+    the frame; it narrows the search. `near_sky`: part of the sky into which the optical axis points; others
+    are not tried. An answer is accepted where chance would give as many coincidences with a probability below 1e-9, all
+    trials included. Raises NotIdentified, and ValueError for an impossible field of view.
     """
     search = _Search(centroids, size_px, _range_of(fov_rad, tolerance), stars, circle, near_sky)
     for lens, field in search.lenses():
@@ -109,7 +108,7 @@ def _least_matches(field: Field) -> int:
 
 
 def advise_on_fields(low_rad: float, high_rad: float, near_sky: NearSky | None) -> str:
-    """What may be tried where no lens from `low_rad` to `high_rad` fits with the axis in `near_sky`, if it is given."""
+    """Advice where no lens from `low_rad` to `high_rad` fits with the axis in `near_sky`, if it is given."""
     low, high = np.degrees([low_rad, high_rad])
     wider = max(low / 2, NARROWEST_DEG), min(2 * high, WIDEST_DEG)
     words = ["if there is a camera file, give it: fewer stars suffice"]
@@ -154,7 +153,7 @@ class _Search:
 
     @property
     def tried_text(self) -> str:
-        """The work done."""
+        """Text about the number of patterns tried."""
         points = f"the {len(self.hypotheses.xy_px)} brightest that stand apart"
         ratios = (
             f" with square pixels and with fx / fy from {min(self.aspects):.2g} to {max(self.aspects):.3g}"
@@ -164,7 +163,7 @@ class _Search:
         return f"{self.hypotheses.tried} patterns of {points}{ratios} tried"
 
     def lenses(self) -> Iterator[tuple[VerifiedLens, Field]]:
-        """Verified lenses, whatever their p-value."""
+        """Verified lenses with their fields, whatever their p-value."""
         low, high = np.degrees(self.range_rad)
         field = f"{low:.3g} to {high:.3g} degrees, {len(self.centroids)} point sources"
         with stating_work(lambda: f"{field}: {self.tried_text}"):

@@ -62,7 +62,7 @@ class VerifiedLens:
 
 @dataclass(frozen=True)
 class Verifier:
-    """What grown lenses are verified with."""
+    """Verification of grown lenses with a list of centroids and the stars."""
 
     centroids: Centroids
     stars: Stars
@@ -102,7 +102,7 @@ class Verifier:
     ) -> VerifiedLens | None:
         """The lens with all stars that lie where it and `R` place them; None where too few do.
 
-        `scale`: of the brightness; the other arguments are those of the call.
+        `scale`: of the brightness; `log_trials`: logarithm of the number of hypotheses; `field`: that of the guess.
         """
         centroids = self.centroids
         camera = _limit_angles(camera, 0.5 * field.largest_rad)

@@ -40,7 +40,7 @@ class Argument(NamedTuple):
 
     @classmethod
     def of(cls, text: str) -> Argument:
-        """From `name: dtype`, `name: dtype[n, m + 1, k >= 2, 3]`, or `name: out dtype[n]` of one that is written to."""
+        """Argument by `name: dtype`, `name: dtype[n, m + 1, k >= 2, 3]`, or, if written to, `name: out dtype[n]`."""
         out, dtype, shape = FORM.fullmatch(text).groups()  # type: ignore[union-attr]
         parts = DIMENSION.findall(shape or "")
         dims = tuple((dim, int(more or 0)) for dim, _, more in parts)
@@ -76,7 +76,7 @@ LEVEL, LIBRARY = _load()
 
 
 def text_of(name: str) -> str:
-    """What the library says of itself: `compiler_name` with its version, or `compiler_flags`."""
+    """Text of the library about itself: `compiler_name` with its version, or `compiler_flags`."""
     return str(ctypes.cast(getattr(LIBRARY, name), ctypes.CFUNCTYPE(ctypes.c_char_p))().decode())
 
 

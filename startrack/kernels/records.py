@@ -14,7 +14,7 @@ RECORDS: dict[str, tuple[list[Argument], Callable[[Any], ctypes.Structure]]] = {
 class Record:
     """Arrays and numbers as a struct `name` of the library, which kernels take as `name: name`; see `declare_record`.
 
-    They are checked once. It keeps its arrays. Another process makes it anew.
+    They are checked once. A record keeps its arrays. Another process makes it anew.
     """
 
     def __init__(self, name: str, *values: Any) -> None:

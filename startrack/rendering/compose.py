@@ -90,7 +90,7 @@ def truth_of(scene: Scene) -> Truth:
 
 
 def truth_paths(image: str | Path) -> tuple[Path, Path]:
-    """NAME.truth.json and NAME.truth.ecsv beside the image NAME.png."""
+    """Paths of NAME.truth.json and NAME.truth.ecsv beside the image NAME.png."""
     path = Path(image)
     return path.with_name(f"{path.stem}.truth.json"), path.with_name(f"{path.stem}.truth.ecsv")
 
@@ -134,7 +134,7 @@ def truth_ecsv(truth: Truth, to_v_mag: float) -> str:
 
 
 def draw_hot_pixels(size_px: tuple[int, int], count: int, *, rng: np.random.Generator) -> HotPixels:
-    """`count` random pixels (`rng`) of a sensor of `size_px` (W, H), dark currents log-uniform in HOT_E_PER_S."""
+    """Hot pixels, `count` random ones (`rng`) of a sensor of `size_px` (W, H); currents log-uniform in HOT_E_PER_S."""
     width, height = size_px
     index = rng.choice(width * height, size=min(count, width * height), replace=False)
     low, high = np.log(HOT_E_PER_S)

@@ -47,7 +47,7 @@ class Drive(Value):
             return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(self.waypoints_m, axis=0), axis=1)))
 
     def count_frames(self, every_s: float) -> int:
-        """Exposures from the path's start to its end, one `every_s` [s].
+        """Number of exposures from the path's start to its end, one `every_s` [s].
 
         Raises BadInput (bad_odometry) for fewer than two or more than a million.
         """

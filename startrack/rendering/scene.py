@@ -75,7 +75,7 @@ class Scene(Value):
 
     @property
     def R_cam_icrs(self) -> Array:
-        """Attitude (3, 3) at mid-exposure."""
+        """Rotation (3, 3) from icrs to the camera at mid-exposure."""
         return self.R_cam_enu @ self.R_enu_icrs
 
     def horizon_rad(self, azimuths_rad: Array) -> Array:

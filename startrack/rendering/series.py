@@ -37,7 +37,7 @@ Stream = IntEnum("Stream", "SKY SENSOR EXPOSURE ODOMETRY", start=0)
 
 @dataclass(frozen=True, kw_only=True)
 class Pose(Value):
-    """Where the rover is in an exposure."""
+    """Pose of the rover in an exposure, with its time."""
 
     time_utc: datetime  # mid-exposure
     position_enu_m: Array = vector()  # the camera's centre, which is the body's origin

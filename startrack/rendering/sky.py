@@ -106,9 +106,9 @@ def _azel(scene: Scene, xy_px: Array) -> tuple[Array, Array]:
 
 
 def _local_axes(scene: Scene, xy_px: Array) -> tuple[Array, Array]:
-    """Unit vectors t (n, 2) across the direction of constant azimuth, and the rise of elevation along it (n,) [rad/px].
+    """Unit vectors t (n, 2) across the direction of constant azimuth, and the rise (n,) [rad/px] of elevation along it.
 
-    From the four neighbours at a small step: d(elevation)/d(px) and d(azimuth)/d(px).
+    They are from the four neighbours at a small step: d(elevation)/d(px) and d(azimuth)/d(px).
     """
     slopes = []
     for axis in np.eye(2):
@@ -133,8 +133,9 @@ def _skyline_pixels(above: Bools, sigma_px: float) -> Bools:
 
 
 def _sky_and_ground(scene: Scene) -> tuple[Array, Array, Bools]:
-    """Arrays (H, W): sky light [e] with no terrain before it, the part of it that is seen, see `_sky_function`, and
-    whether the pixel's centre is above the skyline.
+    """Sky light [e] without terrain, its part that is seen, and whether the pixel is above the skyline, all (H, W).
+
+    The part is 1 above the skyline, the ground's light over the sky's below it.
     """
     camera, (width, height) = scene.camera, scene.camera.size_px
     fx, fy = camera.handed_focal_px
@@ -150,7 +151,7 @@ def _sky_and_ground(scene: Scene) -> tuple[Array, Array, Bools]:
 
 
 def _sky_function(scene: Scene) -> Callable[[Array, Array], tuple[Array, Array, Bools]]:
-    """A function of places x, y in the image [focal lengths], decentring removed, to what `_sky_and_ground` returns.
+    """Function of places x, y in the image [focal lengths], decentring removed: sky light [e], its part, above or not.
 
     The part of the sky's light is that of the pixel's centre: 1 above the skyline, the ground's below it.
     """
@@ -176,7 +177,7 @@ def _sky_function(scene: Scene) -> Callable[[Array, Array], tuple[Array, Array, 
 
 
 def _decentring_of_rows(camera: Camera) -> Callable[[slice], Array]:
-    """A function from rows to the shift (2, rows, W) that decentring adds there [focal lengths]; 0 of a centred lens.
+    """Function of rows: the shift (2, rows, W) that decentring adds there [focal lengths]; 0 of a centred lens.
 
     It is smooth, and its inverse is slow: it is interpolated between the points of a coarse grid.
     """
@@ -207,7 +208,7 @@ def _is_above_horizon(east: Array, north: Array, up: Array, azimuths: Array, tan
 
 
 def _lens_table(scene: Scene) -> tuple[Array, Array, Array, Array]:
-    """Per radius rho [focal lengths]: sky light per pixel [e], sin a / rho and cos a."""
+    """Table of the radius rho [focal lengths]: rho, sky light per pixel [e], sin a / rho and cos a."""
     from scipy.special import ndtr
 
     camera = scene.camera

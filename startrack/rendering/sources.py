@@ -93,7 +93,7 @@ def limiting_v_mag(
 ) -> float:
     """Magnitude of the star on the axis of a `camera` that reaches `snr` in `exposure_s`.
 
-    The sky has the brightness `sky_v_mag_arcsec2`. The inverse of `exposure_for_snr`.
+    The sky has the brightness `sky_v_mag_arcsec2`. It is the inverse of `exposure_for_snr`.
     """
     sensor, area_px, background = _noise_on_axis(camera, sky_v_mag_arcsec2)
     noise_e2 = area_px * (sensor.read_noise_e**2 + background * exposure_s)
@@ -111,7 +111,7 @@ def _noise_on_axis(camera: Camera, sky_v_mag_arcsec2: float | None) -> tuple[Sen
 
 
 def _body_points(body: Body, focal_px: float) -> tuple[Array, Array]:
-    """A body as equal points evenly over its disk (a sunflower spiral); phases and dark limbs are left out."""
+    """Unit vectors (n, 3) and magnitudes (n,) of equal points evenly over the disk of a body, without phases."""
     radius = ANGULAR_RADIUS_RAD.get(body.name, 0.0)
     count = max(1, int(np.ceil(np.pi * (radius * focal_px / DISK_STEP_PX) ** 2)))
     k = np.arange(count)

@@ -1,4 +1,4 @@
-"""What the pipeline measures of a scene, drawn without an image or with the pixels of one beside the skyline."""
+"""Measurements of a scene as the pipeline makes them, drawn without an image or with its pixels beside the skyline."""
 
 from startrack.simulation.ground_errors import draw_ground
 from startrack.simulation.skyline_image import draw_band, draw_camera, simulate_measured

@@ -27,7 +27,7 @@ SHINING_PX = 12.0  # from the band to the last stars whose light is rendered
 
 
 def draw_camera(camera: Camera, *, rng: np.random.Generator) -> Camera:
-    """The true `camera`, drawn by `rng` from the covariance that the file states; the same without one."""
+    """True camera, drawn by `rng` from the covariance that the file of `camera` states; `camera` itself without one."""
     if camera.covariance is None:
         return camera
     order = camera.covariance_order
@@ -39,7 +39,7 @@ def simulate_measured(
     scene: Scene, catalog: StarCatalog, terrain: Terrain, camera: Camera, *, time_utc: datetime,
     time_sigma_s: float | None, rng: np.random.Generator,
 ) -> Measured:  # fmt: skip
-    """What the pipeline measures in the image of a `scene` before it has a position.
+    """Measured stars and pixels of the image of a `scene`, as the pipeline has them before the position.
 
     The scene holds the truth, with its camera; `camera` is the stated one. `catalog`, `terrain`, `time_utc`,
     `time_sigma_s` [s] and `rng` are those of `simulate_rays`. Raises BadInput as that does, NotIdentified where no
@@ -109,7 +109,7 @@ def _seen(stars: SimulatedStars) -> tuple[Ints, Array]:
 
 
 def _identify(stars: SimulatedStars, star: Ints) -> Identification:
-    """Which of the shining stars `star` (n,) that are seen is which one of the catalogue, by Hipparcos number."""
+    """Identification of the shining stars `star` (n,) that are seen as those of the catalogue, by Hipparcos number."""
     hip = stars.scene.stars.hip[stars.shining[star]]
     order = np.argsort(stars.catalog.hip, kind="stable")
     row = order[np.minimum(np.searchsorted(stars.catalog.hip[order], hip), len(order) - 1)]

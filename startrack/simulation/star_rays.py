@@ -81,12 +81,12 @@ def simulate_rays(
     The scene holds the truth. What the files of the image state is given beside it:
 
     Args:
-        scene: with a terrain and a time; its camera has a sensor.
-        catalog: whose stars are measured.
+        scene: scene with a terrain and a time; its camera has a sensor.
+        catalog: list of the stars that are measured.
         terrain: the map (None: the scene's terrain, which is the ground).
         time_utc: the stated time (None: the true one).
         time_sigma_s: its stated error (None: nobody states it).
-        rng: of the noise.
+        rng: generator of the noise.
 
     Raises BadInput: bad_terrain and no_time where scene or map lack what relates the stars to the ground.
     """
@@ -164,6 +164,7 @@ def _shining_stars(scene: Scene) -> tuple[Ints, Array]:
 
 
 def _height_above(scene: Scene, rays_enu: Array) -> Array:
+    """Height (n,) [rad] of directions (n, 3) above the true horizon."""
     azimuth, elevation = azel_from_rays(rays_enu)
     return np.asarray(elevation - scene.horizon_rad(azimuth))
 

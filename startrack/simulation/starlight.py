@@ -25,7 +25,7 @@ class Starlight:
     def measure(
         self, sources: Sources, pixel_variance_e2: Array, saturation_e: float, *, rng: np.random.Generator
     ) -> Photometry:
-        """A draw, by `rng`, of what `startrack.evidence.photometry.measure` finds at the sources (n).
+        """Photometry of `sources` (n): a draw, by `rng`, of what `startrack.evidence.photometry.measure` would find.
 
         The background is known, and the noise of a pixel without stars is the same over the stamp of a star,
         `pixel_variance_e2` (n,). The weights are those of linear least squares for flux and local level; the light of
@@ -62,7 +62,7 @@ def _collect(
 ) -> Array:
     """Sums (5, n) for the stamps about stars (n, 2), over others (m, 2) within reach; no position is negative.
 
-    Of the kernel `collect_light`: parts of the others' light that the stamps collect, times `weight`; the variance that
+    Rows of the result: parts of the others' light that the stamps collect, times `weight`; the variance that
     each of their electrons adds, times `weight`; squares of the parts, times `square_weight`; the variance that each
     electron of the star itself adds; the strength of the fit. Others with a `square_weight` are the stars themselves.
     """

@@ -25,7 +25,7 @@ RELIST_S = 10.0  # after which a folder is listed again whatever its time: some 
 
 @dataclass(frozen=True, order=True)
 class Image:
-    """One image of a batch: a file, or a message of a bag."""
+    """Image of a batch: a file, or a message of a bag."""
 
     name: str  # path relative to the folder, with / on every system
     stem: str  # of its results, relative to the folder of the results
@@ -94,7 +94,7 @@ def listed_images(
 
 
 def maps_among(images: Iterable[Image]) -> list[Image]:
-    """Those of the `images` that are height maps: TIFF files, not packed, with the keys of a GeoTIFF."""
+    """Height maps among the `images`: TIFF files, not packed, with the keys of a GeoTIFF."""
     tiffs = (image for image in images if Path(image.path).suffix.lower() in (".tif", ".tiff"))
     return [image for image in tiffs if os.path.isfile(image.path) and is_geotiff(Path(image.path))]
 
@@ -175,7 +175,7 @@ class ImageTree:
         return found
 
     def _listing(self, folder: Path) -> tuple[_Listing, bool]:
-        """What the folder holds, and whether it was listed anew."""
+        """Content of a `folder`, and whether it was listed anew."""
         now, known = time.monotonic(), self._listed.get(str(folder))
         try:
             stamp = os.stat(folder).st_mtime_ns
@@ -197,7 +197,7 @@ class ImageTree:
 
 @dataclass(frozen=True)
 class _Listing:
-    """What a folder held."""
+    """Content of a folder when it was listed."""
 
     stamp: int  # time of its last change [ns], by the clock of its file system
     listed_s: float  # by the clock of this process
@@ -207,7 +207,7 @@ class _Listing:
 
 
 def _kind_of(entry: os.DirEntry[str]) -> Literal["folder", "file", "other"]:
-    """What an entry is, or leads to; a link that leads nowhere, or to itself, is a file that will be refused."""
+    """Kind of an entry, or of what it leads to; a link to nowhere, or to itself, is a file that will be refused."""
     if entry.is_symlink():
         if os.path.isdir(entry.path):
             return "folder"

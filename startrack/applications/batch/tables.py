@@ -54,7 +54,7 @@ MANIFEST = file_schema(
 
 
 class Rows(NamedTuple):
-    """Rows of all images of a folder, and the number of results that have none."""
+    """Rows of all images of a folder, and the numbers of results without a row and of former solutions kept."""
 
     rows: list[Record]
     omitted: int  # stored results of other settings or contents, or of an attempt that failed
@@ -89,8 +89,8 @@ def write_tables(out: Path, records: Sequence[Record], settings: dict[str, Any])
 
     Args:
         out: folder of the results.
-        records: of the images.
-        settings: of the run, for the manifest.
+        records: those of the images.
+        settings: those of the run, for the manifest.
 
     Tables of an earlier run that this one does not make are removed. Returns the paths written; raises BadInput if
     one cannot be.
@@ -212,6 +212,7 @@ def tabled_results(out: Path) -> set[str] | None:
 
 
 def _manifest_images(out: Path) -> list[dict[str, Any]] | None:
+    """Images in the manifest of the folder `out`, without damaged entries; None if there is no manifest."""
     images = (read_json_object(out / MANIFEST_FILE) or {}).get("images")
     if not isinstance(images, list):
         return None

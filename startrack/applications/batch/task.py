@@ -1,4 +1,4 @@
-"""One image of a batch: located in any process, unless a valid result is there already."""
+"""Task of one image of a batch: located in any process, unless a valid result is there already."""
 
 from __future__ import annotations
 
@@ -110,6 +110,7 @@ def _valid_record(task: Task, key: str) -> dict[str, Any] | None:
 
 
 def _key(task: Task, sha256: str) -> str:
+    """Hash of all that decides the record, except the files that camera and terrain are read from."""
     settings, near_sky = task.settings, task.settings.identifier.near_sky
     near = () if settings.near is None else astuple(settings.near)
     pointing = (settings.near_attitude, None if near_sky is None else astuple(near_sky))
@@ -161,7 +162,7 @@ def read_task(task: Task) -> Exposure:
 
 
 def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str, str]]:
-    """A value with companions, or the record of a refusal without; and the hashes of camera and terrain files."""
+    """Outcome of a task, or the record of one that has no companions; and the hashes of camera and terrain files."""
     try:
         exposure = read_task(task)
     except BadInput as cause:

@@ -32,7 +32,7 @@ MIN_CHANCE_MATCHES = 0.5
 
 @dataclass(frozen=True)
 class Check:
-    """One condition of acceptance."""
+    """Condition of acceptance, and whether it is met."""
 
     name: str
     value: float
@@ -112,7 +112,7 @@ def rings_and_sectors(camera: Camera, points: Observations) -> tuple[Array, Ints
 
 
 def joint_log_p_value(joint: JointFit) -> float:
-    """Log-probability (natural) of as many matches by chance.
+    """Log-probability (natural) that chance gives as many matches as the `joint` fit has.
 
     The number expected by chance is measured by the same matching at certainly wrong attitudes.
     """
@@ -121,6 +121,7 @@ def joint_log_p_value(joint: JointFit) -> float:
 
 
 def _log_p_value(found: int, by_chance: Iterable[int]) -> float:
+    """Log-probability (natural) that chance gives as many as `found`, by the numbers at certainly wrong attitudes."""
     return log_p_value_poisson(found, max(float(np.mean(list(by_chance))), MIN_CHANCE_MATCHES))
 
 
@@ -207,7 +208,7 @@ def horizon_checks(joint: JointFit, catalog: StarCatalog, site: Site | None) -> 
     whole = tuple(replace(f, sky=sky_at(catalog, f.time_utc, None)) for f in joint.frames)
 
     def seen_below(rotation_rad: float) -> Bools:
-        """Whether the matched stars (n,) are below it."""
+        """Whether the matched stars (n,) are below the horizon, at attitudes rotated by an angle."""
         matches = zip(whole, _rotated_matches(joint, whole, rotation_rad), strict=True)
         return np.concatenate([is_below_horizon(f.sky.stars.rays_icrs[m.star], site, f.time_utc) for f, m in matches])
 

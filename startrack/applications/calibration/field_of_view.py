@@ -10,7 +10,7 @@ from startrack.identification import WIDE_FIELD_RAD
 
 
 def field_of_view_rad(camera: Camera | None, fov_rad: float | None) -> float:
-    """`fov_rad`, or the approximate camera's: of the image circle where that is wide, else across the frame's width.
+    """Field of view [rad]: `fov_rad`, else of the approximate camera: image circle if wide, else frame width.
 
     Raises BadInput no_calibration where there is neither.
     """
@@ -32,7 +32,7 @@ def corner_angle_rad(camera: Camera) -> float:
 
 
 def largest_angle_rad(fitted: Camera, start: Camera | None, fov_rad: float | None) -> float:
-    """Edge of the image circle: as given, else the frame's corner; at most the turning point of the polynomial."""
+    """Edge of the image circle [rad]: as given, else the corner; at most the turning point of the polynomial."""
     edge = corner_angle_rad(fitted) if start is None else start.max_angle_rad
     if start is None and fov_rad is not None and fov_rad >= WIDE_FIELD_RAD:
         edge = 0.5 * fov_rad

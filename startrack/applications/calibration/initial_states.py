@@ -108,11 +108,12 @@ class BoardState(State):
     position_cam: Array  # (images, 3) of the boards' origins [squares]
 
     def rays_cam(self, points: Observations) -> Array:
-        """Directions (n, 3) of the corners in their cameras' axes."""
+        """Unit vectors (n, 3) to the corners in the axes of their cameras."""
         corners = self._corners_cam(points)
         return np.asarray(corners / np.linalg.norm(corners, axis=1, keepdims=True))
 
     def _corners_cam(self, points: Observations) -> Array:
+        """Positions (n, 3) [squares] of the corners in the axes of their cameras."""
         rotated = np.einsum("nij,nj->ni", self.R_cam_icrs[points.image], points.rays_icrs)
         return np.asarray(rotated + self.position_cam[points.image])
 

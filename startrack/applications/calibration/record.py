@@ -74,6 +74,7 @@ def _fit_dict(what: str, fit: LensFit) -> dict[str, Any]:
 
 
 def _outcome(found: CheckedCamera, lens: dict[str, Any]) -> dict[str, Any]:
+    """Keys that all JSON objects of a calibration share, with what is known of the `lens`."""
     failed = found.failed_checks
     return {
         "format": CALIBRATION_FORMAT,
@@ -119,6 +120,7 @@ def board_line(found: BoardCalibration, name: str) -> str:
 
 
 def _line(found: CheckedCamera, name: str, fit: LensFit, images: int, of: str, what: str, arcmin: str = "") -> str:
+    """Summary in one line: verdict, used images (`of`), observations (`what`), errors, focal length, angle."""
     verdict = "ok" if found.accepted else f"refused {found.failed_checks[0].reason}"
     return (
         f"{name}  {verdict}  {images} of {images + len(found.refused)} {of}  {int(fit.used.sum())} {what}  "
@@ -133,7 +135,7 @@ def arcmin_per_px(camera: Camera) -> float:
 
 
 def image_rows(calibration: Calibration) -> list[dict[str, Any]]:
-    """What the JSON object says about each image that was used."""
+    """Rows of the JSON object, one for each image that was used."""
     fit, joint = calibration.joint.fit, calibration.joint
     rows = []
     for i, (frame, matched) in enumerate(zip(joint.frames, joint.matches, strict=True)):

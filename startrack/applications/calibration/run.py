@@ -56,6 +56,8 @@ class Calibration(CheckedCamera):
 
 
 class _IdentifiedFrame(NamedTuple):
+    """Frame with a camera and an attitude by its identified stars."""
+
     frame: Frame
     camera: Camera
     R_cam_icrs: Array
@@ -64,6 +66,8 @@ class _IdentifiedFrame(NamedTuple):
 
 @dataclass
 class _Run:
+    """State of a calibration: its settings, the identified frames and the images left out."""
+
     catalog: StarCatalog
     start: Camera | None
     fov_rad: float  # as stated, or of `start`
@@ -78,7 +82,7 @@ class _Run:
         return max(self.identified, key=lambda one: len(one.found))
 
     def refuse(self, image: str, cause: TooFewStars | NotIdentified) -> None:
-        """Leave an image out."""
+        """Leave out the image of this name because of a `cause`."""
         self.refused.append(RefusedImage(name=image, reason=cause.reason, message=str(cause)))
 
 
@@ -101,10 +105,10 @@ def calibrate(
         camera: approximate camera; None: `fov_rad` is needed.
         fov_rad: field of view to about 10 %. Below 100 degrees the angle across the frame's width, from there up that
             of the image circle.
-        site: on the Earth, for refraction and extinction; without it the lens contains the refraction. Pictures that
+        site: place on Earth, for refraction and extinction; without it the lens contains refraction. Pictures that
             a wrong time turns about the celestial pole against most others are left out.
         known_sensor: properties of the sensor that are known already.
-        name: of the camera.
+        name: name of the camera.
         progress: is called with a text at each step.
 
     A calibration that fails a check (`accepted` is False) must not be used.
@@ -143,7 +147,7 @@ def calibrate(
 
 
 def count_steps(images: int) -> int:
-    """How often `calibrate` calls its `progress` for so many `images`, if none is left out after the fit."""
+    """Number of calls of `progress` that `calibrate` makes for so many `images`, if none is left out after the fit."""
     return 2 * images + FINAL_ROUNDS + 1
 
 
@@ -161,6 +165,8 @@ def load_frame(exposure: Exposure, catalog: StarCatalog, site: Site | None, came
 
 
 def _frames(run: _Run, exposures: Sequence[Exposure]) -> list[Frame]:
+    """Frames of the `exposures` with their sources. Raises BadInput (size_mismatch), NotIdentified without any."""
+
     def load(exposure: Exposure) -> Frame | TooFewStars:
         wanted = (run.start or exposures[0]).size_px
         if exposure.size_px != wanted:
@@ -223,7 +229,7 @@ def _identify_all(run: _Run, frames: list[Frame]) -> None:
 
 
 def _identify_first(run: _Run, frame: Frame) -> _IdentifiedFrame:
-    """With the approximate lens, else without one; then the lens is grown outwards."""
+    """The `frame` identified with the approximate lens, else without one, its lens grown outwards."""
     run.progress(f"identifying the stars of {frame.exposure.name}")
     camera, found = run.start, None
     if camera is not None:
@@ -238,7 +244,7 @@ def _identify_first(run: _Run, frame: Frame) -> _IdentifiedFrame:
 
 
 def _stating_sky_of(frame: Frame, run: _Run, camera: Camera | None = None) -> AbstractContextManager[None]:
-    """`stating_sky` of a frame that is identified with a `camera`, or with the field of view alone."""
+    """Context in which a refusal of a `frame`, with a `camera` or a field of view alone, states its sky, too."""
     more = "" if run.site is None else "; check the site (signs) and the time"
     return stating_sky(frame.exposure, frame.sources, camera, run.catalog.v_mag, fov_rad=run.fov_rad, more=more)
 
@@ -283,7 +289,7 @@ def _fit_jointly(run: _Run) -> tuple[JointFit, tuple[Frame, ...]]:
 
 
 def _why_wrong(site: Site | None, joint: JointFit) -> dict[int, str]:
-    """The frames of the joint fit that must be left out, if others can stay, and why."""
+    """Reasons why frames of the joint fit, by their index, must be left out; none where all would be."""
     wrong = {
         k: (
             f"{100 * matched.fraction:.0f} % of its bright sources are stars, or of its bright stars sources, the "

@@ -87,6 +87,7 @@ def measure_sensor(joint: JointFit) -> SensorProperties:
 
 
 def _median_of_enough(values: Array) -> float | None:
+    """Median of the `values`; None where they are too few."""
     return float(np.median(values)) if len(values) >= MIN_WIDTHS else None
 
 
@@ -146,10 +147,11 @@ def _block_statistics(pair: tuple[Exposure, Exposure]) -> Array:
 
 
 def _row_statistics(a: Image, b: Image) -> Array:
-    """The same of a row of blocks; a row at a time stays in the processor's cache.
+    """Median levels [ADU] and variances of a pixel [ADU^2], (2, n), of a row of blocks of two frames.
 
-    The variance is that of differences between neighbouring pixels in the difference of the frames, which the slope of
-    the sky and the sensitivities of the pixels do not affect; clipping excludes the stars.
+    A row at a time stays in the processor's cache. The variance is that of differences between neighbouring pixels in
+    the difference of the frames, which the slope of the sky and the sensitivities of the pixels do not affect; clipping
+    excludes the stars.
     """
     side = len(a)
     one, other = (rows[:, : rows.shape[1] // side * side].reshape(side, -1, side).swapaxes(0, 1) for rows in (a, b))

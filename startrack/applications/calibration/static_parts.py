@@ -1,4 +1,4 @@
-"""What keeps its place in the image while the sky moves: lamps and dust, hot pixels, and what hides the sky."""
+"""Parts of the image that stay in place while the sky moves: lamps and dust, hot pixels, and what hides the sky."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def find_hot_pixels(joint: JointFit) -> Array | None:
 
 
 def _excess_sigmas(joint: JointFit, i: int) -> Array:
-    """How far each pixel (H, W) of frame `i` exceeds those around it, in sigmas of the noise; 0 at identified stars."""
+    """Excess (H, W) of the pixels of frame `i` over those around them, in sigmas of noise; 0 at identified stars."""
     import cv2
 
     frame = joint.frames[i]
@@ -99,7 +99,7 @@ class PredictedStars:
     found: Bools
 
     def once(self) -> PredictedStars:
-        """Each star once at each place, found if a frame shows it there."""
+        """Copy with each star once at each place, found if a frame shows it there."""
         key = np.column_stack([self.star, (self.xy_px // PLACE_PX).astype(np.int64)])
         places, first, place = np.unique(key, axis=0, return_index=True, return_inverse=True)
         found = np.bincount(place.ravel(), self.found, len(places)) > 0

@@ -76,12 +76,12 @@ class _Fit:
 
     @property
     def scatter_mag(self) -> float:
-        """Of the stars."""
+        """Robust standard deviation of the stars' residuals [mag]."""
         return float(robust_sigma(self.residual_mag, 0.0))
 
     @property
     def vignetting(self) -> tuple[float, float]:
-        """v1 and v2 of the relative throughput."""
+        """Coefficients v1 and v2 of the relative throughput 1 + v1 a^2 + v2 a^4 at an angle a off the axis."""
         return _vignetting(self.values, self.edge_rad)
 
 
@@ -195,7 +195,7 @@ def _star_fluxes(joint: JointFit) -> StarFluxes:
 
 
 def _vignetting(values: dict[str, float], edge_rad: float) -> tuple[float, float]:
-    """v1, v2 of the relative throughput 1 + v1 a^2 + v2 a^4 from its values at a^2 = edge^2 / 2 and edge^2."""
+    """Coefficients v1, v2 of the throughput 1 + v1 a^2 + v2 a^4 by its values at a^2 = edge^2 / 2 and edge^2."""
     middle, edge, u = values["middle"], values["edge"], edge_rad**2
     return (4.0 * middle - edge - 3.0) / u, (2.0 + 2.0 * edge - 4.0 * middle) / u**2
 

@@ -46,7 +46,7 @@ class Verification:
 
     @property
     def message(self) -> str:
-        """Why the file cannot be used, and what to do; empty where it can."""
+        """Reason why the file cannot be used, and what to do; empty where it can."""
         if self.is_valid:
             return ""
         if self.has_site and self.file_has_site is False:
@@ -61,7 +61,7 @@ class Verification:
 
     @property
     def warnings(self) -> list[str]:
-        """What an accepted comparison leaves open: whether both lenses are with the refraction of the air."""
+        """Warning of an accepted comparison where one of both lenses may contain the refraction of the air."""
         if not self.is_valid or self.file_has_site == self.has_site or (self.has_site and self.file_has_site is None):
             return []
         made = {True: "with", False: "without", None: "perhaps with"}[self.file_has_site]

@@ -1,4 +1,4 @@
-"""How probable it is that a measured edge is a cloud's, in front of a lower skyline.
+"""Probability that a measured edge is a cloud's, in front of a lower skyline.
 
 A cloud's edge is as sharp and as long as a skyline, and every column of azimuth shows it alike: columns are no
 independent witnesses of which edge is the skyline. A picture's sky above the skyline shows how many such edges it has.
@@ -71,8 +71,8 @@ def cloud_probability(
     Stars missing behind the edge say that it is ground's, unless one cloud hides them all, and so does darkness.
 
     Args:
-        steps: of the picture, in the widest averages of single pixels (CLOUD_STEPS).
-        stars: of the picture.
+        steps: steps of the picture, in the widest averages of single pixels (CLOUD_STEPS).
+        stars: stars of the picture.
         skyline_rad: elevations (AZIMUTH_COLUMNS,) of the edge.
         elevation_rad: (SKYLINE_AZIMUTHS,) of the edge in each bin; infinite or nan ones have no meaning.
         lowest_rad: the lowest elevation that the skyline may have.

@@ -122,7 +122,7 @@ def sample_columns(
 def image_points(
     camera: Camera, R_cam_enu: Array, azimuth_rad: NDArray[np.floating[Any]], elevation_rad: NDArray[np.floating[Any]]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], Bools]:
-    """Where directions are in the image: x and y [px] as OpenCV takes them, and which are in view.
+    """Pixels x and y of directions as OpenCV takes them, and which directions are in view.
 
     `azimuth_rad` and `elevation_rad` have shapes that broadcast to that of the results; `R_cam_enu` is (3, 3).
     """

@@ -47,7 +47,7 @@ class LeftOut:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SkyFrame:
-    """One photograph with its attitude above the horizon, and the catalogue in apparent directions."""
+    """Photograph with its attitude above the horizon, and the catalogue in apparent directions."""
 
     name: str
     detections: Detections
@@ -77,7 +77,7 @@ def orient_frames(
     fov_rad: float | None,
     progress: Progress = lambda text: None,
 ) -> tuple[tuple[SkyFrame, ...], tuple[LeftOut, ...]]:
-    """The `exposures` at the `site` with identified stars of the `catalog`, and those without, or of another attitude.
+    """Frames of `exposures` at the `site` by stars of the `catalog`, and those left out: no stars, or another attitude.
 
     The lens is that of `camera`, or found from `fov_rad`, and then fitted to the stars of all frames in their apparent
     directions. `progress` is called with a text at each step. Raises BadInput (no_time, no_calibration, size_mismatch,
@@ -139,11 +139,12 @@ def orient_frames(
 
 
 def _attitudes(identified: Sequence[Oriented]) -> Array:
+    """Attitudes R_cam_icrs (n, 3, 3) of n exposures."""
     return np.stack([one.attitude_fit.attitude.R_cam_icrs for one in identified])
 
 
 def _require_above_horizon(one: Oriented, site: Site) -> None:
-    """Raises BadInput (inconsistent_evidence) where more identified stars than wrong names are below the horizon."""
+    """Raise BadInput (inconsistent_evidence) where more identified stars than wrong names are below the horizon."""
     rays, time_utc = one.stars.rays_icrs[one.identification.star], require_time(one.exposure)
     below = int(np.count_nonzero(is_below_horizon(rays, site, time_utc)))
     field = cap_grid(one.camera.max_angle_rad) @ one.attitude_fit.attitude.R_cam_icrs

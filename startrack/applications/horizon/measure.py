@@ -1,4 +1,4 @@
-"""From photographs of the night sky to the skyline of a fixed camera."""
+"""Skyline of a fixed camera by photographs of the night sky."""
 
 from __future__ import annotations
 
@@ -66,9 +66,9 @@ class SkylineResult:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredFrame:
-    """One frame: its light, its skyline, and its log-likelihoods.
+    """Frame with its light, its skyline, and its log-likelihoods.
 
-    By its stars (AZIMUTH_COLUMNS, n), and by its steps (KINDS, AZIMUTH_COLUMNS, n).
+    `by_stars` (AZIMUTH_COLUMNS, n) are those of its stars, `by_steps` (KINDS, AZIMUTH_COLUMNS, n) those of its steps.
     """
 
     frame: SkyFrame
@@ -131,7 +131,7 @@ def skyline_of_frames(measured: Sequence[MeasuredFrame], site: Site) -> Measured
 
 
 def measure_frame(frame: SkyFrame, site: Site) -> MeasuredFrame:
-    """What one `frame` shows of the skyline at a `site`."""
+    """Light, skyline and log-likelihoods of one `frame` at a `site`."""
     check_time()
     stars = measure_stars(frame)
     check_time()
@@ -221,7 +221,7 @@ def _higher_skyline(stars: Sequence[StarLight], mean: Array) -> tuple[Array, Arr
 
 
 def _gap_depth(steps: Sequence[list[Steps]], elevation_rad: Array) -> Array:
-    """How far (SKYLINE_AZIMUTHS,) below the skyline light is seen again, as through a tree with gaps."""
+    """Depth (SKYLINE_AZIMUTHS,) [rad] below the skyline at which light is seen again, as through a tree with gaps."""
     depth = np.zeros(AZIMUTH_COLUMNS)
     for one in (one for by_width in steps for one in by_width[:2]):
         below = elevation_rad[one.column] - one.elevation_rad
@@ -232,7 +232,7 @@ def _gap_depth(steps: Sequence[list[Steps]], elevation_rad: Array) -> Array:
 
 
 def _columns_of_bins(values: Array, beside: int) -> Array:
-    """The values (AZIMUTH_COLUMNS,) of the columns of each bin and of so many `beside` it, (SKYLINE_AZIMUTHS, n)."""
+    """Array (SKYLINE_AZIMUTHS, n) of the `values` (AZIMUTH_COLUMNS,) in each bin and in so many columns `beside` it."""
     own = np.arange(-beside, COLUMNS_PER_AZIMUTH + beside)
     return values[(np.arange(0, AZIMUTH_COLUMNS, COLUMNS_PER_AZIMUTH)[:, None] + own) % AZIMUTH_COLUMNS]
 
@@ -274,7 +274,7 @@ def _has_step(steps: Sequence[list[Steps]], elevation_rad: Array) -> Bools:
 def skyline_at(skyline: MeasuredSkyline, azimuth_rad: Array) -> Array:
     """Elevations (n,) [rad] of a `skyline` at azimuths (n,), interpolated between two known ones.
 
-    Beside an unknown one that of the nearest azimuth; not a number where that is unknown.
+    Beside an unknown one it is the elevation at the nearest azimuth; nan where that is unknown.
     """
     n = len(skyline)
     place = np.asarray(azimuth_rad) * (n / (2 * np.pi))
@@ -285,7 +285,7 @@ def skyline_at(skyline: MeasuredSkyline, azimuth_rad: Array) -> Array:
 
 
 def _nearest_bin(n: int, azimuth_rad: Array) -> Ints:
-    """Which of `n` azimuths around the compass is the nearest to each of (m,)."""
+    """Index (m,) of the nearest of `n` even azimuths around the compass to each of `azimuth_rad` (m,)."""
     return np.asarray(np.rint(np.asarray(azimuth_rad) * (n / (2 * np.pi))).astype(np.int64) % n)
 
 

@@ -98,9 +98,9 @@ def limit_llr(llr: Array, missing: Array, spurious: float) -> Array:
 
 
 def sky_likelihood_ratio(log_ratio: Array) -> Array:
-    """Likelihood (...) of the brightness below a step over that above, for a step in the sky against the skyline's.
+    """Likelihood ratio (...) of a step within the sky to one at the skyline, by the light below it over that above.
 
-    `log_ratio`: its logarithm.
+    `log_ratio` (...): the logarithm of light below over light above.
     """
     size = np.abs(log_ratio)
     in_sky = np.exp(-size / SKY_LOG_SCALE) / SKY_LOG_SCALE
@@ -121,7 +121,7 @@ def _skyline_likelihoods(contrast: Array) -> tuple[Array, Array, Array]:
 
 
 def steps_at(steps: Steps, skyline_rad: Array) -> Steps:
-    """Those of the steps at a skyline (AZIMUTH_COLUMNS,) [rad] that are more likely its own, of any kind, than noise.
+    """Steps at a skyline (AZIMUTH_COLUMNS,) [rad] that are more likely its own, of any kind, than noise.
 
     White noise has such steps at 1 of 100 bins, and steps within NEAR_EDGE_RAD at 17.
     """
@@ -133,9 +133,9 @@ def steps_at(steps: Steps, skyline_rad: Array) -> Steps:
 
 
 def add_step_log_likelihood(total: NDArray[np.float32], steps: Steps, temper: float) -> None:
-    """Add that of an image's steps of light, times `temper`, to the log-likelihood `total` (KINDS, AZIMUTH_COLUMNS, n).
+    """Add the log-likelihood of an image's steps of light, times `temper`, to `total` (KINDS, AZIMUTH_COLUMNS, n).
 
-    It is of each kind of ground: darker than the sky above it, brighter, or hardly either.
+    It is that of each kind of ground: darker than the sky above it, brighter, or hardly either.
     """
     noise, contrast = _noise_density(steps), np.abs(steps.contrast)
     usual = np.minimum(contrast / WEAKEST_CONTRAST, 1.0) ** 2

@@ -1,4 +1,4 @@
-"""Where the sky's light stops: steps of the brightness along columns of constant azimuth, to a part of a pixel.
+"""Steps at which the sky's light stops: of the brightness along columns of constant azimuth, to a part of a pixel.
 
 At a step the brightness below departs from the sky's, extrapolated from above. Ground may be darker or brighter. A step
 need not be the skyline: trees have inner edges, the sky has clouds and reflections. The posterior weighs them.
@@ -56,7 +56,7 @@ SKY_LEVEL_PX = 3.0  # above the edge: where the sky's level is taken; below, haz
 
 @dataclass(frozen=True)
 class Steps:
-    """Steps of the brightness (n), from all columns."""
+    """Steps (n) of the brightness, from all columns."""
 
     column: Ints
     elevation_rad: Array
@@ -80,7 +80,7 @@ def find_steps(frame: SkyFrame, stars: StarLight) -> list[Steps]:
 
 @dataclass(frozen=True)
 class Contrasts:
-    """What the light below every sample (k, columns) of averaged columns is beside that above it."""
+    """Contrast of the light below every sample (k, columns) of averaged columns to that above it."""
 
     columns: Columns
     below_e: Array
@@ -182,7 +182,7 @@ def _measure_edges(columns: Columns, row: Ints, column: Ints, noise: Array) -> t
 def _fill_below(light: Array, half: int) -> tuple[Array, Array]:
     """Samples (n, 2 half + 1) with their part below the view at the level of the lowest ground in view.
 
-    Also the depth (n,) of the view below the middle [px].
+    Then the depth (n,) [px] of the view below the middle.
     """
     first = np.minimum(np.argmax(np.isfinite(light), axis=1), half)
     lowest = first[:, None] + np.arange(LEVEL_PX * COLUMN_SAMPLES)
@@ -194,7 +194,7 @@ def _fill_below(light: Array, half: int) -> tuple[Array, Array]:
 def _weigh_edges(light: Array, half: int, noise_e: Array) -> tuple[Array, Ints, Array]:
     """Posterior (widths, places, n) of the edges in samples (n, 2 half + 1), and the index of each best one (n,).
 
-    Also by how many sigma (n,) it explains them better than a smooth course.
+    Then by how many sigma (n,) the best edge explains them better than a smooth course.
     """
     total = np.sum(np.square(light), axis=1)
     rest = np.stack([

@@ -39,7 +39,7 @@ class StarLight:
 
 
 def measure_stars(frame: SkyFrame) -> StarLight:
-    """Every catalogue star in view of a frame."""
+    """Light of every catalogue star in view of a `frame`, and the pixels of bright stars."""
     camera = replace(frame.camera, sensor=None, calibrated_angle_rad=frame.camera.max_angle_rad)
     stars = frame.sky.stars
     air = airmass(azel_from_rays(stars.rays_icrs @ frame.R_enu_icrs.T)[1])

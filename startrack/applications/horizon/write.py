@@ -57,7 +57,7 @@ def output_files(output: str) -> tuple[Path, ...]:
 def check_outputs(*outputs: str, overwrite: bool) -> None:
     """Raise BadOutput for one of the `outputs` of an unknown suffix, that takes no files, or has the path of another.
 
-    And for one that exists, if `overwrite` is False.
+    It is raised for a file that exists, too, if `overwrite` is False.
     """
     files = [path for output in outputs for path in output_files(output)]
     for path in files:
@@ -117,7 +117,7 @@ def _landscape_files(
 
 
 def csv_text(skyline: MeasuredSkyline) -> str:
-    """One row a degree; where the skyline is unknown its numbers are empty, and `is_measured` is 0."""
+    """CSV text, a row for each degree; where the skyline is unknown its numbers are empty, and `is_measured` is 0."""
     is_measured = [str(int(known)) for known in skyline.known]
     columns = *skyline_texts_deg(skyline), is_measured, skyline.source.tolist(), cloud_texts(skyline)
     head = "azimuth_deg,elevation_deg,sigma_deg,is_measured,source,cloud_probability"
@@ -126,7 +126,7 @@ def csv_text(skyline: MeasuredSkyline) -> str:
 
 
 def nina_text(skyline: MeasuredSkyline) -> str:
-    """Lines "azimuth altitude" in degrees from 0 to 360, as N.I.N.A. reads them (# begins a comment)."""
+    """Text of lines "azimuth altitude" in degrees from 0 to 360, as N.I.N.A. reads them (# begins a comment)."""
     rows = _rows(skyline, interpolate_unknown(skyline), "{:g} {:.3f}")
     return "\n".join([*rows, f"360 {rows[-len(skyline)].split()[1]}"]) + "\n"
 

@@ -34,7 +34,7 @@ BELOW_LIMIT_MAG = 3.0  # below the limit at 5 sigma: fainter stars add 2 % to th
 
 
 class Status(IntEnum):
-    """Of a draw."""
+    """Status of a draw: one position, several, or none."""
 
     OK = 0
     AMBIGUOUS = 1
@@ -43,7 +43,7 @@ class Status(IntEnum):
 
 @dataclass(frozen=True)
 class Conditions:
-    """What is predicted: small, so that it is cheap to send to a worker."""
+    """Conditions of a prediction: small, so that they are cheap to send to a worker."""
 
     camera: str  # file, or the name of a shipped one
     terrain: str
@@ -101,7 +101,7 @@ class Predictor:
 
     @cached_property
     def limiting_v_mag(self) -> float:
-        """Magnitude of a star on the axis at 5 sigma."""
+        """Magnitude V of a star on the axis at 5 sigma."""
         sky = self.conditions.sky_v_mag_arcsec2
         return limiting_v_mag(self.camera, sky, exposure_s=self.exposure_s)
 
@@ -113,7 +113,7 @@ class Predictor:
 
     @cached_property
     def faintest_v_mag(self) -> float:
-        """Of the stars in the sky."""
+        """Magnitude V of the faintest stars in the sky."""
         return min(FAINTEST_V_MAG, self.limiting_v_mag + BELOW_LIMIT_MAG)
 
     @cached_property
@@ -133,7 +133,7 @@ class Predictor:
         return {"status": status.astype(np.int8)} | dict(zip(LOCATED, values, strict=True))
 
     def _draw_one(self, place: Place, draw: int) -> tuple[Status, float, Array, Array, float]:
-        """Row `draw`."""
+        """Status, 95 % radius [m], covariance (2, 2) [m2], offset (2,) [m], protection level [m] of a `draw`."""
         series = replace(self._series[draw], east_m=place.east_m, north_m=place.north_m)
         if draw not in self._skies:
             self._skies[draw] = series.draw_sky(self.conditions.times_utc[draw])
@@ -157,6 +157,7 @@ class Predictor:
         return Status.OK, fix.radius95_m, fix.covariance_m2, (fix.position_enu_m - scene.position_enu_m)[:2], level_m
 
     def _series_of(self, draw: int, catalog: StarCatalog, faint_v_mag: float | None) -> Series:
+        """Exposures of a draw under the stars of `catalog` and random ones to `faint_v_mag`; None: no random ones."""
         conditions = self.conditions
         return Series(
             camera=self.camera, terrain=self.terrain, catalog=catalog, seed=MAX_COUNT * conditions.seed + draw,

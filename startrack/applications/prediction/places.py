@@ -107,7 +107,7 @@ def area_cells(terrain: Terrain, spacing_m: float) -> AreaCells:
 
 
 def default_spacing_m(terrain: Terrain) -> float:
-    """At most a tenth of the width [m] of a `terrain`'s search area, a nice number."""
+    """Spacing [m] of cells: a nice number, at most a tenth of the width of a `terrain`'s search area."""
     return nice_step(2 * terrain.search_radius_m / DEFAULT_CELLS_ACROSS)
 
 

@@ -20,7 +20,7 @@ UNKNOWN = "over the places; null: half of the places or more have no radius"
 
 
 def _cell(name: str, unit: str, description: str, form: str = "%.6g") -> output.Quantity:
-    """A quantity of places, a band and a column."""
+    """Quantity of places: a band of predict.tif, a column of predict.ecsv."""
     return output.Quantity(name, unit, dict, itemgetter(name), description, "number", form=form)
 
 
@@ -59,6 +59,7 @@ def median_or_none(radius_m: Array) -> float | None:
 
 
 def _error_ratio(cells: Cells) -> float | None:
+    """Root mean square over the places of the ratios of errors to stated ones; None where no place has one."""
     ratio = cells[ERROR_RATIO]
     return float(np.sqrt(np.nanmean(np.square(ratio)))) if np.isfinite(ratio).any() else None
 

@@ -1,4 +1,4 @@
-"""What a prediction found, as a record, as lines of text, and as files: predict.json, .tif, .ecsv and .png."""
+"""Results of a prediction as a record, as lines of text, and as files: predict.json, .tif, .ecsv and .png."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ SETTINGS = ("kind", "terrain", "camera", "first_time_utc", "last_time_utc", "spa
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What is predicted: the `points` under the `conditions`, on the `terrain` that these name."""
+    """Plan of a prediction: the `points` under the `conditions`, on the `terrain` that these name."""
 
     conditions: Conditions
     terrain: Terrain
@@ -63,7 +63,7 @@ class Plan:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What was predicted, without results."""
+        """Settings of the prediction for its record, without results."""
         predictor, times = predictor_of(self.conditions), self.conditions.times_utc
         return {
             "format": FORMAT,
@@ -85,7 +85,7 @@ class Plan:
     def check_folder(self, out: Path, *, overwrite: bool) -> None:
         """Raise BadOutput if `out` holds a prediction of other places, cameras or times and not `overwrite`.
 
-        Also where one of the files' names is taken by what is no regular file.
+        It is raised, too, where a name of its files is taken by what is no regular file.
         """
         for name in sorted(PREDICTION_FILES):
             check_regular(out / name)
@@ -113,7 +113,7 @@ class Report:
     ) -> Report:  # fmt: skip
         """The report with the predictions: `cells` of the `plan`, and `others` to compare with.
 
-        `depth` and `odometry` are as of the report; the cells get those along the path with odometry here.
+        `depth` is the record of the search for a depth; with `odometry` the cells get the radii by images and odometry.
         """
         variants = []
         for other, found in others.items():
@@ -202,7 +202,7 @@ def write_report(report: Report, out: Path, *, plots: bool) -> list[Path]:
 
 
 def _table(report: Report) -> str:
-    """One row a place; with the distance along the path, if there is one."""
+    """ECSV text with a row for each place, and with the distance along the path, if there is one."""
     points, site, (east_m, north_m) = report.plan.points, report.plan.terrain.site, report.plan.points.position_m.T
     values = {**report.cells, "east_m": east_m, "north_m": north_m}
     if isinstance(points, PathPoints):
@@ -216,7 +216,7 @@ def _table(report: Report) -> str:
 
 
 def _comparison_table(variants: list[dict[str, Any]]) -> str:
-    """One row a camera and exposure: the summary of the same places."""
+    """ECSV text with a row for each camera and exposure: the summary of the same places."""
     rows = [{**one, **one["summary"]} for one in variants]
     columns = [
         output.Column("camera", datatype="string", path=("camera",)),

@@ -1,4 +1,4 @@
-"""From places to predictions on a store of draws: the quantities of places, and those along a path with odometry."""
+"""Predictions at places by a store of draws: the quantities of places, and those along a path with odometry."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ class Predictions:
     def depth(self, conditions: Conditions, target_m: float) -> tuple[Conditions, dict[str, Any]]:
         """The shortest exposure whose radius is at most `target_m` at nine of ten places; and the record of the search.
 
-        By magnitudes one by one, as deep images cost most, then by bisection of the last one. The conditions returned
+        It tries magnitudes one by one, as deep images cost most, then bisects the last one. The conditions returned
         have that exposure, or the longest tried.
         """
         low, deepest = DEPTH_V_MAG
@@ -192,7 +192,7 @@ class Prediction:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """As in predict.json."""
+        """Summary over the positions, by the keys of the summary in predict.json."""
         return summarize_cells(self.cells)
 
 

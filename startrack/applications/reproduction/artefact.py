@@ -51,7 +51,7 @@ class Size:
     compared_series: int  # places of a ground with many exposures
 
     def limit_our_positions(self, most: int) -> Size:
-        """This size with our method on at most `most` positions per starfield, ten times as many in figure 3.10."""
+        """Copy with our method on at most `most` positions per starfield, ten times as many in figure 3.10."""
         per_sky = {name: min(getattr(self, name), most) for name in ("ours_per_sky", "bound_per_sky", "deep_per_sky")}
         return replace(self, **per_sky, ours_one_sky=min(self.ours_one_sky, 10 * most))
 
@@ -98,7 +98,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Artefact:
-    """One reproduced table or figure of the thesis."""
+    """Reproduced table or figure of the thesis."""
 
     name: str  # such as "fig3.7"
     title: str

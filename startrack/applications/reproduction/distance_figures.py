@@ -32,7 +32,7 @@ VIEWS = f"views compared at every {STEP_M:.0f} m"
 
 
 def fig3_7(context: Context) -> Artefact:
-    """Distance between changes against the faintest magnitude."""
+    """Figure 3.7: distance [m] between changes of the visible stars, against the faintest magnitude."""
     curves = np.array([_gaps(context, magnitude, ASPECT_RATIO) for magnitude in MAGNITUDES])
     six = curves[int(np.argmin(np.abs(MAGNITUDES - MAGNITUDE)))].mean(axis=0)
     detail = (
@@ -76,7 +76,7 @@ def fig3_9(context: Context) -> Artefact:
 
 
 def fig3_8(context: Context) -> Artefact:
-    """Distance between changes along one traverse."""
+    """Figure 3.8: distance [m] between changes of the visible stars along one traverse."""
     cylinder = crater()
     changes = change_steps_m(changes_m(Sky.draw(context.seed, 0), cylinder), cylinder)
     gaps, middles = gaps_m(changes, cylinder), (changes[1:] + changes[:-1]) / 2
@@ -153,7 +153,7 @@ def _draw_panels(figure: Figure, x: Array, curves: Array, standard: float, tops:
 
 
 def fig_a2(context: Context) -> Artefact:
-    """Aspect ratios of lunar craters by diameter."""
+    """Figure A.2: aspect ratios of lunar craters by diameter."""
     simple, complex_ = np.linspace(0.5, 15, 59), np.linspace(12, 275, 264)
     # Depths: eq. 3.11 and 3.12 of Kua 2008, from the Lunar Sourcebook.
     ratios = simple / (0.196 * np.power(simple, 1.010)), complex_ / (1.044 * np.power(complex_, 0.301))

@@ -30,7 +30,7 @@ SWEEP_METHODS = ("hull", "pseudo-gradient", "ours", "limit")
 
 
 def fig3_4(context: Context) -> Artefact:
-    """Error of the skyline estimate over the crater."""
+    """Figure 3.4: error of the skyline estimate over the crater."""
     count = context.size.one_sky
     hull, _ = collect_errors(context, "fig 3.4", KUA, 1, count)
     caption = (
@@ -50,7 +50,7 @@ def fig3_4(context: Context) -> Artefact:
 
 
 def fig3_10(context: Context) -> Artefact:
-    """Error of the pseudo-gradient over the crater, and ours."""
+    """Figure 3.10: error of the pseudo-gradient over the crater, and ours."""
     size = context.size
     hull, descent = collect_errors(context, "fig 3.10", KUA, 1, size.one_sky)
     (ours,) = collect_errors(context, "fig 3.10, ours", OURS, 1, size.ours_one_sky)

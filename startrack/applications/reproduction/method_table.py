@@ -32,27 +32,27 @@ def method_table(context: Context) -> Artefact:
 
 
 def map_table(context: Context) -> Artefact:
-    """The same on the map of Shackleton, by the methods that do not need a round crater."""
+    """Errors of the methods that do not need a round crater, on the map of Shackleton."""
     title, places = "Methods that the thesis names on the map of Shackleton", "places of the map of Shackleton"
     tasks = _tasks_on(context, MAP_GROUND, context.size.compared_on_map)
     return _compare(context, "methods.shackleton", tasks, title, places, "the circle in which the places lie")
 
 
 def valley_table(context: Context) -> Artefact:
-    """The same in valleys of the Earth, by the methods that need neither a round crater nor the Moon."""
+    """Errors of the methods that need neither a round crater nor the Moon, in valleys of the Earth."""
     title, places = "Methods that the thesis names in valleys of the Earth", "places in valleys near Jacksboro"
     tasks = _tasks_on(context, VALLEY_GROUND, context.size.compared_in_valley)
     return _compare(context, "methods.valley", tasks, title, places, "a circle of the size of Shackleton")
 
 
 def _tasks_on(context: Context, ground: str, places: int) -> list[Task]:
-    """One place of a `ground` under each of so many skies."""
+    """Tasks of one place of a `ground` under each of as many skies as `places`."""
     more = {"ground": ground, "series_every": _series_every(context, places)}
     return [task for sky in range(places) for task in tasks_of(ALL_METHODS, context.seed, sky, 1, **more)]
 
 
 def _series_every(context: Context, places: int) -> int:
-    """One place in so many has series of exposures."""
+    """Number of places of which one has series of exposures."""
     return -(-places // context.size.compared_series)
 
 
@@ -123,12 +123,12 @@ def _cells(method: ComparedMethod, one: dict[str, Any], tried: int) -> list[str]
 
 
 def _mean(one: dict[str, Any]) -> str:
-    """A mean with its standard error; a dash without an answer."""
+    """Text of a mean with its standard error; a dash without an answer."""
     return "-" if not one["count"] else f"{_number(one['mean_m'])} ± {_number(one['mean_sigma_m'])}"
 
 
 def _number(value: float | None) -> str:
-    """Three digits; a dash for what is not known."""
+    """Text of a value with about three digits; a dash for what is not known."""
     return "-" if value is None else f"{value:.{0 if value >= 100 else 1 if value >= 10 else 2}f}"
 
 

@@ -59,7 +59,7 @@ class Task:
 
     @property
     def key(self) -> str:
-        """Of its chunk."""
+        """Hash of all that decides the chunk: fields, sources and version."""
         more = COMPARED_SOURCES if self.method == ALL_METHODS else ()
         return settings_digest(FIX_SOURCES + more, asdict(self))
 
@@ -81,8 +81,7 @@ def fix_store(out: Path, *, jobs: int, progress: Progress, cluster: str | None =
 
 
 def compute_chunk(task: Task) -> Chunk:
-    """Arrays over the task's positions: `truth_m` (n, 2), the method's own, and `seconds` (1,) of processor time for
-    the method.
+    """Arrays over the positions of a `task`: `truth_m` (n, 2), the method's own, and its processor time `seconds` (1,).
 
     kua: `hull_m`, `refined_m` (n, 2), `settled` (n,). ours: `located` (n,), and of the located ones `fix_m` (m, 2).
     bound: `centroid_m` (n, 2). all: see `compare_places`.
@@ -120,6 +119,7 @@ def compute_chunk(task: Task) -> Chunk:
 
 
 def _solve_kua(points: Array, seen: list[Bools], cylinder: Cylinder) -> Chunk:
+    """Estimates (n, 2) [m] by hull and by pseudo-gradient of the `seen` stars, and whether this settled (n,)."""
     hull = np.stack([hull_position(points[one], cylinder.wall_m, cylinder.radius_m) for one in seen])
     ends = [descend(points, one, first, cylinder.radius_m) for one, first in zip(seen, hull, strict=True)]
     refined, settled = zip(*ends, strict=True)
@@ -142,7 +142,7 @@ class MethodErrors:
 
     @property
     def refused_count(self) -> int:
-        """Positions without an estimate; for the pseudo-gradient, with one that never settled."""
+        """Number of positions without an estimate; for the pseudo-gradient, of those where it never settled."""
         return int(sum((~one).sum() for one in self.answered))
 
     @property
@@ -162,7 +162,7 @@ def error_statistics(errors_m: Array) -> dict[str, float]:
 
 
 def format_errors(errors_m: Array, form: str = "{:.1f} / {:.1f} / {:.1f}") -> str:
-    """Mean / standard deviation / largest."""
+    """Text "mean / standard deviation / largest" of errors (n,) [m], in a `form`."""
     return form.format(errors_m.mean(), errors_m.std(), errors_m.max())
 
 

@@ -1,4 +1,4 @@
-"""What the thesis proposes and does not try: a grid where the descent wanders, skyline stars, a real crater's floor."""
+"""Proposals that the thesis makes and does not try: a grid where the descent wanders, skyline stars, a real floor."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class Row:
 
     @property
     def errors_m(self) -> Array:
-        """Where there is an answer (m,)."""
+        """Errors (m,) [m] of the places where there is an answer."""
         return self.drawn_m[np.isfinite(self.drawn_m)]
 
     def cells(self) -> list[str]:
-        """Of the table."""
+        """Texts of the row in the table."""
         errors, found = self.errors_m, error_statistics(self.errors_m)
         mean = f"{found['mean_m']:.1f} ± {errors.std(ddof=1) / np.sqrt(len(errors)):.1f}"
         refused = f"{len(self.drawn_m) - len(errors)} of {len(self.drawn_m)}"
@@ -52,7 +52,7 @@ class Row:
 
 
 def proposals(context: Context) -> Artefact:
-    """Each proposal beside the thesis's own method, at the same places."""
+    """Table of the errors of each proposal and of the thesis's own method, at the same places."""
     rows = [
         one for one in (*_wandering(context), *_behind_obstacle(context), *_real_floor(context)) if len(one.errors_m)
     ]
@@ -71,7 +71,7 @@ def proposals(context: Context) -> Artefact:
 
 
 def _wandering(context: Context) -> Iterator[Row]:
-    """Page 12: a grid of points about the estimate where the descent wanders."""
+    """Rows for page 12: a grid of points about the estimate where the descent wanders."""
     cylinder = simulator.crater()
     ends, best, settled = [], [], []
     for sky in range(context.size.skies):
@@ -103,11 +103,12 @@ def best_of_grid(points_m: Array, seen: Bools, end_m: Array, radius_m: float) ->
 
 
 def _descend_from_hull(points_m: Array, seen: Bools, wall_m: float, radius_m: float) -> tuple[Array, bool]:
+    """End (2,) [m] of a descent that begins at the estimate by the hull, and whether it settled."""
     return descend(points_m, seen, hull_position(points_m[seen], wall_m, radius_m), radius_m)
 
 
 def _behind_obstacle(context: Context) -> Iterator[Row]:
-    """Page 21: stars along the skyline only, where something on no map hides a part of the sky."""
+    """Rows for page 21: stars along the skyline only, where something on no map hides a part of the sky."""
     cylinder = simulator.crater()
     wall_m, radius_m = cylinder.wall_m, cylinder.radius_m
     errors: dict[str, list[float]] = {}
@@ -161,7 +162,7 @@ def descend_by_skyline(points_m: Array, seen: Bools, start_m: Array, radius_m: f
 
 
 def _real_floor(context: Context) -> Iterator[Row]:
-    """Page 24: the simplified crater on the map of a real floor."""
+    """Rows for page 24: the simplified crater on the map of a real floor."""
     centre, radius_m, rim_m = simplify_crater(terrain_of(REAL_GROUND))
     errors: dict[str, list[float]] = {}
     away = []

@@ -1,4 +1,4 @@
-"""One place in a crater, on a map or in a valley, and what can be measured there: stars, skylines, a picture."""
+"""Place in a crater, on a map or in a valley, and what can be measured there: stars, skylines, a picture."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PICTURE_V_MAG = 9.0  # of the faintest stars rendered: three magnitudes below th
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """One place on a ground with all that can be measured there, each drawn when it is first used."""
+    """Place on a ground with all that can be measured there, each drawn when it is first used."""
 
     seed: int
     sky_number: int
@@ -76,7 +76,7 @@ class Scene:
 
     @cached_property
     def evidence(self) -> Evidence:
-        """Of the list of stars."""
+        """Evidence of the stars in sight as a list without mistakes."""
         return PERFECT.evidence(self.sky, self.seen)
 
     @cached_property
@@ -98,6 +98,7 @@ class Scene:
 
     @cached_property
     def lit(self) -> MeasuredSkyline:
+        """The skyline in sunlight with the true heading."""
         return lit_skyline(self.truth_m, self.terrain, rng=self.draws(Stream.LIT))
 
     @cached_property
@@ -121,10 +122,12 @@ class Scene:
 
     @cached_property
     def bounded_lit(self) -> BoundedPosition:
+        """Mean position by the skyline in sunlight, with bounds. Raises NotLocated."""
         return locate_by_posterior(self.lit, self.grid)
 
     @cached_property
     def bounded_dark(self) -> BoundedPosition:
+        """Mean position by the skyline of the picture, with bounds. Raises NotLocated."""
         return locate_by_posterior(self.dark, self.grid)
 
     @cached_property

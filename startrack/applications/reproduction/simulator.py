@@ -74,7 +74,7 @@ class Sky:
 
     @classmethod
     def draw(cls, seed: int, sky: int, magnitude: float = MAGNITUDE) -> Sky:
-        """phi = 2 pi r1, theta = arcsin r2, r1 and r2 uniform over [0, 1]: eq. 3.9 and 3.10."""
+        """Starfield number `sky` of a `seed`: phi = 2 pi r1, theta = arcsin r2, r1 and r2 uniform: eq. 3.9 and 3.10."""
         r1, r2 = _draw_uniform([seed, Stream.STARS, sky], (star_count(magnitude), 2)).T
         return cls(2 * np.pi * r1, np.arcsin(r2))
 
@@ -99,7 +99,7 @@ def draw_positions(seed: int, sky: int, start: int, stop: int, radius_m: float =
 
 
 def visible_stars(points_m: Array, position_m: Array, radius_m: float) -> Bools:
-    """Which stars (n,), given on the rim's plane, are in sight from a position (2,).
+    """Whether stars (n,), given on the rim's plane [m], are in sight from a position (2,) [m].
 
     The thesis tests against a polygon of 360 points of the rim; it differs from the circle by 0.4 m at most.
     """
@@ -121,12 +121,12 @@ class Mistakes:
     false: float  # for a hidden star
 
     def draw_list(self, in_sight: Bools, seed: int, sky: int, number: int) -> Bools:
-        """Draw the list of position `number`: which stars (n,) are on it."""
+        """Draw the list of position `number`: whether each star (n,) is on it."""
         r = _draw_uniform([seed, Stream.MISTAKES, sky, number], (len(in_sight),))
         return np.where(in_sight, r >= self.missed, r < self.false)
 
     def evidence(self, sky: Sky, listed: Bools) -> Evidence:
-        """ln((1 - missed) / false) for the stars on the list, ln(missed / (1 - false)) for the others."""
+        """Evidence of a list: ln((1 - missed) / false) of the stars on it, ln(missed / (1 - false)) of the others."""
         for_it, against = np.log([(1 - self.missed) / self.false, self.missed / (1 - self.false)])
         llr = np.where(listed, for_it, against)
         return Evidence(azimuth_rad=sky.azimuth_rad, elevation_rad=sky.elevation_rad, llr=llr)
@@ -210,6 +210,6 @@ def change_steps_m(changes: Array, cylinder: Cylinder, step_m: float = STEP_M) -
 
 
 def _draw_uniform(stream: list[int], shape: tuple[int, ...]) -> Array:
-    """Uniform over [0, 1), the same for the same stream; a longer draw begins with the shorter one."""
+    """Array of this shape, uniform over [0, 1), the same for a `stream`; a longer one begins with the shorter one."""
     rng = np.random.default_rng(stream)
     return rng.random(shape)

@@ -37,7 +37,7 @@ ESTIMATE_M = np.array([-3000.0, -1500.0])  # of figure 3.5: far from the true po
 
 
 def fig3_3(context: Context) -> Artefact:
-    """Viewed starfields along the centreline."""
+    """Figure 3.3: viewed starfields along the centreline."""
     sky, positions = Sky.draw(context.seed, 0), [np.array([1e3 * east, 0.0]) for east in ALONG_KM]
     views = [_view(sky, position) for position in positions]
     counts = [int(view.sum()) for view in views]
@@ -57,7 +57,7 @@ def fig3_3(context: Context) -> Artefact:
 
 
 def fig3_5(context: Context) -> Artefact:
-    """One step of the pseudo-gradient."""
+    """Figure 3.5: one step of the pseudo-gradient."""
     sky = Sky.draw(context.seed, 0)
     points_km = sky.project_to_rim_plane(crater()) / 1e3
     views = [_view(sky, position) for position in (ESTIMATE_M, EXAMPLE_M)]
@@ -89,7 +89,7 @@ def fig3_5(context: Context) -> Artefact:
 
 
 def fig3_6(context: Context) -> Artefact:
-    """The visible part of the starfield."""
+    """Figure 3.6: the visible part of the starfield."""
     sky = Sky.draw(context.seed, 0)
     seen = _view(sky, EXAMPLE_M)
     in_sight = int(seen.sum())
@@ -110,7 +110,7 @@ def fig3_6(context: Context) -> Artefact:
 
 
 def fig_a1(context: Context) -> Artefact:
-    """The whole starfield."""
+    """Figure A.1: the whole starfield."""
     sky = Sky.draw(context.seed, 0)
 
     def draw(figure: Figure) -> None:

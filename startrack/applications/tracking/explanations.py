@@ -1,4 +1,4 @@
-"""Which images, moves and odometry of a track belong together: explanations, compared by their evidence.
+"""Explanations of a track: which images, moves and odometry belong together, compared by their evidence.
 
 An explanation states of each image whether it is of this track, and which of its positions is right, of another drive
 in the form of the odometry, or of neither: anywhere, or near its place with a gross error. It states of each move
@@ -40,7 +40,7 @@ MODE, KIND, ANCHOR = 0, slice(1, 3), slice(3, 5)  # of a frame in the history: k
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """One explanation of n frames, with the shares of all that differ in no frame and in no use of the odometry.
+    """Explanation of n frames, with the share of all that differ from it in no frame and in no use of the odometry.
 
     The frames are those that its moves have: all, or the last ones.
     """
@@ -58,18 +58,18 @@ class Explanation:
 
     @property
     def parts(self) -> tuple[tuple[Explanation, ...], Array]:
-        """It and its variants, with the share (m,) of each among them."""
+        """This explanation and its variants, m together, and the share (m,) of each among them."""
         others = [one.share for one in self.variants]
         return (self, *self.variants), np.array([1.0 - sum(others), *others])
 
     @property
     def leg(self) -> Ints:
-        """(n - 1,) number from 1 of the leg, or of the single move, that slipped; 0: none, or begun before them."""
+        """Number (n - 1,), from 1, of the leg, or single move, that slipped; 0: none, or a leg begun before these."""
         return np.where(self.kind > STRAIGHT, np.cumsum((self.kind == SLIPS) | (self.kind == BEGINS)), 0)
 
     @property
     def steps(self) -> Steps:
-        """The moves with their errors: those that slipped with a larger one, those of a leg with what they share."""
+        """Moves with their errors: a larger one where the wheels slipped, and what the moves of a leg share."""
         steps = self.moves.steps(self.anchor)
         sigma_m = np.where(self.kind == SLIPS, np.hypot(steps.sigma_m, SLIP_SIGMA_M), steps.sigma_m)
         by_leg_m = np.where((self.kind >= BEGINS)[:, None, None], steps.by_leg_m, 0.0)
@@ -90,22 +90,23 @@ class Branches:
     history: Ints  # (b, w, 5) of the last frames: mode (of the other drive -2 - mode; -1: of none), kinds and anchors
 
     def __getitem__(self, which: Ints | Bools | slice) -> Branches:
-        """Those of an index."""
+        """Branches that the index, mask or slice `which` selects."""
         return Branches(*(part[which] for part in self._parts))
 
     @property
     def _parts(self) -> tuple[Any, ...]:
+        """Values of all fields, in their order."""
         return tuple(getattr(self, f.name) for f in fields(self))
 
     def swapped(self) -> Branches:
-        """The same with the other drive as the track."""
+        """Copy with the other drive as the track."""
         return Branches(
             self.other[:], self.track[:], self.log_likelihood, self.count[:, ::-1], self.odometry, 1 - self.drive,
             self.anchor[:, ::-1], swap(self.history),
         )  # fmt: skip
 
     def decided(self, mode: int, side: int = 0, anchor: Ints | None = None) -> Branches:
-        """A copy with a decision about the last frame; `anchor` (b,) is the next one of the drive of this `side`."""
+        """Copy with `mode` decided for the last frame; `anchor` (b,) is the next one of the drive of this `side`."""
         found = self[np.arange(len(self.drive))]
         found.history[:, -1, MODE] = mode
         if anchor is not None:
@@ -114,14 +115,14 @@ class Branches:
 
     @staticmethod
     def join(parts: Sequence[Branches]) -> Branches:
-        """All of several."""
+        """Branches of several `parts`, one part after the other."""
         track, other, *decisions = zip(*(one._parts for one in parts), strict=True)
         return Branches(TrackFilter.join(track), TrackFilter.join(other), *map(np.concatenate, decisions))
 
 
 @dataclass(eq=False)
 class Explanations:
-    """The likeliest explanations of the frames so far; `add` in the order of time."""
+    """The likeliest explanations of the frames so far; frames are added in the order of time."""
 
     shared_count: int
     may_slip: bool = True
@@ -134,7 +135,7 @@ class Explanations:
     _found: Branches | None = None
 
     def add(self, modes: Sequence[FrameEstimate], moves: Sequence[Moves], first: int = 0) -> None:
-        """One more frame, with one mode, several (ambiguous) or none (refused).
+        """Add one more frame, with one mode, several (ambiguous) or none (refused).
 
         `moves` are those of each kind of odometry, from frame number `first`, which may be a settled one, to this one
         at least; the first is as stated.
@@ -172,7 +173,7 @@ class Explanations:
     def _settle(self) -> bool:
         """Keep the explanations that take the first frame as the likeliest one does; False where others matter.
 
-        Of those by the same odometry, only the ones with the move to it of their likeliest are kept.
+        Among those by the same odometry, only the ones with the move to it of their likeliest are kept.
         """
         both, found = self._both, self._branches
         total, mode = self._log_posterior(both), np.maximum(both.history[:, 0, MODE], -1)
@@ -194,7 +195,7 @@ class Explanations:
 
     @property
     def likeliest(self) -> tuple[Explanation, Explanation]:
-        """Both drives of the single explanation by which frames are settled, each as the track."""
+        """Explanations of both drives, each as the track, by the single branch that settles frames."""
         best = self._branches[:1]
         first, second = (self._explanation(one, 1.0) for one in (best, best.swapped()))
         return (second, first) if first.drive else (first, second)
@@ -237,21 +238,24 @@ class Explanations:
 
     @property
     def _branches(self) -> Branches:
+        """Branches of the frames so far. Raises ValueError where no frame was added."""
         if self._found is None:
             raise ValueError("no frame was added")
         return self._found
 
     @property
     def _has_fault(self) -> Bools:
+        """Whether each kind of odometry (kinds,) has a fault as a whole."""
         return np.array([bool(m.fault) for m in self._moves])
 
     @property
     def _both(self) -> Branches:
-        """The explanations, and behind them those of which the other drive is the track."""
+        """Branches, and behind them, swapped, those whose other drive has frames."""
         found = self._branches
         return Branches.join([found, found[found.count[:, 1] > 0].swapped()])
 
     def _explanation(self, one: Branches, share: float) -> Explanation:
+        """Explanation by the single branch `one`, with its settled frames and its `share`."""
         number, drive = int(one.odometry[0]), int(one.drive[0])
         before = [swap(of[number]) if drive else of[number] for of in self._settled[self._first :]]
         mode, kind, _, anchor, _ = np.vstack([*before, one.history[0]]).T
@@ -261,6 +265,7 @@ class Explanations:
         )  # fmt: skip
 
     def _start(self) -> Branches:
+        """Branches at the first frame: one for each kind of odometry."""
         n = len(self._moves)
         track = TrackFilter.start(self.shared_count, FREEDOMS, LEG_FREEDOMS, count=n, unknown_m=FOREIGN_SIGMA_M)
         none, pair = np.zeros(n, dtype=np.int64), np.zeros((n, 2), dtype=np.int64)
@@ -270,7 +275,7 @@ class Explanations:
         )  # fmt: skip
 
     def _moved(self, one: Branches, step: int) -> Branches:
-        """After a move, with the entry of the next frame in the history; a known move may be one that slipped.
+        """Branches after a move, with the entry of the next frame in the history; a known move may be one that slipped.
 
         A leg may begin, and go on, in odometry without a fault as a whole.
         """
@@ -309,14 +314,14 @@ class Explanations:
         return Branches.join(branched)
 
     def _used(self, one: Branches, side: int, number: int, mode: FrameEstimate, here: Ints) -> Branches:
-        """The frame is of the drive of this `side`: of the track, or of the other one."""
+        """Branches by whose decision the frame is of the drive of this `side`: of the track, or of the other one."""
         found = one.decided(-2 - number if side else number, side, here[:, side])
         found.log_likelihood += np.log(mode.weight) + (found.track, found.other)[side].update(mode.without_posts)
         found.count[:, side] += 1
         return found
 
     def _wrong(self, one: Branches, modes: Sequence[FrameEstimate]) -> Branches:
-        """The frame is of neither: anywhere, or near with a gross error; its shared errors are its own."""
+        """Branches by whose decision the frame is of neither drive: anywhere, or near with a gross error."""
         free = np.ones(self.shared_count)
         near, far = (np.r_[sigma_m**2, sigma_m**2, free] for sigma_m in (WRONG_SIGMA_M, FOREIGN_SIGMA_M))
         parts = []

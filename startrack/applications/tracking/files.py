@@ -32,7 +32,7 @@ Value = Callable[["FrameValues"], Any]
 
 
 class FrameValues(NamedTuple):
-    """Frame k of a track, with what is computed of all its frames."""
+    """Frame k of a track, the track, and the latitudes and longitudes of all its frames."""
 
     track: Track
     latlon_rad: Array  # (n, 2) of the smoothed positions
@@ -40,7 +40,7 @@ class FrameValues(NamedTuple):
 
     @property
     def frame(self) -> TrackFrame:
-        """The frame."""
+        """Frame number k of the track."""
         return self.track.frames[self.k]
 
 
@@ -53,7 +53,7 @@ def _frame(
 
 
 def _number(array: Callable[[FrameValues], Array], *at: int, convert: Callable[[Any], Any] = float) -> Value:
-    """The element `at` an index of an array at the frame; None where it is not finite."""
+    """Function of a frame to the element `at` in its row of an array of the track; None where it is not finite."""
 
     def value(v: FrameValues) -> float | None:
         found = float(convert(array(v)[(v.k, *at)]))
@@ -63,10 +63,12 @@ def _number(array: Callable[[FrameValues], Array], *at: int, convert: Callable[[
 
 
 def _quaternion(axis: int) -> Value:
+    """Function of a frame to the element `axis` of its quaternion; None without an attitude."""
     return lambda v: None if v.frame.quat_xyzw_body_enu is None else float(v.frame.quat_xyzw_body_enu[axis])
 
 
 def _trajectory(name: str, prefix: str, when: str) -> list[output.Quantity]:
+    """Quantities of the trajectory `name` of a track; keys begin with `prefix`, descriptions tell `when`."""
     elements: list[tuple[Any, ...]] = [
         *((f"{axis}_m", "m", "%.4f", f"{axis} of the camera, {when}", "position_enu_m", k)
           for k, axis in enumerate(("east", "north", "up"))),
@@ -244,7 +246,7 @@ def tum_text(track: Track, trajectory: Trajectory) -> str:
 
 
 def track_geojson(track: Track, records: Sequence[dict[str, Any]]) -> str:
-    """track.geojson: a line through the smoothed positions of a `track`, and a point for each of its `records`."""
+    """Text of track.geojson: a line through the smoothed positions of a `track`, a point for each of its `records`."""
     points = [
         output.feature("Point", [one["longitude_deg"], one["latitude_deg"]], one)
         for one in records

@@ -1,4 +1,4 @@
-"""One frame as an observation of its position and of the errors that it shares with other frames.
+"""Frame as an observation of its position and of the errors that it shares with other frames.
 
 The likelihood of one image in the parameters of a track gives points of the posterior by images of one position. The
 posterior mean m of position and shared errors by one frame, with its prior, depends on the true ones p and on the
@@ -59,42 +59,42 @@ class FrameModel:
     def of_evidence(
         cls, evidence: Evidence, terrain: Terrain, errors: TrackErrors, reference_m: Array, half_m: float
     ) -> Self:
-        """Of `evidence` with its errors of the image, for positions within `half_m` of a reference (2,)."""
+        """Model of `evidence` with its errors of the image, for positions within `half_m` of a reference (2,) [m]."""
         image = errors.of_image(evidence.image_errors)
         basis = ErrorBasis.whole(errors.listed)
         return cls(SkylineModel.of(terrain, evidence, reference_m, half_m, errors.listed, image, basis), errors)
 
     @cached_property
     def rise_rad(self) -> Array:
-        """(SECTORS, k) rise of the skyline by one standard deviation of each shared error."""
+        """Rise (SECTORS, k) [rad] of the skyline by one standard deviation of each shared error."""
         rise = self.model.seen.image_rise
         edge = rise[:, 0] if rise.shape[1] else np.zeros(SECTORS)
         return self.errors.rise_rad(self.model.slopes_rad, edge)
 
     def shifts(self, parameters: Array) -> Array:
-        """(n, SECTORS) of the map's skyline, without errors of the image's own."""
+        """Shift (n, SECTORS) [rad] of the map's skyline from the reference's, without errors of the image's own."""
         found = self.model.shifts(self.errors.to_model(parameters, self.model.seen.rows))
         if self.errors.uses_sky:
             found = found + np.outer(parameters[:, -1], self.rise_rad[:, -1])
         return found
 
     def log_likelihood(self, parameters: Array) -> Array:
-        """(n,) of `parameters`."""
+        """Log-likelihood (n,) of `parameters` (n, 2 + k), with the prior of the likeliest linear errors there."""
         shifts, prior = self.model.with_linear_errors(self.shifts(parameters))
         return self.model.log_likelihood_of(shifts) + prior
 
     def is_allowed(self, parameters: Array) -> Array:
-        """(n,) whether a camera can stand there, in the neighbourhood."""
+        """Whether a camera can stand at each of `parameters` (n, 2 + k), in the neighbourhood of the reference."""
         near = np.abs(parameters[:, :2] - self.model.around.reference_m).max(axis=1) < self.model.around.half_m
         return near & np.asarray(self.model.terrain.allowed(parameters[:, :2]))
 
     def settle(self, parameters: Array) -> None:
-        """Take the states of the chain, which decide where the circle is cut, at parameters (2 + k,)."""
+        """Take the states of the chain, which decide where the circle is cut, as they are at `parameters` (2 + k,)."""
         states = self.model.states(self.errors.to_model(parameters[None], self.model.seen.rows)[0])
         self.model, self.clear = self.model.with_closing(states), states[:, 0]
 
     def slopes(self, parameters: Array, share: Array) -> Array:
-        """(n, SECTORS) change of the log-likelihood with the skyline [1/rad] at points with `share` (n,) of the weight.
+        """Change (n, SECTORS) [1/rad] of the log-likelihood with the skyline, at points with a `share` (n,) of weight.
 
         The edge of a single star is a step: the change is taken over a part of the skyline's spread. Sectors count by
         their probability to show the map's skyline. The likeliest linear errors follow the skyline.
@@ -111,11 +111,11 @@ class FrameModel:
 
     @cached_property
     def design(self) -> Array:
-        """(SECTORS, 2 + k) rise of the skyline by a metre east and north, and by each shared error."""
+        """Rise (SECTORS, 2 + k) [rad] of the skyline by a metre east and north, and by a sigma of each shared error."""
         return np.hstack([self.model.around.slopes.T, self.rise_rad])
 
     def information(self) -> tuple[Array, Array]:
-        """Of a linear model of the sectors: (2 + k, 2 + k), and its product (2 + k,) with the best parameters.
+        """Information (2 + k, 2 + k) of a linear model of sectors, and its product (2 + k,) with the best parameters.
 
         Positions are relative to the reference. Sets how much each sector counts for the linear errors.
         """
@@ -131,7 +131,7 @@ class FrameModel:
         return growth @ design, growth @ (height - linear.expected_rad)
 
     def gradient_by_height(self) -> Array:
-        """(2 + k, SECTORS) growth of the gradient with heights that sectors see, which count as `information` set."""
+        """Growth (2 + k, SECTORS) of the gradient with the heights that sectors see, as `information` weighed them."""
         linear = self.model.linear
         weighted = self.design.T * linear.weight
         return np.asarray(weighted - (weighted @ linear.rise_rad) @ linear.gain)
@@ -200,7 +200,7 @@ def estimate_frame(
 
 
 def largest_sigma(covariance: Array) -> float:
-    """Along the longest axis."""
+    """Standard deviation along the longest axis of a `covariance` (d, d)."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
 
@@ -256,7 +256,7 @@ def shown_part(covariance: Array) -> tuple[Array, Array]:
 
 
 def clipped_noise(noise: Array, whole: Array) -> Array:
-    """`noise` (d, d) with at least the least share of `whole` (d, d) in every direction."""
+    """Covariance `noise` (d, d), in every direction from the least share of `whole` (d, d) to all of it."""
     sizes, axes = np.linalg.eigh(0.5 * (whole + whole.T))
     root = axes * np.sqrt(np.maximum(sizes, 0.0))
     scale = np.where(sizes > 0.0, 1.0 / np.sqrt(np.maximum(sizes, 1e-300)), 0.0)

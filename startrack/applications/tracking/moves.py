@@ -38,7 +38,7 @@ class Moves:
 
     @classmethod
     def of(cls, steps: Steps) -> Moves:
-        """Those of `steps`, which need no attitude."""
+        """Moves without a fault by `steps`, which are in enu and need no attitude."""
         n = len(steps.sigma_m) + 1
         turn, none = np.tile(np.eye(3), (n + 1, 1, 1)), np.zeros((n - 1, 3, FREEDOMS))
         return cls("", 0.0, np.pad(steps.move_m, ((0, 0), (0, 1))), turn, steps.sigma_m, none)
@@ -56,7 +56,7 @@ class Moves:
 def turned(turn: Array, delta_m: Array, sigma_m: Array, freedom_m: Array) -> tuple[Array, Array, Array, Array]:
     """Moves (n, 2) in enu by `delta_m` (n, 3) and rotations `turn` (n, 3, 3), and their standard deviations (n,).
 
-    Also their changes (n, 2, FREEDOMS) and (n, 2, LEG_FREEDOMS) by errors that all moves, and those of a leg, share.
+    Then their changes (n, 2, FREEDOMS) and (n, 2, LEG_FREEDOMS) by errors that all moves, and those of a leg, share.
     """
     move = np.einsum("nij,nj->ni", turn, delta_m)[:, :2]
     by_leg = LEG_SIGMA_1 * moves_by_scale_and_heading(delta_m)
@@ -103,7 +103,7 @@ def odometry_moves(
     ])  # fmt: skip
 
     def moves(fault: str, position_m: Array, to_odometry: Array) -> Moves:
-        """By poses in a frame of the odometry's own."""
+        """Moves with a `fault` by positions (n, 3) and rotations (n, 3, 3) in a frame of the odometry's own."""
         turn = np.concatenate([nowhere[None], R.swapaxes(1, 2) @ to_odometry.swapaxes(1, 2)])
         delta = np.diff(position_m, axis=0)
         sigma_m = np.where(covered[:-1] & covered[1:], errors.sigma_m(delta), np.inf)

@@ -1,4 +1,4 @@
-"""From the result of one image to what a track needs of it: a few numbers and rows, without the image.
+"""Observations of a track, each of one image: a few numbers and rows of its result, without the image.
 
 They are kept as files: a track that was stopped goes on without locating its images again.
 """
@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, eq=False)
 class ImageFix:
-    """One position by an image alone, as `locate` states it."""
+    """Position by an image alone, as `locate` states it."""
 
     position_enu_m: Array  # (3,)
     covariance_m2: Array  # (2, 2)
@@ -44,7 +44,7 @@ class ImageFix:
 
 @dataclass(frozen=True, eq=False)
 class ObservedFrame:
-    """One image of a track."""
+    """Image of a track: what it shows of the position, or why it was refused."""
 
     name: str
     time_utc: datetime
@@ -213,6 +213,6 @@ def decode_frame(data: bytes | bytearray) -> ObservedFrame:
 
 
 def _value(kind: type[T], prefix: str, arrays: dict[str, Any]) -> T:
-    """The dataclass that `encode_frame` took apart."""
+    """Value of the dataclass `kind` from `arrays` whose names begin with `prefix`, as `encode_frame` stored them."""
     values = {f.name: arrays[f"{prefix}.{f.name}"] for f in fields(kind)}  # type: ignore[arg-type]
     return kind(**{name: one if one.ndim else float(one) for name, one in values.items()})

@@ -110,12 +110,12 @@ class Odometry(Value):
 
     @cached_property
     def _extremes(self) -> tuple[float, int]:
-        """The longest step [s] between poses of which none is missing, and the pose before the fastest move."""
+        """Longest step [s] between poses of which none is missing, and index of the pose before the fastest move."""
         length_m, step_s = np.linalg.norm(np.diff(self.position_m, axis=0), axis=1), np.diff(self.time_s)
         return GAP_INTERVALS * float(np.median(step_s)), int(np.argmax(length_m / (step_s + SPAN_TOLERANCE_S)))
 
     def require_covers(self, time_s: Array) -> None:
-        """Raises BadInput (bad_odometry) for one of `time_s` (m,) [Unix s] before the first pose or after the last."""
+        """Raise BadInput (bad_odometry) for one of `time_s` (m,) [Unix s] before the first pose or after the last."""
         first, last = self.time_s[[0, -1]]
         outside = time_s[(time_s < first - SPAN_TOLERANCE_S) | (time_s > last + SPAN_TOLERANCE_S)]
         if len(outside):
@@ -125,7 +125,7 @@ class Odometry(Value):
             _refuse(f"{which} outside the odometry, which covers {_utc_text(first)} to {_utc_text(last)}")
 
     def require_possible(self, max_speed_m_s: float) -> None:
-        """Raises BadInput (bad_odometry) for moves faster than `max_speed_m_s`."""
+        """Raise BadInput (bad_odometry) for moves faster than `max_speed_m_s`."""
         k = self._extremes[1]
         length_m, step_s = np.linalg.norm(self.position_m[k + 1] - self.position_m[k]), np.diff(self.time_s[k : k + 2])
         if length_m > max_speed_m_s * (step_s[0] + SPAN_TOLERANCE_S):
@@ -160,7 +160,7 @@ class OdometryFile:
     """A file of odometry that is read again where it has changed."""
 
     def __init__(self, path: str, topic: str | None, is_followed: bool, floor_m: float = ODOMETRY_FLOOR_M) -> None:
-        """Of a `path`, and of a bag the `topic`; `is_followed`: its last line may be incomplete."""
+        """Take the file at `path`, of a bag a `topic`; `is_followed`: the last line may be incomplete."""
         self.path, self._is_growing = path, is_followed
         self._read_as = partial(read_odometry, path, topic, floor_m=floor_m)
         self._read: tuple[object, Odometry] | None = None  # with the stamp of the file
@@ -177,11 +177,12 @@ class OdometryFile:
         return self._read[1]
 
     def end(self) -> None:
-        """The file grows no more: its last line counts too, if it can be read."""
+        """Read the last line too, if it can be read: the file grows no more."""
         with suppress(BadInput):
             self._read = self._stamp(), self._read_as(growing=False)
 
     def _stamp(self) -> object:
+        """Size and time of the file; None where there is none."""
         with suppress(OSError):
             found = Path(self.path).stat()
             return found.st_size, found.st_mtime_ns
@@ -229,6 +230,7 @@ def _odometry_of_bag(path: FilePath, topic: str | None, floor_m: float) -> Odome
 
 
 def _odometry_of_rows(path: FilePath, rows: ArrayLike, name_row: Callable[[int], str], floor_m: float) -> Odometry:
+    """Odometry of rows (n, 8) of TUM's columns without repeated poses; `name_row` names a row in messages."""
     values = np.asarray(rows, dtype=np.float64).reshape(-1, len(TUM_COLUMNS.split()))
     warnings: tuple[str, ...] = ()
     # The rows before those that have the same time, and the same pose within `floor_m` and ODOMETRY_SIGMA rad.

@@ -48,7 +48,7 @@ def draw_track(track: Track) -> NDArray[np.uint8]:
 
 
 def _facts(track: Track) -> list[str]:
-    """What the track rests on, and its last position."""
+    """Lines of text: the frames of a `track` by status, its times, its last position, its crater and its slips."""
     statuses = [frame.status for frame in track.frames]
     parts = [f"{statuses.count(one)} {one.replace('_', ' ')}" for one in dict.fromkeys(["used", *sorted(statuses)])]
     start, end = (f"{track.frames[k].time_utc:%Y-%m-%d %H:%M:%S}" for k in (0, -1))

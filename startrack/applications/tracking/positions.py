@@ -38,10 +38,10 @@ Modes = Sequence[FrameEstimate]
 
 
 class OnlineTrack:
-    """Positions at the time of each frame; `add` in the order of time. Without contradictions a Kalman filter."""
+    """Positions at the time of each frame, added in the order of time. Without contradictions a Kalman filter."""
 
     def __init__(self, shared_count: int, window: int = WINDOW) -> None:
-        """With `shared_count` errors that frames share; `window`: as of `Explanations`."""
+        """Begin with `shared_count` shared errors; frames that `window` others with a position follow are settled."""
         self.filter = TrackFilter.start(shared_count, FREEDOMS, LEG_FREEDOMS)
         self._before = self.filter[:], self.filter[:]  # of the settled frames: of both drives
         self._number = 0  # their kind of odometry
@@ -53,9 +53,9 @@ class OnlineTrack:
         self._decided: list[tuple[object, ...]] = []  # of each of them that the filter has
 
     def add(self, modes: Modes, moves: Sequence[Moves], first: int = 0) -> None:
-        """One more frame, with one mode, several (ambiguous) or none (refused).
+        """Add one more frame, with one mode, several (ambiguous) or none (refused).
 
-        `moves` are as for `Explanations.add`, from the frame `first` on, at most that of the property.
+        `moves` are by each kind of odometry, from frame number `first`, at most that of the property, to this one.
         """
         settled, self._first = self.compared.settled, first
         self.compared.add(modes, moves, first)
@@ -76,7 +76,7 @@ class OnlineTrack:
 
     @property
     def mode(self) -> int:
-        """Which mode of the last frame is used; -1: none."""
+        """Number of the mode of the last frame that is used; -1: none."""
         return int(self._best.mode[-1]) if self.is_vouched else -1
 
     @property
@@ -99,7 +99,7 @@ class OnlineTrack:
         return self.filter.position_m + found[0] - best.position_m, covariance_m2
 
     def _settle(self, first: int) -> None:
-        """The filters that begin anew have the settled frames from this number on, as they are settled."""
+        """Take the frames that settled, from number `first` on, into the filters from which tracking begins anew."""
         now = self.compared.settled
         if now == first:
             return
@@ -128,7 +128,7 @@ class OnlineTrack:
 
 
 def _take(track: TrackFilter, steps: Steps, at: int, modes: Modes, mode: Ints) -> None:
-    """Take the move to the frame at this index, and its mode that is right."""
+    """Take the move to the frame at index `at` into the filter, and the mode of the frame that is right."""
     if at:
         track.predict(steps, at - 1)
     if mode[at] >= 0:
@@ -147,7 +147,7 @@ class Filtered:
 
 
 def filter_positions(modes: Sequence[Modes], moves: Sequence[Moves], shared_count: int) -> Filtered:
-    """The positions by frames of these `modes`, of which none is settled; `moves` are those of `explain`."""
+    """The positions by frames of these `modes`, of which none is settled; `moves` are by each kind of odometry."""
     n, track = len(modes), OnlineTrack(shared_count, len(modes))
     mode, alone = np.full((2, n), -1)
     found = Filtered(np.zeros((n, 2)), np.zeros((n, 2, 2)), mode, alone, track.compared)
@@ -168,7 +168,7 @@ class RobustTrack:
 
     @property
     def attitude_fits(self) -> Bools:
-        """(n,) whether the attitude of each frame turns the move after it."""
+        """Whether the attitude of each frame (n,) turns the move after it."""
         return np.append(self.best.anchor == np.arange(1, len(self.mode)), True)
 
 
@@ -176,9 +176,9 @@ def conclude(modes: Sequence[Modes], compared: Explanations, names: Sequence[str
     """The estimate from frames with one mode each, several (ambiguous) or none (refused).
 
     Args:
-        modes: of n frames, in the order of time.
+        modes: those of n frames, in the order of time.
         compared: their explanations, with the moves between all of them.
-        names: of the frames, for messages; empty: their numbers from 1.
+        names: those of the frames, for messages; empty: their numbers from 1.
 
     Raises:
         ValueError: no frame has a mode.
@@ -262,7 +262,7 @@ def place_modes(
 
     Where its size is not known, positions are products of it: they are expanded about the estimate by the `moves`
     between all frames anew, by odometry as it is stated first. What may be wrong with it is compared where the
-    expansion is right. `names` are those of `conclude`, which says what this raises then.
+    expansion is right. `names` are those of the frames; raises as `conclude`.
     """
     placed = [[shared.place(one) for one in of] for of in modes]
     if not (shared.bends and any(modes)):

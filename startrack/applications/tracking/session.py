@@ -127,9 +127,9 @@ class TrackSession:
         return self._filtered < len(self.frames)
 
     def newest(self, odometry: Odometry | None, *, has_ended: bool = False) -> Iterator[Track]:
-        """Each frame that was not filtered yet and that the `odometry` reaches, by the frames before it: a track each.
+        """Tracks of one frame each: of every one not filtered yet that the `odometry` reaches, by the frames up to it.
 
-        `has_ended`: also those after its last pose, which no odometry reaches any more. If a frame comes late, all
+        `has_ended`: also of frames after its last pose, which no odometry reaches any more. If a frame comes late, all
         frames after it are filtered anew. Raises as `estimate`.
         """
         terrain, shared = self.terrain, self.shared

@@ -43,14 +43,14 @@ class Trajectory:
 
     @classmethod
     def of_normal(cls, position_enu_m: Array, covariance_m2: Array) -> Trajectory:
-        """At `position_enu_m` (3,), with the circles of normal errors of `covariance_m2` (2, 2)."""
+        """Trajectory of `position_enu_m` (n, 3) with the circles of normal errors of `covariance_m2` (n, 2, 2)."""
         radius95, radius999 = (radius_holding(covariance_m2, part) for part in (0.95, 0.999))
         return cls(position_enu_m, covariance_m2, radius95, radius999)
 
 
 @dataclass(frozen=True, eq=False)
 class TrackFrame:
-    """One image of the track."""
+    """Image of the track with its status."""
 
     name: str
     time_utc: datetime
@@ -72,7 +72,7 @@ class SizeError:
 
     @classmethod
     def of(cls, found: ErrorFound, size_m: float) -> SizeError:
-        """Of a shared error in a crater of that size; it is counted from another one than the stated size."""
+        """Error of a crater's size `size_m` by the error `found`, counted from another than the stated size."""
         stated = 1.0 + found.mean
         return cls(size_m, found.error / stated, found.sigma / stated)
 
@@ -148,10 +148,10 @@ def estimate_track(
 
     Args:
         frames: what `observe_frame` gave of each image, with the same `shared`.
-        terrain: on which all were located.
+        terrain: the ground on which all were located.
         shared: the errors that the frames share.
         odometry: moves between the frames; None: not known.
-        odometry_errors: of these moves.
+        odometry_errors: errors of these moves.
         at_rest: the camera did not move: all exposures have one position.
 
     Raises BadInput: no_time for frames that are not in the order of time, bad_odometry for odometry that covers none of
@@ -218,6 +218,7 @@ def track_of_newest(
 
 
 def _track_frame(frame: ObservedFrame, mode: int, attitude_fits: bool, is_outside: bool) -> TrackFrame:
+    """Frame of the track by the number of its used `mode`; -1: none is used."""
     found, count = ("used", "", ""), len(frame.modes)
     if not frame.modes:
         found = "refused", frame.reason, frame.message
@@ -233,7 +234,7 @@ def _track_frame(frame: ObservedFrame, mode: int, attitude_fits: bool, is_outsid
 def _trajectory(
     position_m: Array, covariance_m2: Array, terrain: Terrain, alone: Mapping[int, Sequence[ImageFix]]
 ) -> Trajectory:
-    """Positions (n, 2) and covariances (n, 2, 2) as a trajectory; `alone` are those of one image."""
+    """Trajectory of positions (n, 2) and covariances (n, 2, 2); `alone` has the fixes of rows by one image only."""
     known = np.sqrt(np.trace(covariance_m2, axis1=1, axis2=2)) < UNKNOWN_SIGMA_M
     position = np.full((len(known), 3), np.nan)
     for k in np.flatnonzero(known):

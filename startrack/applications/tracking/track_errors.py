@@ -22,7 +22,7 @@ BIAS, CLOCK, DEPTH, WIDTH, EDGE = "bias_rad", "clock_s", "depth_1", "diameter_1"
 
 
 class ErrorFound(NamedTuple):
-    """A shared error as estimated, in the unit of its name."""
+    """Shared error as estimated, in the unit of its name."""
 
     error: float  # beyond its mean before
     sigma: float
@@ -45,12 +45,12 @@ class TrackErrors:
 
     @classmethod
     def of(cls, terrain: Terrain, clock: Clock | None, uses_sky: bool = False) -> Self:
-        """Those of a `terrain`, of a `clock`, and with `uses_sky` of the skyline that the sky's light shows."""
+        """Errors of a `terrain`, of a `clock`, and with `uses_sky` of the skyline that the sky's light shows."""
         return cls(SharedErrors.of(terrain, clock), uses_sky)
 
     @classmethod
     def of_exposure(cls, terrain: Terrain, exposure: Exposure, uses_sky: bool = False) -> Self:
-        """Those of a `terrain`, of the clock of an `exposure`, and with `uses_sky` of the skyline in the sky's light.
+        """Errors of a `terrain`, of the clock of an `exposure`, and with `uses_sky` of the skyline in the sky's light.
 
         Raises BadInput (no_time, bad_terrain) where the exposure has no time, or the terrain no site.
         """
@@ -62,21 +62,21 @@ class TrackErrors:
         return cls.of(terrain, clock_at(terrain.site, exposure.time_utc, *stated), uses_sky)
 
     def on(self, terrain: Terrain) -> Self:
-        """The same on a `terrain` of another steepness, which its errors are counted from."""
+        """Copy for a `terrain` of another steepness, from which its errors are counted."""
         return replace(self, listed=SharedErrors.of(terrain, self.listed.clock))
 
     def with_gross(self, facts: Iterable[str]) -> Self:
-        """The same with gross errors of more `facts`; those that the terrain states are left out."""
+        """Copy with gross errors of more `facts`; those that the terrain states are left out."""
         return replace(self, gross=self.gross | (frozenset(facts) & frozenset(self.listed.facts)))
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """(k,); each ends with its unit."""
+        """Names (k,) of the errors; each ends with its unit."""
         return (*(one.name for one in self.listed.listed), *([EDGE] if self.uses_sky else []))
 
     @cached_property
     def sigma(self) -> Array:
-        """(k,) in the units of the names."""
+        """Standard deviations (k,) in the units of the names."""
         found = self.listed.sigma()
         for fact in self.gross:
             found = np.where([one.fact == fact for one in self.listed.listed], self.listed.sigma(fact), found)
@@ -84,7 +84,7 @@ class TrackErrors:
 
     @property
     def mean(self) -> Array:
-        """(k,) before, in the units of the names: what is stated, from what the errors are counted from."""
+        """Means (k,) of the prior in the units of the names: what is stated, from where errors are counted from."""
         return np.append(self.listed.mean, [0.0] if self.uses_sky else [])
 
     def __len__(self) -> int:
@@ -92,22 +92,22 @@ class TrackErrors:
 
     @cached_property
     def _log_sigma(self) -> Array:
-        """(k,) standard deviation of the logarithm of depth and width; 0 for other errors."""
+        """Standard deviation (k,) of the logarithm of depth and width; 0 for other errors."""
         is_size = np.isin(self.names, (DEPTH, WIDTH)) & self.listed.axisymmetric
         return np.divide(self.sigma, 1.0 + self.mean, out=np.zeros(len(self)), where=is_size)
 
     def values(self, shared: Array) -> Array:
-        """(k,) of the errors in the units of the names, at parameters `shared` (k,)."""
+        """Errors (k,) in the units of the names, at parameters `shared` (k,)."""
         s = np.where(self._log_sigma > 0.0, self._log_sigma, 1.0)
         linear = np.where(self._log_sigma > 0.0, np.expm1(s * shared) / s, shared)
         return np.asarray(self.mean + self.sigma * linear)
 
     def slopes(self, shared: Array) -> Array:
-        """(k,) of the `values` by the parameters, at `shared` (k,)."""
+        """Derivatives (k,) of the `values` by the parameters, at `shared` (k,)."""
         return np.asarray(self.sigma * np.exp(self._log_sigma * shared))
 
     def errors_found(self, shared: Array, covariance: Array) -> list[ErrorFound]:
-        """The errors (k,) at parameters `shared` (k,) of this `covariance` (k, k)."""
+        """Errors (k,) relative to their means, with sigmas, at parameters `shared` (k,) of this `covariance` (k, k)."""
         sigma = self.slopes(shared) * np.sqrt(np.diag(covariance))
         found = np.stack([self.values(shared) - self.mean, sigma, self.mean], axis=-1)
         return [ErrorFound(*one) for one in found.tolist()]
@@ -121,15 +121,15 @@ class TrackErrors:
         return found
 
     def rise_rad(self, slopes_rad: Array, edge_rad: Array) -> Array:
-        """(n, k) rise of the skyline by one standard deviation of each error.
+        """Rise (n, k) [rad] of the skyline by one standard deviation of each error.
 
-        `slopes_rad` (m, n) are those of the listed errors by their units, `edge_rad` (n,) by one px of the edge.
+        `slopes_rad` (m, n) are the rises by a unit of each listed error, `edge_rad` (n,) those by one px of the edge.
         """
         units = np.vstack([slopes_rad, edge_rad]) if self.uses_sky else slopes_rad
         return np.asarray((units * self.sigma[:, None]).T)
 
     def of_image(self, errors: ImageErrors | None) -> ImageErrors | None:
-        """Errors of one image without that of the edge, where all images share it."""
+        """Errors of one image without that of the edge, which all images share."""
         if errors is None or not self.uses_sky:
             return errors
         own = errors.covariance.copy()
@@ -143,7 +143,7 @@ class TrackErrors:
 
     @cached_property
     def size_sigma_1(self) -> float:
-        """The larger one of depth and width of a round crater, relative; 0 where they are known."""
+        """Relative standard deviation of depth or width of a round crater, the larger one; 0 where they are known."""
         return max(
             (s for s, name in zip(self.sigma.tolist(), self.names, strict=True) if name in (DEPTH, WIDTH)), default=0.0
         )

@@ -30,7 +30,7 @@ WALK_SIGMAS = (0.0, 1e-5, 1e-3 / ARCSEC_PER_RAD, 0.0)  # of one epoch: the gyros
 
 @dataclass(frozen=True)
 class RestReadings:
-    """What a rover at rest measures: per epoch, the platform's tilt by stars and the horizontal specific force."""
+    """Readings of a rover at rest: per epoch, the platform's tilt by stars and the horizontal specific force."""
 
     tilt_rad: Array  # (n, 2)
     force_m_s2: Array  # (n, 2) in the platform's axes

@@ -45,9 +45,9 @@ class MapFeatures:
 
     @classmethod
     def collect(cls, terrain: Terrain) -> MapFeatures:
-        """Where the skylines of positions all over the search area of a `terrain` have their features.
+        """Corners and peaks of the skylines of positions all over the search area of a `terrain`.
 
-        None of ground without posts.
+        Ground without posts has none.
         """
         found = [np.zeros((0, 3))]
         for view in grid_points(terrain, VIEWS_STEP_M):
@@ -145,7 +145,7 @@ def resect(points_m: Array, bearing_rad: Array) -> Array:
 def _count_matches(
     pose: Array, bearing_rad: Array, elevation_rad: Array, terrain: Terrain, features: MapFeatures
 ) -> Ints:
-    """How many of the features seen (m,) each pose (n, 3) explains by one of the map."""
+    """Number (n,) of the features seen (m,) that each pose (n, 3) explains by one of the map."""
     azimuth, elevation = _directions(pose[:, :2], features.points_m[None], features.up_m, terrain)
     bearing = azimuth - pose[:, 2:]
     found = [

@@ -18,7 +18,7 @@ DIGITS = np.array([BEARING_BINS, 32, 32, 64, 64, 64])  # bins of a chain: bearin
 
 
 def polygon_vertices(elevation_rad: Array, tolerances_rad: Sequence[float]) -> list[Bools]:
-    """Which points of closed skylines (n, sectors) are vertices of polygons no farther off than each tolerance.
+    """Whether the points of closed skylines (n, sectors) are vertices of polygons no farther off than each tolerance.
 
     A chord is split where it is farthest off, beginning with the one from the highest point round to itself; the
     polygons of a smaller tolerance, which follow those of a larger one in `tolerances_rad`, split them further.

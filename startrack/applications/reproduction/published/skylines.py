@@ -34,7 +34,7 @@ def lit_skyline(
 
 
 def require_bearings(skyline: MeasuredSkyline) -> None:
-    """Raises NotLocated for a `skyline` that is known at too few bearings."""
+    """Raise NotLocated for a `skyline` that is known at too few bearings."""
     count = int(np.count_nonzero(skyline.known))
     if count < LEAST_BEARINGS:
         raise NotLocated(f"the skyline is known in {count} sectors, and {LEAST_BEARINGS} are needed")

@@ -30,7 +30,7 @@ def locate_by_four_bearings(skyline: MeasuredSkyline, terrain: Terrain, grid: Ma
 
 
 def positions_with_elevations(skyline: MeasuredSkyline, terrain: Terrain, points_m: Array) -> Bools:
-    """Which cells of the grid `points_m` (n, 2) contain a position with the elevations seen at the four bearings."""
+    """Whether cells of the grid `points_m` (n, 2) contain a position with the elevations seen at the four bearings."""
     left, half_m = np.arange(len(points_m)), np.array(0.5 * MAP_STEP_M)
     for sector in cardinal_sectors(skyline):
         low, high = terrain.horizon_bounds_rad(points_m[left], half_m, skyline.azimuth_rad[sector])

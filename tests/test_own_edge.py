@@ -31,10 +31,10 @@ TRUE = PLACE + np.array([1.0, -2.0])
 STRIP_PX, STRIP_RAD = 1.6, np.radians(99.0)  # how high and how long the lit strip is
 
 
-def in_strip(azimuth_rad: Array, middle_rad: float) -> Bools:
-    """(n,) whether azimuths (n,) are in the lit strip."""
+def in_strip(azimuth_rad: Array, middle_rad: float, long_rad: float = STRIP_RAD) -> Bools:
+    """(n,) whether azimuths (n,) are in a lit strip."""
     off = (azimuth_rad - middle_rad + np.pi) % (2 * np.pi) - np.pi
-    return np.asarray(np.abs(off) < STRIP_RAD / 2)
+    return np.asarray(np.abs(off) <= long_rad / 2)
 
 
 def fix_with(lower_rad: Array | float, seed: int, with_stars: bool = True) -> Fix:
@@ -72,7 +72,9 @@ def test_lit_states_are_those_of_stars_at_the_skyline_and_light_by_its_neighbour
     light, stars = sky_rows(TRUE, rng, NATS), star_rows(TRUE, rng, STARS)
     plain = SkylineModel.of(CRATER, Evidence.concatenate(light, stars), PLACE, 30.0, SharedErrors.of(CRATER, None))
     by_stars = SectorRows(plain.around, stars).profiles
-    edge = OwnEdge(by_stars, rng.uniform(0.01, 2.0, SECTORS) * np.exp(by_stars.offset - plain.seen.profiles.offset))
+    edge = OwnEdge(
+        by_stars, rng.uniform(0.01, 2.0, SECTORS) * np.exp(by_stars.offset - plain.seen.profiles.offset), np.ones(1)
+    )
     seen, shifts = replace(plain.seen, edge=edge), np.radians(rng.uniform(-0.05, 0.05, (5, 1)) * np.ones(SECTORS))
     expected = clear_emissions(by_stars, shifts.T.copy())[:, 0] * edge.light
     np.testing.assert_allclose(seen.emissions(shifts[0])[:, -1], expected)
@@ -82,8 +84,10 @@ def test_lit_states_are_those_of_stars_at_the_skyline_and_light_by_its_neighbour
     assert lit.log_likelihood_of(shifts) == pytest.approx(by_matrices, abs=0.3)
 
 
-def light_strip(frame: Frame, light_e: float) -> Frame:
-    """The frame with a strip of ground lit below the crest."""
+def light_strip(
+    frame: Frame, light_e: float, long_rad: float = STRIP_RAD, between_px: tuple[float, float] = (-STRIP_PX, 0.0)
+) -> Frame:
+    """The frame with more light, or less, in a strip between two heights above the crest."""
     truth, shape = frame.truth, frame.exposure.pixels_adu.shape
     crest = Skyline.trace(truth.position_enu_m[:2], RENDERED)
     band = skyline_band(shape, CAMERA, truth.R_cam_enu, crest, 12.0)
@@ -91,7 +95,9 @@ def light_strip(frame: Frame, light_e: float) -> Frame:
     azimuth, elevation = azel_from_rays(rays_cam @ truth.R_cam_enu)
     height = (elevation - crest(azimuth)) * scale_across(CAMERA, truth.R_cam_enu, crest)(azimuth)
     strip = np.zeros(shape)
-    strip.ravel()[pixel] = np.clip(0.5 - height, 0, 1) * np.clip(height + STRIP_PX + 0.5, 0, 1) * in_strip(azimuth, 2.0)
+    low, high = between_px
+    strip.ravel()[pixel] = np.clip(high - height + 0.5, 0, 1) * np.clip(height - low + 0.5, 0, 1)
+    strip.ravel()[pixel] *= in_strip(azimuth, 2.0, long_rad)
     assert CAMERA.sensor is not None
     adu = light_e * cv2.GaussianBlur(strip, (0, 0), CAMERA.sensor.psf_sigma_px) / CAMERA.sensor.gain_e_per_adu
     return replace(frame, exposure=replace(frame.exposure, pixels_adu=(frame.exposure.pixels_adu + adu).astype("f4")))
@@ -106,3 +112,14 @@ def test_an_image_of_a_lit_strip_is_located_by_its_stars_there() -> None:
     strip = in_strip(MIDDLES_RAD, 2.0)
     assert np.mean(found.sky.used[strip]) < 0.2 and np.mean(found.sky.used[~strip]) > 0.5  # its ends are vague
     assert lit.error_m(found) < found.fix.radius999_m
+
+
+@pytest.mark.parametrize("dark_px", [1.6, 2.6])
+def test_light_with_another_edge_all_around_tells_nothing_of_the_position(dark_px: float) -> None:
+    """The errors of the image, which raise light and not stars, are not drawn to that edge either."""
+    catalog = load_catalog().brighter_than(7.0)
+    dark = light_strip(expose(catalog, PLACES_M["halfway"], 21.0), -150.0, 2 * np.pi, (0.0, dark_px))
+    found = locate(dark, catalog)
+    assert found.status == "ok"
+    assert found.evidence_source == "stars"
+    assert dark.error_m(found) < found.fix.radius999_m

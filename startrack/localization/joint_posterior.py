@@ -97,7 +97,10 @@ def _sample_own_edge(plain: Hypothesis, half_m: float, explored: Explored, refer
     start = None if model is None else Start.among_boxes(model, explored.centres_m, explored.half_m)
     if start is None:
         return []
-    return [sample_hypothesis(start.model, references_m, start.modes, first=[start.boxes], enough=FEW)]
+    found = sample_hypothesis(start.model, references_m, start.modes, first=[start.boxes], enough=FEW)
+    if found.found.log_evidence > plain.found.log_evidence:
+        found = sample_hypothesis(found.model, references_m, [_moments_of(found)])
+    return [found]
 
 
 def _group_boxes(explored: Explored, reach_m: float) -> list[tuple[Array, float]]:

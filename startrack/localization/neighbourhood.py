@@ -149,6 +149,7 @@ class OwnEdge(NamedTuple):
 
     stars: Profiles
     light: Array  # (SECTORS,) likelihood of the light, in which the two profiles' offsets are made up for
+    lit: Array  # (SECTORS,) rough probability of it, by which the linear model leaves the light out
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,8 +179,14 @@ class SectorRows:
 
     @cached_property
     def moments(self) -> SectorMoments:
-        """Heights of the skyline that the rows show."""
-        return measure_moments(self.profiles)
+        """Heights of the skyline that the rows show, by the stars alone where the light has an edge of its own."""
+        together = measure_moments(self.profiles)
+        if self.edge is None:
+            return together
+        by_stars = measure_moments(self.edge.stars)
+        weights = (1.0 - self.edge.lit) / together.variance_rad2, self.edge.lit / by_stars.variance_rad2
+        variance = 1.0 / (weights[0] + weights[1])
+        return SectorMoments(variance * (weights[0] * together.mean_rad + weights[1] * by_stars.mean_rad), variance)
 
     @cached_property
     def log_offset(self) -> float:
@@ -201,7 +208,7 @@ class SectorRows:
 
     def prepare_levels(self, reach: Array) -> Levels:
         """The emissions of all states but the first at shifts up to `reach` (SECTORS,)."""
-        stars, light = (self.profiles, np.zeros(0)) if self.edge is None else self.edge
+        stars, light = (self.profiles, np.zeros(0)) if self.edge is None else self.edge[:2]
         return Levels(reach, prepare_levels(self.profiles, reach), stars, light)
 
     @cached_property
@@ -215,4 +222,5 @@ class SectorRows:
         stars = np.flatnonzero(self.rows.extended_nats == 0.0)
         by_stars = measure_moments(profiles_of(self.rows.take(stars), self.above_rad[stars], np.zeros(SECTORS)))
         share = by_stars.variance_rad2 / (by_stars.variance_rad2 + self.image_errors.variance_rad2)
-        return np.asarray(share[:, None] * self.image_errors.raised_rad)
+        used = share if self.edge is None else share * (1.0 - self.edge.lit)
+        return np.asarray(used[:, None] * self.image_errors.raised_rad)

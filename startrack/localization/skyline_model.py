@@ -161,7 +161,7 @@ class SkylineModel:
         """Sector where the circle is cut, and the states over which it is closed: as at the reference, if not given."""
         if self.closing is not None:
             return self.closing
-        return closing_of(self._states_at(np.zeros(SECTORS)))
+        return closing_of(self.states_at(np.zeros(SECTORS)))
 
     def shift_of(self, parameters: Array) -> Array:
         """Rise (SECTORS,) [rad] of the map's skyline from the reference to parameters (2 + a,), with linear errors."""
@@ -169,13 +169,14 @@ class SkylineModel:
 
     def states(self, parameters: Array) -> Array:
         """Probabilities (SECTORS, STATES) of the chain's states at parameters (2 + a,)."""
-        return self._states_at(self.shift_of(parameters))
+        return self.states_at(self.shift_of(parameters))
 
     def lit(self, states: Array) -> Array:
         """Probabilities (SECTORS,) that the light has an edge of its own, by those of the `states`."""
         return states[:, RISEN + 1 :].sum(axis=1) if self.seen.edge is not None else np.zeros(SECTORS)
 
-    def _states_at(self, shift: Array) -> Array:
+    def states_at(self, shift: Array) -> Array:
+        """Probabilities (SECTORS, STATES) of the chain's states at a `shift` (SECTORS,) of the map's skyline."""
         """Probabilities (SECTORS, STATES) of the chain's states at a shift (SECTORS,) of the map's skyline."""
         return state_probabilities(self.seen.emissions(shift), self.seen.moves)
 

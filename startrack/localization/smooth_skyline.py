@@ -78,5 +78,16 @@ def with_own_edge(plain: Hypothesis, half_m: float) -> SkylineModel | None:
     whole, likely = logs.sum(axis=1), shares(logs.sum(axis=1)) @ logs
     likely += (np.logaddexp.reduce(whole) - np.log(len(whole)) - likely.sum()) / SECTORS  # all equally likely before
     offset = light.profiles.offset + stars.profiles.offset - seen.profiles.offset  # the same about one reference
-    edge = OwnEdge(stars.profiles, np.exp(likely + offset))
-    return SkylineModel(replace(seen, around=around, edge=edge), errors, around.error_slopes_rad(errors), OWN_EDGE)
+    edge = OwnEdge(stars.profiles, np.exp(likely + offset), np.ones(SECTORS))
+    by_stars = SkylineModel(replace(seen, around=around, edge=edge), errors, around.error_slopes_rad(errors), OWN_EDGE)
+    return replace(by_stars, seen=replace(by_stars.seen, edge=edge._replace(lit=_find_lit(by_stars, shift))))
+
+
+def _find_lit(by_stars: SkylineModel, shift: Array) -> Array:
+    """Probabilities (SECTORS,) of light with its own edge at the likelier skyline: the `shift`, or that of the stars.
+
+    All light has its own edge in the linear model of `by_stars`.
+    """
+    shifts = np.stack([shift, by_stars.shift_of(by_stars.solve()[0])])
+    likelier = shifts[int(np.argmax(by_stars.log_likelihood_of(shifts)))]
+    return by_stars.lit(by_stars.states_at(likelier))

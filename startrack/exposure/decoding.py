@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from startrack.core.files import MAX_CAUSE_CHARS, FilePath, missing_text, printable
 from startrack.core.limits import check_memory, memory_refusal
 from startrack.core.types import MAX_PIXELS, BadInput
-from startrack.exposure.sidecar import FORMATS, RAW_SUFFIXES
+from startrack.exposure.sidecar import FORMATS, KINDS_TEXT, RAW_SUFFIXES
 
 MAX_FILE_BYTES = 8 * MAX_PIXELS + 2**24  # the largest image at the widest pixel type, and its headers
 EXACT_IN_FLOAT32 = 2 ** (np.finfo(np.float32).nmant + 1)
@@ -175,7 +175,7 @@ def decode_bytes(raw: bytes, *, camera_raw: bool = False) -> Decoded:
     if camera_raw:
         kind = "camera raw file"
     if kind is None:
-        raise bad_image("is not a PNG, TIFF, JPEG or FITS file, nor named as a camera raw file")
+        raise bad_image(f"is not a file of {KINDS_TEXT}, the last by its suffix")
     try:
         decoder = import_module(f"startrack.exposure.{'mosaic' if camera_raw else kind.lower()}")
         with warnings.catch_warnings():  # the decoders' checks refuse the file or fill `Exposure.warnings`

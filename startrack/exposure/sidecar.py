@@ -58,6 +58,7 @@ FORMATS = {  # by their kind, whose module in lower case has the function `decod
     "JPEG": Format((b"\xff\xd8\xff",), (".jpg", ".jpeg")),
     "FITS": Format((b"SIMPLE  =", b"\x1f\x8b", b"BZh"), (".fits", ".fit", ".fts")),
 }
+KINDS_TEXT = f"{', '.join(FORMATS)} or camera raw"
 PICTURE_SUFFIXES = {suffix for one in FORMATS.values() for suffix in one.suffixes} | RAW_SUFFIXES
 PACKING_SUFFIXES = {".gz", ".bz2", ".fz"}
 MAX_UNKNOWN_KEY_WARNINGS = 5

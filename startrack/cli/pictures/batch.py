@@ -26,7 +26,7 @@ from startrack.core import errors
 from startrack.core.errors import INTERNAL_ERROR, BadInput
 from startrack.core.files import make_folder, printable
 from startrack.core.runner import Runner, RunStopped, count_cores
-from startrack.exposure import is_bag
+from startrack.exposure import KINDS_TEXT, is_bag
 from startrack.output import refusal_line
 
 SHOWN = ("ok", "ambiguous", "refused", "error")
@@ -66,7 +66,7 @@ def _find_images(args: argparse.Namespace) -> tuple[Sequence[Image], Sequence[Im
     maps = maps_left_out({*whole, *found})
     found, whole = ([image for image in images if image not in maps] for images in (found, whole))
     if not found:
-        raise BadInput("bad_image", f"{args.folder}: no PNG, TIFF, FITS, JPEG or camera raw images there")
+        raise BadInput("bad_image", f"{args.folder}: no {KINDS_TEXT} images there")
     if args.time is not None and len(found) > 1:
         args.usage_error(
             f"--time is of one image, and {args.folder} has {len(found)}: give each its time in a sidecar NAME.json "

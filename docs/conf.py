@@ -137,12 +137,13 @@ def join_texts(annotation: addnodes.desc_annotation) -> None:
 
 
 def complete_landmarks(app: Sphinx, page: str, template: str, context: dict[str, Any], doctree: Any) -> None:
-    """Give the captions of the contents a level as headings, and let keys scroll blocks of code."""
+    """Give the captions of the contents a level as headings, and let keys scroll code and tables."""
     contents, body = context.get("furo_navigation_tree"), context.get("body")
     if contents:
         context["furo_navigation_tree"] = contents.replace('role="heading"', 'role="heading" aria-level="2"')
     if body:
-        context["body"] = body.replace("<pre>", '<pre tabindex="0">')
+        focusable = body.replace("<pre>", '<pre tabindex="0">')
+        context["body"] = focusable.replace('<div class="table-wrapper', '<div tabindex="0" class="table-wrapper')
 
 
 def source_with_field_comments(module: str) -> tuple[str | None, str | None]:

@@ -9,10 +9,13 @@ pages that include these files (`link_to_pages`, `link_in_included`).
 from __future__ import annotations
 
 import re
+from dataclasses import is_dataclass
+from itertools import groupby, takewhile
 from pathlib import Path
 from typing import Any
 
 from docutils import nodes
+from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.pycode import ModuleAnalyzer
 
@@ -89,25 +92,58 @@ def restore_attribute(app: Sphinx, what: str, name: str, one: Any, options: Any,
 
 
 def link_figures(app: Sphinx, doctree: nodes.document, docname: str) -> None:
-    """Make each figure a link to its file, and keep short code on one line."""
+    """Make each figure a link to its file."""
     for image in list(doctree.findall(nodes.image)):
         if image["uri"] in app.env.images and not isinstance(image.parent, nodes.reference):
             file = "../" * docname.count("/") + f"_images/{app.env.images[image['uri']][1]}"
             link = nodes.reference("", "", internal=True, refuri=file, classes=["figure"])
             image.replace_self(link)
             link += image
-    for code in doctree.findall(nodes.literal):
-        if len(code.astext()) <= LONGEST_UNBROKEN:
-            code["classes"].append("unbroken")
+
+
+def leave_out_fields(app: Sphinx, what: str, name: str, one: Any, *rest: Any) -> tuple[str, str] | None:
+    """No signature of a dataclass: its fields follow."""
+    return ("", "") if what == "class" and is_dataclass(one) else None
+
+
+def fold_fields(app: Sphinx, doctree: nodes.document) -> None:
+    """Keep fields and properties out of the table of contents, fold the many of a class, and write types shortly."""
+    for one in doctree.findall(addnodes.desc):
+        if one["objtype"] in FIELDS:
+            one["no-contents-entry"] = True
+            for annotation in one[0].findall(addnodes.desc_annotation):
+                join_texts(annotation)
+    for content in list(doctree.findall(addnodes.desc_content)):
+        parts = [child for child in content if isinstance(child, addnodes.desc)]
+        fields = list(takewhile(lambda part: part["objtype"] in FIELDS, parts))
+        if len(fields) > MOST_OPEN_FIELDS:
+            content.insert(content.index(fields[0]), nodes.raw("", OPEN_FOLD.format(len(fields)), format="html"))
+            content.insert(content.index(fields[-1]) + 1, nodes.raw("", "</details>", format="html"))
+
+
+def names_startrack(one: nodes.Node) -> bool:
+    return isinstance(one, addnodes.pending_xref) and one["reftarget"].startswith("startrack")
+
+
+def join_texts(annotation: addnodes.desc_annotation) -> None:
+    """One text of all that is no link to a type of startrack, with short names of arrays."""
+    children: list[nodes.Node] = []
+    for is_link, part in groupby(annotation.children, names_startrack):
+        together = list(part)
+        text = ARRAY_TYPE.sub(r"NDArray[\1]", "".join(one.astext() for one in together))
+        children += together if is_link else [nodes.Text(text)]
+    annotation.children = []
+    annotation.extend(children)
 
 
 def complete_landmarks(app: Sphinx, page: str, template: str, context: dict[str, Any], doctree: Any) -> None:
-    """Give the captions of the contents a level as headings, and let keys scroll blocks of code."""
+    """Give the captions of the contents a level as headings, and let keys scroll code and tables."""
     contents, body = context.get("furo_navigation_tree"), context.get("body")
     if contents:
         context["furo_navigation_tree"] = contents.replace('role="heading"', 'role="heading" aria-level="2"')
     if body:
-        context["body"] = body.replace("<pre>", '<pre tabindex="0">')
+        focusable = body.replace("<pre>", '<pre tabindex="0">')
+        context["body"] = focusable.replace('<div class="table-wrapper', '<div tabindex="0" class="table-wrapper')
 
 
 def source_with_field_comments(module: str) -> tuple[str | None, str | None]:
@@ -118,7 +154,10 @@ def source_with_field_comments(module: str) -> tuple[str | None, str | None]:
     return path, None if source is None else FIELD.sub(r"\1  #: ", source)
 
 
-LONGEST_UNBROKEN = 30  # characters of code in a line of text: what a phone shows in one line
+ARRAY_TYPE = re.compile(r"ndarray\[tuple\[Any, \.\.\.\], dtype\[(\w+)\]\]")
+FIELDS = ("attribute", "property")
+MOST_OPEN_FIELDS = 4
+OPEN_FOLD = "<details><summary>{} fields and properties</summary>"
 FIELD = re.compile(r"^(    \w+: [^#\n]*\S)  # (?!fmt|type|noqa)", re.MULTILINE)
 kept: dict[str, list[str]] = {}
 module_source = ModuleAnalyzer.get_module_source
@@ -129,6 +168,8 @@ def setup(app: Sphinx) -> None:
     """Connect the handlers."""
     app.connect("source-read", link_to_pages)
     app.connect("include-read", link_in_included)
+    app.connect("autodoc-process-signature", leave_out_fields)
+    app.connect("doctree-read", fold_fields, priority=400)  # Sphinx collects the tables of contents at 500
     app.connect("doctree-resolved", link_figures)
     app.connect("html-page-context", complete_landmarks, priority=900)  # after the theme
     app.connect("autodoc-process-docstring", keep_attribute, priority=400)  # Napoleon has 500

@@ -52,7 +52,7 @@ def main() -> None:
     figure.text(0.835, 0.93, "a crater of 20 km", fontsize=20, **words)
     stored = BytesIO()
     figure.savefig(stored, dpi=120, facecolor=DARK)
-    save_webp(Image.open(stored), "hero", width_px=1400)
+    save_webp(Image.open(stored), "hero", 1400, str(solution))
 
 
 def locate_sample() -> tuple[startrack.Solution, Layers, Table]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from PIL import Image
+from PIL import ExifTags, Image
 
 import startrack
 from startrack.chain import Settings
@@ -44,7 +45,7 @@ DARK = {"figure.facecolor": "#0c0f16", "axes.facecolor": "#0c0f16", "savefig.fac
 
 def make_annotated(solution: Any, folder: Path) -> None:
     """The annotated picture of the sample."""
-    save_webp(Image.open(folder / "near-wall.annotated.png"), "annotated", width_px=1600)
+    save_webp(Image.open(folder / "near-wall.annotated.png"), "annotated", 1600, str(solution))
 
 
 def make_lowell(solution: Any, folder: Path) -> None:
@@ -56,7 +57,7 @@ def make_lowell(solution: Any, folder: Path) -> None:
 
 def make_skyline(solution: Any, folder: Path) -> None:
     """The panorama of the sample."""
-    save_webp(Image.open(folder / "near-wall.skyline.png"), "skyline", width_px=1440)
+    save_webp(Image.open(folder / "near-wall.skyline.png"), "skyline", 1440, str(solution))
 
 
 def make_report(solution: Any, folder: Path) -> None:
@@ -68,50 +69,64 @@ def make_report(solution: Any, folder: Path) -> None:
     page, picture = (folder / "near-wall.report.html").as_uri(), folder / "report.png"
     flags = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--virtual-time-budget=3000"]
     subprocess.run([browser, *flags, f"--window-size={PAGE_PX}", f"--screenshot={picture}", page], check=True)
-    save_webp(Image.open(picture), "report", width_px=1200)
+    save_webp(Image.open(picture), "report", 1200, str(solution))
 
 
 def make_posterior(solution: Any, folder: Path) -> None:
-    """Posterior by the stars on the whole floor and enlarged, the 95 % circles by stars and by all, the truth."""
+    """Posterior on the whole floor, and enlarged by the stars and by all, each with its 95 % circle, and the truth.
+
+    By all it is the normal distribution of the stated covariance, which has the errors of image and attitude.
+    """
     by_stars = startrack.locate(SAMPLE, settings=Settings(evidence_sources="stars")).result.fix
     located, terrain = solution.result, solution.result.terrain
     rows, middle_m = located.evidence(), np.asarray(located.fix.position_enu_m[:2])
     horizon = terrain.horizon_rad(middle_m[None], rows.azimuth_rad)
-    near = np.abs(rows.elevation_rad - horizon.ravel()) < NEAR_RAD
+    near = rows.take(np.abs(rows.elevation_rad - horizon.ravel()) < NEAR_RAD)
+    half_m = 1.5 * by_stars.radius95_m
     panels = [
-        ("By the stars: whole crater floor", np.zeros(2), 10_000.0, 1e-3, rows.take(np.abs(rows.llr) > WIDE_LLR)),
-        ("By the stars: enlarged", middle_m, 2 * by_stars.radius95_m, 1.0, rows.take(near)),
+        ("Stars: crater floor (logarithm)", np.zeros(2), 10_000.0, rows.take(np.abs(rows.llr) > WIDE_LLR), None),
+        ("Stars: enlarged", middle_m, half_m, near, by_stars),
+        ("Stars and light of the sky", middle_m, half_m, None, located.fix),
     ]
     with plt.rc_context(DARK):
-        figure, all_axes = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained")
-        for axes, (title, centre_m, half_m, scale, used) in zip(all_axes, panels, strict=True):
-            line = np.linspace(-half_m, half_m, 141)
-            points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2) + centre_m
-            inside = np.hypot(*points.T) < 9_990.0
-            log_p = np.full(len(points), np.nan)
-            log_p[inside] = log_posterior(used, terrain, points[inside])
-            log_p -= np.nanmax(log_p)
-            shown = log_p if scale < 1 else np.exp(log_p)
-            extent = np.repeat(centre_m, 2) + half_m * np.array([-1, 1, -1, 1])
-            lowest = np.nanquantile(shown, 0.02)
-            drawn = axes.imshow(
-                shown.reshape(141, 141), origin="lower", extent=extent * scale, cmap="inferno", vmin=lowest,
-            )  # fmt: skip
-            units, density = ("km", "logarithm of the posterior") if scale < 1 else ("m", "posterior, relative")
-            axes.set(title=title, xlabel=f"east, {units}", ylabel=f"north, {units}")
-            axes.ticklabel_format(useOffset=False)
-            axes.locator_params(nbins=4)
-            figure.colorbar(drawn, ax=axes, fraction=0.046, label=density)
-            axes.plot(TRUE_M[0] * scale, TRUE_M[1] * scale, "+", color="#4fd1c5", ms=14, mew=2, label="true position")
-        for fix, style, label in (
-            (by_stars, "--", "95 % by the stars alone"),
-            (located.fix, "-", "95 % with the light of the sky"),
-        ):
-            turn = np.linspace(0, 2 * np.pi, 121)
-            circle_m = np.asarray(fix.position_enu_m[:2]) + fix.radius95_m * np.stack([np.sin(turn), np.cos(turn)], -1)
-            all_axes[1].plot(*circle_m.T, style, color="#63b3ed", lw=1.8, label=label)
-        all_axes[1].legend(loc="upper left", fontsize=9)
-        save_figure(figure, "posterior")
+        figure, all_axes = plt.subplots(1, 3, figsize=(12, 4.0), layout="constrained")
+        for axes, (title, centre_m, half, used, fix) in zip(all_axes, panels, strict=True):
+            draw_posterior(axes, terrain, used, centre_m, half, fix)
+            axes.set_title(title)
+        save_figure(figure, "posterior", str(solution))
+
+
+def draw_posterior(axes: Any, terrain: Any, rows: Evidence | None, centre_m: Array, half_m: float, fix: Any) -> None:
+    """One panel: of the whole floor (`fix` None) the logarithm of the posterior, else itself, with the circle.
+
+    Without `rows` it is the normal distribution that `fix` states.
+    """
+    scale, unit = (1e-3, "km") if fix is None else (1.0, "m")
+    line = np.linspace(-half_m, half_m, 161)
+    points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2) + centre_m
+    inside = np.hypot(*points.T) < 9_990.0
+    log_p = np.full(len(points), np.nan)
+    log_p[inside] = log_normal(fix, points[inside]) if rows is None else log_posterior(rows, terrain, points[inside])
+    log_p -= np.nanmax(log_p)
+    shown = log_p if fix is None else np.exp(log_p)
+    extent = np.repeat(centre_m, 2) + half_m * np.array([-1, 1, -1, 1])
+    lowest = np.nanquantile(shown, 0.02)
+    axes.imshow(shown.reshape(161, 161), origin="lower", extent=extent * scale, cmap="inferno", vmin=lowest)
+    axes.plot(TRUE_M[0] * scale, TRUE_M[1] * scale, "+", color="#4fd1c5", ms=14, mew=2, label="true position")
+    if fix is not None:
+        turn = np.linspace(0, 2 * np.pi, 121)
+        circle_m = np.asarray(fix.position_enu_m[:2]) + fix.radius95_m * np.stack([np.sin(turn), np.cos(turn)], -1)
+        axes.plot(*circle_m.T, color="#63b3ed", lw=1.8, label=f"95 % within {fix.radius95_m:.1f} m")
+        axes.legend(loc="upper left", fontsize=9)
+    axes.set(xlabel=f"east, {unit}", ylabel=f"north, {unit}")
+    axes.ticklabel_format(useOffset=False)
+    axes.locator_params(nbins=4)
+
+
+def log_normal(fix: Any, points_m: Array) -> Array:
+    """Of the covariance that a fix states, at the points (n, 2)."""
+    away_m = points_m - fix.position_enu_m[:2]
+    return -0.5 * np.einsum("ni,ij,nj->n", away_m, np.linalg.inv(fix.covariance_m2), away_m)
 
 
 def log_posterior(rows: Evidence, terrain: startrack.Terrain, points_m: Array) -> Array:
@@ -178,22 +193,29 @@ def make_tutorial(page: str, picture: str, name: str) -> None:
         save_webp(Image.open(picture), name, width_px=1440)
 
 
-def save_webp(image: Image.Image, name: str, width_px: int) -> None:
-    """The image in docs/images/, at the best quality below MAX_BYTES."""
+def save_webp(image: Image.Image, name: str, width_px: int, line: str = "") -> None:
+    """The image in docs/images/, at the best quality below MAX_BYTES, with the printed `line` that it shows."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.ImageDescription] = without_time(line)
     image = image.convert("RGB")
     if image.width > width_px:
         image = image.resize((width_px, round(image.height * width_px / image.width)), Image.Resampling.LANCZOS)
     path = IMAGES / f"{name}.webp"
     for quality in range(90, 20, -5):
-        image.save(path, quality=quality, method=6)
+        image.save(path, quality=quality, method=6, exif=exif)
         if path.stat().st_size < MAX_BYTES:
             return
     raise SystemExit(f"{path} is larger than {MAX_BYTES} bytes")
 
 
-def save_figure(figure: Any, name: str) -> None:
-    figure.savefig(IMAGES / f"{name}.png", dpi=110, metadata={"Software": None})
+def save_figure(figure: Any, name: str, line: str = "") -> None:
+    figure.savefig(IMAGES / f"{name}.png", dpi=110, metadata={"Software": None, "Description": without_time(line)})
     plt.close(figure)
+
+
+def without_time(line: str) -> str:
+    """The line of a solution without the time that it took; tests/test_readme.py compares it with the pages."""
+    return re.sub(r"  [\d.]+ s$", "", line).replace("±", "+-").replace("°", "")
 
 
 PICTURES = {

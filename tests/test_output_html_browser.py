@@ -86,6 +86,37 @@ def test_keys_zoom_move_and_step_through_the_stars(window):
     assert w.zoom == 1
 
 
+def test_each_figure_has_two_stops_of_the_tab_key(window):
+    """The drawing, and all of its buttons and boxes, among which the arrow keys, Home and End move."""
+    w = window()
+    w.open("small.png")
+    stops = w.page.evaluate(
+        "[...document.querySelectorAll('#detail figure')].map(figure => [...figure.querySelectorAll("
+        "'canvas, [role=toolbar] *')].filter(one => one.tabIndex >= 0).length)"
+    )
+    assert len(stops) > 4 and set(stops) == {2}
+    bar = w.page.locator("#detail figure [role=toolbar]").first
+    w.page.locator("#detail .stage canvas").first.focus()
+    focused = (
+        "[...document.querySelector('#detail [role=toolbar]').querySelectorAll('button, input')]"
+        ".indexOf(document.activeElement)"
+    )
+    walked = []
+    for key in ("Tab", "ArrowRight", "ArrowDown", "ArrowLeft", "End", "ArrowRight", "ArrowLeft", "Home"):
+        w.page.keyboard.press(key)
+        walked.append(w.page.evaluate(focused))
+    last = bar.locator("button, input").count() - 1
+    assert last > 4 and walked == [0, 1, 2, 1, last, 0, last, 0]
+    w.page.keyboard.press("End")
+    before = w.page.evaluate("document.activeElement.checked")
+    w.page.keyboard.press("Space")
+    assert w.page.evaluate("document.activeElement.checked") is not before
+    w.page.keyboard.press("Shift+Tab")
+    assert w.page.evaluate("document.activeElement.tagName") == "CANVAS"
+    w.page.keyboard.press("Tab")
+    assert w.page.evaluate(focused) == last  # the one left
+
+
 def test_fingers_tap_and_pinch(window):
     w = window(PHONE)
     w.open("small.png")

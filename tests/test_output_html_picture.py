@@ -157,7 +157,7 @@ def test_a_star_behind_the_wall_is_found_as_hidden(window):
 
 def test_marks_are_drawn_sharp_at_any_magnification(chromium, folder):
     """A ring is as thin and its star as centred at 15 times as at 3, in pixels of the screen."""
-    context = chromium.new_context(viewport={"width": 1000, "height": 900}, device_scale_factor=2)
+    context = chromium.new_context(viewport={"width": 1000, "height": 1008}, device_scale_factor=2)
     page = context.new_page()
     page.goto((folder / "one.html").as_uri())
     widths = []

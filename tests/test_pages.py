@@ -15,7 +15,7 @@ from page_helpers import ROOT, run_page, same_output, snippets
 from startrack.cli.main import main
 from startrack.exposure import read_exposure, write_exposure
 
-PAGES = [*sorted(ROOT.glob("docs/*.md")), *sorted(ROOT.glob("docs/tutorials/*.md"))]
+PAGES = [path for folder in ("", "tutorials/", "api/") for path in sorted(ROOT.glob(f"docs/{folder}*.md"))]
 
 
 def no_files(folder: Path) -> None:

@@ -11,6 +11,7 @@ import tomllib
 import pytest
 from astropy.table import Table
 from page_helpers import ROOT, run_page
+from PIL import ExifTags, Image
 
 from startrack.camera import camera_from_dict
 from startrack.cli.main import COMMANDS, main
@@ -60,6 +61,24 @@ def test_the_true_position_is_the_one_the_page_gives():
     east, north = re.search(r"really stood at E (-?[\d.]+) m, N (-?[\d.]+) m", README).groups()
     known = json.loads((ROOT / "sample_images/near-wall.truth.json").read_text())
     assert known["position_enu_m"][:2] == [float(east), float(north)]
+
+
+def test_pages_and_pictures_of_the_sample_show_one_solution():
+    """The line that `locate` prints (`test_the_page_is_true`, `test_pages.py`) is the one of which the pictures are."""
+    pages = [ROOT / "README.md", ROOT / "docs/library.md", ROOT / "docs/tutorials/first-fix.md"]
+    printed = [re.findall(r"^near-wall\.png  ok .* stars", page.read_text(encoding="utf-8"), re.M) for page in pages]
+    (line,) = {one for found in printed for one in found}
+    assert all(printed)
+    drawn = {}
+    for name in ("hero.webp", "annotated.webp", "skyline.webp", "report.webp", "posterior.png"):
+        with Image.open(ROOT / "docs/images" / name) as image:
+            drawn[name] = image.info.get("Description") or image.getexif()[ExifTags.Base.ImageDescription]
+    assert set(drawn.values()) == {line.replace("±", "+-").replace("°", "")}, drawn
+    east, north = (float(re.search(rf"{axis} (-?[\d.]+) m", line)[1]) for axis in "EN")
+    truth = json.loads((ROOT / "sample_images/near-wall.truth.json").read_text())["position_enu_m"]
+    error_m = ((east - truth[0]) ** 2 + (north - truth[1]) ** 2) ** 0.5
+    (stated,) = re.findall(r"True error: ([\d.]+) m", README)
+    assert float(stated) == pytest.approx(error_m, abs=0.07)  # roundings of both
 
 
 def test_ci_runs_the_command_of_the_page():

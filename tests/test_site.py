@@ -43,7 +43,7 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     assert broken_links(tmp_path, pages) == []
     assert broken_links(tmp_path, {"a.html": '<a href="index.html#none">'} | pages) == [("a.html", "index.html#none")]
     assert 'role="heading" aria-level="2"' in index and '<pre tabindex="0">' in index
-    reference = (tmp_path / "api/pipeline.html").read_text(encoding="utf-8")
+    reference = (tmp_path / "api/values.html").read_text(encoding="utf-8")
     assert "whole-PSF flux [electrons, or ADU when the gain is unknown]" in reference  # comments of fields
 
 

@@ -72,3 +72,25 @@ View.prototype.pressed = function pressed(event) {
   event.preventDefault();
   acts[event.key]();
 };
+
+// Buttons and boxes as one stop of the tab key: arrow keys, Home and End move among them. `add` takes further ones in.
+function rovingGroup(label, ...kids) {
+  const bar = make("div", { role: "toolbar", "aria-label": label, class: "controls" }, ...kids);
+  const all = () => [...bar.querySelectorAll("button, input")];
+  const stopAt = (chosen) => all().forEach((one) => { one.tabIndex = one === chosen ? 0 : -1; });
+  bar.addEventListener("focusin", (event) => stopAt(event.target));
+  bar.addEventListener("keydown", (event) => {
+    const places = all();
+    const [here, count] = [places.indexOf(event.target), places.length];
+    const next = { ArrowRight: here + 1, ArrowDown: here + 1, ArrowLeft: here - 1 + count, ArrowUp: here - 1 + count, Home: 0, End: count - 1 }[event.key];
+    if (here < 0 || next === undefined || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    places[next % count].focus();
+  });
+  bar.add = (node) => {
+    bar.append(node);
+    stopAt(all()[0]);
+  };
+  stopAt(all()[0]);
+  return bar;
+}

@@ -51,8 +51,8 @@ function drawMeasured(v, g, points, least) {
 
 function choices(view, chosen, stars, points) {
   const redraw = () => view.redraw();
-  view.node.append(kindBoxes("Mark stars", KINDS, stars, chosen, redraw));
-  if (points.length) view.node.append(kindBoxes("Skyline of the image", SKYLINES, points, chosen, redraw));
+  view.controls.add(kindBoxes("Mark stars", KINDS, stars, chosen, redraw));
+  if (points.length) view.controls.add(kindBoxes("Skyline of the image", SKYLINES, points, chosen, redraw));
 }
 
 function panoramaView(detail, stars, name) {

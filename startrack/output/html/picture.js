@@ -152,9 +152,9 @@ function skyView(detail, stars, name) {
   image.onload = () => view.redraw();
   image.src = picture.src;
   const redraw = () => view.redraw();
-  if (placed.length) view.node.append(kindBoxes("Mark stars", KINDS, placed, chosen, redraw));
+  if (placed.length) view.controls.add(kindBoxes("Mark stars", KINDS, placed, chosen, redraw));
   const words = marks?.undrawn ? { ...LAYERS, others: [`${LAYERS.others[0]} (${say(marks.undrawn, 0)} further not drawn)`] } : LAYERS;
-  if (marks) view.node.append(kindBoxes("Also draw", words, layersWithin(marks, placed), chosen, redraw, (g, at, kind) => LAYER_SAMPLES[kind](g, at)));
+  if (marks) view.controls.add(kindBoxes("Also draw", words, layersWithin(marks, placed), chosen, redraw, (g, at, kind) => LAYER_SAMPLES[kind](g, at)));
   return view;
 }
 

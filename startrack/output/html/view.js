@@ -14,7 +14,8 @@ class View {
     const tool = (text, label, act) => make("button", { type: "button", "aria-label": `${label}: ${this.label}`, onclick: act }, text);
     this.tools = make("div", { class: "tools" }, tool("+", "Zoom in", () => this.zoomBy(1.6)),
       tool("−", "Zoom out", () => this.zoomBy(1 / 1.6)), tool("Reset", "Show all", () => this.reset()));
-    this.node = make("figure", { class: "view" }, this.stage, this.tip, this.tools, this.live);
+    this.controls = rovingGroup(`Controls: ${this.label}`, this.tools);
+    this.node = make("figure", { class: "view" }, this.stage, this.tip, this.controls, this.live);
     this.fingers = new Map();
     this.listen();
     this.centre = this.middle();

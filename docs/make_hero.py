@@ -49,7 +49,7 @@ def main() -> None:
     radius_m = solution.position.radius95.to_value("m")
     figure.text(0.835, 0.30, f"±{radius_m:.1f} m", fontsize=64, weight="bold", **words)
     figure.text(0.835, 0.20, "95 % circle of the position", fontsize=20, **words)
-    figure.text(0.835, 0.93, "a crater of 20 km", fontsize=20, **words)
+    figure.text(0.835, 0.93, "a simulated crater of 20 km", fontsize=20, **words)
     stored = BytesIO()
     figure.savefig(stored, dpi=120, facecolor=DARK)
     save_webp(Image.open(stored), "hero", 1400, str(solution))

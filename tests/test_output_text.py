@@ -19,7 +19,7 @@ def test_one_line_for_a_fix(located):
     line = summary_line(located.result, seconds=3.14)
     found = re.fullmatch(
         r"small  ok  E (-?\d+\.\d) m  N (-?\d+\.\d) m  ±(\d+\.\d) m \(95 %\)  heading (\d+\.\d)°  (\d+) stars  "
-        r"3\.1 s with files",
+        r"3\.1 s",
         line,
     )
     assert found is not None, line
@@ -35,7 +35,7 @@ def test_a_position_without_a_circle_is_called_approximate(located):
     point = replace(located.result, fix=point_fix(fix.position_enu_m[:2], located.result.terrain), sky=None)
     line = summary_line(point, seconds=3.14)
     assert re.fullmatch(
-        r"small  ok  E \S+ m  N \S+ m  approximate, no circle  heading .* stars  3\.1 s with files", line
+        r"small  ok  E \S+ m  N \S+ m  approximate, no circle  heading .* stars  3\.1 s", line
     ), line
     assert "error      evidence stars; search approximate; no circle\n" in verbose_text(point)
     own = replace(located.result, fix=replace(fix, search="approximate"))  # of a user's own method, with a circle
@@ -74,7 +74,7 @@ def test_other_results(located):
         summary_line(identified),
     )
     detected = as_stage(result, Detected)
-    assert summary_line(detected, seconds=0.2) == f"small  ok  {len(result.detections)} point sources  0.2 s with files"
+    assert summary_line(detected, seconds=0.2) == f"small  ok  {len(result.detections)} point sources  0.2 s"
 
 
 def test_refusals_are_one_line_with_reason_and_message(located):

@@ -61,7 +61,7 @@ def summary_line(result: Outcome, seconds: float | None = None) -> str:
     """
     if isinstance(result, Refused):
         return refusal_line(image_name(result.exposure), result.reason, result.message)
-    took = f"{sum(result.timing_ms.values()) / 1e3:.1f} s" if seconds is None else f"{seconds:.1f} s with files"
+    took = f"{sum(result.timing_ms.values()) / 1e3:.1f} s" if seconds is None else f"{seconds:.1f} s"
     parts = [text for _, text in rows("summary", stage_values(result))]
     return "  ".join([printable(image_name(result.exposure)), result.status, *parts, took])
 

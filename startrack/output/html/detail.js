@@ -126,7 +126,7 @@ function timings(spent) {
   const rows = Object.entries(spent).filter(([, ms]) => ms > 0).map(([stage, ms]) => make("tr", {}, make("th", { scope: "row" }, stage),
     make("td", { class: "bar" }, make("span", { style: `width:${(100 * ms) / longest}%` })), make("td", {}, time(ms))));
   return [make("table", { class: "times" }, make("tbody", {}, ...rows), make("tfoot", {}, make("tr", {}, make("th", { scope: "row" }, "all stages"), make("td"), make("td", {}, time(all))))),
-    make("p", { class: "dim" }, "The first image of a run also pays for loading programs, catalogue and maps; later ones take less. The time that the command line states “with files” includes the writing of tables and pictures, too.")];
+    make("p", { class: "dim" }, "The first image of a run also pays for loading programs, catalogue and maps; later ones take less. The time on the command line contains the writing of tables and pictures, too.")];
 }
 
 function starsCard(detail, stars) {

@@ -57,9 +57,9 @@ SMALL = Size(
     sweep_skies=1, sweep_per_sky=1, traverses=10, compared_per_sky=1, compared_on_map=1,
     compared_in_valley=1, compared_series=1,
 )  # fmt: skip
-# Tables whose errors other files test: here they are written only.
-FEW_SKIES = dict.fromkeys(("methods", "proposals"), replace(SMALL, skies=2))
-COARSE_M, VALLEY_M = 10 * MAP_STEP_M, 3000.0  # step of the grid of skylines; radius of the valleys
+
+FEW = {"methods": replace(SMALL, skies=2)}  # whose errors other files test: here the table is written only
+COARSE_M, VALLEY_M = 10 * MAP_STEP_M, 1500.0  # step of the grid of skylines; radius of the valleys
 TINY = replace(SMALL, skies=3, per_sky=8, ours_per_sky=2, bound_per_sky=2, deep_per_sky=1, one_sky=8, ours_one_sky=4)
 
 
@@ -90,7 +90,7 @@ def small_run(tmp_path_factory):
         small_grounds(),
         fix_store(shared, jobs=1, progress=hide_progress) as store,
     ):
-        artefacts = {name: make(Context(FEW_SKIES.get(name, SMALL), 0, store)) for name, make in ARTEFACTS.items()}
+        artefacts = {name: make(Context(FEW.get(name, SMALL), 0, store)) for name, make in ARTEFACTS.items()}
     return {name: (artefact, write_artefact(artefact, out, plots=True)) for name, artefact in artefacts.items()}
 
 

@@ -20,6 +20,7 @@ from startrack.applications.reproduction import (
     QUICK,
     Context,
     Size,
+    comparison,
     fix_store,
     methods,
     scene,
@@ -28,6 +29,7 @@ from startrack.applications.reproduction import (
     write_artefact,
 )
 from startrack.applications.reproduction.methods import KUA, OURS, Task, compute_chunk, tasks_of
+from startrack.applications.reproduction.published.kua_drive import DRIVE_M
 from startrack.applications.reproduction.published.skylines import MAP_STEP_M, MapGrid
 from startrack.applications.reproduction.simulator import (
     PERFECT,
@@ -53,13 +55,12 @@ from startrack.core.files import hold_lock
 from startrack.localization import ExactPosterior, Hull, PseudoGradient
 
 SMALL = Size(
-    "small", skies=10, per_sky=300, ours_per_sky=3, bound_per_sky=3, deep_per_sky=1, one_sky=500, ours_one_sky=40,
+    "small", skies=10, per_sky=300, ours_per_sky=3, bound_per_sky=3, deep_per_sky=2, one_sky=500, ours_one_sky=120,
     sweep_skies=1, sweep_per_sky=1, traverses=10, compared_per_sky=1, compared_on_map=1,
     compared_in_valley=1, compared_series=1,
 )  # fmt: skip
-
 FEW = {"methods": replace(SMALL, skies=2)}  # whose errors other files test: here the table is written only
-COARSE_M, VALLEY_M = 10 * MAP_STEP_M, 1500.0  # step of the grid of skylines; radius of the valleys
+COARSE_M, VALLEY_M = 10 * MAP_STEP_M, DRIVE_M  # step of the grid of skylines; radius of valleys that a drive fits in
 TINY = replace(SMALL, skies=3, per_sky=8, ours_per_sky=2, bound_per_sky=2, deep_per_sky=1, one_sky=8, ours_one_sky=4)
 
 
@@ -70,11 +71,12 @@ def hide_progress(what, total):
 
 @contextmanager
 def small_grounds():
-    """Within the block few skylines of a map are traced: those of the whole ones take minutes."""
+    """Within the block few skylines of a map are traced, which take minutes, and no method runs for its time alone."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene, "traced_grid", lru_cache(maxsize=1)(partial(MapGrid.trace, step_m=COARSE_M)))
         patch.setattr(scene, "valleys", lru_cache(maxsize=1)(valley.jacksboro))
         patch.setattr(valley, "VALLEY_RADIUS_M", VALLEY_M)
+        patch.setattr(comparison, "_warm_up", lambda ground: None)
         scene.terrain_of.cache_clear()
         yield
     scene.terrain_of.cache_clear()

@@ -141,14 +141,14 @@ def test_simulated_stars_are_dimmed_as_those_of_a_picture() -> None:
 @pytest.mark.slow
 def test_errors_on_the_earth_agree_with_their_covariance() -> None:
     found = []
-    for seed in range(200, 240):
+    for seed in range(200, 220):
         scene, exposure = picture(seed)
         outcome = solve(exposure, CRATER)
         error = miss_m(outcome, scene)
         found.append((float(np.linalg.norm(error)), nees(outcome, error)))
     errors, all_nees = np.array(found).T
     assert errors.mean() < 5.0  # the Moon's frames: 2.5
-    assert 1.0 < all_nees.mean() < 3.0
+    assert 0.8 < all_nees.mean() < 3.5  # of 40 degrees of freedom: but for one in a thousand on either side
 
 
 def test_a_lens_that_contains_the_refraction_is_refused_below_air() -> None:

@@ -67,7 +67,7 @@ def test_a_prediction_is_a_map_in_the_projection_of_the_terrain(folder):
     import rasterio
 
     out = folder / "predicted"
-    arguments = ["-c", "fisheye-2048", *TIME, "--spacing", "900", "--draws", "1", "-D", str(out), "-q"]
+    arguments = ["-c", "fisheye-2048", *TIME, "--spacing", "1300", "--draws", "1", "-D", str(out), "-q"]
     assert main(["predict", "-t", str(folder / "ground.toml"), *arguments]) == 0
     with rasterio.open(next(out.glob("*.tif"))) as file:
         assert file.crs.to_epsg() == 4326

@@ -14,6 +14,7 @@ from horizon_helpers import CAMERA, LOWELL, SITE, TIME, painted_frame, skyline_d
 from jsonschema import Draft202012Validator
 
 import startrack
+from startrack.applications import horizon
 from startrack.applications.horizon import frames as horizon_frames
 from startrack.applications.horizon import measure_skyline, predicted_visible
 from startrack.applications.horizon.frames import orient_frames
@@ -61,8 +62,13 @@ def painted_later(two_frames, catalog):
 
 
 @pytest.fixture(scope="module")
-def photographed(catalog):
-    return measure_skyline([read_exposure(PHOTO)], catalog, LOWELL, camera=load_camera("lowell-ldt")).skyline
+def measured_photo(catalog):
+    return measure_skyline([read_exposure(PHOTO)], catalog, LOWELL, camera=load_camera("lowell-ldt"))
+
+
+@pytest.fixture(scope="module")
+def photographed(measured_photo):
+    return measured_photo.skyline
 
 
 def error_deg(skyline):
@@ -250,7 +256,10 @@ def test_the_command_writes_files_of_one_computation_and_the_record(tmp_path, ca
     assert len(fitted) == 1 and not (tmp_path / "b.csv").exists()
 
 
-def test_the_folder_of_results_and_no_plots_hold(tmp_path, monkeypatch, capsys):
+def test_the_folder_of_results_and_no_plots_hold(measured_photo, tmp_path, monkeypatch, capsys):
+    oriented = measured_photo.frames, measured_photo.left_out
+    monkeypatch.setattr(horizon, "orient_frames", lambda *args, **more: oriented)
+    monkeypatch.setattr(horizon, "measure_frames", lambda *args: measured_photo)
     monkeypatch.chdir(tmp_path)
     words = ["horizon", str(PHOTO), "-o", "a.csv", "-D", "out", LOWELL_FLAG, "-c", "lowell-ldt"]
     assert main([*words, "--no-plots"]) == 0

@@ -20,15 +20,21 @@ from startrack.terrain import Cylinder, load_terrain
 THESIS = load_terrain("shackleton-thesis")
 assert isinstance(THESIS, Cylinder)
 PIT = replace(THESIS, diameter_m=200.0, depth_m=40.0, camera_height_m=0.0, search_radius_m=100.0)
-STEP_M, FINE_STEP_M = 1.0, 0.5  # of the grid over the whole floor, and of one about the position
+FLOOR_STEP_M, FINE_STEP_M = 2.0, 0.5  # of the grid over the whole floor, and of one about the position
 SECTORS = 240  # of 1.5 degrees
 
 
-def grid() -> np.ndarray:
-    line = np.arange(-100.0, 100.0, STEP_M) + STEP_M / 2
+def grid(step_m: float = 1.0) -> np.ndarray:
+    line = np.arange(-100.0, 100.0, step_m) + step_m / 2
     x, y = np.meshgrid(line, line)
     places = np.stack([x.ravel(), y.ravel()], axis=1)
     return places[np.hypot(*places.T) < 100.0]
+
+
+def shares(log: np.ndarray) -> np.ndarray:
+    """Weights (n,) of sum one, of log-likelihoods (n,)."""
+    weight = np.exp(log - log.max())
+    return np.asarray(weight / weight.sum())
 
 
 def log_likelihood(places: np.ndarray, evidence: Evidence) -> np.ndarray:
@@ -73,28 +79,22 @@ def test_any_small_problem_agrees_with_the_grid(seed: int) -> None:
     """The whole floor, so that no other place is left out."""
     rng = np.random.default_rng(seed)
     evidence = simulate_rays(rng.uniform(-60, 60, 2), 500, 0.0, rng)
-    fix, places = ExactPosterior()(evidence, PIT), grid()
-    log = slow_chain_scores(places, evidence, PIT, fix.position_enu_m[:2])
-    weight = np.exp(log - log.max())
-    weight /= weight.sum()
+    fix, floor = ExactPosterior()(evidence, PIT), grid(FLOOR_STEP_M)
+    at, sigma = fix.position_enu_m[:2], np.sqrt(np.trace(fix.covariance_m2))
+    weight = shares(slow_chain_scores(floor, evidence, PIT, at))
     assert fix.dropped_probability < 1e-3
-    close = np.linalg.norm(places - fix.position_enu_m[:2], axis=1)
-    if len(fix.modes) == 1:
-        mean = weight @ places
-        line = np.arange(-30.0, 30.0) * FINE_STEP_M
-        near = mean + np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-        near_log = slow_chain_scores(near, evidence, PIT, fix.position_enu_m[:2])
-        part = np.exp(near_log - near_log.max())
-        part /= part.sum()
-        mean = part @ near
-        spread = np.einsum("n,ni,nj->ij", part, near - mean, near - mean)
-        sigma = np.sqrt(np.trace(spread))
-        # Cells narrower than a step are the grid's own error.
-        assert np.linalg.norm(fix.position_enu_m[:2] - mean) < 0.1 * sigma + 0.5 * FINE_STEP_M
-        assert fix.covariance_m2 == pytest.approx(spread, abs=0.15 * sigma**2 + FINE_STEP_M**2)
-    assert weight[close < 1.1 * fix.radius95_m + STEP_M].sum() > 0.94
-    assert weight[close < 0.85 * fix.radius95_m - STEP_M].sum() < 0.96
-    assert weight[close > 1.1 * fix.radius999_m + STEP_M].sum() < 3e-3
+    assert weight[np.linalg.norm(floor - at, axis=1) > 1.1 * fix.radius999_m + FLOOR_STEP_M].sum() < 3e-3
+    assert len(fix.modes) == 1 and sigma < 3.0
+    line = np.arange(-20.0, 20.0) * FINE_STEP_M
+    near = weight @ floor + np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    weight, close = shares(slow_chain_scores(near, evidence, PIT, at)), np.linalg.norm(near - at, axis=1)
+    mean = weight @ near
+    spread = np.einsum("n,ni,nj->ij", weight, near - mean, near - mean)
+    # Cells narrower than a step are the grid's own error.
+    assert np.linalg.norm(at - mean) < 0.1 * sigma + 0.5 * FINE_STEP_M
+    assert fix.covariance_m2 == pytest.approx(spread, abs=0.15 * sigma**2 + FINE_STEP_M**2)
+    assert weight[close < 1.1 * fix.radius95_m + FINE_STEP_M].sum() > 0.94
+    assert weight[close < 0.85 * fix.radius95_m - FINE_STEP_M].sum() < 0.96
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -103,9 +103,7 @@ def test_the_search_leaves_the_boxes_that_matter(seed: int) -> None:
     rng = np.random.default_rng(seed)
     evidence = simulate_rays(rng.uniform(-50, 50, 2), 120, 0.0, rng)
     places = grid()
-    log = log_likelihood(places, evidence)
-    weight = np.exp(log - log.max())
-    weight /= weight.sum()
+    weight = shares(log_likelihood(places, evidence))
     for nats in (12.0, 20.0, 60.0):
         method = ExactPosterior(prune_nats=nats)
         centres, half, log_weight, log_dropped, *_ = method.explore(evidence, PIT)

@@ -91,7 +91,7 @@ def test_in_a_round_crater_the_position_lies_on_an_arc(sigma_s: float) -> None:
     rows = evidence_at((-6500.0, 1000.0), 6)
     clock = clock_at(site, sigma_s)
     fix = ExactPosterior()(replace(rows, clock=clock), terrain)
-    offsets = np.linspace(-3.5, 3.5, 29)
+    offsets = np.linspace(-3.5, 3.5, 15)
     weight = np.exp(-0.5 * offsets**2)
     weight /= weight.sum()
     fixes = [

@@ -6,6 +6,7 @@ import os
 import sys
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import lru_cache, partial
 from itertools import pairwise
 
 import numpy as np
@@ -19,12 +20,17 @@ from startrack.applications.reproduction import (
     QUICK,
     Context,
     Size,
+    comparison,
     fix_store,
     methods,
+    scene,
     simulator,
+    valley,
     write_artefact,
 )
 from startrack.applications.reproduction.methods import KUA, OURS, Task, compute_chunk, tasks_of
+from startrack.applications.reproduction.published.kua_drive import DRIVE_M
+from startrack.applications.reproduction.published.skylines import MAP_STEP_M, MapGrid
 from startrack.applications.reproduction.simulator import (
     PERFECT,
     Mistakes,
@@ -49,10 +55,12 @@ from startrack.core.files import hold_lock
 from startrack.localization import ExactPosterior, Hull, PseudoGradient
 
 SMALL = Size(
-    "small", skies=10, per_sky=300, ours_per_sky=5, bound_per_sky=5, deep_per_sky=2, one_sky=500, ours_one_sky=120,
-    sweep_skies=1, sweep_per_sky=2, traverses=10, compared_per_sky=1, compared_on_map=1,
+    "small", skies=10, per_sky=300, ours_per_sky=3, bound_per_sky=3, deep_per_sky=2, one_sky=500, ours_one_sky=120,
+    sweep_skies=1, sweep_per_sky=1, traverses=10, compared_per_sky=1, compared_on_map=1,
     compared_in_valley=1, compared_series=1,
 )  # fmt: skip
+FEW = {"methods": replace(SMALL, skies=2)}  # whose errors other files test: here the table is written only
+COARSE_M, VALLEY_M = 10 * MAP_STEP_M, DRIVE_M  # step of the grid of skylines; radius of valleys that a drive fits in
 TINY = replace(SMALL, skies=3, per_sky=8, ours_per_sky=2, bound_per_sky=2, deep_per_sky=1, one_sky=8, ours_one_sky=4)
 
 
@@ -61,13 +69,30 @@ def hide_progress(what, total):
     yield Progress()
 
 
+@contextmanager
+def small_grounds():
+    """Within the block few skylines of a map are traced, which take minutes, and no method runs for its time alone."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene, "traced_grid", lru_cache(maxsize=1)(partial(MapGrid.trace, step_m=COARSE_M)))
+        patch.setattr(scene, "valleys", lru_cache(maxsize=1)(valley.jacksboro))
+        patch.setattr(valley, "VALLEY_RADIUS_M", VALLEY_M)
+        patch.setattr(comparison, "_warm_up", lambda ground: None)
+        scene.terrain_of.cache_clear()
+        yield
+    scene.terrain_of.cache_clear()
+
+
 @pytest.fixture(scope="module")
 def small_run(tmp_path_factory):
     """Every table and figure of a small run, with its files. Workers of pytest-xdist share what is computed."""
     out = tmp_path_factory.mktemp("reproduced")
     shared = tmp_path_factory.getbasetemp().parent if "PYTEST_XDIST_WORKER" in os.environ else out
-    with hold_lock(shared / "reproduced.lock"), fix_store(shared, jobs=1, progress=hide_progress) as store:
-        artefacts = {name: make(Context(SMALL, 0, store)) for name, make in ARTEFACTS.items()}
+    with (
+        hold_lock(shared / "reproduced.lock"),
+        small_grounds(),
+        fix_store(shared, jobs=1, progress=hide_progress) as store,
+    ):
+        artefacts = {name: make(Context(FEW.get(name, SMALL), 0, store)) for name, make in ARTEFACTS.items()}
     return {name: (artefact, write_artefact(artefact, out, plots=True)) for name, artefact in artefacts.items()}
 
 

@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 LAG_FRAMES = 10
-BIAS = gtsam.symbol("b", 0)
+SHARED = gtsam.symbol("b", 0)
 
 
 def main() -> None:
@@ -41,7 +41,7 @@ def run(data, update, estimate, lag):
         here = gtsam.symbol("x", k)
         values.insert(here, data["mean"][k][:2])
         if k == 0:
-            add_prior(graph, values, BIAS)
+            add_prior(graph, values, SHARED, data["response"][0].shape[1] - 2)
         else:
             graph.add(move_factor(data, k - 1))
         posts = [gtsam.symbol("h", int(p)) for p in data["post"][k]]
@@ -49,18 +49,18 @@ def run(data, update, estimate, lag):
             if post not in seen or seen[post] < k - 1 - lag:  # new, or no longer in the window
                 add_prior(graph, values, post)
             seen[post] = k
-        stamps = dict.fromkeys([here, BIAS, *posts], float(k))
-        graph.add(frame_factor(data, k, [here, BIAS, *posts]))
+        stamps = dict.fromkeys([here, SHARED, *posts], float(k))
+        graph.add(frame_factor(data, k, [here, SHARED, *posts]))
         update(graph, values, stamps)
         positions.append(estimate().atVector(here))
         seconds.append(time.process_time() - start)
     return np.array(positions), np.array(seconds)
 
 
-def add_prior(graph, values, key) -> None:
-    """A shared error or a post, in its standard deviations."""
-    graph.add(gtsam.PriorFactorVector(key, np.zeros(1), gtsam.noiseModel.Unit.Create(1)))
-    values.insert(key, np.zeros(1))
+def add_prior(graph, values, key, count=1) -> None:
+    """The `count` shared errors, or a post, in their standard deviations."""
+    graph.add(gtsam.PriorFactorVector(key, np.zeros(count), gtsam.noiseModel.Unit.Create(count)))
+    values.insert(key, np.zeros(count))
 
 
 def frame_factor(data, k, keys):

@@ -33,8 +33,8 @@ BELOW_DEG, ABOVE_DEG, BRIGHTEST_ADU = 2.5, 3.5, 70.0  # of the columns about the
 SHIFTS_DEG, EDGE_DEG = np.arange(-1.5, 1.51, 0.02), 0.12  # tried, and the width of the edge: a pixel
 
 
-def compare_night(folder: Path, out: Path) -> None:
-    """Print what `startrack horizon` and the light of the picture in `folder` say beside the model.
+def compare_night(folder: Path, out: Path) -> str:
+    """What `startrack horizon` and the light of the picture in `folder` say beside the model, in sentences.
 
     A figure of the model's skyline on the picture, and the terrain, are written to `out`.
     """
@@ -42,7 +42,7 @@ def compare_night(folder: Path, out: Path) -> None:
     site = Site("earth", *np.radians(PLACE_DEG), HEIGHT_M).with_air({})
     exposure = read_exposure(folder / PICTURE, time_utc=parse_utc(TIME_UTC))
     (frame,), _ = orient_frames([exposure], load_catalog(), site, camera=None, fov_rad=FOV_RAD)
-    print(f"{PICTURE}: {len(frame.matched_star)} stars fit the lens, {frame.extra_sigma_px:.2f} px off")
+    stars = f"{len(frame.matched_star)} stars fit the lens, {frame.extra_sigma_px:.2f} px off."
     azimuth_deg = np.arange(FROM_DEG, TO_DEG, STEP_DEG)
     model_deg = horizon_deg(terrain, azimuth_deg)
     found = measure_frames((frame,), (), site).skyline
@@ -50,7 +50,10 @@ def compare_night(folder: Path, out: Path) -> None:
     here = ((degree - FROM_DEG) % 360.0 <= TO_DEG - FROM_DEG) & found.known
     off_deg = np.degrees(found.elevation_rad[here]) - horizon_deg(terrain, degree[here])
     words = f", {np.median(off_deg):+.2f} degrees off the model (median)" if here.any() else ""
-    print(f"horizon: {here.sum()} azimuths known from {FROM_DEG:g} to {TO_DEG:g}{words}")
+    horizon = (
+        f"`startrack horizon` knows {found.known.sum()} azimuths of 360, {here.sum()} of those from {FROM_DEG:g} to "
+        f"{TO_DEG:g}, where the model has the ridge{words}."
+    )
     offsets_deg, light = columns_about(frame, folder / PICTURE, azimuth_deg, model_deg)
     shift_deg, step = best_shift(offsets_deg, light.mean(axis=1))
     rng, blocks = (
@@ -59,11 +62,13 @@ def compare_night(folder: Path, out: Path) -> None:
     )
     drawn = [np.concatenate([blocks[k] for k in rng.integers(len(blocks), size=len(blocks))]) for _ in range(DRAWS)]
     spread = np.percentile([best_shift(offsets_deg, light[:, one].mean(axis=1))[0] for one in drawn], [16, 84])
-    print(
-        f"light of all columns: the model stands {-shift_deg:+.2f} degrees above the picture "
-        f"({-spread[1]:+.2f} to {-spread[0]:+.2f}), light below over above {1.0 + step / light.mean():.2f}"
+    columns = (
+        f"By the light of all columns together the model stands {-shift_deg:+.2f} degrees above the picture "
+        f"({-spread[1]:+.2f} to {-spread[0]:+.2f}); the light below the ridge over that above it is "
+        f"{1.0 + step / light.mean():.2f}."
     )
     draw_skyline(folder / PICTURE, pixels_of(frame, azimuth_deg, model_deg), out / "svalbard.png", brighter=4.0)
+    return f"{stars} {horizon} {columns}"
 
 
 def make_terrain(folder: Path, out: Path) -> Terrain:

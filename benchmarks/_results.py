@@ -18,6 +18,7 @@ from _sources import ROOT, hash_of
 
 HERE = Path(__file__).parent
 RESULTS, STORE = HERE / "RESULTS.md", HERE / "results"
+WORSE = STORE / "worse.md"  # what is worse than at the measurement before, with the reason, written by hand
 HEAD = """# Results
 
 Each section is written by its own command; machines differ, so compare ratios, not seconds. A section that is marked
@@ -104,7 +105,8 @@ def write_results() -> None:
 
 def results_text() -> str:
     """RESULTS.md of the stored results, those of earlier programs marked."""
-    return "\n\n".join([HEAD.rstrip(), *(one.text() for one in stored_results())]) + "\n"
+    top = HEAD.rstrip(), WORSE.read_text(encoding="utf-8").strip()
+    return "\n\n".join([*top, *(one.text() for one in stored_results())]) + "\n"
 
 
 def commit_name() -> str:

@@ -29,13 +29,14 @@ SKY = SAMPLE.with_name("lowell-2018-08-06.fits.bz2")
 NIGHT = "2030-06-01T00:00:00Z"
 PREDICTED = ("--time", NIGHT, "--draws", "1", "--path", "way.csv", "--spacing", "200", "-j", "1")
 CAMERA = ("-c", "camera.toml")
+SHIPPED = "fisheye-2048"  # the camera of the sample, whose record is pointed
 COMMANDS = (
     ("locate", "image.png", "--json", "--no-plots"), ("identify", "image.png", "--json", "--no-plots"),
     ("detect", "image.png", "--json", "--no-plots"), ("locate", "image.png", "--no-plots"),
     ("terrain", "show", "terrain.toml", "--json", "--no-plots"), ("calibrate", "show", "camera.toml"),
     ("calibrate", "convert", "camera.toml", "--to", "opencv", "-q"), ("track", "image.png", "--no-plots"),
-    ("calibrate", "convert", "camera.toml", "--to", "platepar", "--attitude", "image.fix.json", "--site=34,-111", "-q"),
-    ("calibrate", "convert", "camera.toml", "--to", "indi-allsky", "--attitude", "image.fix.json", "--site=34,-111"),
+    ("calibrate", "convert", SHIPPED, "--to", "platepar", "--attitude", "image.fix.json", "--site=-34,69", "-q"),
+    ("calibrate", "convert", SHIPPED, "--to", "indi-allsky", "--attitude", "image.fix.json", "--site=-34,69"),
     ("calibrate", "convert", "camera.yaml", "--from", "ros", "-q"), ("calibrate", "verify", "image.png", *CAMERA),
     ("calibrate", "image.png", *CAMERA, "-q", "-o"),
     ("horizon", "sky.fits.bz2", "-c", "sky.toml", "--site=34.74,-111.42,2360", "-q", "-o"),

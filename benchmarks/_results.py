@@ -18,7 +18,7 @@ from _sources import ROOT, hash_of
 
 HERE = Path(__file__).parent
 RESULTS, STORE = HERE / "RESULTS.md", HERE / "results"
-WORSE = STORE / "worse.md"  # what is worse than at the measurement before, with the reason, written by hand
+WORSE = HERE / "worse.md"  # what is worse than at the measurement before, with the reason, written by hand
 HEAD = """# Results
 
 Each section is written by its own command; machines differ, so compare ratios, not seconds. A section that is marked

@@ -34,9 +34,7 @@ def test_a_position_without_a_circle_is_called_approximate(located):
     fix = located.result.fix
     point = replace(located.result, fix=point_fix(fix.position_enu_m[:2], located.result.terrain), sky=None)
     line = summary_line(point, seconds=3.14)
-    assert re.fullmatch(
-        r"small  ok  E \S+ m  N \S+ m  approximate, no circle  heading .* stars  3\.1 s", line
-    ), line
+    assert re.fullmatch(r"small  ok  E \S+ m  N \S+ m  approximate, no circle  heading .* stars  3\.1 s", line), line
     assert "error      evidence stars; search approximate; no circle\n" in verbose_text(point)
     own = replace(located.result, fix=replace(fix, search="approximate"))  # of a user's own method, with a circle
     assert re.search(r"±\S+ m \(95 %\)  approximate  heading", summary_line(own))

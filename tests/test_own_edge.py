@@ -15,12 +15,12 @@ from test_skyline import CAMERA, PLACES_M, Frame, expose, locate
 from test_skyline import CRATER as RENDERED
 
 from startrack.catalog import load_catalog
-from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Bools, Evidence, Fix
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Bools, Evidence, Fix, ImageErrors
 from startrack.evidence.sky_light import LEVELS
 from startrack.evidence.skyline import Skyline, look_through, scale_across, skyline_band
 from startrack.frames import azel_from_rays
 from startrack.localization import ExactPosterior
-from startrack.localization.neighbourhood import OwnEdge, SectorRows
+from startrack.localization.neighbourhood import Neighbourhood, OwnEdge, SectorRows
 from startrack.localization.obstacle_chain import STATES, clear_emissions
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel
@@ -69,11 +69,13 @@ def test_light_alone_has_no_other_edge_than_the_skyline() -> None:
 def test_lit_states_are_those_of_stars_at_the_skyline_and_light_by_its_neighbours() -> None:
     """The chain's likelihood is a product of matrices."""
     rng = np.random.default_rng(3)
-    light, stars = sky_rows(TRUE, rng, NATS), star_rows(TRUE, rng, STARS)
-    plain = SkylineModel.of(CRATER, Evidence.concatenate(light, stars), PLACE, 30.0, SharedErrors.of(CRATER, None))
+    sky, stars = sky_rows(TRUE, rng, NATS), star_rows(TRUE, rng, STARS)
+    plain = SkylineModel.of(CRATER, Evidence.concatenate(sky, stars), PLACE, 30.0, SharedErrors.of(CRATER, None))
     by_stars = SectorRows(plain.around, stars).profiles
     edge = OwnEdge(
-        by_stars, rng.uniform(0.01, 2.0, SECTORS) * np.exp(by_stars.offset - plain.seen.profiles.offset), np.ones(1)
+        by_stars,
+        rng.uniform(0.01, 2.0, SECTORS) * np.exp(by_stars.offset - plain.seen.profiles.offset),
+        np.ones(SECTORS),
     )
     seen, shifts = replace(plain.seen, edge=edge), np.radians(rng.uniform(-0.05, 0.05, (5, 1)) * np.ones(SECTORS))
     expected = clear_emissions(by_stars, shifts.T.copy())[:, 0] * edge.light
@@ -123,3 +125,32 @@ def test_light_with_another_edge_all_around_tells_nothing_of_the_position(dark_p
     assert found.status == "ok"
     assert found.evidence_source == "stars"
     assert dark.error_m(found) < found.fix.radius999_m
+    assert found.fix.integrity.protection_level_m < 200.0
+
+
+@pytest.mark.parametrize("lit", [0.0, 0.5, 1.0])
+def test_the_linear_model_leaves_light_with_another_edge_out(lit: float) -> None:
+    """Moments of a mixture, and errors of the image that raise the light alone."""
+    rng = np.random.default_rng(5)
+    sky, stars = sky_rows(TRUE, rng, NATS), star_rows(TRUE, rng, STARS)
+    raised = ImageErrors(np.ones((SECTORS, 1)), np.zeros(1), np.eye(1), np.full(SECTORS, 1e-8))
+    plain = SectorRows(Neighbourhood(CRATER, PLACE, 30.0), Evidence.concatenate(sky, stars), raised)
+    alone = SectorRows(plain.around, stars)
+    seen = replace(plain, edge=OwnEdge(alone.profiles, np.ones(SECTORS), np.full(SECTORS, lit)))
+    np.testing.assert_allclose(seen.image_rise, (1.0 - lit) * plain.image_rise)
+    drawn = rng.random(200_000) < lit
+    first, second = (one.moments for one in (plain, alone))
+    heights = np.where(drawn, *(
+        rng.normal(one.mean_rad[0], np.sqrt(one.variance_rad2[0]), len(drawn)) for one in (second, first)
+    ))  # fmt: skip
+    assert seen.moments.mean_rad[0] == pytest.approx(heights.mean(), abs=5e-3 * heights.std())
+    assert seen.moments.variance_rad2[0] == pytest.approx(heights.var(), rel=0.02)
+
+
+def test_a_wrong_lens_under_a_bright_sky_has_circles_that_hold_the_truth() -> None:
+    """Light off by 0.4 px at the rim is not the skyline; a protection level is found."""
+    tilted = replace(CAMERA, focal_px=(CAMERA.focal_px[0] * 1.002, CAMERA.focal_px[1] * 1.002))
+    catalog = load_catalog().brighter_than(7.0)
+    frame = expose(catalog, PLACES_M["halfway"], 19.0, camera=tilted)
+    found = locate(frame, catalog)
+    assert found.status == "refused" or frame.error_m(found) < found.fix.radius999_m

@@ -39,14 +39,15 @@ def assess_integrity(
         whole_m2: (2, 2) covariance of the position with all errors.
         radius999_m: of the fix.
     """
-    groups = _divide()
+    groups, lit = _divide(), model.lit(model.states(parameters))
     mean, without = np.full((len(groups), 2), np.nan), np.full((len(groups), 2, 2), np.inf)
     for number, (reach, across) in enumerate(GRIDS):
         offsets, is_rim = _grid(model, parameters[:2], covariance_m2, reach, across)
-        by_sector, prior = _sector_logs(model, parameters, offsets, clear)
+        by_sector, prior = _sector_logs(model, parameters, offsets, clear, lit)
         whole = by_sector.sum(axis=1)[:, None] + prior[:, None]
         if number == 0:
             (best,), (covariance,) = _moments(offsets, whole)
+            covariance = covariance + TINY_PART * covariance_m2
         rest = whole - by_sector @ groups.T
         new = np.isnan(mean[:, 0]) & (_masses(rest)[is_rim].sum(axis=0) < RIM_MASS)
         mean[new], without[new] = (found[new] for found in _moments(offsets, rest))
@@ -73,11 +74,19 @@ def _grid(model: SkylineModel, middle_m: Array, covariance_m2: Array, reach: flo
     return (offsets[kept], is_rim[kept]) if kept.any() else (offsets, is_rim)
 
 
-def _sector_logs(model: SkylineModel, parameters: Array, offsets: Array, clear: Array) -> tuple[Array, Array]:
-    """Log-likelihoods (n, SECTORS) of the sectors at offsets (n, 2), and logarithms (n,) of the errors' densities."""
+def _sector_logs(
+    model: SkylineModel, parameters: Array, offsets: Array, clear: Array, lit: Array
+) -> tuple[Array, Array]:
+    """Log-likelihoods (n, SECTORS) of the sectors at offsets (n, 2), and logarithms (n,) of the errors' densities.
+
+    The stars alone count where the light rather has an edge of its own (`lit`) than ends at the skyline (`clear`).
+    """
     moved = model.with_likely_errors(parameters[:2] + offsets, clear)
     shifts, prior = model.with_linear_errors(model.shifts(moved))
-    return clear_logs(model.seen.profiles, shifts, clear), prior + model.basis.log_prior(moved[:, 2:])
+    logs = clear_logs(model.seen.profiles, shifts, clear)
+    if model.seen.edge is not None:
+        logs = np.where(lit > clear, clear_logs(model.seen.edge.stars, shifts, np.minimum(clear + lit, 1.0)), logs)
+    return logs, prior + model.basis.log_prior(moved[:, 2:])
 
 
 def clear_logs(profiles: Profiles, shifts: Array, clear: Array) -> Array:

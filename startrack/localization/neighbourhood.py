@@ -184,9 +184,7 @@ class SectorRows:
         if self.edge is None:
             return together
         by_stars = measure_moments(self.edge.stars)
-        weights = (1.0 - self.edge.lit) / together.variance_rad2, self.edge.lit / by_stars.variance_rad2
-        variance = 1.0 / (weights[0] + weights[1])
-        return SectorMoments(variance * (weights[0] * together.mean_rad + weights[1] * by_stars.mean_rad), variance)
+        return together.mix(by_stars, self.edge.lit)
 
     @cached_property
     def log_offset(self) -> float:

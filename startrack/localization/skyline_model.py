@@ -177,7 +177,6 @@ class SkylineModel:
 
     def states_at(self, shift: Array) -> Array:
         """Probabilities (SECTORS, STATES) of the chain's states at a `shift` (SECTORS,) of the map's skyline."""
-        """Probabilities (SECTORS, STATES) of the chain's states at a shift (SECTORS,) of the map's skyline."""
         return state_probabilities(self.seen.emissions(shift), self.seen.moves)
 
     @cached_property

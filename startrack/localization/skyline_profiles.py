@@ -254,6 +254,12 @@ class SectorMoments(NamedTuple):
         """Part (SECTORS,) of the window's variance that the rows take away; next to 0 where they show nothing."""
         return np.clip(1.0 - 3.0 * self.variance_rad2 / REACH_RAD**2, LEAST_SHOWN_PART, 1.0)
 
+    def mix(self, other: SectorMoments, part: Array) -> SectorMoments:
+        """Moments of the distribution that is the `other` one with a probability `part` (SECTORS,)."""
+        mean = (1.0 - part) * self.mean_rad + part * other.mean_rad
+        own, others = (np.square(one.mean_rad - mean) + one.variance_rad2 for one in (self, other))
+        return SectorMoments(mean, (1.0 - part) * own + part * others)
+
 
 def measure_moments(profiles: Profiles) -> SectorMoments:
     """Moments of all sectors, every height within REACH_RAD equally likely before."""

@@ -178,7 +178,7 @@ def test_what_cannot_correct_the_image_is_refused_in_one_line(tmp_path, capsys, 
     for file, words in (
         (small, f"the {name} is 40 x 60 px, the image 60 x 40"),
         (tmp_path / "none.fits", f"{name} .*none.fits: cannot be opened"),
-        (tmp_path / "text.fits", f"{name} .*text.fits: is not a PNG"),
+        (tmp_path / "text.fits", f"{name} .*text.fits: is not a file of PNG"),
         (tmp_path / "useless.png", f"{name} .*useless.png: (every pixel is saturated|is dark)"),
     ):
         with pytest.raises(BadInput, match=words) as refusal:

@@ -124,7 +124,7 @@ def draw_posterior(axes: Any, terrain: Any, rows: Evidence | None, centre_m: Arr
 
 
 def log_normal(fix: Any, points_m: Array) -> Array:
-    """Of the covariance that a fix states, at the points (n, 2)."""
+    """Logarithm (n,), less a constant, of the normal density that a fix states at points (n, 2) [m]."""
     away_m = points_m - fix.position_enu_m[:2]
     return -0.5 * np.einsum("ni,ij,nj->n", away_m, np.linalg.inv(fix.covariance_m2), away_m)
 

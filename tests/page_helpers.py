@@ -26,7 +26,7 @@ SNIPPET = re.compile(
     flags=re.MULTILINE | re.DOTALL,
 )
 EXIT_CODE = re.compile(r"#.*\bexit code (\d)")
-TIME_TAKEN = re.compile(r"  \d+\.\d s(?=$)|computed in \d+\.\d s")
+TIME_TAKEN = re.compile(r"  \d+\.\d s$|computed in \d+\.\d s")
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 ERROR = re.compile(r"± ?(\d+(?:\.\d+)?)")
 RADII = re.compile(r"\s*(one sigma|[\d.]+ % within|protected) ")

@@ -148,7 +148,7 @@ def test_the_linear_model_leaves_light_with_another_edge_out(lit: float) -> None
 
 
 def test_a_wrong_lens_under_a_bright_sky_has_circles_that_hold_the_truth() -> None:
-    """Light off by 0.4 px at the rim is not the skyline; a protection level is found."""
+    """A focal length that is wrong by 0.2 %: refused, or the truth is in the circle."""
     tilted = replace(CAMERA, focal_px=(CAMERA.focal_px[0] * 1.002, CAMERA.focal_px[1] * 1.002))
     catalog = load_catalog().brighter_than(7.0)
     frame = expose(catalog, PLACES_M["halfway"], 19.0, camera=tilted)

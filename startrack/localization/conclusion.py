@@ -135,7 +135,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
     if not best.model.seen.rows.is_first_look:
         require_files(found, best.found.likeliest(own))
         if not ambiguous:
-            integrity = assess_integrity(best.model, parameters, near[:2, :2], clear, covariance, radius999)
+            integrity = assess_integrity(best.model, parameters, near[:2, :2], clear, lit, covariance, radius999)
     blocked, lit_up = Blocked(1.0 - clear - lit), Blocked(lit)
     is_bias = np.array([one.name == "bias_rad" for one in best.model.errors.listed], dtype=bool)
     bias_rad = float((shares(best.log_weight) @ best.values[:, is_bias]).sum())

@@ -27,7 +27,13 @@ TINY_PART = 1e-9  # of the covariance, added so that one on a single point of a 
 
 
 def assess_integrity(
-    model: SkylineModel, parameters: Array, covariance_m2: Array, clear: Array, whole_m2: Array, radius999_m: float
+    model: SkylineModel,
+    parameters: Array,
+    covariance_m2: Array,
+    clear: Array,
+    lit: Array,
+    whole_m2: Array,
+    radius999_m: float,
 ) -> Integrity:
     """Integrity of a fix: its separations without each group of directions, and its protection level.
 
@@ -36,10 +42,11 @@ def assess_integrity(
         parameters: (2 + k,) of the fix.
         covariance_m2: (2, 2) about that of the position where the shared errors suit it.
         clear: (SECTORS,) probabilities that a sector shows the map's skyline.
+        lit: (SECTORS,) probabilities that its light has an edge of its own.
         whole_m2: (2, 2) covariance of the position with all errors.
         radius999_m: of the fix.
     """
-    groups, lit = _divide(), model.lit(model.states(parameters))
+    groups = _divide()
     mean, without = np.full((len(groups), 2), np.nan), np.full((len(groups), 2, 2), np.inf)
     for number, (reach, across) in enumerate(GRIDS):
         offsets, is_rim = _grid(model, parameters[:2], covariance_m2, reach, across)

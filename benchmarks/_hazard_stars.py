@@ -45,8 +45,10 @@ def false_light(part: float) -> Callable[[StarRays, Rng], StarRays]:
     """A part of the stars shows the light that is expected, hidden or not."""
 
     def change(rays: StarRays, rng: Rng) -> StarRays:
-        false = (rng.random(len(rays.light.llr)) < part) & rays.light.usable
-        return replace(rays, light=replace(rays.light, llr=np.where(false, _shown_llr(rays), rays.light.llr)))
+        false = (rng.random(len(rays.photometry.llr)) < part) & rays.photometry.usable
+        return replace(
+            rays, photometry=replace(rays.photometry, llr=np.where(false, _shown_llr(rays), rays.photometry.llr))
+        )
 
     return change
 
@@ -55,16 +57,16 @@ def rows_wrong(part: float) -> Callable[[StarRays, Rng], StarRays]:
     """A part of the stars shows the opposite of the truth: the light that is expected, or that of a hidden star."""
 
     def change(rays: StarRays, rng: Rng) -> StarRays:
-        light, shown = rays.light, _shown_llr(rays)
+        light, shown = rays.photometry, _shown_llr(rays)
         wrong = (rng.random(len(light.llr)) < part) & light.usable
-        return replace(rays, light=replace(light, llr=np.where(wrong, -np.sign(light.llr) * shown, light.llr)))
+        return replace(rays, photometry=replace(light, llr=np.where(wrong, -np.sign(light.llr) * shown, light.llr)))
 
     return change
 
 
 def _shown_llr(rays: StarRays) -> Array:
     """The log-likelihood ratio of stars with exactly the light that is expected."""
-    light = rays.light
+    light = rays.photometry
     sigma = np.maximum(light.sigma_e, 1.0)
     return np.asarray(visibility_llr(light.expected_e, light.expected_e, sigma, sigma))
 

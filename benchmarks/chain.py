@@ -122,7 +122,7 @@ def peers(result: Located, position_m: np.ndarray) -> dict[str, float]:
     """
     if not isinstance(result.terrain, Cylinder):
         return {}
-    photometry = result.light
+    photometry = result.photometry
     seen = np.isin(photometry.star, result.identification.star)
     listed = seen | (photometry.expected_e > 5.0 * np.maximum(photometry.sigma_e, 1e-9))
     listed &= photometry.usable & (photometry.elevation_rad > np.radians(3.0))

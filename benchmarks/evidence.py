@@ -135,8 +135,8 @@ def _score_fix(fix: Fix | None, position_m: Array) -> dict[str, Any]:
 def _ablations(result: Measured) -> Iterator[tuple[str, Evidence, ExactPosterior]]:
     full = ExactPosterior()
     yield "without remeasuring near the skyline", _photometry(result).evidence(), full
-    yield "list at 5 sigma", _list_evidence(result.light, 5.0), full
-    yield "list at 3 sigma", _list_evidence(result.light, 3.0), full
+    yield "list at 5 sigma", _list_evidence(result.photometry, 5.0), full
+    yield "list at 3 sigma", _list_evidence(result.photometry, 3.0), full
     lonely = _photometry(result, visible=np.zeros(len(result.stars)))  # neighbours that are never visible
     yield "without crowding", lonely.evidence(), full
     yield "without flux uncertainty", _photometry(result, certain=True).evidence(), full

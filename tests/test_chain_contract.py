@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from startrack.catalog import load_catalog
-from startrack.chain import Located, Outcome, Refused, Settings, pipeline, second_pass
+from startrack.chain import Located, Outcome, Refused, Settings, pipeline, two_looks
 from startrack.core.types import Evidence, Explored, Fix, MeasuredSkyline, NotLocated
 from startrack.evidence import StarEvidence
 from startrack.localization import ExactPosterior, PseudoGradient
@@ -113,13 +113,13 @@ class CountedPosterior(ExactPosterior):
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """How often the sky is measured, and what `locate_counted` adds."""
-    counter, measure = Counter[str](), second_pass.pixels_near_skyline
+    counter, measure = Counter[str](), two_looks.pixels_near_skyline
 
     def measure_counted(*args: Any) -> Any:
         counter["sky"] += 1
         return measure(*args)
 
-    monkeypatch.setattr(second_pass, "pixels_near_skyline", measure_counted)
+    monkeypatch.setattr(two_looks, "pixels_near_skyline", measure_counted)
     return counter
 
 

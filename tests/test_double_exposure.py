@@ -70,7 +70,7 @@ def locate(scene: Scene, electrons: Array, catalog: StarCatalog) -> Any:
 
 
 def photometry(scene: Scene, catalog: StarCatalog, rng: np.random.Generator) -> StarPhotometry:
-    return simulate_rays(scene, catalog, rng=rng).light
+    return simulate_rays(scene, catalog, rng=rng).photometry
 
 
 def mix(first: StarPhotometry, second: StarPhotometry, part: float, rng: np.random.Generator) -> StarPhotometry:

@@ -102,7 +102,7 @@ def test_stars_low_in_the_air_are_no_evidence() -> None:
     flat = replace(CRATER, depth_m=150.0, diameter_m=2e4)  # the rim stands 0.85 degrees high
     _, exposure = picture(102, flat, east_m=0.0, north_m=0.0)
     outcome = solve(exposure, flat)
-    light = (outcome if isinstance(outcome, Located) else outcome.reached).light  # type: ignore[union-attr]
+    light = (outcome if isinstance(outcome, Located) else outcome.reached).photometry  # type: ignore[union-attr]
     low = light.elevation_rad < LOWEST_PREDICTED_RAD
     assert low.sum() > 20
     assert not light.usable[low].any()
@@ -114,7 +114,7 @@ def test_stars_that_the_air_dims_are_not_hidden() -> None:
     outcome = solve(exposure, CRATER)
     assert isinstance(outcome, Located), outcome.message
     assert nees(outcome, miss_m(outcome, scene)) < EVERY_CHI2_2DOF
-    light = outcome.light
+    light = outcome.photometry
     above = light.elevation_rad - scene.horizon_rad(light.azimuth_rad)
     low = light.usable & (above > np.radians(0.5)) & (light.elevation_rad < np.radians(20.0))
     assert low.sum() > 100
@@ -130,10 +130,10 @@ def test_simulated_stars_are_dimmed_as_those_of_a_picture() -> None:
     outcome = solve(exposure, CRATER)
     assert isinstance(outcome, Located), outcome.message
     rays = simulate_rays(scene, load_catalog(), CRATER, rng=np.random.default_rng(1))
-    shown = {int(star): k for k, star in enumerate(outcome.light.star)}
-    pairs = np.array([(shown[int(s)], k) for k, s in enumerate(rays.light.star) if int(s) in shown])
-    bright = outcome.light.expected_e[pairs[:, 0]] > 50 * np.median(outcome.light.sigma_e)
-    ratio = np.log(rays.light.expected_e[pairs[bright, 1]] / outcome.light.expected_e[pairs[bright, 0]])
+    shown = {int(star): k for k, star in enumerate(outcome.photometry.star)}
+    pairs = np.array([(shown[int(s)], k) for k, s in enumerate(rays.photometry.star) if int(s) in shown])
+    bright = outcome.photometry.expected_e[pairs[:, 0]] > 50 * np.median(outcome.photometry.sigma_e)
+    ratio = np.log(rays.photometry.expected_e[pairs[bright, 1]] / outcome.photometry.expected_e[pairs[bright, 0]])
     assert np.abs(ratio).max() < 0.25
     assert abs(np.median(ratio)) < 0.05
 

@@ -432,7 +432,7 @@ def test_the_scale_is_that_of_stars_measured_at_their_predicted_pixels(located: 
 
 def test_evidence_of_a_rendered_crater(located: Any) -> None:
     """The pipeline's evidence against the renderer's truth: large ratios are right, all are calibrated."""
-    light, truth = located.result.light, located.truth
+    light, truth = located.result.photometry, located.truth
     stars = located.result.stars
     hidden = dict(zip(truth.sources.catalog_id.tolist(), truth.hidden.tolist(), strict=True))
     names = stars.catalog_id[light.star]

@@ -20,7 +20,7 @@ def with_covariance(camera, sigma_px):
 
 
 def photometry(result):
-    return measure_evidence(as_stage(result, Oriented), result.terrain, Settings(deep_stars=False)).light
+    return measure_evidence(as_stage(result, Oriented), result.terrain, Settings(deep_stars=False)).photometry
 
 
 def test_an_uncertain_lens_weakens_the_evidence_at_the_rim(located):

@@ -43,7 +43,7 @@ def test_a_damaged_frame_gives_the_position_with_honest_errors(located: Any, kin
 
 def test_the_corrected_evidence_is_calibrated(located: Any) -> None:
     pixels = located.result.exposure.pixels_adu
-    found = locate_damaged(located, damage_of(pixels, "clipped")).light
+    found = locate_damaged(located, damage_of(pixels, "clipped")).photometry
     horizon = located.result.terrain.horizon_rad(located.truth.position_enu_m[None, :2], found.azimuth_rad)
     hidden = found.usable & (found.elevation_rad < horizon - np.radians(2)) & (found.elevation_rad > 0)
     z = found.flux_e[hidden] / found.sigma_e[hidden]

@@ -291,7 +291,7 @@ def test_pixels_of_an_image_near_its_skyline(located: Any) -> None:
     near = SkylineEstimate(horizon, np.zeros(SECTORS))
     band = pixels_near_skyline(result.detections, result.camera, result.R_cam_enu, near)
     assert np.array_equal(band.reach_px, np.full(SECTORS, CLIP_SHIFT_PX))
-    pixels = band.without_stars(result.light)
+    pixels = band.without_stars(result.photometry)
     assert len(band.pixel) > len(pixels.light_e) > 20_000
     assert np.abs(band.height_px).max() < BAND_PX
     elevation = horizon(pixels.azimuth_rad) + pixels.height_px / pixels.px_per_rad
@@ -301,7 +301,7 @@ def test_pixels_of_an_image_near_its_skyline(located: Any) -> None:
     columns, rows = np.rint(xy).astype(int).T
     assert np.array_equal(pixels.light_e, result.detections.image_e[rows, columns])
     assert not result.detections.dead[rows, columns].any()
-    bright = result.light.xy_px[result.light.expected_e > 1000.0]
+    bright = result.photometry.xy_px[result.photometry.expected_e > 1000.0]
     assert cKDTree(bright).query(xy)[0].min() > 3.0  # px: three sigma of the PSF
     # The height is measured across the skyline: pixels one height apart are that far apart in the image.
     up, _ = result.camera.project(rays_from_azel(pixels.azimuth_rad, horizon(pixels.azimuth_rad)) @ result.R_cam_enu.T)

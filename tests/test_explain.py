@@ -37,8 +37,8 @@ def test_a_small_circle_needs_nothing(located: Any) -> None:
 
 @pytest.mark.parametrize("by_sky", [True, False])
 def test_a_longer_exposure_shows_more_stars_and_narrows_the_circle(located: Any, by_sky: bool) -> None:
-    light = located.result.light
-    noisy = replace(with_fix(located, radius95_m=30.0), light=replace(light, sigma_e=6.0 * light.sigma_e))
+    light = located.result.photometry
+    noisy = replace(with_fix(located, radius95_m=30.0), photometry=replace(light, sigma_e=6.0 * light.sigma_e))
     (text,) = explain(noisy if by_sky else replace(noisy, sky=None))
     seconds = located.result.exposure.exposure_s
     assert text.startswith(f"4 times the exposure ({4 * seconds:.3g} s): ")

@@ -136,7 +136,7 @@ def test_a_fix_beside_a_blocked_quarter_is_right(located: Any) -> None:
     blocked = result_dict(result)["evidence"]["blocked"]
     assert 60.0 < sum((b - a) % 360 for a, b in blocked) < 140.0
     assert any("not the map's skyline" in text for text in result.warnings)
-    assert result.fix.blocked.hides(result.light.azimuth_rad).any()
+    assert result.fix.blocked.hides(result.photometry.azimuth_rad).any()
 
 
 @pytest.mark.parametrize(

@@ -90,14 +90,14 @@ def test_behind_a_masked_mast_the_fix_stays_right_and_a_lamp_on_it_does_no_harm(
     assert nees(dark, located) < EVERY_CHI2_2DOF
     assert np.array_equal(lit.fix.position_enu_m, dark.fix.position_enu_m)
     assert np.array_equal(lit.detections.xy_px, dark.detections.xy_px)
-    columns, rows = np.rint(dark.light.xy_px).astype(int).T
+    columns, rows = np.rint(dark.photometry.xy_px).astype(int).T
     behind = hidden[np.clip(rows, 0, 1023), np.clip(columns, 0, 1023)]
     assert np.count_nonzero(behind) > 50
-    assert set(status_of(dark.light)[behind]) == {"unusable"}
-    assert "masked" in set(dark.light.cause[behind])
-    near = touch_masked(hidden, dark.light.xy_px, 8)
-    assert not np.any(dark.light.cause[~near] == "masked")
-    assert len(dark.light.evidence()) < len(known.light.evidence())
+    assert set(status_of(dark.photometry)[behind]) == {"unusable"}
+    assert "masked" in set(dark.photometry.cause[behind])
+    near = touch_masked(hidden, dark.photometry.xy_px, 8)
+    assert not np.any(dark.photometry.cause[~near] == "masked")
+    assert len(dark.photometry.evidence()) < len(known.photometry.evidence())
 
 
 def test_a_masked_ridge_that_hugs_the_horizon_does_not_move_the_fix(located, catalog):

@@ -117,7 +117,7 @@ def test_the_ground_behind_an_obstacle_says_nothing():
     assert not told.result.fix.blocked
     off = told.result.fix.position_enu_m[:2] - true_m()
     assert np.linalg.norm(off) < told.result.fix.radius999_m < 3.0 * located().result.fix.radius999_m
-    light = told.result.light
+    light = told.result.photometry
     azimuth, elevation = np.degrees(light.azimuth_rad), np.degrees(light.elevation_rad)
     behind = (azimuth > FROM_DEG + 1) & (azimuth < TO_DEG - 1) & (elevation < 29.0)
     assert behind.sum() > 100

@@ -93,9 +93,11 @@ def test_identified_stars_have_a_green_ring_and_hidden_ones_a_cross(picture, vie
             any(has_colour_near(picture, at + np.array([0.0, r]), Ink.IDENTIFIED, tolerance=120) for r in range(5, 11))
         )
     assert np.mean(ringed) > 0.8
-    hidden = np.flatnonzero(result.light.llr < -3.0)[:10]
+    hidden = np.flatnonzero(result.photometry.llr < -3.0)[:10]
     assert (
-        np.mean([has_colour_near(picture, place, Ink.HIDDEN) for place in view.canvas_px(result.light.xy_px[hidden])])
+        np.mean(
+            [has_colour_near(picture, place, Ink.HIDDEN) for place in view.canvas_px(result.photometry.xy_px[hidden])]
+        )
         > 0.8
     )
 
@@ -140,7 +142,7 @@ def test_names_lie_on_no_other_name_and_no_bright_mark(located, view):
     assert len(names) > 20
     seen = result.names.stars
     first = seen.xy_px[np.argsort(result.stars.v_mag[seen.star], kind="stable")[:20]]
-    hidden_px = result.light.xy_px[status_of(result.light) == "hidden"][:10]
+    hidden_px = result.photometry.xy_px[status_of(result.photometry) == "hidden"][:10]
     marks = [view.canvas_px(place) for place in (*first, *hidden_px, *(body[1:3] for body in overlay["bodies"]))]
     for k, (text, (left, top, right, bottom)) in enumerate(names):
         assert "hidden" not in text

@@ -140,7 +140,7 @@ def test_star_counts(fix, located):
     assert 0 <= stars["false_alarm_probability"] < 1e-9
     # The truth states which stars the wall hides; the position found may change a few of them.
     visible = set(located.truth.sources.catalog_id[~located.truth.hidden].tolist())
-    measured = result.stars.catalog_id[result.light.star[result.light.usable]].tolist()
+    measured = result.stars.catalog_id[result.photometry.star[result.photometry.usable]].tolist()
     assert stars["predicted_visible"] == pytest.approx(sum(star in visible for star in measured), abs=8)
 
 

@@ -30,7 +30,7 @@ def table(located, tmp_path_factory):
 
 
 def test_every_measured_star_is_a_row_in_its_units(table, located):
-    light, stars = located.result.light, located.result.stars
+    light, stars = located.result.photometry, located.result.stars
     assert " ".join(table.colnames) == COLUMNS
     assert len(table) == len(light.star)
     assert table["catalog_id"].tolist() == stars.catalog_id[light.star].tolist()
@@ -56,7 +56,7 @@ def test_what_was_not_measured_is_masked(table, located):
     for name in ("flux_e", "sigma_e", "evidence"):
         assert (np.ma.getmaskarray(table[name]) == unusable).all()
     assert (np.ma.getmaskarray(table["cause"]) == ~unusable).all()
-    assert set(table["cause"][unusable]) <= set(result.light.cause.tolist())
+    assert set(table["cause"][unusable]) <= set(result.photometry.cause.tolist())
 
 
 def test_the_status_agrees_with_the_truth(table, located):
@@ -71,7 +71,7 @@ def test_the_status_agrees_with_the_truth(table, located):
 
 
 def test_status_of_evidence(located):
-    light = located.result.light
+    light = located.result.photometry
     few = [replace_row(light, llr, cause) for llr, cause in ((3.5, ""), (-3.5, ""), (0.5, ""), (0.0, "bad pixels"))]
     assert [status_of(one)[0] for one in few] == ["seen", "hidden", "uncertain", "unusable"]
 
@@ -98,11 +98,11 @@ def test_without_a_terrain_there_are_matches_and_predictions(located, tmp_path):
 
 
 def test_a_full_table_has_a_line_for_each_star(located):
-    light = located.result.light
+    light = located.result.photometry
     many = np.resize(np.arange(len(light.star)), 35_000)
     rows = {name: getattr(light, name)[many] for name in vars(light) if name != "causes"}
     nobody = replace(located.result.names, stars=located.result.names.stars.take(slice(0)))
-    result = replace(located.result, light=replace(light, **rows), names=nobody)
+    result = replace(located.result, photometry=replace(light, **rows), names=nobody)
     text = star_table_text(result)
     assert text.count("\n") > 35_000
 

@@ -14,7 +14,7 @@ from test_evidence import without_sources
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.chain import Settings, locate, locate_rays, second_pass
+from startrack.chain import Settings, locate, locate_rays, two_looks
 from startrack.chain.stages import StarRays
 from startrack.core.types import BadInput
 from startrack.evidence.photometry import Sources, half_width, measure
@@ -112,13 +112,13 @@ def test_a_wrong_clock_turns_the_rays_and_not_what_is_seen(series: Series):
     )  # fmt: skip
     assert right.clock.sigma_s == wrong.clock.sigma_s == 3600.0
     back = wrong.later(-3600.0, np.inf)
-    off = (back.light.azimuth_rad - right.light.azimuth_rad + np.pi) % (2 * np.pi) - np.pi
-    assert np.abs(off[right.light.elevation_rad < 1.4]).max() < 1e-4
-    assert right.light.llr == pytest.approx(wrong.light.llr, abs=0.1)
+    off = (back.photometry.azimuth_rad - right.photometry.azimuth_rad + np.pi) % (2 * np.pi) - np.pi
+    assert np.abs(off[right.photometry.elevation_rad < 1.4]).max() < 1e-4
+    assert right.photometry.llr == pytest.approx(wrong.photometry.llr, abs=0.1)
 
 
 def test_the_stars_of_an_image_are_located_as_the_pipeline_locates_them(located: Any, monkeypatch: Any):
-    monkeypatch.setattr(second_pass, "exceeds_noise", lambda light: False)  # no star is measured anew after a first fix
+    monkeypatch.setattr(two_looks, "exceeds_noise", lambda light: False)  # no star is measured anew after a first fix
     known, settings = located.result, Settings(evidence_sources="stars")
     catalog = load_catalog().brighter_than(7.0)
     by_stars = locate(known.exposure, known.camera, known.terrain, catalog, settings)

@@ -65,7 +65,7 @@ def test_the_skyline_of_the_band_is_measured_as_that_of_images(
         horizon = Skyline(true.elevation_rad + raised_px / series.camera.focal_px[0])
         near = SkylineEstimate(horizon, np.zeros(SECTORS))
         band = pixels_near_skyline(measured.detections, series.camera, scene.R_cam_enu, near)
-        sky = measure_sky_light(band.without_stars(measured.light), horizon)
+        sky = measure_sky_light(band.without_stars(measured.photometry), horizon)
         good = sectors_with_step(sky)
         error_px = (sky.shift_px + raised_px * sky.px_per_rad / series.camera.focal_px[0])[good]
         off.append(np.average(error_px, weights=1.0 / sky.variance_px2[good]))

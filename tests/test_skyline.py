@@ -213,11 +213,11 @@ def test_the_table_of_the_skyline(by_source: dict[str, Located], tmp_path: Path)
 def test_the_skyline_is_measured_once(
     by_source: dict[str, Located], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(located: Located) -> None:
+    def fail(*given: object) -> None:
         raise AssertionError("the skyline is measured again")
 
     monkeypatch.setattr("startrack.chain.image_skyline.measured_skyline", fail)
-    monkeypatch.setattr("startrack.chain.pipeline.measured_skyline", fail)
+    monkeypatch.setattr("startrack.chain.two_looks.measured_skyline", fail)
     write_results(by_source["both"], tmp_path / "frame.fix.json")
     assert Solution(by_source["both"]).skyline is not None
     assert {path.name for path in tmp_path.glob("frame.skyline.*")} == {"frame.skyline.ecsv", "frame.skyline.png"}

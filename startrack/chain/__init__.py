@@ -38,12 +38,12 @@ from startrack.chain.pipeline import (
 )  # fmt: skip
 from startrack.chain.positioned import Positioned
 from startrack.chain.run import add_timing
-from startrack.chain.second_pass import EDGE_SIGMA_PX
 from startrack.chain.sky_state import stating_sky
 from startrack.chain.source_names import identified_names
 from startrack.chain.stages import (
     STAGES,
     Detected,
+    FirstLook,
     Identified,
     Inputs,
     Located,
@@ -51,20 +51,22 @@ from startrack.chain.stages import (
     Oriented,
     Outcome,
     Refused,
+    SecondLook,
     Settings,
     StarFix,
     StarRays,
     last_value,
 )
+from startrack.chain.two_looks import EDGE_SIGMA_PX
 
 __all__ = [
     "CERTAIN_PROBABILITY", "COMPLETE_V_MAG", "CORRELATION_RAD", "EDGE_SIGMA_PX", "MISSING", "STAGES", "Detected",
-    "Identified", "Image", "Inputs", "Located", "Measured", "NearAttitude", "Oriented", "Outcome",
-    "PlacedBySkyline", "Positioned", "Refused", "Settings", "SkylineErrors", "StarFix", "StarRays",
-    "StatedAttitude", "Time", "add_timing", "angle_rad", "are_unchanged", "camera_input", "content_sha256",
-    "detect", "duration_s", "exposure_input", "field_of_view_rad", "fit_orientation", "identified_names",
-    "identify", "identify_blind", "input_hashes", "is_list_of_centroids", "job_sha256", "last_value",
-    "load_camera_input", "load_named", "locate", "locate_exposure", "locate_measured", "locate_rays",
-    "locate_skyline", "mask_unpredictable", "read_near_attitude", "settings_input", "skyline_exposure",
-    "skyline_points", "stating_sky", "terrain_input", "time_input",
+    "FirstLook", "Identified", "Image", "Inputs", "Located", "Measured", "NearAttitude", "Oriented", "Outcome",
+    "PlacedBySkyline", "Positioned", "Refused", "SecondLook", "Settings", "SkylineErrors", "StarFix", "StarRays",
+    "StatedAttitude", "Time", "add_timing", "angle_rad", "are_unchanged", "camera_input", "content_sha256", "detect",
+    "duration_s", "exposure_input", "field_of_view_rad", "fit_orientation", "identified_names", "identify",
+    "identify_blind", "input_hashes", "is_list_of_centroids", "job_sha256", "last_value", "load_camera_input",
+    "load_named", "locate", "locate_exposure", "locate_measured", "locate_rays", "locate_skyline", "mask_unpredictable",
+    "read_near_attitude", "settings_input", "skyline_exposure", "skyline_points", "stating_sky", "terrain_input",
+    "time_input",
 ]  # fmt: skip

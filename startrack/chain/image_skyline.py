@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from startrack.chain.stages import Located
-from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, MeasuredSkyline, sector_of
+from startrack.chain.stages import Measured, SkyEvidence
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, Fix, MeasuredSkyline, sector_of
 from startrack.evidence import SEEN_LLR, Skyline, average_shifts
 
 WINDOW_RAD, WINDOW_STEP_RAD = np.radians(3.0), np.radians(0.01)  # about the terrain's skyline, which gives the shape
@@ -15,24 +15,25 @@ END_DENSITY = 0.05  # at either end of the window, beside the mean density
 SIMILAR_SIGMAS = 3.0  # sigma by the stars, in that by the sky's light, up to which both count as sources
 
 
-def measured_skyline(located: Located) -> MeasuredSkyline | None:
-    """The skyline of a `located` image at the middles of 240 sectors of azimuth, without the terrain's heights.
+def measured_skyline(measured: Measured, fix: Fix, sky: SkyEvidence | None) -> MeasuredSkyline | None:
+    """The skyline of a located image at the middles of 240 sectors of azimuth, without the terrain's heights.
 
-    The terrain serves for the shape of the skyline within each sector only: the elevation is that of the image. None
-    where several positions fit, and of a method of localization that is not right to the error of the image.
+    It is that by the stars of `measured` and by the light of the `sky`, None where that is not used. The terrain at the
+    `fix` serves for the shape of the skyline within each sector only: the elevation is that of the image. None where
+    several positions fit, and of a method of localization that is not right to the error of the image.
     """
-    if located.fix.ambiguous or located.fix.search == "approximate":
+    if fix.ambiguous or fix.search == "approximate":
         return None
-    horizon = Skyline.trace(located.position_at_time_m, located.terrain)
-    elevation, sigma = _skyline_by_stars(located.evidence(), horizon)
+    horizon = Skyline.trace(fix.at_time_m, measured.terrain)
+    elevation, sigma = _skyline_by_stars(measured.evidence(), horizon)
     source = np.where(sigma < MOST_SIGMA_RAD, "stars", "").astype("<U9")
-    if located.sky is not None:
-        sky, used, errors = located.sky
-        used = used & np.isfinite(sky.shift_sigma_px)
-        used = used if located.fix.blocked is None else used & ~located.fix.blocked.whole
+    if sky is not None:
+        light, used, errors = sky
+        used = used & np.isfinite(light.shift_sigma_px)
+        used = used if fix.blocked is None else used & ~fix.blocked.whole
         by_image = np.einsum("ni,ij,nj->n", errors.raised_rad, errors.covariance, errors.raised_rad)
-        by_sky = sky.elevation_rad + sky.shift_px / sky.px_per_rad - errors.raised_rad @ errors.mean
-        sky_sigma = np.sqrt(sky.variance_px2 / np.square(sky.px_per_rad) + by_image)
+        by_sky = light.elevation_rad + light.shift_px / light.px_per_rad - errors.raised_rad @ errors.mean
+        sky_sigma = np.sqrt(light.variance_px2 / np.square(light.px_per_rad) + by_image)
         both = used & (sigma < SIMILAR_SIGMAS * sky_sigma)
         share = np.zeros(SECTORS)
         share[both] = 1.0 / (1.0 + np.square(sigma[both] / sky_sigma[both]))

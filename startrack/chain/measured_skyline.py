@@ -19,8 +19,9 @@ from startrack.chain.near_attitude import REASON, read_near_attitude
 from startrack.chain.positioned import Positioned
 from startrack.chain.run import Run
 from startrack.chain.stages import Inputs, Refused
-from startrack.core.errors import BadInput
+from startrack.core.errors import BadInput, NoSolution
 from startrack.core.files import FilePath, printable
+from startrack.core.limits import limited_time
 from startrack.core.obstacles import column_names, read_columns
 from startrack.core.types import MIDDLES_RAD, Array, Exposure, Fix, MeasuredSkyline, PositionPrior
 from startrack.frames import R_enu_icrs, R_from_rotvec, Site, azel_from_rays, rays_from_azel
@@ -220,8 +221,9 @@ def locate_skyline(
     if terrain.site is None:
         raise BadInput("bad_terrain", f"terrain {terrain.name} has no [origin]")
     inputs = Inputs(exposure=exposure, terrain=terrain, localizer_name="posterior")
-    with Run(inputs, time_limit_s) as run:
-        with run.stage("locate"):
+    run = Run(inputs)
+    try:
+        with limited_time(time_limit_s), run.stage("locate"):
             fix, seen = locate_points(points, terrain)
         shown = MeasuredSkyline(
             azimuth_rad=MIDDLES_RAD, elevation_rad=np.where(seen.used, seen.elevation_rad, np.nan),
@@ -232,4 +234,5 @@ def locate_skyline(
             skyline=shown, near=points.near,
         )  # fmt: skip
         return run.finish(placed)
-    return run.refusal
+    except (BadInput, NoSolution) as cause:
+        return run.refuse(cause)

@@ -16,7 +16,7 @@ from startrack.catalog import (
     load_deep_catalog,
 )
 from startrack.chain.orientation import require_time_and_site
-from startrack.chain.stages import Located, Measured, Oriented, Settings, StarFix, StarRays
+from startrack.chain.stages import FirstLook, Measured, Oriented, Settings, StarFix, StarRays
 from startrack.core.types import Array, Detections, Evidence, Fix, Ints, Stars, sector_of
 from startrack.evidence import (
     BAND_PX,
@@ -65,35 +65,40 @@ def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -
     Gaia's stars are used. Raises BadInput (bad_terrain, no_time) where the frame `enu` cannot be related to the stars.
     """
     when, site = require_time_and_site(oriented.exposure, terrain)
-    R_enu_cam = R_enu_icrs(site, when) @ oriented.attitude_fit.attitude.R_cam_icrs.T
-    mask = add_obstacles(oriented.detections.mask, oriented.camera, R_enu_cam, terrain, oriented.exposure.obstacles)
-    oriented = replace(oriented, detections=leave_out_obstacles(oriented.detections, mask))
-    shown = oriented
-    if settings.deep_stars:
-        oriented = add_gaia_stars(oriented, site)
-    R, response = R_enu_icrs(site, when), None
-    if oriented.damage is not None:
-        oriented = replace(oriented, detections=with_noise_of_blocks(oriented.detections))
-    scale = _flux_scale(oriented, R, site)
-    light = _photometry(oriented, terrain, R, scale, settings.evidence, oriented.detections)
-    if oriented.catalog_name != shown.catalog_name and not _shows_deep_stars(light, oriented.stars):
-        warnings = (*shown.exposure.warnings, NO_DEEP_STARS.format(oriented.catalog_name))
-        exposure = replace(shown.exposure, warnings=warnings)
-        oriented = replace(shown, exposure=exposure, detections=oriented.detections)
-        scale = _flux_scale(oriented, R, site)
-        light = _photometry(oriented, terrain, R, scale, settings.evidence, oriented.detections)
-    if oriented.damage is not None:
-        response = measure_response(light)
-        light = response.correct(light)
-    clock = clock_at(site, when, oriented.exposure.time_sigma_s, oriented.exposure.time_sigma_is_stated)
+    R = R_enu_icrs(site, when)
+    hipparcos = replace(oriented, detections=_usable_detections(oriented, terrain, R))
+    deep = add_gaia_stars(hipparcos, site) if settings.deep_stars else hipparcos
+    used, note = deep, ""
+    scale, photometry = _measure_stars(deep, terrain, R, settings.evidence)
+    if deep is not hipparcos and not _shows_deep_stars(photometry, deep.stars):
+        used, note = hipparcos, NO_DEEP_STARS.format(deep.catalog_name)
+        scale, photometry = _measure_stars(hipparcos, terrain, R, settings.evidence)
+    response = None if oriented.damage is None else measure_response(photometry)
     above = {"terrain": terrain, "site": site}
     return Measured(
-        **vars(oriented) | above, R_enu_icrs=R, clock=clock, scale=scale, light=light, response=response,
-        near=settings.near,
+        **vars(used) | above, R_enu_icrs=R, scale=scale, response=response, near=settings.near, catalog_note=note,
+        clock=clock_at(site, when, oriented.exposure.time_sigma_s, oriented.exposure.time_sigma_is_stated),
+        photometry=photometry if response is None else response.correct(photometry),
     )  # fmt: skip
 
 
-def _flux_scale(oriented: Oriented, R_enu_icrs: Array, site: Site) -> FluxScale:
+def _usable_detections(oriented: Oriented, terrain: Terrain, R_enu_icrs: Array) -> Detections:
+    """Detections without those on stated obstacles; of a damaged image with the noise of its blocks."""
+    R_enu_cam = R_enu_icrs @ oriented.attitude_fit.attitude.R_cam_icrs.T
+    mask = add_obstacles(oriented.detections.mask, oriented.camera, R_enu_cam, terrain, oriented.exposure.obstacles)
+    detections = leave_out_obstacles(oriented.detections, mask)
+    return detections if oriented.damage is None else with_noise_of_blocks(detections)
+
+
+def _measure_stars(
+    oriented: Oriented, terrain: Terrain, R_enu_icrs: Array, measure: StarEvidence
+) -> tuple[FluxScale, StarPhotometry]:
+    """Scale of the light of `oriented` stars by the identified ones, and by it the photometry of all of them."""
+    scale = _flux_scale(oriented, R_enu_icrs, terrain.site)
+    return scale, _photometry(oriented, terrain, R_enu_icrs, scale, measure, oriented.detections)
+
+
+def _flux_scale(oriented: Oriented, R_enu_icrs: Array, site: Site | None) -> FluxScale:
     """The scale of the light of `oriented` stars by the identified ones."""
     found, stars = oriented.identification, oriented.stars
     return flux_scale(
@@ -126,44 +131,45 @@ def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
     )
 
 
-def _shows_deep_stars(light: StarPhotometry, stars: Stars) -> bool:
+def _shows_deep_stars(photometry: StarPhotometry, stars: Stars) -> bool:
     """Whether the image shows the stars that Hipparcos lacks, by their light together high above any skyline.
 
     Synthetic images of Hipparcos alone do not: every one of these stars would then be evidence of a wall.
     """
-    high = light.usable & (stars.hip[light.star] == 0) & (light.elevation_rad > OPEN_SKY_RAD)
+    high = photometry.usable & (stars.hip[photometry.star] == 0) & (photometry.elevation_rad > OPEN_SKY_RAD)
     if not high.any():
         return True
-    expected, weight = light.expected_e[high], 1.0 / np.square(light.sigma_e[high])
+    expected, weight = photometry.expected_e[high], 1.0 / np.square(photometry.sigma_e[high])
     information = float(weight @ np.square(expected))
-    part = float((weight * expected) @ light.flux_e[high]) / information
+    part = float((weight * expected) @ photometry.flux_e[high]) / information
     return part + SURE_SIGMAS / np.sqrt(information) > DEEP_PART
 
 
-def remeasure_stars(first: Located, band: SkylineBand, sky: SkyLight, photometry: StarEvidence) -> Located:
-    """Copy of `first` whose stars beside the skyline are measured without the step of the `sky` in their background.
+def remeasure_stars(first: FirstLook, band: SkylineBand, light: SkyLight, measure: StarEvidence) -> Measured:
+    """Copy of the measured stars whose light beside the skyline is measured without the step of the sky's `light`.
 
-    `band` has the pixels beside the skyline of the `first` fix, `photometry` the settings.
+    `band` has the pixels beside the skyline of the `first` look, `measure` the photometry and its settings.
     """
-    light = first.light
-    azimuth, elevation = light.azimuth_rad, light.elevation_rad
-    sector = sector_of(azimuth)
-    above_px = band.heights_px(azimuth, elevation)
-    is_reliable = sky.levels.covered[sector] & (band.reach_px[sector] < MOST_SHIFT_PX) & band.near.is_level(azimuth)
+    known, blocked = first.measured, first.fix.blocked
+    stars = known.photometry
+    sector = sector_of(stars.azimuth_rad)
+    above_px = band.heights_px(stars.azimuth_rad, stars.elevation_rad)
+    is_reliable = light.levels.covered[sector] & (band.reach_px[sector] < MOST_SHIFT_PX)
+    is_reliable &= band.near.is_level(stars.azimuth_rad)
     wanted = (np.abs(above_px) < BAND_PX) & is_reliable
-    if first.fix.blocked is not None:
-        wanted &= ~first.fix.blocked.hides(azimuth)
+    if blocked is not None:
+        wanted &= ~blocked.hides(stars.azimuth_rad)
     around = np.abs(above_px) < BAND_PX + NEIGHBOURS_PX
     # The fix determines the visibility of neighbours better than their faint flux does, except next to the skyline.
     undecided = (np.abs(above_px) < UNDECIDED_PX) | ~is_reliable
     by_fix = np.where(above_px > 0, CERTAIN_PROBABILITY, 1.0 - CERTAIN_PROBABILITY)
-    visible = np.where(undecided, 1.0 / (1.0 + np.exp(-light.llr)), by_fix)
+    visible = np.where(undecided, 1.0 / (1.0 + np.exp(-stars.llr)), by_fix)
     newer = _photometry(
-        first, first.terrain, first.R_enu_icrs, first.scale, photometry, take_out_sky_step(band, sky),
-        light.star[around], visible[around],
+        known, known.terrain, known.R_enu_icrs, known.scale, measure, take_out_sky_step(band, light),
+        stars.star[around], visible[around],
     )  # fmt: skip
-    newer = newer if first.response is None else first.response.correct(newer)
-    return replace(first, light=light.replace_stars(newer, light.star[wanted]))
+    newer = newer if known.response is None else known.response.correct(newer)
+    return replace(known, photometry=stars.replace_stars(newer, stars.star[wanted]))
 
 
 def _photometry(
@@ -171,7 +177,7 @@ def _photometry(
     terrain: Terrain,
     R_enu_icrs: Array,
     scale: FluxScale,
-    photometry: StarEvidence,
+    measure: StarEvidence,
     detections: Detections,
     only: Ints | None = None,
     visible: Array | None = None,
@@ -179,7 +185,7 @@ def _photometry(
     """Photometry of all stars, or of those with the indices `only`; 0 evidence where the terrain is not known."""
     R, stars = oriented.attitude_fit.attitude.R_cam_icrs, oriented.stars
     air = airmass_at(stars.rays_icrs @ R_enu_icrs.T, terrain.site)
-    light = photometry(
+    found = measure(
         detections,
         oriented.camera,
         stars if only is None else stars.take(only),
@@ -191,16 +197,16 @@ def _photometry(
         visible,
         air if air is None or only is None else air[only],
     )
-    light = light if only is None else replace(light, star=only[light.star])
-    return mask_unpredictable(light, terrain)
+    found = found if only is None else replace(found, star=only[found.star])
+    return mask_unpredictable(found, terrain)
 
 
-def mask_unpredictable(light: StarPhotometry, terrain: Terrain) -> StarPhotometry:
-    """The photometry `light` without evidence where the `terrain` is not known, and of stars low in the air."""
-    rays = light.azimuth_rad, light.elevation_rad
+def mask_unpredictable(photometry: StarPhotometry, terrain: Terrain) -> StarPhotometry:
+    """The `photometry` without evidence where the `terrain` is not known, and of stars low in the air."""
+    rays = photometry.azimuth_rad, photometry.elevation_rad
     if terrain.air is not None:
-        light = light.mask_stars(np.where(light.elevation_rad < LOWEST_PREDICTED_RAD, LOW_IN_AIR, ""))
-    return light if terrain.is_informative(*rays).all() else light.mask_stars(terrain.mask_reason(*rays))
+        photometry = photometry.mask_stars(np.where(rays[1] < LOWEST_PREDICTED_RAD, LOW_IN_AIR, ""))
+    return photometry if terrain.is_informative(*rays).all() else photometry.mask_stars(terrain.mask_reason(*rays))
 
 
 def locate_rays(rays: StarRays, localizer: Localizer | None = None) -> StarFix:

@@ -78,11 +78,12 @@ def site_on_earth(exposure: Exposure) -> Site | None:
     return None
 
 
-def detect_sources(inputs: Inputs, camera: Camera | None, detector: Detector) -> Detected:
+def detect_sources(inputs: Inputs, detector: Detector) -> Detected:
     """Point sources of an exposure. Raises BadInput bad_image for fractions where the camera's levels are in counts.
 
-    `detector` finds them in the exposure of `inputs`; the levels of a `camera` convert counts to electrons.
+    `detector` finds them in the exposure of `inputs`; the levels of its camera, if known, convert counts to electrons.
     """
+    camera = inputs.camera
     stated = camera is not None and camera.sensor is not None
     if stated and inputs.exposure.saturation_adu is None and are_fractions(inputs.exposure.recorded_adu):
         raise BadInput(

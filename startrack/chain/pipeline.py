@@ -9,7 +9,6 @@ from dataclasses import replace
 
 from startrack.camera import Camera, load_camera
 from startrack.catalog import StarCatalog, load_catalog
-from startrack.chain.image_skyline import measured_skyline
 from startrack.chain.measurement import measure_evidence
 from startrack.chain.orientation import (
     check_inputs,
@@ -21,9 +20,10 @@ from startrack.chain.orientation import (
     solve_orientation,
 )  # fmt: skip
 from startrack.chain.run import Run, add_timing
-from startrack.chain.second_pass import fix_by_all, fix_by_stars, measure_at, see_skyline
 from startrack.chain.stages import Detected, Inputs, Located, Measured, Oriented, Refused, Settings
-from startrack.core.types import BadInput, Exposure
+from startrack.chain.two_looks import fix_by_all, look_at_skyline, look_first
+from startrack.core.limits import limited_time
+from startrack.core.types import BadInput, Exposure, NoSolution
 from startrack.detection import find_damage
 from startrack.evidence import check_single_skyline
 from startrack.frames import Site
@@ -40,28 +40,28 @@ def locate(
     `settings` exchanges stages. Bad input of an image makes a refusal too: no image raises an exception.
     """
     settings = settings or Settings()
-    inputs = Inputs(
+    given = Inputs(
         exposure=exposure, camera=camera, terrain=terrain, catalog_name=catalog.name,
         localizer_name=localizer_name(settings.localizer), damage=find_damage(exposure, camera),
     )  # fmt: skip
-    with Run(inputs, settings.time_limit_s) as run:
-        check_inputs(inputs)
-        ground = terrain.with_air(exposure.air)
-        inputs = run.reached = replace(inputs, terrain=ground)
-        with run.stage("detect"):
-            detected = run.reached = detect_sources(inputs, camera, settings.detector)
-        with run.stage("identify"):
-            identified = run.reached = identify_stars(detected, camera, catalog, settings, ground.site)
-        with run.stage("attitude"):
-            oriented = run.reached = solve_orientation(identified)
-            check_one_attitude(oriented)
-        with run.stage("evidence"):
-            measured = run.reached = measure_evidence(oriented, ground, settings)
-        located = locate_measured(measured, settings, run.stage)
-        with run.stage("locate"):
-            located = replace(located, skyline=measured_skyline(located))
-        return run.finish(located)
-    return run.refusal
+    run = Run(given)
+    try:
+        with limited_time(settings.time_limit_s):
+            check_inputs(given)
+            ground = terrain.with_air(exposure.air)
+            inputs = run.reach(replace(given, terrain=ground))
+            with run.stage("detect"):
+                detected = run.reach(detect_sources(inputs, settings.detector))
+            with run.stage("identify"):
+                identified = run.reach(identify_stars(detected, camera, catalog, settings, ground.site))
+            with run.stage("attitude"):
+                oriented = run.reach(solve_orientation(identified))
+                check_one_attitude(oriented)
+            with run.stage("evidence"):
+                measured = run.reach(measure_evidence(oriented, ground, settings))
+            return run.finish(locate_measured(measured, settings, run.stage))
+    except (BadInput, NoSolution) as cause:
+        return run.refuse(cause)
 
 
 def locate_measured(
@@ -73,14 +73,13 @@ def locate_measured(
     there. The work is done in blocks of `stage`, which is given the name of each. Raises NoSolution of the localizer.
     """
     with stage("locate"):
-        first = fix_by_stars(measured, settings.localizer)
-        near = see_skyline(first)
+        first = look_first(measured, settings.localizer)
     with stage("evidence"):
-        complete = measure_at(near, first, settings)
+        second = look_at_skyline(first, settings)
     with stage("locate"):
-        if complete.damage is None:  # which changes the light of stars in part
-            check_single_skyline(complete.light, complete.terrain, complete.position_at_time_m)
-        return fix_by_all(complete, settings.localizer)
+        if second.measured.damage is None:  # which changes the light of stars in part
+            check_single_skyline(second.measured.photometry, second.measured.terrain, first.fix.at_time_m)
+        return fix_by_all(second, settings.localizer)
 
 
 def locate_exposure(exposure: Exposure, settings: Settings | None = None) -> Located | Refused:
@@ -117,18 +116,21 @@ def identify(
     """
     settings = settings or Settings()
     inputs = Inputs(exposure=exposure, camera=camera, catalog_name=catalog.name)
-    with Run(inputs, settings.time_limit_s) as run:
-        check_inputs(inputs)
-        known = site or site_on_earth(exposure)
-        where = known if known is None else known.with_air(exposure.air)
-        with run.stage("detect"):
-            detected = run.reached = detect_sources(inputs, camera, settings.detector)
-        with run.stage("identify"):
-            identified = run.reached = identify_stars(detected, camera, catalog, settings, where)
-        with run.stage("attitude"):
-            oriented = solve_orientation(identified)
-        return run.finish(oriented)
-    return run.refusal
+    run = Run(inputs)
+    try:
+        with limited_time(settings.time_limit_s):
+            check_inputs(inputs)
+            known = site or site_on_earth(exposure)
+            where = known if known is None else known.with_air(exposure.air)
+            with run.stage("detect"):
+                detected = run.reach(detect_sources(inputs, settings.detector))
+            with run.stage("identify"):
+                identified = run.reach(identify_stars(detected, camera, catalog, settings, where))
+            with run.stage("attitude"):
+                oriented = solve_orientation(identified)
+            return run.finish(oriented)
+    except (BadInput, NoSolution) as cause:
+        return run.refuse(cause)
 
 
 def identify_blind(
@@ -147,24 +149,29 @@ def identify_blind(
     """
     settings = settings or Settings()
     inputs = Inputs(exposure=exposure, catalog_name=catalog.name)
-    with Run(inputs, settings.time_limit_s) as run:
-        with run.stage("detect"):
-            detected = run.reached = detect_sources(inputs, None, settings.detector)
-        with run.stage("identify"):
-            where = None if site is None else site.with_air(exposure.air)
-            near_sky = settings.identifier.near_sky
-            identified = run.reached = identify_unknown_lens(detected, fov_rad, catalog, near_sky, where)
-        with run.stage("attitude"):
-            oriented = solve_orientation(identified, has_file=False)
-        return run.finish(oriented)
-    return run.refusal
+    run = Run(inputs)
+    try:
+        with limited_time(settings.time_limit_s):
+            with run.stage("detect"):
+                detected = run.reach(detect_sources(inputs, settings.detector))
+            with run.stage("identify"):
+                where = None if site is None else site.with_air(exposure.air)
+                near_sky = settings.identifier.near_sky
+                identified = run.reach(identify_unknown_lens(detected, fov_rad, catalog, near_sky, where))
+            with run.stage("attitude"):
+                oriented = solve_orientation(identified, has_file=False)
+            return run.finish(oriented)
+    except (BadInput, NoSolution) as cause:
+        return run.refuse(cause)
 
 
 def detect(exposure: Exposure, camera: Camera | None, settings: Settings | None = None) -> Detected | Refused:
     """Point sources of an `exposure`; `camera` (None: not known) gives fluxes in electrons, `settings` the detector."""
     inputs = Inputs(exposure=exposure, camera=camera)
-    with Run(inputs) as run:
+    run = Run(inputs)
+    try:
         with run.stage("detect"):
-            detected = detect_sources(inputs, camera, (settings or Settings()).detector)
+            detected = detect_sources(inputs, (settings or Settings()).detector)
         return run.finish(detected)
-    return run.refusal
+    except (BadInput, NoSolution) as cause:
+        return run.refuse(cause)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import replace
-from types import MappingProxyType, TracebackType
-from typing import Self, TypeVar
+from types import MappingProxyType
+from typing import TypeVar
 
 from startrack.chain.stages import Inputs, Outcome, Refused
 from startrack.core.errors import Reason
-from startrack.core.limits import check_time, limited_time, stating_work
+from startrack.core.limits import check_time, stating_work
 from startrack.core.types import BadInput, NoSolution
 
 HIDDEN_BY_DAMAGE = {  # reasons that damage of the image causes too
@@ -22,36 +22,16 @@ AnyOutcome = TypeVar("AnyOutcome", bound=Outcome)
 
 
 class Run:
-    """A block of stages that ends where one of them refuses; `refusal` is then the outcome.
+    """The last complete value that a run from the `inputs` on has reached, and the wall times of its stages."""
 
-    `limit_s` is that of the processor time of all stages; None: the one of a block around, if any.
-    """
-
-    refusal: Refused
-
-    def __init__(self, inputs: Inputs, limit_s: float | None = None) -> None:
-        self.reached, self.limit_s = inputs, limit_s
+    def __init__(self, inputs: Inputs) -> None:
+        self._reached = inputs
         self._times = dict[str, float]()
-        self._limit = ExitStack()
 
-    def __enter__(self) -> Self:
-        self._limit.enter_context(limited_time(self.limit_s))
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, cause: BaseException | None, trace: TracebackType | None
-    ) -> bool:
-        self._limit.close()
-        if not isinstance(cause, BadInput | NoSolution):
-            return False
-        damage = self.reached.damage if cause.reason in HIDDEN_BY_DAMAGE else None  # of which it may be the result
-        self.refusal = Refused(
-            reason=cause.reason if damage is None else Reason.DAMAGED_IMAGE,
-            message=str(cause) if damage is None else f"{damage.message} ({cause})",
-            reached=self.reached,
-            timing_ms=MappingProxyType(self._times),
-        )
-        return True
+    def reach(self, value: T) -> T:
+        """The `value` itself, which is from now on the last complete one."""
+        self._reached = value
+        return value
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -67,6 +47,16 @@ class Run:
     def finish(self, value: T) -> T:
         """Copy of the last `value` with the times of the stages."""
         return replace(value, timing_ms=MappingProxyType(self._times))
+
+    def refuse(self, cause: BadInput | NoSolution) -> Refused:
+        """The refusal that the `cause` makes of the run, with the last complete value that was reached."""
+        damage = self._reached.damage if cause.reason in HIDDEN_BY_DAMAGE else None  # of which it may be the result
+        return Refused(
+            reason=cause.reason if damage is None else Reason.DAMAGED_IMAGE,
+            message=str(cause) if damage is None else f"{damage.message} ({cause})",
+            reached=self._reached,
+            timing_ms=MappingProxyType(self._times),
+        )
 
 
 def add_timing(outcome: AnyOutcome, **more_ms: float) -> AnyOutcome:

@@ -1,9 +1,9 @@
 """The complete values that the stages of the pipeline return, and the settings of the stages.
 
-    Inputs -> Detected -> Identified -> Oriented -> Measured -> Located, or Refused
+    Inputs -> Detected -> Identified -> Oriented -> Measured -> FirstLook -> SecondLook -> Located, or Refused
 
-Each value has the fields of the one before it and the results of one more stage. All are frozen. Which value a function
-returns states which stages have run; no field is filled in later.
+Each value has the fields of the one before it and the results of one more stage; the two looks hold a `Measured`. All
+are frozen. Which value a function returns states which stages have run; no field is filled in later.
 """
 
 from __future__ import annotations
@@ -163,19 +163,19 @@ class StarRays:
     terrain: Terrain
     R_enu_icrs: Array  # (3, 3) at the likeliest time
     clock: Clock
-    light: StarPhotometry
+    photometry: StarPhotometry
     near: PositionPrior | None = None  # of the position
 
     def evidence(self) -> Evidence:
         """Rays of the stars as evidence for the localizer."""
-        return replace(self.light.evidence(), clock=self.clock, near=self.near)
+        return replace(self.photometry.evidence(), clock=self.clock, near=self.near)
 
     def later(self, seconds: float, reach_s: float) -> Self:
         """Copy under the sky of a time later by `seconds`, which is right to `reach_s` [s]."""
         R = R_from_rotvec(seconds * self.clock.turn_rad_s)
         clock = replace(self.clock, offset_s=self.clock.offset_s + seconds, reach_s=reach_s)
-        light = self.light.turn_frame(R, self.terrain.air)
-        return replace(self, R_enu_icrs=R @ self.R_enu_icrs, light=light, clock=clock)
+        photometry = self.photometry.turn_frame(R, self.terrain.air)
+        return replace(self, R_enu_icrs=R @ self.R_enu_icrs, photometry=photometry, clock=clock)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -197,6 +197,7 @@ class Measured(StarRays, Oriented):
     site: Site  # of the terrain
     scale: FluxScale  # of the stars' light
     response: DamagedResponse | None = None  # of a damaged image to stars
+    catalog_note: str = ""  # why the stars of the deeper list are not used; "": they are, or are not asked for
 
     @property
     def R_cam_enu(self) -> Array:
@@ -207,7 +208,8 @@ class Measured(StarRays, Oriented):
     def warnings(self) -> list[str]:
         """Warnings before the terrain was used; what the terrain does not cover or state; a Sun that is up."""
         day = [] if self.exposure.time_utc is None else daylight_warnings(self.site, self.exposure.time_utc)
-        return [*super().warnings, *self.terrain.warnings(), *day]
+        note = [self.catalog_note] if self.catalog_note else []
+        return [*super().warnings, *note, *self.terrain.warnings(), *day]
 
 
 class SkyEvidence(NamedTuple):
@@ -216,6 +218,34 @@ class SkyEvidence(NamedTuple):
     light: SkyLight  # of the image at the skyline
     used: Bools  # (SECTORS,) where it is used
     errors: ImageErrors  # of it
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FirstLook:
+    """A rough position by the stars alone: it tells where the skyline stands."""
+
+    measured: Measured  # on ground of the likeliest steepness, under the sky of the likeliest time
+    fix: Fix
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SecondLook:
+    """What the image shows at the skyline of a first look: all that the position is from."""
+
+    first: FirstLook
+    measured: Measured  # that of the first look; stars beside the skyline without the step of the sky's light
+    sky: SkyEvidence | None = None  # None: not used for the fix
+    by_stars: bool = True  # whether the stars' rows are in the posterior too
+    sky_unused: str = ""  # why the sky's light is not used
+    sky_brightness_mag_arcsec2: float | None = None  # beyond that of the ground; None: no step, no zero point
+
+    def evidence(self) -> Evidence:
+        """Rows of the stars, of the sky's light, or of both as evidence for the localizer."""
+        rows, sky = self.measured.evidence(), self.sky
+        if sky is None:
+            return rows
+        light = replace(sky.light.evidence(sky.used), clock=rows.clock, near=rows.near)
+        return replace(Evidence.concatenate(rows, light) if self.by_stars else light, image_errors=sky.errors)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

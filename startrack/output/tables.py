@@ -44,7 +44,7 @@ def star_table_text(value: Inputs, *, catalog: bool = False) -> str:
     """
     if not isinstance(value, Oriented):
         raise ValueError("no star table without identified stars")
-    light, named = value.light if isinstance(value, Measured) else None, value.names.stars
+    light, named = value.photometry if isinstance(value, Measured) else None, value.names.stars
     if light is None and not catalog:
         star = np.sort(named.star)
         xy_px, _ = value.camera.project(value.stars.rays_icrs[star] @ value.attitude.R_cam_icrs.T)

@@ -220,7 +220,7 @@ def _longer_exposure(measured: Measured) -> Iterator[str]:
 
 def _deciding_stars(measured: Measured, longer: float) -> int:
     """Usable stars near the skyline that an exposure longer by a factor shows, by the noise of the background."""
-    light, skyline_rad = measured.light, _skyline(measured)
+    light, skyline_rad = measured.photometry, _skyline(measured)
     above = light.elevation_rad - np.interp(light.azimuth_rad, MIDDLES_RAD, skyline_rad, period=2 * np.pi)
     decides = light.expected_e * np.sqrt(longer) > DECIDABLE_SNR * light.sigma_e
     return int(np.count_nonzero(light.usable & decides & (np.abs(above) < NEAR_SKYLINE_RAD)))

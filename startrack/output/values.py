@@ -111,7 +111,7 @@ def body_sigmas_deg(value: Measured) -> Array:
 def predicted_visible(value: Located) -> int:
     """Number of stars of a located `value` that were measured and are above the skyline of the fix."""
     if value not in _predicted_visible:  # horizons of a height map take time, and several outputs need this number
-        light = value.light
+        light = value.photometry
         horizon = value.terrain.horizon_rad(np.array([skyline_position_m(value)]), light.azimuth_rad)
         _predicted_visible[value] = int((light.usable & (light.elevation_rad > horizon)).sum())
     return _predicted_visible[value]

@@ -151,7 +151,7 @@ def simulate_stars(
     return SimulatedStars(
         scene=scene, shining=shining, xy_px=xy_px, flux_e=light_e, noise_e=float(np.sqrt(pixel_e2)),
         saturation_e=saturation_e, catalog=stars, scale=scale, mask=mask,
-        rays=StarRays(terrain=terrain, R_enu_icrs=R_enu, clock=clock, light=measured),
+        rays=StarRays(terrain=terrain, R_enu_icrs=R_enu, clock=clock, photometry=measured),
     )  # fmt: skip
 
 

@@ -185,8 +185,8 @@ def _hidden_stars(value: Inputs) -> tuple[Ints, Array]:
     """Stars that are hidden, and their predicted pixels, brightest first."""
     if not isinstance(value, Measured):
         return np.empty(0, dtype=np.int64), np.empty((0, 2))
-    hidden = status_of(value.light) == "hidden"
-    return value.light.star[hidden], value.light.xy_px[hidden]
+    hidden = status_of(value.photometry) == "hidden"
+    return value.photometry.star[hidden], value.photometry.xy_px[hidden]
 
 
 def _draw_compass(canvas: Canvas, view: View, overlay: dict[str, Any]) -> None:

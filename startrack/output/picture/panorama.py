@@ -149,7 +149,7 @@ def located_picture(value: Positioned, skyline: MeasuredSkyline) -> NDArray[np.u
     canvas = Canvas(WIDTH_PX, HEIGHT_PX + ENLARGED_PX + (0 if has_stars else MAPS_PX))
     horizon = Skyline.trace(value.position_at_time_m, value.terrain)
     if isinstance(value, Measured):
-        light, status = value.light, status_of(value.light)
+        light, status = value.photometry, status_of(value.photometry)
         decided = np.isin(status, ("seen", "hidden"))  # brightest first
         azimuth_rad, elevation_rad, status = light.azimuth_rad[decided], light.elevation_rad[decided], status[decided]
     else:

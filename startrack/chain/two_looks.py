@@ -1,0 +1,150 @@
+"""Both looks at an image: a rough position by the stars, what is at its skyline, and the position by all of that."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from startrack.chain.image_skyline import measured_skyline
+from startrack.chain.measurement import fix_again, fix_position, remeasure_stars
+from startrack.chain.stages import FirstLook, Located, Measured, SecondLook, Settings, SkyEvidence
+from startrack.core.statistics import relative_weights
+from startrack.core.types import MIDDLES_RAD, SECTORS, Bools, Fix, ImageErrors, NotLocated
+from startrack.evidence import (
+    NEEDED_SECTORS,
+    SkyLight,
+    SkylineEstimate,
+    brightness_mag_arcsec2,
+    exceeds_noise,
+    measure_sky_light,
+    measure_star_offsets,
+    offset_terms,
+    pixels_near_skyline,
+    sectors_with_step,
+)
+from startrack.localization import Localizer, moments
+from startrack.terrain import Terrain
+
+EDGE_SIGMA_PX = 0.02  # of the whole skyline, from the models of the PSF and of both levels; see docs/method.md
+MOST_MOVED = 3.0  # of nine tenths of the skyline by the second fix, in its reach; in 30 rendered frames 0.3 at most
+
+
+def look_first(measured: Measured, localizer: Localizer) -> FirstLook:
+    """First look: roughly the position by the stars, and the other positions that they allow.
+
+    Raises NotLocated as the `localizer` does.
+    """
+    measured, fix = fix_position(measured, localizer, replace(measured.evidence(), is_first_look=True))
+    return FirstLook(measured=measured, fix=fix)
+
+
+def look_at_skyline(first: FirstLook, settings: Settings) -> SecondLook:
+    """Second look: the light of the sky at the skyline of the `first` one, and the stars beside it without its step.
+
+    Without a skyline, or without such light, the stars stay as they are, and `sky_unused` has the reason. Where nothing
+    but the light of the sky counts by the `settings`, that raises NotLocated (insufficient_geometry).
+    """
+    unseen = why_unseen(first)
+    second = (
+        SecondLook(first=first, measured=first.measured, sky_unused=unseen) if unseen else _measure(first, settings)
+    )
+    if settings.evidence_sources == "stars":
+        return replace(second, sky=None, sky_unused="")
+    if settings.evidence_sources == "sky":
+        if second.sky is None:
+            raise NotLocated(f"the light of the sky gives no position: {second.sky_unused}")
+        return replace(second, by_stars=False)
+    return second
+
+
+def why_unseen(first: FirstLook) -> str:
+    """Reason why nothing can be measured at the skyline of a `first` look; "" where it can."""
+    damage = first.measured.damage
+    if damage is not None and not damage.has_levels:
+        return "the image is damaged"
+    if first.fix.ambiguous:
+        return "several positions fit the stars"
+    return "the method of localization has no posterior" if first.fix.search == "approximate" else ""
+
+
+def _measure(first: FirstLook, settings: Settings) -> SecondLook:
+    """Light of the sky and stars beside the skyline of the `first` look, one position, in an image with levels."""
+    known, estimate = first.measured, estimate_skyline(first)
+    band = pixels_near_skyline(known.detections, known.camera, known.R_cam_enu, estimate)
+    light = measure_sky_light(band.without_stars(known.photometry), estimate.skyline)
+    measured = remeasure_stars(first, band, light, settings.evidence) if exceeds_noise(light) else known
+    used = sectors_with_step(light) & known.terrain.is_informative(MIDDLES_RAD, light.elevation_rad)
+    unused = _too_few_text(light, used) if np.count_nonzero(used) < NEEDED_SECTORS else ""
+    sky = None if unused else SkyEvidence(light, used, _image_errors(known, light, used))
+    brightness = brightness_mag_arcsec2(light, known.camera, known.R_cam_enu, known.exposure.exposure_s)
+    return SecondLook(first=first, measured=measured, sky=sky, sky_unused=unused, sky_brightness_mag_arcsec2=brightness)
+
+
+def estimate_skyline(first: FirstLook) -> SkylineEstimate:
+    """The skyline as it stands by the one position of a `first` look, and how well it is known."""
+    fix, covariance = first.fix, first.fix.covariance_m2
+    if fix.samples is not None:  # without the arc on which an error of the clock turns a position in a round crater
+        _, covariance = moments(fix.samples.centres_m, relative_weights(fix.samples.log_likelihood))
+    return SkylineEstimate.of(np.asarray(fix.at_time_m), covariance, first.measured.terrain, fix.raised_rad)
+
+
+def fix_by_all(second: SecondLook, localizer: Localizer) -> Located:
+    """Position by all that the `second` look shows, found from the points of the first one.
+
+    Raises NotLocated as the `localizer` does, and where the position contradicts the light that it is from.
+    """
+    measured, fix = fix_again(second.measured, second.first.fix, localizer, second.evidence())
+    sky, unused = second.sky, second.sky_unused
+    if sky is not None and fix.lit is not None:
+        used = sky.used & ~fix.lit.whole
+        sky = sky._replace(used=used) if used.any() else None
+        unused = f"at azimuths {fix.lit.text}, where its edge is not the skyline that the stars show: lit ground?"
+    if sky is not None and not fix.ambiguous:
+        _require_near(fix, measured.terrain, sky)
+    return Located(
+        **vars(measured), fix=fix, sky=sky, by_stars=second.by_stars, sky_unused=unused,
+        skyline=measured_skyline(measured, fix, sky), sky_brightness_mag_arcsec2=second.sky_brightness_mag_arcsec2,
+    )  # fmt: skip
+
+
+def _require_near(fix: Fix, terrain: Terrain, sky: SkyEvidence) -> None:
+    """Raise NotLocated (inconsistent_evidence) where the skyline of the fix is far from where the sky was measured."""
+    skyline = terrain.horizon_rad(np.asarray(fix.at_time_m)[None], MIDDLES_RAD)
+    if fix.raised_rad is not None:
+        skyline = skyline + fix.raised_rad
+    moved_px = np.abs(skyline - sky.light.elevation_rad) * sky.light.px_per_rad
+    if np.quantile((moved_px / sky.light.reach_px)[sky.used], 0.9) > MOST_MOVED:
+        raise NotLocated(
+            f"the light of the sky moves the skyline by {np.quantile(moved_px[sky.used], 0.9):.0f} px from where the "
+            "stars show it: wrong terrain, time or camera file, or light that is not the sky's?",
+            reason="inconsistent_evidence",
+        )
+
+
+def _image_errors(measured: Measured, sky: SkyLight, used: Bools) -> ImageErrors:
+    """Errors of attitude and lens at the skyline, by the identified stars near it."""
+    found, fit = measured.identification, measured.attitude_fit
+    rays_cam = measured.stars.rays_icrs[found.star[fit.used]] @ fit.attitude.R_cam_icrs.T
+    centroids = measured.detections.covariance_px2[found.detection[fit.used]]
+    offsets = measure_star_offsets(
+        measured.camera, measured.R_cam_enu, fit.centroid_covariance_rad2, sky.horizon, rays_cam,
+        fit.residual_px[fit.used], 0.5 * np.trace(centroids, axis1=1, axis2=2) + fit.extra_sigma_px**2,
+    )  # fmt: skip
+    covariance = offsets.covariance_px2.copy()
+    covariance[0, 0] += EDGE_SIGMA_PX**2
+    return ImageErrors(
+        raised_rad=offset_terms(MIDDLES_RAD) / sky.px_per_rad[:, None], mean=offsets.mean_px, covariance=covariance,
+        variance_rad2=np.where(used, sky.variance_px2 / np.square(sky.px_per_rad), np.inf),
+    )  # fmt: skip
+
+
+def _too_few_text(sky: SkyLight, used: Bools) -> str:
+    """Reason for too few `used` sectors (SECTORS,): the skyline is not in view, has no step, or is not in the map."""
+    counts = sky.levels.covered.sum(), sectors_with_step(sky).sum(), used.sum(), NEEDED_SECTORS
+    in_view, clear, on_map, needed = (n * 360.0 / SECTORS for n in counts)
+    if in_view < needed:
+        return f"the image shows sky and ground beside {in_view:.0f}° of the skyline, and {needed:.0f}° are needed"
+    if not clear:
+        return f"no step of light is clear over {needed:.0f}° of the skyline"
+    return f"the terrain gives {on_map:.0f}° of the skyline that has a step of light, and {needed:.0f}° are needed"

@@ -258,7 +258,7 @@ def test_evidence_and_moments_are_those_of_a_grid(seed: int) -> None:
     log = found.model.log_likelihood(points) + found.model.seen.log_offset - np.log(np.pi * CRATER.reach_m**2)
     weight = np.exp(log - log.max())
     evidence = log.max() + np.log(weight.sum() * step**2 * np.prod(np.diag(root)))
-    assert found.found.log_evidence == pytest.approx(evidence, abs=0.1)
+    assert found.log_evidence == pytest.approx(evidence, abs=0.1)
     inside = np.abs(np.linalg.solve(root, (found.positions_m - centre).T)).max(axis=0) < 6.0
     mean, covariance = moments(found.positions_m[inside], share[inside])
     expected, expected_covariance = moments(points, weight)

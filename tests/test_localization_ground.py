@@ -220,4 +220,4 @@ def test_a_search_without_a_proof_looks_elsewhere_than_the_first_beam(shackleton
     )
     explored = ExactPosterior(budget_horizons=1.0).explore(evidence, shackleton)
     assert explored.search == "beam"
-    assert np.linalg.norm(explored.centres_m[np.argmax(explored.log_likelihood)] - at) < 20.0
+    assert np.linalg.norm(explored.centres_m[np.argmax(explored.log_weight)] - at) < 20.0

@@ -120,7 +120,7 @@ def test_the_posterior_by_stars_and_sky_light_is_that_of_a_plain_sum(nats: float
     rng = np.random.default_rng([12, int(nats)])
     true = PLACE + np.array([1.0, -2.0])
     light, stars = sky_rows(true, rng, nats), star_rows(true, rng, 100)
-    rows = replace(Evidence.concatenate(light, stars), support=ExactPosterior()(stars, CRATER).samples)
+    rows = replace(Evidence.concatenate(light, stars), support=ExactPosterior()(stars, CRATER).support)
     mean, covariance = posterior_on_a_grid(rows, true, 6 * np.sqrt(np.linalg.eigvalsh(expected_covariance(nats))[1]))
     fix = ExactPosterior()(rows, CRATER)
     sigma = np.sqrt(np.trace(covariance))

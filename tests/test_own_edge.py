@@ -42,7 +42,7 @@ def fix_with(lower_rad: Array | float, seed: int, with_stars: bool = True) -> Fi
     rng = np.random.default_rng([19, seed])
     light, stars = sky_rows(TRUE, rng, NATS), star_rows(TRUE, rng, STARS)
     light = replace(light, elevation_rad=light.elevation_rad - lower_rad)
-    support = ExactPosterior()(replace(stars, is_first_look=True), CRATER).samples
+    support = ExactPosterior()(replace(stars, is_first_look=True), CRATER).support
     rows = Evidence.concatenate(light, stars) if with_stars else light
     return ExactPosterior()(replace(rows, support=support), CRATER)
 

@@ -30,7 +30,7 @@ from startrack.evidence import (
     add_obstacles,
     filtered_noise_e,
     flux_scale,
-    leave_out_obstacles,
+    mask_obstacles,
     measure_response,
     take_out_sky_step,
     with_noise_of_blocks,
@@ -55,7 +55,7 @@ OPEN_SKY_RAD = np.radians(45.0)  # no skyline is as high, except beside a wall
 DEEP_PART = 0.5  # of the light of the stars that only the deep catalogue has
 NO_DEEP_STARS = "the image does not show the faint stars of {}: only Hipparcos is used"
 COMPLETE_V_MAG = 6.5  # frames with 5 sigma at this magnitude show many stars that Hipparcos lacks
-R = TypeVar("R", bound=StarRays)
+AnyRays = TypeVar("AnyRays", bound=StarRays)
 
 
 def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -> Measured:
@@ -65,28 +65,29 @@ def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -
     Gaia's stars are used. Raises BadInput (bad_terrain, no_time) where the frame `enu` cannot be related to the stars.
     """
     when, site = require_time_and_site(oriented.exposure, terrain)
-    R = R_enu_icrs(site, when)
-    hipparcos = replace(oriented, detections=_usable_detections(oriented, terrain, R))
+    R_at_time = R_enu_icrs(site, when)
+    hipparcos = replace(oriented, detections=_mask_detections(oriented, terrain, R_at_time))
     deep = add_gaia_stars(hipparcos, site) if settings.deep_stars else hipparcos
     used, note = deep, ""
-    scale, photometry = _measure_stars(deep, terrain, R, settings.evidence)
+    scale, photometry = _measure_stars(deep, terrain, R_at_time, settings.evidence)
     if deep is not hipparcos and not _shows_deep_stars(photometry, deep.stars):
         used, note = hipparcos, NO_DEEP_STARS.format(deep.catalog_name)
-        scale, photometry = _measure_stars(hipparcos, terrain, R, settings.evidence)
+        scale, photometry = _measure_stars(hipparcos, terrain, R_at_time, settings.evidence)
     response = None if oriented.damage is None else measure_response(photometry)
     above = {"terrain": terrain, "site": site}
     return Measured(
-        **vars(used) | above, R_enu_icrs=R, scale=scale, response=response, near=settings.near, catalog_note=note,
+        **vars(used) | above, R_enu_icrs=R_at_time, scale=scale, response=response, near=settings.near,
+        catalog_note=note,
         clock=clock_at(site, when, oriented.exposure.time_sigma_s, oriented.exposure.time_sigma_is_stated),
         photometry=photometry if response is None else response.correct(photometry),
     )  # fmt: skip
 
 
-def _usable_detections(oriented: Oriented, terrain: Terrain, R_enu_icrs: Array) -> Detections:
-    """Detections without those on stated obstacles; of a damaged image with the noise of its blocks."""
+def _mask_detections(oriented: Oriented, terrain: Terrain, R_enu_icrs: Array) -> Detections:
+    """The same detections, the pixels of stated obstacles masked; of a damaged image with the noise of its blocks."""
     R_enu_cam = R_enu_icrs @ oriented.attitude_fit.attitude.R_cam_icrs.T
     mask = add_obstacles(oriented.detections.mask, oriented.camera, R_enu_cam, terrain, oriented.exposure.obstacles)
-    detections = leave_out_obstacles(oriented.detections, mask)
+    detections = mask_obstacles(oriented.detections, mask)
     return detections if oriented.damage is None else with_noise_of_blocks(detections)
 
 
@@ -183,14 +184,14 @@ def _photometry(
     visible: Array | None = None,
 ) -> StarPhotometry:
     """Photometry of all stars, or of those with the indices `only`; 0 evidence where the terrain is not known."""
-    R, stars = oriented.attitude_fit.attitude.R_cam_icrs, oriented.stars
+    stars = oriented.stars
     air = airmass_at(stars.rays_icrs @ R_enu_icrs.T, terrain.site)
     found = measure(
         detections,
         oriented.camera,
         stars if only is None else stars.take(only),
         list(oriented.bodies),
-        R,
+        oriented.attitude_fit.attitude.R_cam_icrs,
         R_enu_icrs,
         scale,
         oriented.attitude_fit.extra_sigma_px,
@@ -215,27 +216,36 @@ def locate_rays(rays: StarRays, localizer: Localizer | None = None) -> StarFix:
     Raises NotLocated (or another NoSolution of the `localizer`) where the pipeline refuses an image with these `rays`.
     """
     localizer = localizer or require_localizer(DEFAULT_LOCALIZER)
-    rays, first = fix_position(rays, localizer, replace(rays.evidence(), is_first_look=True))
-    rays, fix = fix_again(rays, first, localizer, rays.evidence())
-    return StarFix(**vars(rays), fix=fix)
+    turned, rough = fix_roughly(rays, localizer)
+    turned, fix = fix_again(turned, rough, localizer, turned.evidence())
+    return StarFix(**vars(turned), fix=fix)
 
 
-def fix_again(rays: R, first: Fix, localizer: Localizer, evidence: Evidence) -> tuple[R, Fix]:
-    """Rays and position by `evidence`, from the points of a `first` fix on; a method without posterior keeps that."""
-    if first.search == "approximate":
-        return rays, first
-    support = None if first.ambiguous else first.samples
-    return fix_position(rays, localizer, replace(evidence, support=support))
+def fix_roughly(rays: AnyRays, localizer: Localizer) -> tuple[AnyRays, Fix]:
+    """The `rays` on ground of the steepness that they show, under the sky of the time that they show; and their fix.
 
-
-def fix_position(rays: R, localizer: Localizer, evidence: Evidence) -> tuple[R, Fix]:
-    """The `rays` under the sky of the time that `evidence` shows, on ground of its steepness, and the position by it.
-
-    `rays` are those of the image that the evidence is from. Raises NotLocated as the `localizer` does.
+    Raises NotLocated as the `localizer` does.
     """
-    rays = replace(rays, terrain=settle_steepness(evidence, rays.terrain))
-    fix = localizer(evidence, rays.terrain)
-    if fix.clock is not None and not rays.terrain.axisymmetric and clock_matters(rays.clock, rays.terrain):
-        later_s = fix.clock.offset_s - rays.clock.offset_s
-        rays = rays.later(later_s, SURE_SIGMAS * fix.clock.sigma_s) if later_s else rays
-    return rays, fix
+    rows = replace(rays.evidence(), is_first_look=True)
+    on_ground = replace(rays, terrain=settle_steepness(rows, rays.terrain))
+    return _fix_position(on_ground, localizer, rows)
+
+
+def fix_again(rays: AnyRays, rough: Fix, localizer: Localizer, rows: Evidence) -> tuple[AnyRays, Fix]:
+    """The `rays` under the sky of the time that `rows` show, and the fix by these, from the points of a `rough` one on.
+
+    A method without a posterior keeps the `rough` fix. Raises NotLocated as the `localizer` does.
+    """
+    if rough.search == "approximate":
+        return rays, rough
+    support = None if rough.ambiguous else rough.support
+    return _fix_position(rays, localizer, replace(rows, support=support))
+
+
+def _fix_position(rays: AnyRays, localizer: Localizer, rows: Evidence) -> tuple[AnyRays, Fix]:
+    """The `rays` under the sky of the time that `rows` show, and the fix by these, which are of the same image."""
+    fix = localizer(rows, rays.terrain)
+    if fix.clock is None or rays.terrain.axisymmetric or not clock_matters(rays.clock, rays.terrain):
+        return rays, fix
+    later_s = fix.clock.offset_s - rays.clock.offset_s
+    return (rays.later(later_s, SURE_SIGMAS * fix.clock.sigma_s) if later_s else rays), fix

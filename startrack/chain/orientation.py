@@ -114,11 +114,11 @@ def identify_stars(
     The identifier of the `settings` finds them, first near their rough attitude. `site` (None: not known) is where
     the `camera` stands. Raises NotIdentified, TooFewStars.
     """
-    when, near = detected.exposure.time_utc, settings.near_attitude
+    when, rough = detected.exposure.time_utc, settings.near_attitude
     stars = apparent_stars(catalog, when, site)
-    near_R_cam_icrs = None if near is None else near.R_cam_icrs_at(when, site)
+    rough_R_cam_icrs = None if rough is None else rough.R_cam_icrs_at(when, site)
     with stating_sky(detected.exposure, detected.detections, camera, stars.v_mag, on_moon=_on_moon(detected)):
-        found = settings.identifier(detected.detections, camera, stars, near_R_cam_icrs)
+        found = settings.identifier(detected.detections, camera, stars, rough_R_cam_icrs)
     bodies = apparent_bodies(site, when) if site is not None and when is not None else ()
     return _identified(detected, camera, stars, bodies, site, found)
 
@@ -191,5 +191,5 @@ def fit_orientation(identified: Identified, has_file: bool = True) -> Oriented:
 
 def check_one_attitude(oriented: Oriented) -> None:
     """Raise NotLocated (inconsistent_evidence) where the sources of `oriented` show a second attitude, too."""
-    known = replace(oriented.identification, R_cam_icrs=oriented.attitude_fit.attitude.R_cam_icrs)
-    check_single_field(oriented.detections, oriented.camera, oriented.stars, known)
+    refined = replace(oriented.identification, R_cam_icrs=oriented.attitude_fit.attitude.R_cam_icrs)
+    check_single_field(oriented.detections, oriented.camera, oriented.stars, refined)

@@ -25,7 +25,6 @@ from startrack.chain.two_looks import fix_by_all, look_at_skyline, look_first
 from startrack.core.limits import limited_time
 from startrack.core.types import BadInput, Exposure, NoSolution
 from startrack.detection import find_damage
-from startrack.evidence import check_single_skyline
 from startrack.frames import Site
 from startrack.localization import localizer_name
 from startrack.terrain import Terrain, load_terrain
@@ -77,8 +76,6 @@ def locate_measured(
     with stage("evidence"):
         second = look_at_skyline(first, settings)
     with stage("locate"):
-        if second.measured.damage is None:  # which changes the light of stars in part
-            check_single_skyline(second.measured.photometry, second.measured.terrain, first.fix.at_time_m)
         return fix_by_all(second, settings.localizer)
 
 

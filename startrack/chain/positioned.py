@@ -22,7 +22,7 @@ class Positioned:
 
     @property
     def position_at_time_m(self) -> Array:
-        """East and north (2,) at the time of `R_enu_icrs`: where the skyline and the stars are compared.
+        """East and north (2,) where the skyline and the stars are compared, see `Fix.at_time_m`.
 
         In a round crater the error of the clock spreads the position over an arc, whose mean lies beside it.
         """

@@ -138,7 +138,10 @@ class Identified(Detected):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Oriented(Identified):
-    """Identified stars with the attitude of the camera among the stars."""
+    """Identified stars with the attitude of the camera among the stars.
+
+    `camera` is corrected where the stars show another lens; `names` and `bodies` have the brightest sources too.
+    """
 
     attitude_fit: AttitudeFit
     lens_change_px: float = 0.0  # by which `camera` differs from the camera file, as the stars show it; RMS
@@ -192,7 +195,11 @@ class StarFix(StarRays):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Measured(StarRays, Oriented):
-    """An attitude above a terrain, with photometry at every catalogue star in view."""
+    """An attitude above a terrain, with photometry at every catalogue star in view.
+
+    The pixels of stated obstacles are masked in `detections`. `stars`, `catalog_name`, `identification` and `names` are
+    those of the deeper list of stars where the image shows these.
+    """
 
     site: Site  # of the terrain
     scale: FluxScale  # of the stars' light
@@ -215,7 +222,8 @@ class Measured(StarRays, Oriented):
 class SkyEvidence(NamedTuple):
     """The light of the sky as evidence of a position."""
 
-    light: SkyLight  # of the image at the skyline
+    light: SkyLight  # of the image at the skyline, under the sky of the first look: the second moves it by less than
+    # the error of the clock that is left then
     used: Bools  # (SECTORS,) where it is used
     errors: ImageErrors  # of it
 
@@ -236,7 +244,7 @@ class SecondLook:
     measured: Measured  # that of the first look; stars beside the skyline without the step of the sky's light
     sky: SkyEvidence | None = None  # None: not used for the fix
     by_stars: bool = True  # whether the stars' rows are in the posterior too
-    sky_unused: str = ""  # why the sky's light is not used
+    sky_unused: str = ""  # why the sky's light is not used; "" also where the settings leave it out
     sky_brightness_mag_arcsec2: float | None = None  # beyond that of the ground; None: no step, no zero point
 
     def evidence(self) -> Evidence:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from startrack.chain.image_skyline import measured_skyline
-from startrack.chain.measurement import fix_again, fix_position, remeasure_stars
+from startrack.chain.measurement import fix_again, fix_roughly, remeasure_stars
 from startrack.chain.stages import FirstLook, Located, Measured, SecondLook, Settings, SkyEvidence
 from startrack.core.statistics import relative_weights
 from startrack.core.types import MIDDLES_RAD, SECTORS, Bools, Fix, ImageErrors, NotLocated
@@ -16,6 +16,7 @@ from startrack.evidence import (
     SkyLight,
     SkylineEstimate,
     brightness_mag_arcsec2,
+    check_single_skyline,
     exceeds_noise,
     measure_sky_light,
     measure_star_offsets,
@@ -35,15 +36,16 @@ def look_first(measured: Measured, localizer: Localizer) -> FirstLook:
 
     Raises NotLocated as the `localizer` does.
     """
-    measured, fix = fix_position(measured, localizer, replace(measured.evidence(), is_first_look=True))
-    return FirstLook(measured=measured, fix=fix)
+    turned, fix = fix_roughly(measured, localizer)
+    return FirstLook(measured=turned, fix=fix)
 
 
 def look_at_skyline(first: FirstLook, settings: Settings) -> SecondLook:
     """Second look: the light of the sky at the skyline of the `first` one, and the stars beside it without its step.
 
-    Without a skyline, or without such light, the stars stay as they are, and `sky_unused` has the reason. Where nothing
-    but the light of the sky counts by the `settings`, that raises NotLocated (insufficient_geometry).
+    The stars are measured anew wherever that light is above the noise, even if too few sectors show a clear step for it
+    to count itself; `sky_unused` has the reason. Where nothing but the light of the sky counts by the `settings`, that
+    raises NotLocated (insufficient_geometry).
     """
     unseen = why_unseen(first)
     second = (
@@ -84,17 +86,21 @@ def _measure(first: FirstLook, settings: Settings) -> SecondLook:
 def estimate_skyline(first: FirstLook) -> SkylineEstimate:
     """The skyline as it stands by the one position of a `first` look, and how well it is known."""
     fix, covariance = first.fix, first.fix.covariance_m2
-    if fix.samples is not None:  # without the arc on which an error of the clock turns a position in a round crater
-        _, covariance = moments(fix.samples.centres_m, relative_weights(fix.samples.log_likelihood))
+    if fix.support is not None:  # without the arc on which an error of the clock turns a position in a round crater
+        _, covariance = moments(fix.support.centres_m, relative_weights(fix.support.log_weight))
     return SkylineEstimate.of(np.asarray(fix.at_time_m), covariance, first.measured.terrain, fix.raised_rad)
 
 
 def fix_by_all(second: SecondLook, localizer: Localizer) -> Located:
     """Position by all that the `second` look shows, found from the points of the first one.
 
-    Raises NotLocated as the `localizer` does, and where the position contradicts the light that it is from.
+    Raises NotLocated as the `localizer` does, where two skylines explain the stars far better than one, and where the
+    position contradicts the light that it is from.
     """
-    measured, fix = fix_again(second.measured, second.first.fix, localizer, second.evidence())
+    known, rough = second.measured, second.first.fix
+    if known.damage is None:  # damage changes the light of stars in part, as a second skyline does
+        check_single_skyline(known.photometry, known.terrain, rough.at_time_m)
+    measured, fix = fix_again(known, rough, localizer, second.evidence())
     sky, unused = second.sky, second.sky_unused
     if sky is not None and fix.lit is not None:
         used = sky.used & ~fix.lit.whole

@@ -169,7 +169,7 @@ class Explored(NamedTuple):
 
     centres_m: Array  # (n, 2) east and north
     half_m: float  # of the side of a square
-    log_likelihood: Array  # (n,) at the centres
+    log_weight: Array  # (n,) of the squares in the posterior, up to a constant; of a search the log-density [1/m2]
     log_dropped: float  # logarithm of a bound of the mass [m2] that was dropped
     search: str  # "proven" or "beam"
     dropped_probability: float | None = None  # of the whole search, known before; None: by `log_dropped`
@@ -190,10 +190,13 @@ class Fix(Value):
     radius95_m: float  # circle about the position that holds 95 % of the posterior
     radius999_m: float
     modes: tuple[Mode, ...]  # heaviest first; weights sum to 1
-    at_time_m: Array = array(2, default=np.nan, may_be_nan=True)  # if the stated time is right; nan: at the position
+    # On the ground and under the sky of the evidence, where both are compared; nan: at the position. The errors of the
+    # clock and of a crater's width that the evidence shows move the position away from there.
+    at_time_m: Array = array(2, default=np.nan, may_be_nan=True)
     ambiguous: bool  # modes outside the main mode's 99.9 % circle hold more than 1 %
     dropped_probability: float | None = None  # bound on what the search left out of the posterior; None: none below 1
-    search: str = "proven"  # no other position fits; "beam": not proven to the end; "approximate": no posterior
+    search: str = "proven"  # no other position fits; "beam": not proven; "approximate": no posterior. Of a first look,
+    # if there was one: the second begins with its points
     horizon_error_rad: float = 0.0  # common to all azimuths: how much higher the true horizon is than the map's
     clock: ClockError | None = None  # as the evidence shows it; None: not estimated
     blocked: Blocked | None = None  # parts of the view; None: nothing is blocked
@@ -203,7 +206,7 @@ class Fix(Value):
     shown: tuple[ShownError, ...] = ()  # errors beyond the defaults
     exact_map_radius999_m: float | None = None  # if the map had no waves; None: it has none
     lit: Blocked | None = None  # where the edge of the sky's light is not the skyline; None: nowhere
-    samples: Explored | None = None  # of the posterior, for a later fix by more rows of the image; None: there are none
+    support: Explored | None = None  # of the posterior, for a later fix by more rows of the image; None: there are none
 
     def __post_init__(self) -> None:
         super().__post_init__()

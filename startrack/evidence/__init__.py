@@ -10,7 +10,7 @@ from startrack.evidence.flux_scale import (
     fit_flux_scale,
     flux_scale,
 )
-from startrack.evidence.obstacles import add_obstacles, leave_out_obstacles
+from startrack.evidence.obstacles import add_obstacles, mask_obstacles
 from startrack.evidence.photometry import (
     SURE_SIGMAS,
     Photometry,
@@ -56,7 +56,7 @@ __all__ = [
     "SKYLINE_SIGMAS", "SURE_SIGMAS", "DamagedResponse", "FluxScale", "Horizon", "Photometry", "SkyLight", "SkyPixels",
     "Skyline", "SkylineBand", "SkylineEstimate", "Sources", "StarEvidence", "StarPhotometry", "add_obstacles",
     "average_shifts", "brightness_mag_arcsec2", "check_single_skyline", "exceeds_noise", "expect_stars",
-    "expected_flux_scale", "filtered_noise_e", "fit_flux_scale", "flux_scale", "half_width", "leave_out_obstacles",
+    "expected_flux_scale", "filtered_noise_e", "fit_flux_scale", "flux_scale", "half_width", "mask_obstacles",
     "measure", "measure_response", "measure_sky_light", "measure_star_offsets", "neighbour_profiles", "offset_terms",
     "order_by_cell", "pixels_near_skyline", "profiles_of", "sectors_with_step", "skyline_band", "take_out_sky_step",
     "with_noise_of_blocks",

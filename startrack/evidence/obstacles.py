@@ -40,8 +40,8 @@ def add_obstacles(
     return mask
 
 
-def leave_out_obstacles(detections: Detections, mask: Mask | None) -> Detections:
-    """Copy of the `detections` with another `mask`, whose pixels count as dead."""
+def mask_obstacles(detections: Detections, mask: Mask | None) -> Detections:
+    """The same `detections` with another `mask`, whose pixels count as dead."""
     if mask is detections.mask or mask is None:
         return detections
     return replace(detections, mask=mask, dead=detections.dead | mask.masked)

@@ -24,6 +24,7 @@ from startrack.core.types import (
 from startrack.localization.hypothesis import Hypothesis
 from startrack.localization.importance_sampling import moments
 from startrack.localization.integrity import assess_integrity
+from startrack.localization.search import bound_dropped
 from startrack.localization.summary import camera_at, link_points, require_inside
 from startrack.localization.wrong_files import require_files, require_map_in_view
 from startrack.terrain import DIAMETER, Terrain
@@ -56,7 +57,7 @@ class Posterior:
     @cached_property
     def share(self) -> Array:
         """Shares (n,) of the points in the probability."""
-        return shares(np.concatenate([one.log_weight for one in self.hypotheses]))
+        return shares(np.concatenate([one.copies_log_weight for one in self.hypotheses]))
 
     @property
     def best(self) -> Hypothesis:
@@ -67,7 +68,7 @@ class Posterior:
     def is_core(self) -> Array:
         """Whether points (n,) are of hypotheses with the gross error of the best one, if it has any."""
         gross = self.best.gross
-        return np.concatenate([np.full(len(one.log_weight), one.gross == gross) for one in self.hypotheses])
+        return np.concatenate([np.full(len(one.copies_log_weight), one.gross == gross) for one in self.hypotheses])
 
     @cached_property
     def label(self) -> Ints:
@@ -111,8 +112,8 @@ def label_modes(points_m: Array, share: Array) -> Ints:
     return np.asarray(np.argmin(away, axis=0))
 
 
-def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, dropped_probability: float) -> Fix:
-    """The fix by sampled hypotheses, the heaviest first, in a terrain, after a search.
+def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored) -> Fix:
+    """The fix by sampled hypotheses, the heaviest first, in a terrain, after a search that left the boxes `explored`.
 
     A first look is not compared with other explanations of what it shows, and has no protection level.
     Raises NotLocated: outside_search_area, insufficient_geometry, inconsistent_evidence.
@@ -124,38 +125,40 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
     modes = _list_modes(whole)
     ambiguous = len(modes) > 1 and _share_beyond_circle(whole, middle) > AMBIGUOUS_MASS
     best, own = whole.best, _own_main(whole)
-    parameters, near = moments(best.found.points[own], best.found.share[own])
+    parameters, own_covariance = moments(best.sampled.points[own], best.sampled.share[own])
     states = best.model.states(parameters)
     clear, lit = states[:, 0], best.model.lit(states)
     widest_m = USELESS_FRACTION * terrain.search_radius_m
     if not ambiguous and radius95 > widest_m and whole.unscaled_radius95_m > widest_m:
         raise NotLocated(_useless_text(whole))
     require_map_in_view(best.model, clear + lit)
-    integrity = None
+    dropped, integrity = bound_dropped(explored), None
     if not best.model.seen.rows.is_first_look:
-        require_files(found, best.found.likeliest(own))
+        require_files(found, best.sampled.likeliest(own))
         if not ambiguous:
-            integrity = assess_integrity(best.model, parameters, near[:2, :2], clear, lit, covariance, radius999)
+            integrity = assess_integrity(
+                best.model, parameters, own_covariance[:2, :2], clear, lit, covariance, radius999
+            )
     blocked, lit_up = Blocked(1.0 - clear - lit), Blocked(lit)
     is_bias = np.array([one.name == "bias_rad" for one in best.model.errors.listed], dtype=bool)
-    bias_rad = float((shares(best.log_weight) @ best.values[:, is_bias]).sum())
+    bias_rad = float((shares(best.copies_log_weight) @ best.values[:, is_bias]).sum())
     return Fix(
         position_enu_m=camera_at(middle, terrain), covariance_m2=covariance, radius95_m=radius95, radius999_m=radius999,
         modes=modes, ambiguous=ambiguous, search=explored.search,
-        dropped_probability=dropped_probability if dropped_probability < 1.0 else None,
+        dropped_probability=dropped if dropped < 1.0 else None,
         horizon_error_rad=bias_rad, clock=_clock(whole), blocked=blocked if blocked else None,
         integrity=integrity, unstated=_unstated_facts(whole),
         exact_map_radius999_m=_radius_by_exact_map(whole), raised_rad=best.model.rise_rad(parameters),
         at_time_m=parameters[:2], shown=_shown_errors(best),
         lit=lit_up if lit_up else None,
-        samples=_restart_points(whole, explored, dropped_probability),
+        support=_support(best, explored, dropped),
     )  # fmt: skip
 
 
 def _own_main(whole: Posterior) -> Array:
     """Whether points of the best hypothesis (n,) are in the main mode, with most of their copies; all if none is."""
     best = whole.best
-    copies = whole.main[: len(best.log_weight)].reshape(-1, best.copies)
+    copies = whole.main[: len(best.copies_log_weight)].reshape(-1, best.copies)
     own = copies.mean(axis=1) > 0.5
     return np.asarray(own if own.any() else np.ones(len(own), dtype=bool))
 
@@ -207,7 +210,7 @@ def _clock(whole: Posterior) -> ClockError | None:
         return ClockError(stated.offset_s, stated.sigma_s)
     core = [one for one in whole.hypotheses if one.gross == whole.best.gross]
     later = np.concatenate([one.model.errors.later_s + one.values[:, -1] for one in core])
-    share = shares(np.concatenate([one.log_weight for one in core]))
+    share = shares(np.concatenate([one.copies_log_weight for one in core]))
     mean = float(share @ later)
     return ClockError(mean, float(np.sqrt(share @ np.square(later - mean))))
 
@@ -216,7 +219,9 @@ def _unstated_facts(whole: Posterior) -> tuple[UnstatedFact, ...]:
     """The facts that no file states, the one that widens the 99.9 % circle most first."""
     found = []
     for fact in whole.best.model.errors.unstated_facts:
-        parts = [(_positions_without_fact(one, fact), one.log_weight) for one in whole.hypotheses if one.gross != fact]
+        parts = [
+            (_positions_without_fact(one, fact), one.copies_log_weight) for one in whole.hypotheses if one.gross != fact
+        ]
         if not parts:
             continue
         positions, logs = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -233,7 +238,7 @@ def _positions_without_fact(one: Hypothesis, fact: str) -> Array:
     if one.model.errors.are_waves(fact):
         return _positions_without_waves(one)
     own = one.model.errors.is_of_fact(fact)
-    _, covariance = moments(np.hstack([one.unturned_m, one.values[:, own]]), shares(one.log_weight))
+    _, covariance = moments(np.hstack([one.unturned_m, one.values[:, own]]), shares(one.copies_log_weight))
     drift = np.linalg.pinv(covariance[2:, 2:], hermitian=True) @ covariance[2:, :2]
     values = one.values.copy()
     values[:, own] = 0.0
@@ -245,7 +250,7 @@ def _radius_by_exact_map(whole: Posterior) -> float | None:
     best = whole.best
     if not best.model.errors.waves:
         return None
-    positions, share = _positions_without_waves(best), shares(best.log_weight)
+    positions, share = _positions_without_waves(best), shares(best.copies_log_weight)
     return whole.radii(positions, share, share @ positions)[1]
 
 
@@ -253,14 +258,14 @@ def _positions_without_waves(one: Hypothesis) -> Array:
     """Positions (n, 2) of a hypothesis's points about their mean, narrower as in the linear model without waves."""
     exact = replace(one.model, errors=replace(one.model.errors, waves=()))
     wide, narrow = (np.linalg.cholesky(model.solve()[1][:2, :2]) for model in (one.model, exact))
-    mean = shares(one.log_weight) @ one.positions_m
+    mean = shares(one.copies_log_weight) @ one.positions_m
     return np.asarray(mean + (one.positions_m - mean) @ np.linalg.solve(wide.T, narrow.T))
 
 
 def _shown_errors(best: Hypothesis) -> tuple[ShownError, ...]:
     """The errors that nobody states and that the image shows to be larger than their default."""
     errors = best.model.errors
-    mean, covariance = moments(best.values - errors.stated_values, shares(best.log_weight))
+    mean, covariance = moments(best.values - errors.stated_values, shares(best.copies_log_weight))
     sigma = np.sqrt(np.diag(covariance))
     return tuple(
         ShownError(one.name, one.fact, float(mean[k]), float(sigma[k]))
@@ -269,12 +274,12 @@ def _shown_errors(best: Hypothesis) -> tuple[ShownError, ...]:
     )
 
 
-def _restart_points(whole: Posterior, explored: Explored, dropped_probability: float) -> Explored:
-    """The SUPPORT likeliest points (n, 2) [m, enu] of the best hypothesis, where a later search of the image begins."""
-    one = whole.best
-    order = np.argsort(-one.found.log_weight)[:SUPPORT]
-    points, log = one.found.points[order, :2], one.found.log_weight[order]
+def _support(best: Hypothesis, explored: Explored, dropped: float) -> Explored:
+    """The SUPPORT points (n, 2) [m, enu] of most weight of the best hypothesis, where a later search of the image begins.
+
+    `explored` is left by the search of this one, with a bound of the probability that it `dropped`.
+    """
+    order = np.argsort(-best.sampled.log_weight)[:SUPPORT]
+    points, log = best.sampled.points[order, :2], best.sampled.log_weight[order]
     spread = np.sqrt(max(float(np.linalg.eigvalsh(moments(points, relative_weights(log))[1])[1]), 1e-6))
-    return explored._replace(
-        centres_m=points, half_m=0.5 * spread, log_likelihood=log, dropped_probability=dropped_probability,
-    )  # fmt: skip
+    return explored._replace(centres_m=points, half_m=0.5 * spread, log_weight=log, dropped_probability=dropped)

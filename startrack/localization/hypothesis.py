@@ -25,11 +25,16 @@ class Hypothesis:
     """Points of the posterior where one fact, or none, has a gross error."""
 
     model: SkylineModel
-    found: WeightedPoints  # the weights include the prior probability of the hypothesis
+    sampled: WeightedPoints  # the weights include the prior probability of the hypothesis
 
     def weighed(self, nats: float) -> Hypothesis:
         """Copy of this hypothesis whose logarithms of weights are greater by so many `nats`."""
-        return replace(self, found=replace(self.found, log_weight=self.found.log_weight + nats))
+        return replace(self, sampled=replace(self.sampled, log_weight=self.sampled.log_weight + nats))
+
+    @property
+    def log_evidence(self) -> float:
+        """Logarithm of the probability of the rows, all positions together, times the prior of the hypothesis."""
+        return self.sampled.log_evidence
 
     @property
     def gross(self) -> str:
@@ -42,32 +47,37 @@ class Hypothesis:
         return HIDDEN_COPIES if self.model.basis.hidden.shape[1] else 1
 
     @cached_property
-    def log_weight(self) -> Array:
+    def copies_log_weight(self) -> Array:
         """Logarithms (n,) of the weights of all copies."""
-        return np.repeat(self.found.log_weight, self.copies) - np.log(self.copies)
+        return np.repeat(self.sampled.log_weight, self.copies) - np.log(self.copies)
 
     @cached_property
     def _hidden(self) -> Array:
         """Coordinates (n, b) of the errors that the rows do not show."""
-        count, b = len(self.found.log_weight) * self.copies, self.model.basis.hidden.shape[1]
+        count, b = len(self.sampled.log_weight) * self.copies, self.model.basis.hidden.shape[1]
         return normal_sequence(b, 0, count)[0][:, :b] if b else np.zeros((count, 0))
 
     @cached_property
     def values(self) -> Array:
         """Values (n, k) of the shared errors, each in its unit."""
-        return self.model.basis.values(np.repeat(self.found.points[:, 2:], self.copies, axis=0), self._hidden)
+        return self.model.basis.values(np.repeat(self.sampled.points[:, 2:], self.copies, axis=0), self._hidden)
 
     @cached_property
     def unturned_m(self) -> Array:
         """Positions (n, 2) [m, enu] before the turn by the clock's error in a round crater."""
         return np.asarray(
-            np.repeat(self.found.points[:, :2], self.copies, axis=0) + self._hidden @ self.model.basis.drift_m
+            np.repeat(self.sampled.points[:, :2], self.copies, axis=0) + self._hidden @ self.model.basis.drift_m
         )
 
     @cached_property
     def positions_m(self) -> Array:
         """Positions (n, 2) [m, enu] of all copies."""
         return self.model.errors.true_positions(self.unturned_m, self.values)
+
+
+def heaviest_first(found: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The hypotheses that were `found` by falling evidence."""
+    return sorted(found, key=lambda one: -one.log_evidence)
 
 
 def first_group(found: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -132,12 +142,12 @@ def _gross_modes(plain: Hypothesis, other: SkylineModel) -> list[Gaussian]:
     model, whose own solution may be far off.
     """
     _, linear, _ = other.solve()
-    points = plain.found.points
+    points = plain.sampled.points
     off = points[:, 2:] @ plain.model.basis.shown.T  # errors that the rows do not show keep their prior: 0 in the mean
     errors = np.zeros((len(off), len(other.errors)))
     for number, one in enumerate(other.errors.listed):
         errors[:, number] = off[:, [known.name == one.name for known in plain.model.errors.listed]].sum(axis=1)
-    mean, same = moments(other.basis.parameters(points[:, :2], errors), plain.found.share)
+    mean, same = moments(other.basis.parameters(points[:, :2], errors), plain.sampled.share)
     own = other.errors.is_of_fact(other.gross)
     picked = np.pad(other.basis.shown[own], ((0, 0), (2, 0)))
     before, after = (other.errors.sigma(gross)[own] ** -2.0 for gross in ("", other.gross))

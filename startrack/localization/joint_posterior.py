@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from startrack.core.types import Array, Evidence, Explored, NotLocated
-from startrack.localization.hypothesis import WIDER, Hypothesis, sample_gross_errors, sample_hypothesis
+from startrack.localization.hypothesis import WIDER, Hypothesis, heaviest_first, sample_gross_errors, sample_hypothesis
 from startrack.localization.importance_sampling import (
     ENOUGH,
     FEW,
@@ -53,23 +53,23 @@ def sample_posterior(
         if start is None:
             continue
         references_m[number] = start.model.around.reference_m
-        best = max((one.found.log_evidence for one in found), default=-np.inf)
+        best = max((one.log_evidence for one in found), default=-np.inf)
         plain = _sample_group(start, references_m, best, is_first=number == 0)
         references_m[number] = plain.model.around.reference_m
         found.append(plain)
-        if plain.found.log_evidence >= best - NATS:
+        if plain.log_evidence >= best - NATS:
             found.extend(sample_gross_errors(plain, references_m))
             found.extend(_sample_own_edge(plain, start.model.around.half_m, explored, references_m))
     if not found:
         raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
-    best = max(one.found.log_evidence for one in found)
+    best = max(one.log_evidence for one in found)
     found = [
         sample_hypothesis(one.model, references_m, [_moments_of(one)])
-        if one.found.effective < FEW and one.found.log_evidence > best - NATS
+        if one.sampled.effective < FEW and one.log_evidence > best - NATS
         else one
         for one in found
     ]
-    return sorted(found, key=lambda one: -one.found.log_evidence)
+    return heaviest_first(found)
 
 
 def _begin_group(
@@ -92,28 +92,31 @@ def _begin_group(
 
 
 def _sample_own_edge(plain: Hypothesis, half_m: float, explored: Explored, references_m: Array) -> list[Hypothesis]:
-    """Hypothesis that the sky's light has an edge of its own, within `half_m` of the plain one's reference; or none."""
+    """Hypothesis that the sky's light has an edge of its own, within `half_m` of the plain one's reference; or none.
+
+    Its points are drawn from all boxes that the search has left.
+    """
     model = with_own_edge(plain, half_m)
     start = None if model is None else Start.among_boxes(model, explored.centres_m, explored.half_m)
     if start is None:
         return []
     found = sample_hypothesis(start.model, references_m, start.modes, first=[start.boxes], enough=FEW)
-    if found.found.log_evidence > plain.found.log_evidence:
+    if found.log_evidence > plain.log_evidence:
         found = sample_hypothesis(found.model, references_m, [_moments_of(found)])
     return [found]
 
 
 def _group_boxes(explored: Explored, reach_m: float) -> list[tuple[Array, float]]:
     """Centres (n, 2) of boxes, the best first, and their reach [m] from it, in groups that one neighbourhood serves."""
-    order = np.argsort(-explored.log_likelihood, kind="stable")
+    order = np.argsort(-explored.log_weight, kind="stable")
     centres = explored.centres_m[order]
     groups: list[tuple[Array, float]] = []
     reach_m = max(reach_m, 20.0 * explored.half_m)
     while len(centres) and len(groups) < MOST_GROUPS:
         away = np.abs(centres - centres[0]).max(axis=1)
-        near = away <= reach_m
-        groups.append((centres[near], float(away[near].max()) + 2 * explored.half_m))
-        centres = centres[~near]
+        is_own = away <= reach_m
+        groups.append((centres[is_own], float(away[is_own].max()) + 2 * explored.half_m))
+        centres = centres[~is_own]
     return groups
 
 
@@ -169,7 +172,7 @@ def _sample_group(start: Start, references_m: Array, best: float, is_first: bool
     if is_first and model.terrain.axisymmetric:
         return sample_at_start()
     plain = sample_at_start(rounds=FIRST_ROUNDS)
-    if plain.found.log_evidence < best - NATS:
+    if plain.log_evidence < best - NATS:
         return plain
     mean, covariance = _moments_of(plain)
     reach_m = max(NEIGHBOURHOOD_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1])), SMALLEST_M)
@@ -194,6 +197,6 @@ def _begin_closer(model: SkylineModel, mean: Array, covariance: Array, reach_m: 
 
 def _moments_of(one: Hypothesis) -> Gaussian:
     """Mean and covariance of a hypothesis by its points, wide enough where few count."""
-    mean, covariance = moments(one.found.points, one.found.share)
+    mean, covariance = moments(one.sampled.points, one.sampled.share)
     _, linear, _ = one.model.solve()
     return mean, covariance + 0.05 * linear

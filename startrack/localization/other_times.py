@@ -38,7 +38,7 @@ LEAST_SHARE, FULL_SHARE = 5e-5, 1e-2  # of the probability: next times are sampl
 
 
 def sample_other_times(found: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Hypotheses of a gross error of the clock about the heaviest of those `found`, the first one, on real ground.
+    """Hypotheses of a gross error of the clock on real ground, about the plain one of the group of the first `found`.
 
     A stated clock has them too, but not at a first look: the image is then measured at the stated time.
     """
@@ -49,7 +49,7 @@ def sample_other_times(found: Sequence[Hypothesis]) -> list[Hypothesis]:
     is_stated = clock.gross_probability == 0.0
     if clock.sigma_s >= clock.gross_sigma_s or (is_stated and rows.is_first_look):
         return []
-    log_evidence = float(np.logaddexp.reduce([one.found.log_evidence for one in found]))
+    log_evidence = float(np.logaddexp.reduce([one.log_evidence for one in found]))
     probability = WRONG_TIME_PROBABILITY if is_stated else clock.gross_probability
     return OtherTimes(plain, plain.model.with_gross(CLOCK_FACT), clock, probability, log_evidence).sample()
 
@@ -92,7 +92,7 @@ class OtherTimes:
                 continue
             found[at] = self._sample_time(at, found.get(at - 1, found.get(at + 1)))
             least = FULL_SHARE if self.model.seen.rows.is_first_look else LEAST_SHARE
-            if found[at].found.log_evidence > self.log_evidence + np.log(least):
+            if found[at].log_evidence > self.log_evidence + np.log(least):
                 waiting += [at - 1, at + 1]
         return list(found.values())
 
@@ -121,7 +121,7 @@ class OtherTimes:
         """The hypothesis of one time; sampling begins at the points of a `neighbour`, if there is one."""
         model, begin = self._model_at(float(self.times_s[at])), neighbour or self.plain
         linear, covariance, weight = model.solve()
-        mean, spread = moments(begin.found.points[:, :2], begin.found.share)
+        mean, spread = moments(begin.sampled.points[:, :2], begin.sampled.share)
         wide = WIDER * covariance
         wide[:2, :2] += WIDER * spread
         modes: list[Gaussian] = [(model.with_likely_errors(mean[None], weight)[0], wide)]
@@ -130,7 +130,7 @@ class OtherTimes:
         for rounds in FEW_ROUNDS, GROSS_ROUNDS:
             one = sample_hypothesis(model, model.around.reference_m[None], modes, rounds=rounds, enough=FEW)
             one = one.weighed(self.log_part[at])
-            if one.found.log_evidence < self.log_evidence + np.log(FULL_SHARE):
+            if one.log_evidence < self.log_evidence + np.log(FULL_SHARE):
                 break
         return one
 

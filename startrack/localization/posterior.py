@@ -11,10 +11,11 @@ import numpy as np
 from startrack.core.types import Array, Evidence, Explored, Fix, NotLocated, PositionPrior
 from startrack.localization.clock import explore_times, is_wide
 from startrack.localization.conclusion import conclude
+from startrack.localization.hypothesis import Hypothesis, heaviest_first
 from startrack.localization.joint_posterior import NO_OTHERS, sample_posterior
 from startrack.localization.other_times import sample_other_times
 from startrack.localization.position_prior import SearchedNear, name_prior, require_agreement, require_prior_inside
-from startrack.localization.search import NATS, dropped_probability, explore
+from startrack.localization.search import NATS, search_boxes
 from startrack.localization.search_profiles import SLACK_NATS
 from startrack.localization.steepness import settle_steepness
 from startrack.terrain import Terrain, require_terrain
@@ -41,7 +42,7 @@ class ExactPosterior:
 
         Raises NotLocated: insufficient_geometry, outside_search_area, inconsistent_evidence.
         """
-        terrain = settle_steepness(evidence, require_terrain(terrain))
+        terrain = settle_steepness(evidence, require_terrain(terrain))  # of the chain: it has settled it
         informative = (np.abs(evidence.llr) > MIN_ROW_NATS) | (evidence.extended_nats > MIN_ROW_NATS)
         informative &= terrain.is_informative(evidence.azimuth_rad, evidence.elevation_rad)
         count = int(np.count_nonzero(informative))
@@ -65,7 +66,7 @@ class ExactPosterior:
 
     def explore(self, evidence: Evidence, terrain: Terrain) -> Explored:
         """The boxes of the `terrain` that may matter by `evidence`."""
-        return explore(evidence, terrain, self.prune_nats, self.budget_horizons)[0]
+        return search_boxes(evidence, terrain, self.prune_nats, self.budget_horizons)[0]
 
     def _explore_near(self, evidence: Evidence, terrain: Terrain, near: PositionPrior) -> Explored:
         """Boxes that may matter in the neighbourhood of the prior `near`, with its log-density added.
@@ -76,16 +77,16 @@ class ExactPosterior:
         """
         nearby = SearchedNear(terrain, near)
         require_prior_inside(nearby)
-        found, places = explore(evidence, nearby, self.prune_nats, self.budget_horizons)
+        found, places = search_boxes(evidence, nearby, self.prune_nats, self.budget_horizons)
         while nearby.is_at_edge(places):
             wider = nearby.enlarged()
             try:
-                found, places = explore(evidence, wider, self.prune_nats, self.budget_horizons)
+                found, places = search_boxes(evidence, wider, self.prune_nats, self.budget_horizons)
             except NotLocated:  # the smaller disk has an answer
                 break
             nearby = wider
         require_agreement(places, near)
-        return found._replace(log_likelihood=found.log_likelihood + near.log_density(found.centres_m))
+        return found._replace(log_weight=found.log_weight + near.log_density(found.centres_m))
 
 
 class Part(NamedTuple):
@@ -105,10 +106,12 @@ def weigh_parts(parts: Sequence[Part], terrain: Terrain, of_one_sky: bool = True
     Raises NotLocated: insufficient_geometry, outside_search_area, inconsistent_evidence.
     """
     found = [one for part in parts for one in sample_posterior(part.explored, part.rows, terrain, part.others_m)]
-    if not of_one_sky:
-        anywhere = [float(one.model.seen.profiles.free.sum()) for one in found]
-        best = int(np.argmax([one.found.log_evidence - nats for one, nats in zip(found, anywhere, strict=True)]))
-        found = [one.weighed(anywhere[best] - nats) for one, nats in zip(found, anywhere, strict=True)]
-    found.sort(key=lambda one: -one.found.log_evidence)
-    found = sorted([*found, *sample_other_times(found)], key=lambda one: -one.found.log_evidence)
-    return conclude(found, terrain, parts[0].explored, dropped_probability(parts[0].explored))
+    at_stated = heaviest_first(found if of_one_sky else _weigh_against_free(found))
+    return conclude(heaviest_first([*at_stated, *sample_other_times(at_stated)]), terrain, parts[0].explored)
+
+
+def _weigh_against_free(found: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The hypotheses, weighed by how much better than a free skyline each explains its rows."""
+    free = [float(one.model.seen.profiles.free.sum()) for one in found]
+    best = int(np.argmax([one.log_evidence - nats for one, nats in zip(found, free, strict=True)]))
+    return [one.weighed(free[best] - nats) for one, nats in zip(found, free, strict=True)]

@@ -44,7 +44,7 @@ def log_sum(values: Array) -> float:
     return float(np.logaddexp.reduce(values, initial=-np.inf))
 
 
-def dropped_probability(explored: Explored, log_known: float = -np.inf) -> float:
+def bound_dropped(explored: Explored, log_known: float = -np.inf) -> float:
     """Bound of the part of the posterior that a search left out; 1 where nothing is known.
 
     `log_known` is the logarithm of the integral of the likelihood [m2] about known places: where rows are strong it is
@@ -52,7 +52,7 @@ def dropped_probability(explored: Explored, log_known: float = -np.inf) -> float
     """
     if explored.dropped_probability is not None:
         return explored.dropped_probability
-    log_mass = max(log_sum(explored.log_likelihood) + float(np.log(4 * explored.half_m**2)), log_known)
+    log_mass = max(log_sum(explored.log_weight) + float(np.log(4 * explored.half_m**2)), log_known)
     return float(np.exp(min(explored.log_dropped + SLACK_NATS - log_mass, 0.0)))
 
 
@@ -68,7 +68,7 @@ def boxes_about(places: list[Place], terrain: Terrain) -> Explored:
     return Explored(centres[allowed], reach_m / (BOXES_ACROSS - 1), score[allowed], np.inf, "beam")
 
 
-def explore(
+def search_boxes(
     rows: Evidence, terrain: Terrain, prune_nats: float, budget_horizons: float
 ) -> tuple[Explored, list[Place]]:
     """The boxes of a `terrain` that may matter by `rows`, and the best places known.
@@ -95,8 +95,8 @@ def explore(
         log_masses = np.add(log_likelihood, np.log(areas_m2))
         found = found._replace(  # the best place is the first reference of the sampling
             centres_m=np.vstack([points, found.centres_m]),
-            log_likelihood=np.append(log_likelihood, found.log_likelihood),
-            dropped_probability=dropped_probability(found, max(log_masses)) if places else None,
+            log_weight=np.append(log_likelihood, found.log_weight),
+            dropped_probability=bound_dropped(found, max(log_masses)) if places else None,
         )
     return found, places
 

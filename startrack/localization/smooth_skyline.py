@@ -73,7 +73,7 @@ def with_own_edge(plain: Hypothesis, half_m: float) -> SkylineModel | None:
     around = replace(plain.model.around, half_m=half_m)
     stars, light = (SectorRows(around, rows.take(np.flatnonzero(own))) for own in (~is_light, is_light))
     width_rad = float(np.median(rows.edge_sigma_rad[is_light]))
-    shift = plain.model.shift_of(plain.found.share @ plain.found.points)
+    shift = plain.model.shift_of(plain.sampled.share @ plain.sampled.points)
     logs = list_free_logs(light.profiles, shift, EDGE_REACH * width_rad, EDGE_ROUGHNESS * width_rad)
     whole, likely = logs.sum(axis=1), shares(logs.sum(axis=1)) @ logs
     likely += (np.logaddexp.reduce(whole) - np.log(len(whole)) - likely.sum()) / SECTORS  # all equally likely before

@@ -58,7 +58,7 @@ def require_files(found: Sequence[Hypothesis], parameters: Array) -> None:
             "or camera file, or something on no map?",
             reason="inconsistent_evidence",
         )
-    share = shares(np.array([one.found.log_evidence for one in found]))
+    share = shares(np.array([one.log_evidence for one in found]))
     wrong_time = float(share @ [_is_wrong_time(one) for one in found])
     if wrong_time > 0.5:
         raise NotLocated(
@@ -123,6 +123,6 @@ def _log_evidence(found: Sequence[Hypothesis]) -> float:
     kept = {OWN_EDGE: float(np.log(OWN_EDGE_PROBABILITY))}
     return float(
         np.logaddexp.reduce(
-            [one.found.log_evidence - one.model.basis.log_probability + kept.get(one.gross, 0.0) for one in found]
+            [one.log_evidence - one.model.basis.log_probability + kept.get(one.gross, 0.0) for one in found]
         )
     )

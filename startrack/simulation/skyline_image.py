@@ -16,7 +16,7 @@ from startrack.catalog import StarCatalog
 from startrack.chain import Identified, Measured, fit_orientation, identified_names
 from startrack.core.types import Array, Bools, Detections, Exposure, Identification, Image, Ints, SmoothImage
 from startrack.detection import Detector, electrons, source_variances
-from startrack.evidence import BAND_PX, half_width, leave_out_obstacles, skyline_band
+from startrack.evidence import BAND_PX, half_width, mask_obstacles, skyline_band
 from startrack.psf import noise_area_px, pixel_profile
 from startrack.rendering import EDGE_WIDTH_SIGMAS, Scene, diffuse_at_e, read_out, splat
 from startrack.simulation.star_rays import SimulatedStars, simulate_stars
@@ -66,7 +66,7 @@ def simulate_measured(
     known, site = _identify(stars, star), require_site(terrain)
     identified = Identified(
         exposure=exposure, camera=camera, terrain=terrain, catalog_name=catalog.name,
-        detections=leave_out_obstacles(detections, stars.mask), stars=stars.catalog, bodies=scene.bodies, site=site,
+        detections=mask_obstacles(detections, stars.mask), stars=stars.catalog, bodies=scene.bodies, site=site,
         identification=known, names=identified_names(detections, known, scene.bodies),
     )  # fmt: skip
     oriented, rays = fit_orientation(identified), vars(stars.rays)

@@ -304,47 +304,77 @@ def positions_at_rest(
     image apart. Raises ValueError where no exposure has a position, and BadInput (inconsistent_evidence) where half of
     those with a single position or more are elsewhere.
     """
+    terrain = terrain.with_steepness(next((frame.steepness_1 for frame in frames if frame.modes), 1.0))
+    errors = errors.on(terrain)
+    modes = [[errors.place(one) for one in frame.modes] for frame in frames]
     n = len(frames)
     still = Steps(np.zeros((n - 1, 2)), np.full(n - 1, STILL_M))
-    terrain = terrain.with_steepness(next((frame.steepness_1 for frame in frames if frame.modes), 1.0))
-    errors, modes = errors.on(terrain), [[errors.place(one) for one in frame.modes] for frame in frames]
     compared = explain(modes, [Moves.of(still)], may_slip=False)
     agreeing = conclude(modes, compared, [frame.name for frame in frames])
-    single = np.array([len(frame.modes) == 1 for frame in frames])
-    agree, count = np.count_nonzero(single & (agreeing.mode >= 0)), np.count_nonzero(single)
+    _require_majority(frames, agreeing.mode >= 0)
+    used = np.flatnonzero(agreeing.mode >= 0).tolist()
+    first = used[0]
+    first_mode = frames[first].modes[agreeing.mode[first]]
+    about = agreeing.smoothed.position_m[first], agreeing.smoothed.covariance_m2[first]
+    if errors.bends:  # positions are sampled before they are scaled with the crater
+        about = first_mode.mean[:2], first_mode.covariance[:2, :2]
+    together = _estimate_together([frames[k] for k in used], first_mode, about, terrain, errors)
+    by_all = together[-1]
+    known = agreeing.smoothed.covariance_m2[:, 0, 0] < UNKNOWN_M**2  # explanations do not differ
+    smoothed = replace(
+        by_all, position_m=np.repeat(by_all.position_m, n, axis=0), covariance_m2=known_m2(by_all.covariance_m2, known)
+    )  # fmt: skip
+    return replace(agreeing, smoothed=smoothed), _filtered_at_rest(together, agreeing.mode, compared)
+
+
+def _filtered_at_rest(together: Sequence[Smoothed], mode: Ints, compared: Explanations) -> Filtered:
+    """The positions by each of n exposures with those before it, of which the modes (n,) are used.
+
+    `together` are the estimates by the first exposure that is used, by the first two of them, and so on.
+    """
+    count = np.cumsum(mode >= 0)  # of the exposures that are used up to each one
+    position = np.array([np.zeros(2), *(one.position_m[0] for one in together)])[count]
+    covariance = np.array([UNKNOWN_M**2 * np.eye(2), *(one.covariance_m2[0] for one in together)])[count]
+    return Filtered(position, covariance, mode, np.where(count == 1, np.flatnonzero(mode >= 0)[0], -1), compared)
+
+
+def _require_majority(frames: Sequence[ObservedFrame], is_used: Bools) -> None:
+    """Raise BadInput inconsistent_evidence where of the frames with one position half or fewer are used (n,)."""
+    is_single = np.array([len(frame.modes) == 1 for frame in frames])
+    agree, count = np.count_nonzero(is_single & is_used), np.count_nonzero(is_single)
     if count > 1 and 2 * agree <= count:
         raise BadInput(
             "inconsistent_evidence",
             f"only {agree} of {count} images agree on one position: has the camera moved? Then leave --at-rest out",
         )
-    position, covariance = np.zeros((n, 2)), np.repeat([UNKNOWN_M**2 * np.eye(2)], n, axis=0)
 
-    def take(k: int, estimate: FrameEstimate) -> Smoothed:
-        found = smooth([errors.place(estimate)], Steps.unknown(1))
-        for _ in range(SIZE_ROUNDS if errors.bends else 0):
-            placed = errors.place(estimate, found.position_m[0], found.shared)
-            found = smooth([placed], Steps.unknown(1))
-        position[k:], covariance[k:] = found.position_m[0], found.covariance_m2[0]
-        return found
 
-    first, *later = np.flatnonzero(agreeing.mode >= 0).tolist()
-    one = frames[first].modes[agreeing.mode[first]]
-    compared_as = agreeing.smoothed
-    found, reference, spread = take(first, one), compared_as.position_m[first], compared_as.covariance_m2[first]
-    if errors.bends:  # models have positions before these are scaled with the crater
-        reference, spread = one.mean[:2], one.covariance[:2, :2]
-    half = max(FRAME_REACH_SIGMAS * largest_sigma(found.covariance_m2[0]), LEAST_FRAME_HALF_M)
+def _estimate_together(
+    frames: Sequence[ObservedFrame], first_mode: FrameEstimate, about: tuple[Array, Array], terrain: Terrain,
+    errors: TrackErrors,
+) -> list[Smoothed]:  # fmt: skip
+    """The estimates of one position by the first of m frames, by the first two, and so on to all of them (m).
+
+    `first_mode` is the observation by the first frame. The others are by points of the posterior of several exposures,
+    sampled from `about`: a position (2,) [m] and its covariance (2, 2).
+    """
+    found = [_place_one(first_mode, errors)]
+    half = max(FRAME_REACH_SIGMAS * largest_sigma(found[0].covariance_m2[0]), LEAST_FRAME_HALF_M)
     models: list[FrameModel] = []
-    for k in (first, *later):
-        evidence = frames[k].evidence
-        if evidence is not None:
-            models.append(FrameModel.of_evidence(evidence, terrain, errors, reference, half))
-        if k != first:
-            points = sample_together(models, reference, spread)
-            found = take(k, observe_together(models, points))
-    alone = np.where(np.cumsum(agreeing.mode >= 0) == 1, first, -1)
-    known = compared_as.covariance_m2[:, 0, 0] < UNKNOWN_M**2  # explanations do not differ
-    found = replace(
-        found, position_m=np.repeat(found.position_m, n, axis=0), covariance_m2=known_m2(found.covariance_m2, known)
-    )  # fmt: skip
-    return replace(agreeing, smoothed=found), Filtered(position, covariance, agreeing.mode, alone, compared)
+    for k, frame in enumerate(frames):
+        if frame.evidence is not None:
+            models.append(FrameModel.of_evidence(frame.evidence, terrain, errors, about[0], half))
+        if k > 0:
+            found.append(_place_one(observe_together(models, sample_together(models, *about)), errors))
+    return found
+
+
+def _place_one(estimate: FrameEstimate, errors: TrackErrors) -> Smoothed:
+    """The position and the shared errors by one observation, after the turn and the scaling of a round crater.
+
+    Where its size is not known, the change with the size is taken about the result anew.
+    """
+    found = smooth([errors.place(estimate)], Steps.unknown(1))
+    for _ in range(SIZE_ROUNDS if errors.bends else 0):
+        found = smooth([errors.place(estimate, found.position_m[0], found.shared)], Steps.unknown(1))
+    return found

@@ -44,6 +44,8 @@ class _BrightSources:
 
         self.sources, self.camera, self.stars, self.known, self.R_cam_icrs = sources, camera, stars, known, R_cam_icrs
         self.known_px = sources.xy_px[known.detection]
+        self.source_mag = np.full(len(sources), np.inf)  # of the star that each source is; inf: none
+        self.source_mag[known.detection] = stars.v_mag[known.star]
         predicted_px, _ = camera.project(stars.rays_icrs[known.star] @ R_cam_icrs.T)
         self.radius_px = coincidence_radius_px(np.hypot(*(predicted_px - self.known_px).T))
         self.blobs = find_blobs(sources)
@@ -92,56 +94,74 @@ class _BrightSources:
         """
         seen, detection, blob = [], [self.known.detection[:0]], [self.known_blob[:0]]
         scale = float(self.camera.mean_scale_rad_per_px(np.array(self.camera.calibrated_angle_rad / 2)))
-        star_mag = np.full(len(self.sources), np.inf)
-        star_mag[self.known.detection] = self.stars.v_mag[self.known.star]
         for body in bodies:
             px, in_view = self.camera.project(self.R_cam_icrs @ body.ray_icrs)
             if not in_view:
                 continue
-            moved_px = parallax_rad / scale if body.name in ("Moon", "Earth") else 0.0
-            reach_px = self.radius_px + moved_px + HALF_PIXEL_PX
-            touched = np.unique(self.blobs.blob[self.tree.query_ball_point(px, reach_px)])
-            is_large = self.area_px[touched] > len(disc_px(self.sources))  # the Moon: its glare is no background
-            if moved_px:  # stars may be about its place
-                touched, is_large = touched[is_large], is_large[is_large]
-            is_near = (np.hypot(*(self.sources.xy_px - px).T) < self.radius_px) | np.isin(self.source_blob, touched)
-            near = np.flatnonzero(is_near & (star_mag > body.v_mag))
-            light_e = [*light_at(self.sources, self.sources.xy_px[near]), *self.blobs.light_e[touched]]
-            if is_large.any() or max(light_e, default=0.0) > self.light_bounds(np.array([body.v_mag]))[0][0]:
+            at, is_large = self._blobs_of_body(px, parallax_rad / scale if body.name in ("Moon", "Earth") else 0.0)
+            near = self._detections_of_body(body, px, at)
+            light_e = [*light_at(self.sources, self.sources.xy_px[near]), *self.blobs.light_e[at]]
+            if is_large or max(light_e, default=0.0) > self.light_bounds(np.array([body.v_mag]))[0][0]:
                 seen.append(body)
                 detection.append(near)
             if body.v_mag < self.depth_mag + DISTINCT_MAG:
-                blob.append(touched)
+                blob.append(at)
         return _FoundBodies(tuple(seen), np.concatenate(detection), np.concatenate(blob))
+
+    def _blobs_of_body(self, px: Array, moved_px: float) -> tuple[Ints, bool]:
+        """The blobs (n,) at the place (2,) of a body, and whether one is larger than any star, as that of the Moon.
+
+        The body is up to `moved_px` from that place. Stars may be about it then: only large blobs count.
+        """
+        found = np.unique(self.blobs.blob[self.tree.query_ball_point(px, self.radius_px + moved_px + HALF_PIXEL_PX)])
+        is_large = self.area_px[found] > len(disc_px(self.sources))  # the Moon's glare is no background
+        return found[is_large] if moved_px else found, bool(is_large.any())
+
+    def _detections_of_body(self, body: Body, px: Array, at: Ints) -> Ints:
+        """The detections (n,) at the place (2,) of a body or in the blobs `at` (m,), without stars as bright."""
+        is_near = (np.hypot(*(self.sources.xy_px - px).T) < self.radius_px) | np.isin(self.source_blob, at)
+        return np.flatnonzero(is_near & (self.source_mag > body.v_mag))
 
     def name_stars(self, of_bodies: Ints) -> tuple[NamedStars, Ints]:
         """The stars without a name that are blobs, with these blobs; the blobs `of_bodies` are none."""
         blobs, v_mag = self.blobs, self.stars.v_mag
-        free = blobs.compact & (self.camera.angle_rad(blobs.xy_px) <= self.camera.max_angle_rad)
-        free[of_bodies] = False
-        free[self.known_blob[self.known_blob >= 0]] = False
         count = int(np.searchsorted(v_mag, self.depth_mag + DISTINCT_MAG))
         star_px, in_view = self.camera.project(self.stars.rays_icrs[:count] @ self.R_cam_icrs.T)
-        at = np.where(in_view, self.blob_at(star_px), -1)
-        star = np.flatnonzero(at >= 0)  # the brightest first
-        at = at[star]
-        _, first = np.unique(at, return_index=True)
-        second = np.full(len(blobs), np.inf)
-        others = np.setdiff1d(np.arange(len(star)), first)
-        np.minimum.at(second, at[others], v_mag[star[others]])
-        clutter = free.copy()
-        clutter[at] = False
-        named = np.zeros(len(self.stars), dtype=bool)
-        named[self.known.star] = True
-        first = first[free[at[first]] & ~named[star[first]] & (v_mag[star[first]] <= self.depth_mag)]
-        first = first[v_mag[star[first]] + DISTINCT_MAG < second[at[first]]]
-        star, at = star[first], at[first]
+        star_blob = np.where(in_view, self.blob_at(star_px), -1)
+        is_free = self._are_free(of_bodies)
+        is_clutter = is_free.copy()
+        is_clutter[star_blob[star_blob >= 0]] = False
+        is_named = np.zeros(len(self.stars), dtype=bool)
+        is_named[self.known.star] = True
+        star = self._single_stars(star_blob)
+        star = star[is_free[star_blob[star]] & ~is_named[star] & (v_mag[star] <= self.depth_mag)]
         least, most = self.light_bounds(v_mag[star])
-        alike = (blobs.light_e[at] > least) & (blobs.light_e[at] < most)
-        trials = np.cumsum(in_view & ~named[:count])[star]
-        alike &= trials * self._chances(at, least, most, clutter) < MOST_CHANCE_NAMES
-        star, at = star[alike], at[alike]
+        at = star_blob[star]
+        is_alike = (blobs.light_e[at] > least) & (blobs.light_e[at] < most)
+        trials = np.cumsum(in_view & ~is_named[:count])[star]  # stars as bright, of those without a name
+        by_chance = trials * self._chances(at, least, most, is_clutter)
+        star = star[is_alike & (by_chance < MOST_CHANCE_NAMES)]
+        at = star_blob[star]
         return NamedStars(star=star, xy_px=blobs.xy_px[at], saturated=blobs.saturated[at]), at
+
+    def _are_free(self, of_bodies: Ints) -> Bools:
+        """Whether each blob (n,) may be a star: it has a star's shape, and no named star and no body is there."""
+        found = self.blobs.compact & (self.camera.angle_rad(self.blobs.xy_px) <= self.camera.max_angle_rad)
+        found[of_bodies] = False
+        found[self.known_blob[self.known_blob >= 0]] = False
+        return found
+
+    def _single_stars(self, star_blob: Ints) -> Ints:
+        """The stars (n,) that are the brightest of their blob, by DISTINCT_MAG; in the order of the blobs.
+
+        `star_blob` (m,) are the blobs of the m brightest stars, -1: none.
+        """
+        star, v_mag = np.flatnonzero(star_blob >= 0), self.stars.v_mag
+        _, first = np.unique(star_blob[star], return_index=True)
+        brightest, others = star[first], np.delete(star, first)
+        second_mag = np.full(len(self.blobs), np.inf)
+        np.minimum.at(second_mag, star_blob[others], v_mag[others])
+        return brightest[v_mag[brightest] + DISTINCT_MAG < second_mag[star_blob[brightest]]]
 
     def _chances(self, at: Ints, least: Array, most: Array, clutter: Bools) -> Array:
         """Probability (n,) that a `clutter` blob with light from `least` to `most` (n,) is at a star by chance.

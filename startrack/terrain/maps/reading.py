@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from startrack.core.errors import how_to_install
 from startrack.core.files import MAX_CAUSE_CHARS, data_dir
 from startrack.core.limits import memory_refusal
-from startrack.core.types import MAX_PIXELS, BadInput
+from startrack.core.types import MAX_PIXELS, BadInput, Bools
 from startrack.terrain.maps.heights import Stored, heights_of, note_bands
 from startrack.terrain.maps.projections import (
     EQUIRECTANGULAR,
@@ -184,22 +184,42 @@ def require_extra(name: str) -> None:
 
 
 def _content_of(file: Any, path: Path, near: tuple[float, float] | None, hint: str) -> Stored:
-    """The content of an open rasterio file."""
+    """The content of an open rasterio file, cut to a window about `near`. Raises BadInput bad_terrain."""
     import pyproj
-    from rasterio.enums import ColorInterp
     from rasterio.windows import Window
 
-    if file.crs is None or file.transform.is_identity:
+    _require_place(file, path, hint)
+    crs = pyproj.CRS.from_wkt(file.crs.to_wkt())
+    t, unread = file.transform, np.broadcast_to(np.float32(0), (file.height, file.width))
+    raster = place_on(crs, unread, (t.c + 0.5 * t.a, t.f + 0.5 * t.e), (float(t.a), float(t.e)), near)
+    rows, columns = _rows_and_columns(file, path, raster, near)
+    _require_small_blocks(file, path)
+    window = Window(columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start)
+    values, alphas = file.read(1, window=window), _alpha_bands(file)
+    scale, offset = float(file.scales[0]), float(file.offsets[0])
+    return Stored(
+        values=replace(raster.crop(rows, columns), heights_m=values), missing=_voids(file, window, values, alphas),
+        scale=None if (scale, offset) == (1.0, 0.0) else scale, offset=offset, units=tuple(_units_of(file, crs, path)),
+        notes=note_bands(file.count, alphas, file.descriptions),
+    )  # fmt: skip
+
+
+def _require_place(file: Any, path: Path, hint: str) -> None:
+    """Raise BadInput bad_terrain, with the `hint` of the file's kind, without a position or with a rotated grid."""
+    t = file.transform
+    if file.crs is None or t.is_identity:
         raise BadInput(
             "bad_terrain",
             f"{path}: it has no position on a body{hint or ': add its projection (gdal_translate -a_srs)'}",
         )
-    t = file.transform
     if t.b or t.d:
         raise BadInput("bad_terrain", f"{path}: a rotated grid; bring it to north up (gdalwarp)")
-    crs = pyproj.CRS.from_wkt(file.crs.to_wkt())
-    unread = np.broadcast_to(np.float32(0), (file.height, file.width))
-    raster = place_on(crs, unread, (t.c + 0.5 * t.a, t.f + 0.5 * t.e), (float(t.a), float(t.e)), near)
+
+
+def _rows_and_columns(
+    file: Any, path: Path, raster: Raster, near: tuple[float, float] | None
+) -> tuple[slice, slice]:  # fmt: skip
+    """The rows and columns of a `raster` that are read: those about `near`, or all. Raises BadInput bad_terrain."""
     rows, columns = slice(0, file.height), slice(0, file.width)
     if near is not None:
         rows, columns = raster.window(*near, WINDOW_HALF_M[raster.projection.body])
@@ -208,22 +228,24 @@ def _content_of(file: Any, path: Path, near: tuple[float, float] | None, hint: s
         raise _not_on(str(path), raster)
     if shape[0] * shape[1] > MAX_PIXELS:
         raise BadInput("bad_terrain", f"{path}: too large; cut it to the area (startrack terrain import --half)")
-    _require_small_blocks(file, path)
-    window = Window(columns.start, rows.start, shape[1], shape[0])
-    values = file.read(1, window=window)
-    missing = file.read_masks(1, window=window) == 0
+    return rows, columns
+
+
+def _alpha_bands(file: Any) -> list[int]:
+    """Numbers, from 0, of the bands that say which posts are voids."""
+    from rasterio.enums import ColorInterp
+
+    return [k for k, kind in enumerate(file.colorinterp) if kind == ColorInterp.alpha]
+
+
+def _voids(file: Any, window: Any, values: np.ndarray, alphas: Sequence[int]) -> Bools:
+    """Whether the posts of a window with these `values` (rows, columns) are voids: by mask, value or alpha band."""
+    missing: Bools = file.read_masks(1, window=window) == 0
     if file.nodata is not None:
         missing |= values == file.nodata  # where the file has a mask too, that is not in it
-    alphas = [k for k, kind in enumerate(file.colorinterp) if kind == ColorInterp.alpha]
     for k in alphas:
         missing |= file.read(k + 1, window=window) == 0
-    scale, offset = float(file.scales[0]), float(file.offsets[0])
-    raster = raster.crop(rows, columns)
-    return Stored(
-        values=replace(raster, heights_m=values), missing=missing,
-        scale=None if (scale, offset) == (1.0, 0.0) else scale, offset=offset, units=tuple(_units_of(file, crs, path)),
-        notes=note_bands(file.count, alphas, file.descriptions),
-    )  # fmt: skip
+    return missing
 
 
 def place_on(

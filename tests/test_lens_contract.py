@@ -14,7 +14,8 @@ from astropy.wcs import WCS
 from scipy.spatial.transform import Rotation
 
 from startrack.applications.calibration import fit_lens, observations
-from startrack.camera import Camera, Lens, lenses, load_camera, save_camera
+from startrack.camera import Camera, Lens, camera_keys, lenses, load_camera, save_camera
+from startrack.core.declaration import Flag, Key, List, Number
 from startrack.core.types import Array
 from startrack.output.wcs import header_block, wcs_cards
 
@@ -194,6 +195,44 @@ def test_a_wrong_lens_breaks_the_contract(kind: type[Lens]) -> None:
             except AssertionError:
                 broken.add(check)
     assert broken == WRONG[kind]
+
+
+@pytest.mark.parametrize("kind", lenses.LENSES)
+def test_a_key_of_a_camera_file_has_one_declaration(kind: type[Lens]) -> None:
+    """The schema of camera files, which is for all lenses, has the keys that a file of this lens is checked by."""
+    of_all = camera_keys().keys
+    for key, declared in camera_keys(kind).keys.items():
+        assert replace(of_all[key], required=False) == replace(declared, required=False), key
+
+
+@pytest.mark.parametrize(
+    ("key", "declared", "agrees"),
+    [
+        ("k", Number(), False),  # of another lens
+        ("size_px", Number(), False),  # of every camera file
+        ("mirrored", Number(), False),
+        ("mirrored", Flag(default=False, required=True), True),
+        ("k", List(each=Number(low=-1e3, high=1e3), most=4, description="k1 to k4", required=True), True),
+        ("q", Number(), True),
+    ],
+)
+def test_a_key_that_a_lens_declares_otherwise_is_named(
+    monkeypatch: pytest.MonkeyPatch, key: str, declared: Key, agrees: bool
+) -> None:
+    class Renamed(Nonsense):
+        @classmethod
+        def file_keys(cls) -> dict[str, Key]:
+            return {key: declared}
+
+    before = camera_keys().keys
+    monkeypatch.setattr(lenses, "LENSES", (*lenses.LENSES, Renamed))
+    if agrees:
+        after = camera_keys().keys
+        assert set(after) == {*before, key}
+        assert {one for one in before if after[one] != before[one]} == {"model"}
+    else:
+        with pytest.raises(ValueError, match=f"the nonsense lens declares the key '{key}' .* otherwise"):
+            camera_keys()
 
 
 def camera_of(lens: Lens, least_slope: float = 0.0) -> Camera:

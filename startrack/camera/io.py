@@ -7,6 +7,7 @@ them has mirrored images, image circles, calibrated angles, sensors or covarianc
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -29,7 +30,7 @@ from startrack.camera.camera import (
 from startrack.camera.formats import FOREIGN_FORMATS, choose_part, find_program
 from startrack.camera.lens import Lens
 from startrack.camera.lenses import default_lens, lens_kinds
-from startrack.core.declaration import Choice, Flag, List, Number, Table, Text
+from startrack.core.declaration import Choice, Flag, Key, List, Number, Table, Text
 from startrack.core.files import (
     FOREIGN_CAMERA_SUFFIXES,
     MAX_CAUSE_CHARS,
@@ -78,43 +79,60 @@ SMALL_ANGLE_DEG = 1e-3  # of an image circle within any lens
 
 
 def camera_keys(lens: type[Lens] | None = None) -> Table:
-    """The declared keys of camera files with this lens; None: those of all lenses, none of which is then required."""
-    if lens is None:
-        declared = (item for kind in lens_kinds().values() for item in kind.file_keys().items())
-        lens_keys = {key: replace(one, required=False) for key, one in declared}
-    else:
-        lens_keys = lens.file_keys()
+    """The declared keys of camera files with this lens; None: those of all lenses, none of which is then required.
+
+    Raises ValueError for a key of all lenses that has two declarations.
+    """
+    first: dict[str, Key] = {
+        "format": Choice(values=(1,), default=1),
+        "name": Text(max_chars=200),
+        "model": Choice(values=tuple(lens_kinds()), default=default_lens().model),
+        "size_px": List(each=Number(low=1, high=65_535, integer=True), count=2, required=True),
+        "focal_px": List(each=Number(low=1e-3, high=1e6), count=2, required=True,
+                         description="pixels per radian on the axis"),
+        "centre_px": List(each=Number(low=-1e6, high=1e6), count=2, required=True,
+                          description="(0, 0) is the centre of the top-left pixel"),
+    }  # fmt: skip
+    last: dict[str, Key] = {
+        "max_angle_deg": Number(low=0, high=180, above=True, required=True,
+                                description="edge of the image circle, off the axis"),
+        "calibrated_angle_deg": Number(low=0, high=360, above=True,
+                                       description="beyond this the lens is not known; default: max_angle_deg"),
+        "mirrored": Flag(default=False),
+        "mask": Text(is_path=True,
+                     description="8-bit image of this size, relative to this file: pixels below 128 do not count"),
+        "obstacles": Text(is_path=True,
+                          description="CSV file, relative to this one: azimuth_deg from body x to the right, and "
+                          "elevation_deg above the body's x y plane, below which the view is hidden"),
+        "refraction": Choice(values=(REFRACTION_REMOVED, REFRACTION_CONTAINED),
+                             description="of the Earth's air: contained in a lens calibrated without a site"),
+        "decentring": List(each=Number(low=-1, high=1), count=2, description="p1, p2 of a decentred lens"),
+        "mount": MOUNT,
+        "sensor": SENSOR,
+        "covariance": COVARIANCE,
+    }  # fmt: skip
     return Table(
         description="x_px = cx + fx rho cos b, y_px = cy + fy rho sin b; rho = a + k1 a^3 + k2 a^5 + k3 a^7 + k4 a^9, "
         "or tan a",
-        keys={
-            "format": Choice(values=(1,), default=1),
-            "name": Text(max_chars=200),
-            "model": Choice(values=tuple(lens_kinds()), default=default_lens().model),
-            "size_px": List(each=Number(low=1, high=65_535, integer=True), count=2, required=True),
-            "focal_px": List(each=Number(low=1e-3, high=1e6), count=2, required=True,
-                             description="pixels per radian on the axis"),
-            "centre_px": List(each=Number(low=-1e6, high=1e6), count=2, required=True,
-                              description="(0, 0) is the centre of the top-left pixel"),
-            **lens_keys,
-            "max_angle_deg": Number(low=0, high=180, above=True, required=True,
-                                    description="edge of the image circle, off the axis"),
-            "calibrated_angle_deg": Number(low=0, high=360, above=True,
-                                           description="beyond this the lens is not known; default: max_angle_deg"),
-            "mirrored": Flag(default=False),
-            "mask": Text(is_path=True,
-                         description="8-bit image of this size, relative to this file: pixels below 128 do not count"),
-            "obstacles": Text(is_path=True,
-                              description="CSV file, relative to this one: azimuth_deg from body x to the right, and "
-                              "elevation_deg above the body's x y plane, below which the view is hidden"),
-            "refraction": Choice(values=(REFRACTION_REMOVED, REFRACTION_CONTAINED),
-                                 description="of the Earth's air: contained in a lens calibrated without a site"),
-            "decentring": List(each=Number(low=-1, high=1), count=2, description="p1, p2 of a decentred lens"),
-            "mount": MOUNT,
-            "sensor": SENSOR,
-            "covariance": COVARIANCE,
-        },
-    )  # fmt: skip
+        keys={**first, **(_keys_of_lenses({**first, **last}) if lens is None else lens.file_keys()), **last},
+    )
+
+
+def _keys_of_lenses(common: Mapping[str, Key]) -> dict[str, Key]:
+    """The keys of all lenses beside those `common` to camera files; none is required.
+
+    Raises ValueError for a key that a lens declares otherwise than another lens or all camera files.
+    """
+    found = {key: replace(one, required=False) for key, one in common.items()}
+    for lens in lens_kinds().values():
+        for key, one in lens.file_keys().items():
+            declared = replace(one, required=False)
+            if found.setdefault(key, declared) != declared:
+                raise ValueError(
+                    f"the {lens.model} lens declares the key {key!r} of camera files otherwise than another lens or "
+                    "than all camera files: give it another name"
+                )
+    return {key: one for key, one in found.items() if key not in common}
 
 
 def save_camera(camera: Camera, path: str | Path) -> None:

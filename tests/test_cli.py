@@ -631,6 +631,14 @@ def test_the_flag_of_the_evidence_has_the_sources_of_the_settings():
     assert EVIDENCE.options["choices"] == EVIDENCE_SOURCES
 
 
+def test_the_help_has_the_programs_whose_camera_files_are_read():
+    from startrack.camera.formats import FOREIGN_FORMATS
+    from startrack.core.file_kinds import PROGRAMS, PROGRAMS_TEXT
+
+    assert list(FOREIGN_FORMATS) == list(PROGRAMS)
+    assert PROGRAMS_TEXT == "ROS, Kalibr, COLMAP, OpenCV or RMS"
+
+
 def test_the_flags_of_the_odometry_have_the_defaults_of_the_track():
     from startrack.cli.flags import ODOMETRY
     from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA

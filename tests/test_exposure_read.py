@@ -181,9 +181,9 @@ def test_unreadable_exif_costs_a_warning_only(read):
         (tiff(np.stack([FRAME16] * 4), photometric="minisblack"), "4 pictures"),
         (tiff(np.stack([FRAME16] * 4), imagej=True), "pictures"),
         (tiff(FRAME16.astype(np.complex64)), "complex64"),
-        (encode_image(FRAME8, "GIF"), "not a file of PNG, TIFF, JPEG, FITS"),
-        (encode_image(FRAME8, "BMP"), "not a file of PNG, TIFF, JPEG, FITS"),
-        (b"a text file, not a picture\n", "not a file of PNG, TIFF, JPEG, FITS"),
+        (encode_image(FRAME8, "GIF"), "not a file of PNG, TIFF, FITS, JPEG"),
+        (encode_image(FRAME8, "BMP"), "not a file of PNG, TIFF, FITS, JPEG"),
+        (b"a text file, not a picture\n", "not a file of PNG, TIFF, FITS, JPEG"),
         (b"", "empty"),
     ],
 )

@@ -37,6 +37,7 @@ class Sine(Lens):
 
     model: ClassVar[str] = "sine"
     label: ClassVar[str] = "sine"
+    law: ClassVar[str] = "2 sin(a / 2)"
 
     def rho(self, angle_rad):
         return 2.0 * np.sin(np.asarray(angle_rad) / 2.0)
@@ -119,7 +120,7 @@ ENTRIES = {  # of the module of each list: the entry, with the beginning of the 
     "startrack.terrain.io": [
         (f'    "wall": Kind({WALL}.TABLE, {WALL}.make_wall),', '    "cylinder": Kind('),
     ],
-    "startrack.exposure.sidecar": [('    "COUNTS": Format((b"COUNTS",), (".counts",)),', '    "PNG": Format(')],
+    "startrack.core.file_kinds": [('    "COUNTS": Format((b"COUNTS",), (".counts",)),', '    "PNG": Format(')],
     "startrack.cli.main": [('    "size": "size",', '    "locate": "pictures"')],
 }
 SITECUSTOMIZE = """
@@ -210,6 +211,11 @@ def startrack(base, *words, code=0):
 def test_the_command_reads_the_format(folder):
     assert "sizes of images" in startrack(folder, "--help")
     assert startrack(folder, "size", "night/one.counts").split() == ["512", "512"]
+
+
+def test_help_and_schema_name_the_format_and_the_law(folder):
+    assert "COUNTS, PNG" in startrack(folder, "size", "--help")
+    assert ", or 2 sin(a / 2)" in startrack(folder, "schema", "camera")
 
 
 def test_it_is_located(folder):

@@ -14,7 +14,9 @@ from page_helpers import ROOT, run_page
 from PIL import ExifTags, Image
 
 from startrack.camera import camera_from_dict
+from startrack.camera.lenses import LENSES
 from startrack.cli.main import COMMANDS, main
+from startrack.core import file_kinds
 from startrack.core.errors import Reason
 from startrack.terrain import terrain_from_dict
 
@@ -143,6 +145,15 @@ def test_camera_and_terrain_of_the_format_page_are_the_shipped_ones():
     # The mount that is shown is the one that stands in when it is absent.
     assert camera_from_dict(camera).R_body_cam == pytest.approx(camera_from_dict(shipped).R_body_cam, abs=1e-12)
     assert terrain_from_dict(terrain).name == "shackleton-thesis"
+
+
+def test_lenses_and_kinds_of_files_of_the_pages_are_those_of_the_lists():
+    for lens in LENSES:
+        assert f"`{lens.model}`: rho = {lens.law}" in FORMATS
+        assert [key for key in lens.file_keys() if f"\n| `{key}` |" not in FORMATS] == []
+    kinds = re.search(r"^PNG .*", FORMATS, flags=re.MULTILINE)[0]
+    assert [kind for kind in file_kinds.FORMATS if kind not in kinds] == []
+    assert f"Images may be {', '.join(file_kinds.FORMATS)} or" in (ROOT / "docs/options.md").read_text(encoding="utf-8")
 
 
 def leaf_keys(value, before=""):

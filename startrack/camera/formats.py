@@ -204,7 +204,6 @@ class Format(NamedTuple):
     what was chosen or left out, and no angles. Both raise ValueError, LookupError, TypeError or AttributeError.
     """
 
-    title: str
     write: Callable[[Camera, Coefficients], str] | None
     split: Callable[[str], list[Part]]
     read: Callable[[Any, float | None], dict[str, Any]]
@@ -382,10 +381,10 @@ def _split_platepar(text: str) -> list[Part]:
     return [Part("", "", plate)]
 
 
-FOREIGN_FORMATS = {
-    "ros": Format("ROS", write_ros, split_ros, read_ros),
-    "kalibr": Format("Kalibr", _write_kalibr, _split_kalibr, _read_kalibr),
-    "colmap": Format("COLMAP", _write_colmap, _split_colmap, _read_colmap),
-    "opencv": Format("OpenCV", _write_opencv, _split_opencv, _read_opencv),
-    "platepar": Format("RMS", None, _split_platepar, read_platepar),
+FOREIGN_FORMATS = {  # by the names of PROGRAMS in startrack.core.file_kinds
+    "ros": Format(write_ros, split_ros, read_ros),
+    "kalibr": Format(_write_kalibr, _split_kalibr, _read_kalibr),
+    "colmap": Format(_write_colmap, _split_colmap, _read_colmap),
+    "opencv": Format(_write_opencv, _split_opencv, _read_opencv),
+    "platepar": Format(None, _split_platepar, read_platepar),
 }

@@ -31,6 +31,7 @@ from startrack.camera.formats import FOREIGN_FORMATS, choose_part, find_program
 from startrack.camera.lens import Lens
 from startrack.camera.lenses import default_lens, lens_kinds
 from startrack.core.declaration import Choice, Flag, Key, List, Number, Table, Text
+from startrack.core.file_kinds import PROGRAMS, PROGRAMS_TEXT
 from startrack.core.files import (
     FOREIGN_CAMERA_SUFFIXES,
     MAX_CAUSE_CHARS,
@@ -112,8 +113,8 @@ def camera_keys(lens: type[Lens] | None = None) -> Table:
         "covariance": COVARIANCE,
     }  # fmt: skip
     return Table(
-        description="x_px = cx + fx rho cos b, y_px = cy + fy rho sin b; rho = a + k1 a^3 + k2 a^5 + k3 a^7 + k4 a^9, "
-        "or tan a",
+        description="x_px = cx + fx rho cos b, y_px = cy + fy rho sin b; rho = "
+        + ", or ".join(one.law for one in lens_kinds().values() if one.law),
         keys={**first, **(_keys_of_lenses({**first, **last}) if lens is None else lens.file_keys()), **last},
     )
 
@@ -288,7 +289,7 @@ def read_camera(name_or_path: str | Path) -> Camera:
         if program is not None:
             return camera_from_foreign_text(text, program, _stem(path, wanted), wanted=wanted)
         if path.suffix in FOREIGN_CAMERA_SUFFIXES:
-            raise BadInput("bad_calibration", f"not a camera file of startrack (.toml), {known_programs()}")
+            raise BadInput("bad_calibration", f"not a camera file of startrack (.toml), {PROGRAMS_TEXT}")
         keys = parse_toml(text, "bad_calibration")
         return camera_from_dict(keys, default_name=printable(path.stem), folder=path.parent)
     except BadInput as cause:
@@ -306,14 +307,8 @@ def read_foreign_camera(name_or_path: str | Path, program: str | None, calibrate
     text = read_text(file, "no_calibration")
     program = program or find_program(text)
     if program is None:
-        raise BadInput("bad_calibration", f"{printable(file)}: not a camera file of {known_programs()}")
+        raise BadInput("bad_calibration", f"{printable(file)}: not a camera file of {PROGRAMS_TEXT}")
     return camera_from_foreign_text(text, program, _stem(Path(file), wanted), calibrated_angle_rad, wanted)
-
-
-def known_programs() -> str:
-    """Text that lists the programs whose camera files are read."""
-    *titles, last = [one.title for one in FOREIGN_FORMATS.values()]
-    return f"{', '.join(titles)} or {last}"
 
 
 def _stem(path: Path, wanted: str | None) -> str:
@@ -352,7 +347,7 @@ def camera_from_foreign_text(
     the angle at the edge of the frame that is nearest to the centre. `wanted` is the name of one camera of several.
     Raises BadInput bad_calibration.
     """
-    refusal = f"not a camera file of {FOREIGN_FORMATS[program].title} that can be used"
+    refusal = f"not a camera file of {PROGRAMS[program]} that can be used"
     try:
         content = choose_part(program, text, wanted)
         camera = _framed_camera(FOREIGN_FORMATS[program].read(content, calibrated_angle_rad), name)

@@ -42,6 +42,7 @@ class Lens(ABC):
 
     model: ClassVar[str]  # key `model` of camera files
     label: ClassVar[str]  # in reports
+    law: ClassVar[str] = ""  # rho(a) as text, for the schema of camera files
     parameter_names: ClassVar[tuple[str, ...]] = ()  # of the radial law, beside focal length, centre and decentring
     max_fit_rad: ClassVar[float] = np.pi  # a calibration tries this lens if all its stars are nearer to the axis
 

@@ -26,6 +26,7 @@ class KannalaBrandt(Lens):
 
     model: ClassVar[str] = "kannala_brandt"
     label: ClassVar[str] = "Kannala-Brandt"
+    law: ClassVar[str] = "a + k1 a^3 + k2 a^5 + k3 a^7 + k4 a^9"
     parameter_names: ClassVar[tuple[str, ...]] = tuple(f"k{n + 1}" for n in range(MAX_COEFFICIENTS))
 
     k: tuple[float, ...] = ()
@@ -138,6 +139,7 @@ class Pinhole(Lens):
 
     model: ClassVar[str] = "pinhole"
     label: ClassVar[str] = "pinhole"
+    law: ClassVar[str] = "tan a"
     max_fit_rad: ClassVar[float] = np.radians(65.0)
 
     def rho(self, angle_rad: Array) -> Array:

@@ -15,8 +15,9 @@ from typing import Any
 from startrack.catalog import has_deep_catalog
 from startrack.core import __version__
 from startrack.core.errors import BadInput
+from startrack.core.file_kinds import RAW_SUFFIXES
 from startrack.core.files import is_path, parse_toml, read_text, relative_path, split_camera
-from startrack.exposure import IMAGE_KEYS, RAW_SUFFIXES, BagImage, Sidecar, sidecar_of
+from startrack.exposure import IMAGE_KEYS, BagImage, Sidecar, sidecar_of
 from startrack.terrain import files_of_terrain
 
 MISSING = "?"  # in place of the hash of a file that cannot be read; once it can, the hash differs

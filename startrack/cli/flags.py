@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from startrack.core import MAX_COUNT, MAX_EXPOSURE_S, MAX_SPEED_M_S, ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.declaration import LARGEST, SHOWN_CHARS
 from startrack.core.errors import how_to_install
+from startrack.core.file_kinds import FORMATS, KINDS_TEXT, PROGRAMS_TEXT
 
 if TYPE_CHECKING:
     from startrack.core.declaration import Key
@@ -306,13 +307,11 @@ def cluster_address(text: str) -> str:
     return text
 
 
-IMAGES = flag("images IMAGE", "PNG, TIFF, FITS, JPEG, camera raw, ROS bag, or BAG#NUMBER", nargs="+")
+IMAGES = flag("images IMAGE", f"{', '.join(FORMATS)}, camera raw, ROS bag, or BAG#NUMBER", nargs="+")
 SOME_IMAGES = IMAGES._replace(options={**IMAGES.options, "nargs": "*"})
-PHOTOGRAPHS = flag("images IMAGE", "PNG, TIFF, FITS, JPEG or camera raw", nargs="+")
+PHOTOGRAPHS = flag("images IMAGE", KINDS_TEXT, nargs="+")
 TOPIC = flag("--image-topic TOPIC", "topic of the images in a ROS bag that has several")
-CAMERA = flag(
-    "-c --camera FILE", "camera file of startrack, ROS, Kalibr, COLMAP, OpenCV or RMS, or the name of a shipped one"
-)
+CAMERA = flag("-c --camera FILE", f"camera file of startrack, {PROGRAMS_TEXT}, or the name of a shipped one")
 TERRAIN = flag("-t --terrain FILE", "terrain file, or the name of a shipped one")
 TIME = flag("--time UTC", "middle of the exposure, ISO 8601 (of one image)")
 EXPOSURE = flag("--exposure S", "exposure time in seconds", seconds)

@@ -12,6 +12,8 @@ from decimal import Decimal
 from enum import StrEnum
 from typing import Any
 
+from startrack.core.file_kinds import KINDS_TEXT
+
 EXIT_OK, EXIT_INTERNAL_ERROR, EXIT_REFUSED, EXIT_BAD_INPUT, EXIT_STOPPED = 0, 1, 3, 4, 5
 
 
@@ -34,7 +36,7 @@ class Reason(StrEnum):
     BAD_IMAGE = (
         "bad_image", EXIT_BAD_INPUT, "The image, or its sidecar, cannot be used",
         "Correct what the message names. startrack reads one whole picture of one channel or three, with a number in "
-        "every pixel, as PNG, TIFF, FITS, JPEG or camera raw; a sidecar must be valid JSON.",
+        f"every pixel, as {KINDS_TEXT}; a sidecar must be valid JSON.",
     )  # fmt: skip
     SIZE_MISMATCH = (
         "size_mismatch", EXIT_BAD_INPUT, "The image's size is not the camera's",

@@ -28,10 +28,8 @@ from startrack.exposure.png import insert_png_chunks, png_chunks
 from startrack.exposure.read import exposure_of, read_exposure
 from startrack.exposure.sidecar import (
     IMAGE_KEYS,
-    KINDS_TEXT,
     PACKING_SUFFIXES,
     PICTURE_SUFFIXES,
-    RAW_SUFFIXES,
     SIDECAR,
     Sidecar,
     sidecar_of,
@@ -40,8 +38,8 @@ from startrack.exposure.sidecar import (
 from startrack.exposure.write import write_exposure, write_sidecar
 
 __all__ = [
-    "BAG_SUFFIXES", "BLOCK_BYTES", "IMAGE_KEYS", "KINDS_TEXT", "NO_TIME", "ODOMETRY_TYPES", "PACKING_SUFFIXES",
-    "PICTURE_SUFFIXES", "RAW_SUFFIXES", "SIDECAR", "BagImage", "Facts", "Sidecar", "are_fractions",
+    "BAG_SUFFIXES", "BLOCK_BYTES", "IMAGE_KEYS", "NO_TIME", "ODOMETRY_TYPES", "PACKING_SUFFIXES",
+    "PICTURE_SUFFIXES", "SIDECAR", "BagImage", "Facts", "Sidecar", "are_fractions",
     "check_time_sigma_s", "choose_bag_image", "combine_masks", "exposure_of", "exposure_of_message",
     "insert_png_chunks", "is_bag", "list_bag_images", "mask_of", "png_chunks", "read_bag_exposures",
     "read_bag_image", "read_dark", "read_exposure", "read_flat", "read_mask", "read_messages", "sidecar_of",

@@ -18,10 +18,10 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.file_kinds import FORMATS, KINDS_TEXT, RAW_SUFFIXES
 from startrack.core.files import MAX_CAUSE_CHARS, FilePath, missing_text, printable
 from startrack.core.limits import check_memory, memory_refusal
 from startrack.core.types import MAX_PIXELS, BadInput
-from startrack.exposure.sidecar import FORMATS, KINDS_TEXT, RAW_SUFFIXES
 
 MAX_FILE_BYTES = 8 * MAX_PIXELS + 2**24  # the largest image at the widest pixel type, and its headers
 EXACT_IN_FLOAT32 = 2 ** (np.finfo(np.float32).nmant + 1)

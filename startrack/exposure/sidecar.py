@@ -1,4 +1,4 @@
-"""Files of images by their kinds, and the sidecar NAME.json beside one: its keys, its path, and its checked values."""
+"""Sidecar NAME.json beside an image: its keys, its path, and its checked values; and the names of images' files."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from startrack.core import MAX_EXPOSURE_S
 from startrack.core.declaration import SHOWN_CHARS, Choice, Number, Table, Text, value_text
+from startrack.core.file_kinds import FORMATS, RAW_SUFFIXES
 from startrack.core.files import MAX_CAUSE_CHARS, MAX_TEXT_BYTES, is_path, printable
 from startrack.core.types import BadInput
 from startrack.frames import AIR_TABLE, parse_utc
@@ -42,23 +43,6 @@ SIDECAR = Table(
 )
 NAMED_FILES = ("camera", "terrain")  # paths, or names of shipped files
 IMAGE_KEYS = ("mask", "obstacles", "dark", "flat")  # always paths: none is shipped, and no header names one
-RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".crw", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"}
-
-
-class Format(NamedTuple):
-    """Files of images of one kind: the first bytes that they may have, and the suffixes of their names."""
-
-    starts: tuple[bytes, ...]
-    suffixes: tuple[str, ...]
-
-
-FORMATS = {  # by their kind, whose module in lower case has the function `decode`
-    "PNG": Format((b"\x89PNG\r\n\x1a\n",), (".png",)),
-    "TIFF": Format((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), (".tif", ".tiff")),
-    "JPEG": Format((b"\xff\xd8\xff",), (".jpg", ".jpeg")),
-    "FITS": Format((b"SIMPLE  =", b"\x1f\x8b", b"BZh"), (".fits", ".fit", ".fts")),
-}
-KINDS_TEXT = f"{', '.join(FORMATS)} or camera raw"
 PICTURE_SUFFIXES = {suffix for one in FORMATS.values() for suffix in one.suffixes} | RAW_SUFFIXES
 PACKING_SUFFIXES = {".gz", ".bz2", ".fz"}
 MAX_UNKNOWN_KEY_WARNINGS = 5

@@ -14,21 +14,21 @@ from startrack.cli.flags import (
     number,
     positive_number,
 )
+from startrack.core.file_kinds import PROGRAMS
 
-CALIBRATE = """usage: startrack calibrate [ACTION] ... (startrack calibrate --help lists the flags of each action)
+CALIBRATE = f"""usage: startrack calibrate [ACTION] ... (startrack calibrate --help lists the flags of each action)
 
 from stars       startrack calibrate NIGHT.jpg... --fov 180 -o CAMERA.toml   the lens, from pictures of the night sky
 from a board     startrack calibrate board BOARD.png... --pattern 9x6        the lens, from pictures of a chessboard
 check            startrack calibrate verify LATER.jpg -c CAMERA.toml         does the camera file still fit?
 look             startrack calibrate show CAMERA.toml                        the content of a camera file
-other programs   startrack calibrate convert CAMERA.toml --to ros            ros, kalibr, colmap, opencv, platepar"""
+other programs   startrack calibrate convert CAMERA.toml --to ros            {", ".join(PROGRAMS)}"""
 TERRAIN = """usage: startrack terrain ACTION ... (startrack terrain ACTION --help)
 
 look             startrack terrain show shackleton --at 0 0                  properties, relief, a horizon
 your own map     startrack terrain import MAP.tif -o NAME.toml --latitude DEG --longitude DEG
 state errors     startrack terrain state NAME.toml                           what its file leaves out widens circles
 prepare          startrack terrain build NAME.toml                           its horizons, before the first fix"""
-FORMATS = ("ros", "kalibr", "colmap", "opencv")
 NAME = flag("--name NAME", "name of the camera (default: that of its file)")
 CAMERA_OUTPUT = (flags.FILE, NAME, flags.DIR, flags.OVERWRITE, flags.NO_PLOTS, flags.JSON)
 STATED_ERRORS = {  # keys of the file, and the unit of each
@@ -93,8 +93,8 @@ COMMANDS = (
                     "camera file with --to; else the other program's file, FILE#NAME for one camera of several",
                 ),
                 Either((
-                    flag("--to", "write this format", choices=(*FORMATS, "platepar", "indi-allsky")),
-                    flag("--from", "read this format (default: by the content)", choices=(*FORMATS, "platepar"),
+                    flag("--to", "write this format", choices=(*PROGRAMS, "indi-allsky")),
+                    flag("--from", "read this format (default: by the content)", choices=tuple(PROGRAMS),
                          dest="source"),
                 )),
                 flag(

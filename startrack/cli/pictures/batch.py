@@ -24,9 +24,10 @@ from startrack.cli.images import absolute_facts, maps_left_out, prepare_referenc
 from startrack.cli.pictures.report import write_page_of
 from startrack.core import errors
 from startrack.core.errors import INTERNAL_ERROR, BadInput
+from startrack.core.file_kinds import KINDS_TEXT
 from startrack.core.files import make_folder, printable
 from startrack.core.runner import Runner, RunStopped, count_cores
-from startrack.exposure import KINDS_TEXT, is_bag
+from startrack.exposure import is_bag
 from startrack.output import refusal_line
 
 SHOWN = ("ok", "ambiguous", "refused", "error")

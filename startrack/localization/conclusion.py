@@ -275,7 +275,7 @@ def _shown_errors(best: Hypothesis) -> tuple[ShownError, ...]:
 
 
 def _support(best: Hypothesis, explored: Explored, dropped: float) -> Explored:
-    """The SUPPORT points (n, 2) [m, enu] of most weight of the best hypothesis, where a later search of the image begins.
+    """The SUPPORT points (n, 2) [m, enu] of most weight of the best hypothesis, where a later search begins.
 
     `explored` is left by the search of this one, with a bound of the probability that it `dropped`.
     """

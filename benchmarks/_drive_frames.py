@@ -16,7 +16,7 @@ from startrack.applications.tracking.observed_frame import image_fixes, observe_
 from startrack.catalog import apparent_stars, load_catalog
 from startrack.chain import Located, Settings, locate
 from startrack.core.types import Array, Evidence, NotLocated
-from startrack.evidence.star_evidence import visibility_llr
+from startrack.evidence.star_photometer import visibility_llr
 from startrack.frames import R_enu_icrs, azel_from_rays
 from startrack.localization import ExactPosterior
 from startrack.rendering import Series, render

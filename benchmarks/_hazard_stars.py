@@ -10,7 +10,7 @@ from _hazard_grounds import turn
 
 from startrack.chain import StarRays
 from startrack.core.types import Array
-from startrack.evidence.star_evidence import visibility_llr
+from startrack.evidence.star_photometer import visibility_llr
 from startrack.frames import azel_from_rays
 from startrack.rendering import Scene
 

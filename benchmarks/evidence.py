@@ -25,7 +25,7 @@ from startrack.camera import load_camera
 from startrack.catalog import load_catalog, load_deep_catalog
 from startrack.chain import Located, Measured, Settings, last_value, locate
 from startrack.core.types import Array, Evidence, Fix, NoSolution
-from startrack.evidence import StarEvidence, StarPhotometry, flux_scale, star_evidence
+from startrack.evidence import StarPhotometer, StarPhotometry, flux_scale, star_photometer
 from startrack.localization import ExactPosterior
 from startrack.rendering import Series, exposure_for_snr, render
 from startrack.terrain import load_terrain
@@ -143,12 +143,12 @@ def _ablations(result: Measured) -> Iterator[tuple[str, Evidence, ExactPosterior
     yield "without caps", _photometry(result, settings=_Uncapped()).evidence(), full
 
 
-class _Uncapped(StarEvidence):
+class _Uncapped(StarPhotometer):
     """Plain Gaussian ratios; whether neighbours are visible is guessed as always."""
 
     def judge(self, found: Any, light: Any) -> StarPhotometry:
         none = {"MISSING_PROBABILITY": 0.0, "ANOMALY_PROBABILITY": 0.0, "CAP": np.inf}
-        with patch.multiple(star_evidence, **none), np.errstate(divide="ignore"):
+        with patch.multiple(star_photometer, **none), np.errstate(divide="ignore"):
             return super().judge(found, light)
 
 
@@ -170,7 +170,7 @@ def _list_evidence(photometry: StarPhotometry, threshold: float) -> Evidence:
 
 
 def _photometry(
-    result: Measured, *, visible: Array | None = None, certain: bool = False, settings: StarEvidence | None = None
+    result: Measured, *, visible: Array | None = None, certain: bool = False, settings: StarPhotometer | None = None
 ) -> StarPhotometry:
     """The frame's evidence once more, with a part left out."""
     stars, R, found = result.stars, result.attitude_fit.attitude.R_cam_icrs, result.identification
@@ -179,7 +179,7 @@ def _photometry(
     if certain:
         stars, scale = replace(stars, v_sigma_mag=np.zeros(len(stars))), replace(scale, scatter=0.0)
         extra_px = 0.0
-    return (settings or StarEvidence())(
+    return (settings or StarPhotometer())(
         result.detections, result.camera, stars, list(result.bodies),
         result.attitude_fit.attitude.R_cam_icrs, result.R_enu_icrs, scale, extra_px, visible,
     )  # fmt: skip

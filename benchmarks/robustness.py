@@ -23,7 +23,7 @@ from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.chain import Located, Settings, locate
 from startrack.core.types import Array
-from startrack.evidence import StarEvidence
+from startrack.evidence import StarPhotometer
 from startrack.frames import R_from_rotvec
 from startrack.localization import ExactPosterior
 from startrack.rendering import Series, render
@@ -66,7 +66,7 @@ class Biased:
 
     def __call__(self, *what: Any) -> Any:
         turn = R_from_rotvec(np.radians(np.full(3, self.arcsec) / 3600))
-        return StarEvidence()(*what[:4], turn @ what[4], *what[5:])  # the fifth is the attitude
+        return StarPhotometer()(*what[:4], turn @ what[4], *what[5:])  # the fifth is the attitude
 
 
 def ridge(width_deg: float, height_deg: float) -> Callable[[Cylinder], Cylinder]:
@@ -133,8 +133,8 @@ def measure_frame(job: tuple[int, int]) -> dict[str, Any]:
         rays = np.array(catalog.rays_icrs)
         rays[chosen] = rays[np.roll(chosen, 1)]
         catalog = replace(catalog, rays_icrs=rays)
-    evidence = Biased(trouble.attitude_bias_arcsec) if trouble.attitude_bias_arcsec else StarEvidence()
-    settings = Settings(localizer=ExactPosterior(), evidence=evidence)  # type: ignore[arg-type]
+    evidence = Biased(trouble.attitude_bias_arcsec) if trouble.attitude_bias_arcsec else StarPhotometer()
+    settings = Settings(localizer=ExactPosterior(), photometer=evidence)  # type: ignore[arg-type]
     result = locate(exposure, scene.camera, trouble.stated(true), catalog, settings)
     if not isinstance(result, Located) or result.status != "ok":
         return {"status": result.status, "reason": result.reason}

@@ -18,7 +18,7 @@ import pytest
 from startrack.catalog import load_catalog
 from startrack.chain import Located, Outcome, Refused, Settings, pipeline, two_looks
 from startrack.core.types import Evidence, Explored, Fix, MeasuredSkyline, NotLocated
-from startrack.evidence import StarEvidence
+from startrack.evidence import StarPhotometer
 from startrack.localization import ExactPosterior, PseudoGradient
 from startrack.rendering import Series
 from startrack.rendering.compose import light_e, read_out
@@ -86,7 +86,7 @@ def test_the_way_of_an_image_is_short() -> None:
 
 
 @dataclass(frozen=True)
-class CountedPhotometry(StarEvidence):
+class CountedPhotometry(StarPhotometer):
     """The photometry of stars, counted."""
 
     calls: Counter[str] = field(default_factory=Counter)
@@ -141,7 +141,10 @@ def locate_counted(
     if electrons is not None:
         pixels = read_out(electrons, known.camera.sensor, rng=np.random.default_rng(1))
         exposure = replace(exposure, pixels_adu=pixels, time_utc=datetime(2031, 2, 3, tzinfo=UTC))
-    counted = {"evidence": CountedPhotometry(calls), "localizer": CountedPosterior(calls=calls, changes=changes or {})}
+    counted = {
+        "photometer": CountedPhotometry(calls),
+        "localizer": CountedPosterior(calls=calls, changes=changes or {}),
+    }
     catalog = load_catalog().brighter_than(7.0)
     return pipeline.locate(exposure, known.camera, known.terrain, catalog, Settings(**counted | settings))
 

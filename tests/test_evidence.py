@@ -15,9 +15,9 @@ from star_painter import cramer_rao, paint
 
 from startrack.core.types import Body, Detections, SmoothImage, Stars
 from startrack.detection.background import background_and_noise
-from startrack.evidence import FluxScale, StarEvidence, StarPhotometry, fit_flux_scale, flux_scale
+from startrack.evidence import FluxScale, StarPhotometer, StarPhotometry, fit_flux_scale, flux_scale
 from startrack.evidence.photometry import Photometry, Sources, half_width, measure
-from startrack.evidence.star_evidence import CAP, visibility_llr
+from startrack.evidence.star_photometer import CAP, visibility_llr
 from startrack.frames import airmass, azel_from_rays
 
 SIZE, VARIANCE, READ_NOISE = 1024, 100.0, 2.5
@@ -258,7 +258,7 @@ def measure_frame(
     detections = frame(stars, shines, rng)
     detections = detections if dead is None else replace(detections, dead=dead)
     settings: dict[str, Any] = {"bodies": [], "position_sigma_px": 0.05} | how
-    return StarEvidence()(
+    return StarPhotometer()(
         detections, CAMERA, stars, settings["bodies"], R_CAM_ENU, np.eye(3), SCALE, settings["position_sigma_px"]
     )
 
@@ -320,7 +320,7 @@ def test_stars_at_the_frame_edge_are_left_out() -> None:
     narrow = replace(CAMERA, size_px=(512, 512), focal_px=(500.0, 500.0))  # the frame cuts the circle
     stars = stars_at(narrow.unproject(px), np.array([3.0, 3.1, 3.2]))
     detections = frame(stars, np.zeros(3, bool), rng)
-    light = StarEvidence()(detections, narrow, stars, [], np.eye(3), np.eye(3), SCALE, 0.05)
+    light = StarPhotometer()(detections, narrow, stars, [], np.eye(3), np.eye(3), SCALE, 0.05)
     assert light.cause.tolist() == ["", "", "off the frame"]
 
 
@@ -461,8 +461,8 @@ def test_evidence_does_not_depend_on_where_north_is() -> None:
     stars = random_stars(400, rng)
     detections = frame(stars, np.ones(400, bool), rng)
     turn = Rotation.from_euler("z", 40, degrees=True).as_matrix()  # enu turned against icrs
-    plain = StarEvidence()(detections, CAMERA, stars, [], R_CAM_ENU, np.eye(3), SCALE, 0.05)
-    turned = StarEvidence()(detections, CAMERA, stars, [], R_CAM_ENU, turn, SCALE, 0.05)
+    plain = StarPhotometer()(detections, CAMERA, stars, [], R_CAM_ENU, np.eye(3), SCALE, 0.05)
+    turned = StarPhotometer()(detections, CAMERA, stars, [], R_CAM_ENU, turn, SCALE, 0.05)
     assert np.array_equal(plain.llr, turned.llr)
     assert turned.elevation_rad == pytest.approx(plain.elevation_rad, abs=1e-12)
     assert np.radians(40) == pytest.approx((plain.azimuth_rad - turned.azimuth_rad) % (2 * np.pi), abs=1e-9)

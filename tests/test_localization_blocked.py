@@ -13,7 +13,7 @@ from test_localization_shape import evidence_at
 from startrack.catalog import load_catalog
 from startrack.chain import pipeline
 from startrack.core.types import Array, Evidence, Fix
-from startrack.evidence.star_evidence import visibility_llr
+from startrack.evidence.star_photometer import visibility_llr
 from startrack.localization import ExactPosterior
 from startrack.output import result_dict
 from startrack.terrain import load_terrain

@@ -216,8 +216,8 @@ def test_the_skyline_is_measured_once(
     def fail(*given: object) -> None:
         raise AssertionError("the skyline is measured again")
 
-    monkeypatch.setattr("startrack.chain.image_skyline.measured_skyline", fail)
-    monkeypatch.setattr("startrack.chain.two_looks.measured_skyline", fail)
+    monkeypatch.setattr("startrack.chain.image_skyline.skyline_of_image", fail)
+    monkeypatch.setattr("startrack.chain.two_looks.skyline_of_image", fail)
     write_results(by_source["both"], tmp_path / "frame.fix.json")
     assert Solution(by_source["both"]).skyline is not None
     assert {path.name for path in tmp_path.glob("frame.skyline.*")} == {"frame.skyline.ecsv", "frame.skyline.png"}

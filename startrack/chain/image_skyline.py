@@ -15,14 +15,14 @@ END_DENSITY = 0.05  # at either end of the window, beside the mean density
 SIMILAR_SIGMAS = 3.0  # sigma by the stars, in that by the sky's light, up to which both count as sources
 
 
-def measured_skyline(measured: Measured, fix: Fix, sky: SkyEvidence | None) -> MeasuredSkyline | None:
+def skyline_of_image(measured: Measured, fix: Fix, sky: SkyEvidence | None) -> MeasuredSkyline | None:
     """The skyline of a located image at the middles of 240 sectors of azimuth, without the terrain's heights.
 
     It is that by the stars of `measured` and by the light of the `sky`, None where that is not used. The terrain at the
     `fix` serves for the shape of the skyline within each sector only: the elevation is that of the image. None where
     several positions fit, and of a method of localization that is not right to the error of the image.
     """
-    if fix.ambiguous or fix.search == "approximate":
+    if fix.ambiguous or fix.is_approximate:
         return None
     horizon = Skyline.trace(fix.at_time_m, measured.terrain)
     elevation, sigma = _skyline_by_stars(measured.evidence(), horizon)

@@ -25,7 +25,7 @@ from startrack.evidence import (
     FluxScale,
     SkyLight,
     SkylineBand,
-    StarEvidence,
+    StarPhotometer,
     StarPhotometry,
     add_obstacles,
     filtered_noise_e,
@@ -61,18 +61,19 @@ AnyRays = TypeVar("AnyRays", bound=StarRays)
 def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -> Measured:
     """Photometry at every catalogue star in view, above a terrain.
 
-    `oriented` is the exposure with its attitude; its time must be known. `settings` has the photometry, and whether
-    Gaia's stars are used. Raises BadInput (bad_terrain, no_time) where the frame `enu` cannot be related to the stars.
+    `oriented` is the exposure with its attitude; its time must be known, as `check_inputs` makes sure. `settings` has
+    the photometry, and whether Gaia's stars are used. Raises BadInput (bad_terrain, no_time) where the frame `enu`
+    cannot be related to the stars.
     """
     when, site = require_time_and_site(oriented.exposure, terrain)
     R_at_time = R_enu_icrs(site, when)
     hipparcos = replace(oriented, detections=_mask_detections(oriented, terrain, R_at_time))
     deep = add_gaia_stars(hipparcos, site) if settings.deep_stars else hipparcos
     used, note = deep, ""
-    scale, photometry = _measure_stars(deep, terrain, R_at_time, settings.evidence)
+    scale, photometry = _measure_stars(deep, terrain, R_at_time, settings.photometer)
     if deep is not hipparcos and not _shows_deep_stars(photometry, deep.stars):
         used, note = hipparcos, NO_DEEP_STARS.format(deep.catalog_name)
-        scale, photometry = _measure_stars(hipparcos, terrain, R_at_time, settings.evidence)
+        scale, photometry = _measure_stars(hipparcos, terrain, R_at_time, settings.photometer)
     response = None if oriented.damage is None else measure_response(photometry)
     above = {"terrain": terrain, "site": site}
     return Measured(
@@ -92,11 +93,11 @@ def _mask_detections(oriented: Oriented, terrain: Terrain, R_enu_icrs: Array) ->
 
 
 def _measure_stars(
-    oriented: Oriented, terrain: Terrain, R_enu_icrs: Array, measure: StarEvidence
+    oriented: Oriented, terrain: Terrain, R_enu_icrs: Array, photometer: StarPhotometer
 ) -> tuple[FluxScale, StarPhotometry]:
     """Scale of the light of `oriented` stars by the identified ones, and by it the photometry of all of them."""
     scale = _flux_scale(oriented, R_enu_icrs, terrain.site)
-    return scale, _photometry(oriented, terrain, R_enu_icrs, scale, measure, oriented.detections)
+    return scale, _photometry(oriented, terrain, R_enu_icrs, scale, photometer, oriented.detections)
 
 
 def _flux_scale(oriented: Oriented, R_enu_icrs: Array, site: Site | None) -> FluxScale:
@@ -146,17 +147,17 @@ def _shows_deep_stars(photometry: StarPhotometry, stars: Stars) -> bool:
     return part + SURE_SIGMAS / np.sqrt(information) > DEEP_PART
 
 
-def remeasure_stars(first: FirstLook, band: SkylineBand, light: SkyLight, measure: StarEvidence) -> Measured:
+def remeasure_stars(first: FirstLook, band: SkylineBand, light: SkyLight, photometer: StarPhotometer) -> Measured:
     """Copy of the measured stars whose light beside the skyline is measured without the step of the sky's `light`.
 
-    `band` has the pixels beside the skyline of the `first` look, `measure` the photometry and its settings.
+    `band` has the pixels beside the skyline of the `first` look, `photometer` measures them.
     """
     known, blocked = first.measured, first.fix.blocked
     stars = known.photometry
     sector = sector_of(stars.azimuth_rad)
     above_px = band.heights_px(stars.azimuth_rad, stars.elevation_rad)
     is_reliable = light.levels.covered[sector] & (band.reach_px[sector] < MOST_SHIFT_PX)
-    is_reliable &= band.near.is_level(stars.azimuth_rad)
+    is_reliable &= band.estimate.is_level(stars.azimuth_rad)
     wanted = (np.abs(above_px) < BAND_PX) & is_reliable
     if blocked is not None:
         wanted &= ~blocked.hides(stars.azimuth_rad)
@@ -166,7 +167,7 @@ def remeasure_stars(first: FirstLook, band: SkylineBand, light: SkyLight, measur
     by_fix = np.where(above_px > 0, CERTAIN_PROBABILITY, 1.0 - CERTAIN_PROBABILITY)
     visible = np.where(undecided, 1.0 / (1.0 + np.exp(-stars.llr)), by_fix)
     newer = _photometry(
-        known, known.terrain, known.R_enu_icrs, known.scale, measure, take_out_sky_step(band, light),
+        known, known.terrain, known.R_enu_icrs, known.scale, photometer, take_out_sky_step(band, light),
         stars.star[around], visible[around],
     )  # fmt: skip
     newer = newer if known.response is None else known.response.correct(newer)
@@ -178,7 +179,7 @@ def _photometry(
     terrain: Terrain,
     R_enu_icrs: Array,
     scale: FluxScale,
-    measure: StarEvidence,
+    photometer: StarPhotometer,
     detections: Detections,
     only: Ints | None = None,
     visible: Array | None = None,
@@ -186,7 +187,7 @@ def _photometry(
     """Photometry of all stars, or of those with the indices `only`; 0 evidence where the terrain is not known."""
     stars = oriented.stars
     air = airmass_at(stars.rays_icrs @ R_enu_icrs.T, terrain.site)
-    found = measure(
+    found = photometer(
         detections,
         oriented.camera,
         stars if only is None else stars.take(only),
@@ -236,7 +237,7 @@ def fix_again(rays: AnyRays, rough: Fix, localizer: Localizer, rows: Evidence) -
 
     A method without a posterior keeps the `rough` fix. Raises NotLocated as the `localizer` does.
     """
-    if rough.search == "approximate":
+    if rough.is_approximate:
         return rays, rough
     support = None if rough.ambiguous else rough.support
     return _fix_position(rays, localizer, replace(rows, support=support))

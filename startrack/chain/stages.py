@@ -39,7 +39,7 @@ from startrack.core.types import (
 )  # fmt: skip
 from startrack.detection import Damage, Detector
 from startrack.estimation.attitude import AttitudeFit
-from startrack.evidence import DamagedResponse, FluxScale, SkyLight, StarEvidence, StarPhotometry
+from startrack.evidence import DamagedResponse, FluxScale, SkyLight, StarPhotometer, StarPhotometry
 from startrack.frames import R_from_rotvec, Site
 from startrack.identification import Identifier
 from startrack.localization import DEFAULT_LOCALIZER, Localizer, has_posterior, require_localizer
@@ -59,7 +59,7 @@ class Settings:
 
     detector: Detector = field(default_factory=Detector)
     identifier: Identifier = field(default_factory=Identifier)
-    evidence: StarEvidence = field(default_factory=StarEvidence)
+    photometer: StarPhotometer = field(default_factory=StarPhotometer)
     localizer: Localizer = field(default_factory=lambda: require_localizer(DEFAULT_LOCALIZER))
     evidence_sources: str = "both"  # "stars", "sky" (the light of the sky at the skyline) or "both"
     near: PositionPrior | None = None  # of the position; None: anywhere in the search area of the terrain

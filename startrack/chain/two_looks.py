@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from startrack.chain.image_skyline import measured_skyline
+from startrack.chain.image_skyline import skyline_of_image
 from startrack.chain.measurement import fix_again, fix_roughly, remeasure_stars
 from startrack.chain.stages import FirstLook, Located, Measured, SecondLook, Settings, SkyEvidence
 from startrack.core.statistics import relative_weights
@@ -67,7 +67,7 @@ def why_unseen(first: FirstLook) -> str:
         return "the image is damaged"
     if first.fix.ambiguous:
         return "several positions fit the stars"
-    return "the method of localization has no posterior" if first.fix.search == "approximate" else ""
+    return "the method of localization has no posterior" if first.fix.is_approximate else ""
 
 
 def _measure(first: FirstLook, settings: Settings) -> SecondLook:
@@ -75,7 +75,7 @@ def _measure(first: FirstLook, settings: Settings) -> SecondLook:
     known, estimate = first.measured, estimate_skyline(first)
     band = pixels_near_skyline(known.detections, known.camera, known.R_cam_enu, estimate)
     light = measure_sky_light(band.without_stars(known.photometry), estimate.skyline)
-    measured = remeasure_stars(first, band, light, settings.evidence) if exceeds_noise(light) else known
+    measured = remeasure_stars(first, band, light, settings.photometer) if exceeds_noise(light) else known
     used = sectors_with_step(light) & known.terrain.is_informative(MIDDLES_RAD, light.elevation_rad)
     unused = _too_few_text(light, used) if np.count_nonzero(used) < NEEDED_SECTORS else ""
     sky = None if unused else SkyEvidence(light, used, _image_errors(known, light, used))
@@ -110,7 +110,7 @@ def fix_by_all(second: SecondLook, localizer: Localizer) -> Located:
         _require_near(fix, measured.terrain, sky)
     return Located(
         **vars(measured), fix=fix, sky=sky, by_stars=second.by_stars, sky_unused=unused,
-        skyline=measured_skyline(measured, fix, sky), sky_brightness_mag_arcsec2=second.sky_brightness_mag_arcsec2,
+        skyline=skyline_of_image(measured, fix, sky), sky_brightness_mag_arcsec2=second.sky_brightness_mag_arcsec2,
     )  # fmt: skip
 
 

@@ -214,6 +214,11 @@ class Fix(Value):
             object.__setattr__(self, "at_time_m", self.position_enu_m[:2])
 
     @property
+    def is_approximate(self) -> bool:
+        """Whether the method has no posterior: its error is larger than the evidence allows."""
+        return self.search == "approximate"
+
+    @property
     def cautions(self) -> list[str]:
         """Warning for the user after a search that was not proven to its end; empty after any other."""
         return [UNPROVEN] if self.search == "beam" else []

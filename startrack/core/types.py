@@ -282,7 +282,9 @@ class Evidence(Rows):
     near: PositionPrior | None = None  # of the camera's position; None: anywhere in the search area
     image_errors: ImageErrors | None = None  # of the rows of extended light; None: these are exact
     support: Explored | None = None  # points of an earlier fix from much the same rows; None: the area is searched
-    is_first_look: bool = False  # a fix by more rows of the image follows: this one is sampled roughly and not checked
+    # A fix by more rows of the image follows: this one has fewer points, no times that a stated clock excludes, and no
+    # check of its files or its integrity.
+    is_first_look: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -39,22 +39,22 @@ from startrack.evidence.skyline import (
     SkylineEstimate,
     skyline_band,
 )
-from startrack.evidence.star_evidence import (
+from startrack.evidence.star_offsets import measure_star_offsets, offset_terms
+from startrack.evidence.star_photometer import (
     DECIDABLE_SNR,
     SEEN_LLR,
     DamagedResponse,
-    StarEvidence,
+    StarPhotometer,
     StarPhotometry,
     filtered_noise_e,
     measure_response,
     with_noise_of_blocks,
 )
-from startrack.evidence.star_offsets import measure_star_offsets, offset_terms
 
 __all__ = [
     "BAND_PX", "DECIDABLE_SNR", "NEEDED_SECTORS", "SCALE_SNR", "SCALE_STARS", "SEEN_LLR", "SKYLINE_POINTS",
     "SKYLINE_SIGMAS", "SURE_SIGMAS", "DamagedResponse", "FluxScale", "Horizon", "Photometry", "SkyLight", "SkyPixels",
-    "Skyline", "SkylineBand", "SkylineEstimate", "Sources", "StarEvidence", "StarPhotometry", "add_obstacles",
+    "Skyline", "SkylineBand", "SkylineEstimate", "Sources", "StarPhotometer", "StarPhotometry", "add_obstacles",
     "average_shifts", "brightness_mag_arcsec2", "check_single_skyline", "exceeds_noise", "expect_stars",
     "expected_flux_scale", "filtered_noise_e", "fit_flux_scale", "flux_scale", "half_width", "mask_obstacles",
     "measure", "measure_response", "measure_sky_light", "measure_star_offsets", "neighbour_profiles", "offset_terms",

@@ -20,7 +20,7 @@ import numpy as np
 from startrack.core.types import Array, Bools, NotLocated
 from startrack.evidence.photometry import CLIPPED_SIGMAS
 from startrack.evidence.skyline import SKYLINE_POINTS, Skyline
-from startrack.evidence.star_evidence import StarPhotometry
+from startrack.evidence.star_photometer import StarPhotometry
 from startrack.terrain import Terrain
 
 PRIOR = 1e-3  # that a frame is a double exposure

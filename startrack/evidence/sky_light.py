@@ -21,7 +21,7 @@ from startrack.evidence.photometry import SURE_SIGMAS
 from startrack.evidence.sky_levels import CLIP_SIGMAS, GROUND, SKY, SkyLevels, measure_levels
 from startrack.evidence.sky_pixels import SkyPixels
 from startrack.evidence.skyline import CLIP_SHIFT_PX, Horizon
-from startrack.evidence.star_evidence import SEEN_LLR
+from startrack.evidence.star_photometer import SEEN_LLR
 from startrack.kernels.library import kernel
 
 CELL_PX = 0.75  # of a cell

@@ -20,7 +20,7 @@ from startrack.evidence.skyline import (
     scale_across,
     skyline_band,
 )
-from startrack.evidence.star_evidence import StarPhotometry, filtered_noise_e
+from startrack.evidence.star_photometer import StarPhotometry, filtered_noise_e
 from startrack.frames import azel_from_rays
 from startrack.kernels.library import kernel
 from startrack.psf import noise_area_px
@@ -47,7 +47,7 @@ class SkylineBand:
     """The pixels (n,) of an image near a predicted skyline, each with its direction."""
 
     detections: Detections
-    near: SkylineEstimate
+    estimate: SkylineEstimate
     to_px: Skyline  # pixels per radian of elevation, across the skyline
     whole: Bools  # (H, W) of the band, with dead pixels and some to spare
     pixel: Ints  # in the flat image
@@ -58,7 +58,7 @@ class SkylineBand:
 
     def heights_px(self, azimuth_rad: Array, elevation_rad: Array) -> Array:
         """Heights (n,) [px] of directions `azimuth_rad`, `elevation_rad` (n,) in enu above the skyline, across it."""
-        return np.asarray((elevation_rad - self.near.skyline(azimuth_rad)) * self.to_px(azimuth_rad))
+        return np.asarray((elevation_rad - self.estimate.skyline(azimuth_rad)) * self.to_px(azimuth_rad))
 
     def without_stars(self, stars: StarPhotometry) -> SkyPixels:
         """The pixels that show no source, and no star of `stars`, visible or hidden."""
@@ -76,27 +76,27 @@ class SkylineBand:
 
 
 def pixels_near_skyline(
-    detections: Detections, camera: Camera, R_cam_enu: Array, near: SkylineEstimate
+    detections: Detections, camera: Camera, R_cam_enu: Array, estimate: SkylineEstimate
 ) -> SkylineBand:  # fmt: skip
     """Pixels of the `detections`' image near a skyline, which `camera` and `R_cam_enu` place in the image.
 
     The band is as much wider as the skyline is uncertain.
     """
-    to_px = scale_across(camera, R_cam_enu, near.skyline)
-    reach_px = np.maximum(SKYLINE_SIGMAS * near.sigma_rad * to_px(MIDDLES_RAD), CLIP_SHIFT_PX)
+    to_px = scale_across(camera, R_cam_enu, estimate.skyline)
+    reach_px = np.maximum(SKYLINE_SIGMAS * estimate.sigma_rad * to_px(MIDDLES_RAD), CLIP_SHIFT_PX)
     reach_px[reach_px > MOST_REACH_PX] = np.inf
     half_px = BAND_PX + np.minimum(reach_px, MOST_REACH_PX) - CLIP_SHIFT_PX
-    band = skyline_band(detections.image_e.shape, camera, R_cam_enu, near.skyline, float(half_px.max()))
+    band = skyline_band(detections.image_e.shape, camera, R_cam_enu, estimate.skyline, float(half_px.max()))
     pixel, rays_cam = look_through(band & ~detections.dead, camera)
     azimuth, elevation = azel_from_rays(rays_cam @ R_cam_enu)
     scale = to_px(azimuth)
-    height = (elevation - near.skyline(azimuth)) * scale
+    height = (elevation - estimate.skyline(azimuth)) * scale
     limit_rad = min(camera.calibrated_angle_rad, camera.max_angle_rad) - CIRCLE_EDGE_PX / camera.focal_px[0]
     sector = sector_of(azimuth)
     usable = (rays_cam[:, 2] > np.cos(limit_rad)) & (np.abs(height) < half_px[sector])
     usable = np.flatnonzero(usable & np.isfinite(reach_px[sector]))
     rows = pixel[usable], azimuth[usable], scale[usable], height[usable]
-    return SkylineBand(detections, near, to_px, band, *rows, reach_px)
+    return SkylineBand(detections, estimate, to_px, band, *rows, reach_px)
 
 
 def _leave_out_stars(band: Bools, detections: Detections, stars: StarPhotometry) -> None:

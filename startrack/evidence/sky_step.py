@@ -66,7 +66,7 @@ def take_out_sky_step(band: SkylineBand, sky: SkyLight) -> Detections:
     s, height_px, pixel = sector[known], band.height_px[known], band.pixel[known]
     background, noise = band.detections.background_e.copy(), band.detections.noise_e.copy()
     image, level, sigma = (values.reshape(-1) for values in (band.detections.image_e, background, noise))
-    before_px2 = np.square(band.near.sigma_rad * band.to_px(MIDDLES_RAD)) + PREDICTED_SIGMA_PX**2
+    before_px2 = np.square(band.estimate.sigma_rad * band.to_px(MIDDLES_RAD)) + PREDICTED_SIGMA_PX**2
     shift_px = sky.shift_px * before_px2 / (before_px2 + sky.variance_px2)
     visible = ndtr((height_px - shift_px[s]) / sky.width_px)
     low, high = (levels.level_e[side, s] + levels.slope_e[side, s] * height_px for side in (GROUND, SKY))

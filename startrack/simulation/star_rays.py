@@ -20,7 +20,7 @@ from startrack.evidence import (
     SCALE_STARS,
     FluxScale,
     Skyline,
-    StarEvidence,
+    StarPhotometer,
     add_obstacles,
     expect_stars,
     expected_flux_scale,
@@ -145,7 +145,7 @@ def simulate_stars(
     saturation_e = sensor.gain_e_per_adu * (sensor.saturation_adu - sensor.bias_adu)
     sources = found.sources(visible)
     light = Starlight(xy_px, light_e, sensor.psf_sigma_px).measure(sources, variance, saturation_e, rng=rng)
-    measured = mask_unpredictable(StarEvidence().judge(found, light), terrain)
+    measured = mask_unpredictable(StarPhotometer().judge(found, light), terrain)
     sigma_s = TIME_SIGMA_S if time_sigma_s is None else time_sigma_s
     clock = clock_at(site, when, sigma_s, is_stated=time_sigma_s is not None)
     return SimulatedStars(

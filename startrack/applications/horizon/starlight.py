@@ -13,7 +13,7 @@ from startrack.core.types import Array, Evidence
 from startrack.evidence import (
     SEEN_LLR,
     FluxScale,
-    StarEvidence,
+    StarPhotometer,
     StarPhotometry,
     flux_scale,
     measure_response,
@@ -46,7 +46,7 @@ def measure_stars(frame: SkyFrame) -> StarLight:
     matches = frame.matched_detection, frame.matched_star
     detections = frame.detections if frame.damage is None else with_noise_of_blocks(frame.detections)
     scale = flux_scale(detections, camera, stars, matches, frame.R_cam_icrs, air)
-    light = StarEvidence()(
+    light = StarPhotometer()(
         detections, camera, stars, list(frame.bodies), frame.R_cam_icrs, frame.R_enu_icrs, scale,
         frame.extra_sigma_px, air=air,
     )  # fmt: skip

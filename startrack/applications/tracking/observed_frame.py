@@ -79,7 +79,7 @@ def observe_frame(outcome: Outcome, errors: TrackErrors | None = None, terrain: 
         return ObservedFrame(name, when, R, (), None, reason=str(outcome.reason), message=outcome.message)
     if not isinstance(value, Located):
         return ObservedFrame(name, when, R, (), None)
-    if value.fix.search == "approximate":
+    if value.fix.is_approximate:
         raise ValueError(f"{name}: a track needs the localizer posterior")
     terrain = terrain or value.terrain
     if errors is None:

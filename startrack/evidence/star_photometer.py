@@ -88,7 +88,7 @@ class StarPhotometry(ExpectedStars):
 
 
 @dataclass(frozen=True)
-class StarEvidence:
+class StarPhotometer:
     """Forced photometry at the catalogue's stars, turned into log-likelihood ratios."""
 
     def __call__(

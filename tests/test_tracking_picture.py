@@ -10,14 +10,17 @@ from synthetic_track import odometry_alone, synthetic_track
 
 from startrack.applications.tracking.picture import (
     ODOMETRY,
+    SEEN_PX,
     TRACK_SIZE_PX,
     UNUSED,
+    draw_last_position,
     draw_track,
     draw_track_map,
     half_axes_95_m,
     track_extent,
 )
-from startrack.output import Canvas, Ink
+from startrack.output import TEXT_PX, Canvas, Ink
+from startrack.output.picture.canvas import text_box
 from startrack.terrain import load_terrain
 
 BOX = (0.0, 0.0, 600.0, 600.0)
@@ -41,7 +44,7 @@ def test_the_map_shows_every_part_of_a_track_and_its_legend_names_them():
     for colour in (Ink.POSITION, Ink.BLUE, ODOMETRY, UNUSED):
         assert pixels_like(pixels, colour) > 20
     words = " | ".join(text for _, _, text in legend)
-    for word in ("smoothed", "filtered", "odometry alone", "refused frame", "frame left out", "slip", "enlarged"):
+    for word in ("smoothed", "filtered", "odometry alone", "refused frame", "frame left out", "slip", "true size"):
         assert word in words
     everything = np.concatenate([track.smoothed.position_enu_m[:, :2], track.odometry_m])
     places = view.canvas_px(everything)
@@ -51,14 +54,34 @@ def test_the_map_shows_every_part_of_a_track_and_its_legend_names_them():
     assert not any(word in text for _, _, text in legend for word in ("slip", "odometry"))
 
 
-def test_small_ellipses_are_enlarged_and_large_ones_are_not():
-    small, large = synthetic_track(step_m=500.0), synthetic_track(step_m=2.0)
-    words = [next(text for _, _, text in drawn(track)[2] if "ellipse" in text) for track in (small, large)]
-    assert "enlarged" in words[0] and "enlarged" not in words[1]
-    times = float(words[0].split("enlarged ")[1].split()[0])
-    _, view, _ = drawn(small)
-    median_px = times * np.median(half_axes_95_m(small.smoothed.covariance_m2)) / view.metres_per_px
-    assert 13.0 <= median_px <= 30.0
+@pytest.mark.parametrize(("step_m", "is_enlarged"), [(500.0, True), (2.0, False)])
+def test_ellipses_have_their_true_size_and_a_small_last_one_is_enlarged_beside_the_map(step_m, is_enlarged):
+    track = synthetic_track(step_m=step_m)
+    axis_m = half_axes_95_m(track.smoothed.covariance_m2)[-1]
+    canvas, box = Canvas(961, 601), (640.0, 300.0, 940.0, 600.0)
+    view, _ = draw_track_map(canvas, BOX, track)
+    draw_last_position(view, box, track)
+    assert any("enlarged" in text for _, text, *_ in canvas._texts) == is_enlarged
+    middle, metres_per_px = view.canvas_px(track.smoothed.position_enu_m[-1, :2]), view.metres_per_px
+    if is_enlarged:
+        assert axis_m < SEEN_PX * view.metres_per_px
+        middle, metres_per_px = np.array([790.0, 450.0]), 2.0 * axis_m / 150.0
+    along = np.linalg.eigh(track.smoothed.covariance_m2[-1])[1][:, 1] * [1.0, -1.0]
+    for end in (middle + along * axis_m / metres_per_px, middle - along * axis_m / metres_per_px):
+        x, y = np.rint(end).astype(int)
+        assert pixels_like(canvas.pixels[y - 3 : y + 4, x - 3 : x + 4], Ink.POSITION) >= 2
+
+
+def test_heights_of_contours_stand_clear_of_the_track_and_of_the_caption():
+    track = synthetic_track(load_terrain("shackleton"), start_m=(-6000.0, 0.0), step_m=200.0, frames=40)
+    canvas = Canvas(601, 601)
+    view, _ = draw_track_map(canvas, BOX, track)
+    heights = [text_box(at, text, anchor, size) for at, text, anchor, size, *_ in canvas._texts if text[-1].isdigit()]
+    assert len(heights) > 3
+    places = view.canvas_px(track.smoothed.position_enu_m[:, :2])
+    for left, top, right, bottom in heights:
+        assert top > 2 * TEXT_PX
+        assert not ((places > [left, top]) & (places < [right, bottom])).all(axis=1).any()
 
 
 def test_half_axes_hold_95_percent():
@@ -69,7 +92,7 @@ def test_half_axes_hold_95_percent():
 def test_a_map_at_rest_holds_all_ellipses():
     track = synthetic_track(at_rest=True)
     pixels, view, legend = drawn(track)
-    assert ("ring", Ink.BLUE, "95 % ellipses") in legend
+    assert ("ring", Ink.BLUE, "95 % ellipses, at their true size") in legend
     assert pixels_like(pixels, Ink.BLUE) > 100 < pixels_like(pixels, Ink.POSITION)
     away_m = np.abs(track.filtered.position_enu_m[:, :2] - view.centre_m).max(axis=1)
     reach_m = half_axes_95_m(track.filtered.covariance_m2) + away_m

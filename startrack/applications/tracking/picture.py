@@ -1,4 +1,7 @@
-"""The picture of a track: a map with its positions and 95 % ellipses, odometry alone, and frames not used."""
+"""The picture of a track: a map with its positions and 95 % ellipses, odometry alone, and frames not used.
+
+Ellipses have their true size: where the map shows the last one too small to see, it is enlarged beside the map.
+"""
 
 from __future__ import annotations
 
@@ -20,15 +23,17 @@ from startrack.output import (
     Ink,
     Legend,
     Map,
+    box_around,
     ellipse_m,
-    nice_step,
 )
 
 MAP_BOX: Box = (MARGIN_PX, MARGIN_PX, MARGIN_PX + SIDE_PX, MARGIN_PX + SIDE_PX)
 PANEL_PX = 22.5 * TEXT_PX  # beside the map
 TRACK_SIZE_PX = round(MAP_BOX[2] + 4 * TEXT_PX + PANEL_PX), round(MAP_BOX[3] + MARGIN_PX)
 ODOMETRY, UNUSED = Ink.YELLOW, Ink.PURPLE
-SEEN_PX = 14.0  # half of the longer axis that the median ellipse has at least
+SEEN_PX, HIDDEN_PX = 14.0, 3.0  # longer half axes of an ellipse that is seen well, and of one that its mark hides
+RESERVED_PLACES = 100  # along a line
+LEAST_INSET_PX = 8 * TEXT_PX  # a lower part of the panel has no room for the last position
 SMALLEST_HALF_M = 0.05
 WIDEST = 25.0  # ellipse that the map has room for, in half axes of the last one
 
@@ -43,7 +48,8 @@ def draw_track(track: Track) -> NDArray[np.uint8]:
     left, y = MAP_BOX[2] + 2 * TEXT_PX, MAP_BOX[1] + TEXT_PX
     for line in _facts(track):
         y = canvas.paragraph(left, y, line, PANEL_PX, Ink.PLAIN)
-    canvas.legend(left, y + TEXT_PX, PANEL_PX, legend)
+    y = canvas.legend(left, y + TEXT_PX, PANEL_PX, legend)
+    draw_last_position(drawn, (left, max(y + TEXT_PX, MAP_BOX[3] - PANEL_PX), left + PANEL_PX, MAP_BOX[3]), track)
     return canvas.rendered_pixels()
 
 
@@ -66,7 +72,7 @@ def _facts(track: Track) -> list[str]:
 
 def track_extent(track: Track) -> tuple[tuple[float, float], float]:
     """Centre (east, north) and half side [m] of a map of the `track`; the search area where no position is known."""
-    shown = track.filtered if track.at_rest else track.smoothed
+    shown = _shown(track)
     around = known_points(np.concatenate([shown.position_enu_m[:, :2], track.odometry_m]))
     if not len(around):
         return (0.0, 0.0), track.terrain.search_radius_m
@@ -96,10 +102,52 @@ def draw_track_map(canvas: Canvas, box: Box, track: Track) -> tuple[Map, Legend]
     """Draw the map into the box; returns it and its legend."""
     drawn = Map.of_extent(canvas, box, *track_extent(track))
     drawn.draw_ground(track.terrain)
-    words, window = drawn.draw_heights(track.terrain), drawn.window
-    shown, colour = (track.filtered, Ink.BLUE) if track.at_rest else (track.smoothed, Ink.POSITION)
-    times = _draw_ellipses(drawn, shown, colour)
-    legend: Legend = [("ring", colour, "95 % ellipses" + (f", enlarged {times:g} times" if times > 1 else ""))]
+    _keep_heights_off(drawn, track)
+    words = drawn.draw_heights(track.terrain)
+    legend = _draw_marks(drawn, track)
+    drawn.draw_frame(words)
+    return drawn, legend
+
+
+def _keep_heights_off(drawn: Map, track: Track) -> None:
+    """Keep the heights of contours off the caption, the scale bar and the lines of a `track` on a map."""
+    left, top, right, bottom = drawn.box
+    drawn.canvas.reserve((left, top, right, top + 2 * TEXT_PX))
+    drawn.canvas.reserve((left + (right - left) / 2, bottom - 3 * TEXT_PX, right, bottom))
+    for line in (track.smoothed.position_enu_m[:, :2], track.odometry_m):
+        if len(points := drawn.canvas_px(known_points(line))):
+            places = np.linspace(0, len(points) - 1, RESERVED_PLACES)
+            for at in np.stack([np.interp(places, np.arange(len(points)), x) for x in points.T], axis=-1):
+                drawn.canvas.reserve(box_around(at, TEXT_PX / 2))
+
+
+def draw_last_position(drawn: Map, box: Box, track: Track) -> None:
+    """The last known position of a `track` in the `box`, where its ellipse is small on the map that is `drawn`."""
+    shown = _shown(track)
+    axis_m = half_axes_95_m(shown.covariance_m2)
+    known = np.flatnonzero(np.isfinite(axis_m))
+    if not len(known) or axis_m[known[-1]] >= SEEN_PX * drawn.metres_per_px or box[3] - box[1] < LEAST_INSET_PX:
+        return
+    east_m, north_m = shown.position_enu_m[known[-1], :2].tolist()
+    half_m = 2.0 * max(float(axis_m[known[-1]]), SMALLEST_HALF_M)
+    inset = Map.of_extent(drawn.canvas, box, (east_m, north_m), half_m)
+    inset.window.rectangle(box, Ink.FLOOR)
+    inset.draw_grid()
+    _draw_marks(inset, track)
+    inset.draw_frame("")
+    drawn.canvas.text((box[0], box[1] - TEXT_PX / 2), "the last position, enlarged")
+
+
+def _shown(track: Track) -> Trajectory:
+    """The positions of a `track` whose ellipses are drawn: at rest the smoothed ones are all the same."""
+    return track.filtered if track.at_rest else track.smoothed
+
+
+def _draw_marks(drawn: Map, track: Track) -> Legend:
+    """Draw ellipses, lines and marks of a `track` on a map; returns their legend."""
+    window, colour = drawn.window, Ink.BLUE if track.at_rest else Ink.POSITION
+    _draw_ellipses(drawn, _shown(track), colour)
+    legend: Legend = [("ring", colour, "95 % ellipses, at their true size")]
     if len(track.odometry_m):
         window.line(drawn.canvas_px(known_points(track.odometry_m)), ODOMETRY, 2)
         legend += [("line", ODOMETRY, "odometry alone")]
@@ -118,20 +166,16 @@ def draw_track_map(canvas: Canvas, box: Box, track: Track) -> tuple[Map, Legend]
         for place in known_points(at):
             window.mark(place, kind, 0.45 * TEXT_PX, ink, 2 if kind == "ring" else 3)
         legend += [(kind, ink, what)] if len(at) else []
-    drawn.draw_frame(words)
-    return drawn, legend
+    return legend
 
 
-def _draw_ellipses(drawn: Map, shown: Trajectory, colour: Colour) -> float:
-    """Ellipses of positions, each clear of the last one's centre; returns how much they are enlarged."""
+def _draw_ellipses(drawn: Map, shown: Trajectory, colour: Colour) -> None:
+    """Ellipses of positions that their marks do not hide, each clear of the last one's centre."""
     axis_m, last = half_axes_95_m(shown.covariance_m2), None
-    known = np.flatnonzero(np.isfinite(axis_m))
-    median_px = max(float(np.median(axis_m[known])) / drawn.metres_per_px, 1e-6) if len(known) else SEEN_PX
-    times = 1.0 if median_px >= SEEN_PX else nice_step(2.5 * SEEN_PX / median_px)
-    for k in known:
+    seen = np.flatnonzero(np.isfinite(axis_m) & (axis_m > HIDDEN_PX * drawn.metres_per_px))
+    for k in seen:
         centre_m = shown.position_enu_m[k, :2]
-        if last is None or k == known[-1] or np.linalg.norm(centre_m - last) > 0.8 * times * axis_m[k]:
+        if last is None or k == seen[-1] or np.linalg.norm(centre_m - last) > 0.8 * axis_m[k]:
             last = centre_m
-            outline = ellipse_m(tuple(centre_m.tolist()), (times * SIGMAS_95) ** 2 * shown.covariance_m2[k])
+            outline = ellipse_m(tuple(centre_m.tolist()), SIGMAS_95**2 * shown.covariance_m2[k])
             drawn.window.curve(drawn.canvas_px(outline[:-1]), colour, 1.6, closed=True)
-    return times

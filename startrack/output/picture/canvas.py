@@ -173,12 +173,13 @@ class Canvas:
             y += LINE_PX / TEXT_PX * size
         return y
 
-    def legend(self, left: float, y: float, width: float, entries: Legend) -> None:
-        """Marks and words of a legend's `entries` in `width` [px], one below the other from the line at `y` on."""
+    def legend(self, left: float, y: float, width: float, entries: Legend) -> float:
+        """Marks and words of a legend's `entries` in `width` [px], in lines from `y` on; where the next would stand."""
         for kind, colour, words in entries:
             half = TEXT_PX / (8 if kind == "disc" else 2)
             self.mark((left + TEXT_PX / 2, y - TEXT_PX / 3), kind, half, colour)
             y = self.paragraph(left + 2 * TEXT_PX, y, words, width - 2 * TEXT_PX)
+        return y
 
     def label(self, at: ArrayLike, text: str, colour: Colour, gap: float, within: Box, size: float = TEXT_PX) -> bool:
         """Write `text` of `size` [px] and `colour` beside the place `at`, a `gap` [px] off, inside the box `within`.

@@ -18,11 +18,13 @@ from horizon_helpers import CAMERA, TIME, painted_frame
 from horizon_helpers import SITE as HIGH_SITE
 from html_helpers import DESKTOP, SMALL, Window
 from jsonschema import ValidationError
+from matplotlib.figure import Figure
 from schema_helpers import check_printed_schema
 from scipy.spatial import cKDTree
 
 from startrack.applications.calibration import calibrate
 from startrack.applications.calibration.acceptance import joint_log_p_value
+from startrack.applications.calibration.plots import _draw_vectors
 from startrack.applications.calibration.report import _report_html, write_report
 from startrack.applications.calibration.static_parts import find_obstructions
 from startrack.applications.calibration.verify import Verification, verify, verify_dict, verify_line
@@ -240,6 +242,17 @@ def test_the_command_writes_camera_record_and_report(written_files):
     assert "accepted" in page
     assert not re.search(r'(src|href)="(?!data:|#main)', page)  # nothing is fetched
     assert (written_files / "new.report.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_residuals_stand_on_the_photograph(cold_calibration):
+    axes = Figure().subplots()
+    _draw_vectors(axes, cold_calibration)
+    (photograph,), (arrows,) = axes.images, axes.collections
+    exposure = cold_calibration.joint.frames[0].exposure
+    np.testing.assert_array_equal(photograph.get_array(), exposure.pixels_adu)
+    width, height = exposure.size_px
+    assert photograph.get_extent() == [-0.5, width - 0.5, height - 0.5, -0.5] == [*axes.get_xlim(), *axes.get_ylim()]
+    assert photograph.get_zorder() < arrows.get_zorder()
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Picture of a calibration: residual vectors, residuals by angle, projection sigma over the image, sectors."""
+"""Picture of a calibration: residual vectors on a photograph, residuals by angle, projection sigma, sectors."""
 
 from __future__ import annotations
 
@@ -27,6 +27,8 @@ PLAIN, GOOD, BAD, LINE = "#ecf0f5", "#56b4e9", "#e69f00", "#2fd3a0"
 DARK_LETTERS_FROM = 0.45  # of the colour map, from which dark letters are read on it
 ARROW_FRACTION = 0.02  # of the frame's width: length of an arrow of the RMS residual
 MAP_SIDE = 160
+BLACK, WHITE = 1.0, 99.8  # percentiles of the photograph's pixels
+DIMMED = 0.5  # opacity of the photograph, on which arrows are read
 MAX_ARROWS = 1000  # more overlap
 
 
@@ -60,11 +62,16 @@ def _draw_frame(axes: Axes, camera: Camera) -> None:
     ):
         px = camera.project_unlimited(cone_rays(np.array(angle), np.linspace(0.0, 2 * np.pi, 181)))
         axes.plot(px[:, 0], px[:, 1], style, color=LINE, linewidth=1.2, label=label)
-    axes.legend(loc="lower right", framealpha=0.9)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), borderaxespad=4.5, ncols=3, frameon=False)
 
 
 def _draw_vectors(axes: Axes, calibration: Calibration) -> None:
-    fit, camera = calibration.joint.fit, calibration.camera
+    """Arrows of the residuals of all pictures, on the first of them."""
+    fit, camera, frames = calibration.joint.fit, calibration.camera, calibration.joint.frames
+    dark, bright = np.percentile(frames[0].exposure.pixels_adu, (BLACK, WHITE))
+    axes.imshow(frames[0].exposure.pixels_adu, cmap="gray", vmin=dark, vmax=bright, alpha=DIMMED)
+    if len(frames) > 1:
+        axes.text(0.01, 0.98, f"on the first of {len(frames)} pictures", transform=axes.transAxes, va="top")
     px, residual = calibration.joint.points.xy_px, fit.held_out_px
     scale = ARROW_FRACTION * camera.size_px[0] / max(fit.held_out_rms_px, 1e-6)
     used = np.flatnonzero(fit.used)

@@ -2,12 +2,16 @@
 
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from startrack.applications.reproduction import QUICK, Context, fix_store, write_artefact
 from startrack.applications.reproduction.comparison import COMPARED, ComparedErrors, compare_places, methods_on
+from startrack.applications.reproduction.method_figures import cumulative_picture, label_of
 from startrack.applications.reproduction.method_table import MAP_GROUND, method_table
 from startrack.applications.reproduction.methods import ALL_METHODS, KUA, Task, compute_chunk
 from startrack.applications.reproduction.scene import VALLEY_GROUND, Scene
@@ -105,6 +109,24 @@ def test_statistics_of_errors_with_a_refusal():
     assert found.statistics("kua-hull")["mean_m"] is None and found.statistics("kua-hull")["refused"] == 3
 
 
+def test_each_curve_ends_with_its_name_clear_of_the_others():
+    names, refused = tuple(COMPARED), ["naval-lit", "naval-dark"]
+    distance_m = np.where([one in refused for one in names], np.nan, 30.0)  # the curves lie one upon the other
+    position_m = np.stack([np.full((4, len(names)), distance_m), np.zeros((4, len(names)))], axis=-1)
+    tried = np.ones((4, len(names)), dtype=bool)
+    found = ComparedErrors(names, np.zeros((4, 2)), position_m, tried, np.zeros((4, 2, 2, 2)), np.zeros(tried.shape))
+    figure, picture = Figure(figsize=(9.0, 6.4)), cumulative_picture(found)
+    picture.draw(figure)
+    figure.draw_without_rendering()
+    (axes,) = figure.axes
+    shown = [text for text in axes.texts if text.get_text()]
+    assert {text.get_text() for text in shown} == {label_of(one) for one in names if one not in refused}
+    assert all(label_of(one) in picture.caption for one in refused)
+    boxes = sorted((Text.get_window_extent(text) for text in shown), key=lambda box: box.y0)
+    assert all(below.y1 <= above.y0 + 1.0 for below, above in pairwise(boxes))
+    assert boxes[0].y0 > axes.bbox.y0 and boxes[-1].y1 < axes.bbox.y1
+
+
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes(tmp_path):
     def write(name):
@@ -115,6 +137,6 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
         }
 
     artefact, one = write("one")
-    assert one == write("two")[1] and set(one) == {"methods.md", "methods.ecsv", "methods.png", "methods.map.png"}
+    assert one == write("two")[1] and set(one) == {"methods.md", "methods.ecsv", "methods.png"}
     assert all(method.name in artefact.text for method in COMPARED.values())
     assert set(artefact.timing_ms) == set(COMPARED)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +27,7 @@ FIGURE_STYLE: dict[Any, Any] = {
 EDGE_COLOUR = "#1a9641"  # the thesis draws the crater's edge in green
 STAR, OTHER_STAR = "#20304a", "#b9c0cc"
 CENTRE = PUBLISHED = "#d7191c"  # and centres of mass in red
+LABEL_STEP = 0.042  # of the axes' height, between names at the ends of curves
 PALETTE_SIZE = 128  # of a PNG's palette: enough for these drawings, at a third of the size
 
 
@@ -155,3 +156,20 @@ def fisheye_axes(axes: Axes) -> None:
     axes.plot(*fisheye_points(np.linspace(0.0, 2 * np.pi, 361), np.zeros(361)).T, color="0.6", linewidth=0.7)
     axes.set(aspect="equal", xlim=(-93, 93), ylim=(-93, 93), xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
+
+
+def label_ends(axes: Axes, ends: Sequence[tuple[str, tuple[float, float], str]]) -> None:
+    """Write names of curves at the right of the axes: near to their last points, clear of each other, in colours."""
+    from scipy.optimize import isotonic_regression
+
+    axes.autoscale_view()
+    at = axes.transData + axes.transAxes.inverted()
+    heights = [(float(at.transform(point)[1]), name, point, colour) for name, point, colour in ends]
+    steps = LABEL_STEP * np.arange(len(heights))
+    free = isotonic_regression(np.array([height for height, *_ in sorted(heights)]) - steps).x
+    places = np.clip(free, 0.0, max(1.0 - steps[-1], 0.0)) + steps
+    for place, (_, name, point, colour) in zip(places, sorted(heights), strict=True):
+        line = {"arrowstyle": "-", "color": colour, "lw": 0.7, "relpos": (0.0, 0.5), "shrinkA": 1.0, "shrinkB": 0.0}
+        axes.annotate(
+            name, point, (1.05, place), "data", "axes fraction", color=colour, fontsize=9, va="center", arrowprops=line
+        )

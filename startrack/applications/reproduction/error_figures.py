@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from startrack.applications.reproduction.artefact import PUBLISHED, STAR, Artefact, Context, Picture, markdown_table
+from startrack.applications.reproduction.artefact import (
+    STAR,
+    Artefact,
+    Context,
+    Picture,
+    label_ends,
+    markdown_table,
+)
 from startrack.applications.reproduction.methods import (
     BOUND,
     KUA,
@@ -25,8 +32,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RINGS_KM = np.linspace(0.0, DIAMETER_M / 2e3, 6)
-SCALED = "Point size and colour scaled to position error."
+CLASSES = (  # of the points by their errors, smallest first: share up to the class's end, words, colour, size [pt^2]
+    (0.5, "half of the points", "#c3cdda", 4.0), (0.9, "next 40 %", "#56b4e9", 5.0), (0.99, "next 9 %", "#e69f00", 9.0),
+    (1.0, "worst 1 %", "#d55e00", 18.0),
+)  # fmt: skip
+COLUMNS = 5  # of panels
 SWEEP_METHODS = ("hull", "pseudo-gradient", "ours", "limit")
+SWEEP_STYLES = (("s:", "#009e73"), ("^--", "#009e73"), ("o-", "#d55e00"), ("x", STAR))
 
 
 def fig3_4(context: Context) -> Artefact:
@@ -34,7 +46,7 @@ def fig3_4(context: Context) -> Artefact:
     count = context.size.one_sky
     hull, _ = collect_errors(context, "fig 3.4", KUA, 1, count)
     caption = (
-        f"Figure 3.4: Position error at {count:,} sampled points for the skyline estimate. {SCALED} "
+        f"Figure 3.4: Position error at {count:,} sampled points for the skyline estimate. "
         f"Mean / s.d. / largest: {format_errors(hull.errors, '{:.0f} / {:.0f} / {:.0f}')} m; thesis 637 / 275 / 1735 m."
     )
     return Artefact(
@@ -43,7 +55,7 @@ def fig3_4(context: Context) -> Artefact:
         line=f"skyline estimate {hull.errors.mean():.0f} m (thesis 637)",
         text=f"{caption}\n\n{_ring_table({'skyline estimate': hull})}",
         columns=_ring_columns({"hull": hull}),
-        pictures={"fig3.4": _error_map(hull, 0, "Skyline estimate", caption)},
+        pictures={"fig3.4": _error_map(hull, ["Skyline estimate"], caption)},
         values={"thesis": THESIS["hull"], "reproduced": hull.statistics},
         timing_ms={"hull_and_descent": hull.ms_per_fix},
     )
@@ -56,13 +68,12 @@ def fig3_10(context: Context) -> Artefact:
     (ours,) = collect_errors(context, "fig 3.10, ours", OURS, 1, size.ours_one_sky)
     unsettled = descent.errors[~descent.answered[0]]
     caption = (
-        f"Figure 3.10: Position error at {size.one_sky:,} sampled points. {SCALED} "
+        f"Figure 3.10: Position error at {size.one_sky:,} sampled points. "
         f"Mean / s.d. / largest: {format_errors(descent.errors)} m (thesis, table 3.1: 34.2 / 31.1 / 358.4 m); "
         f"{100 * descent.refused_fraction:.2f} % never settle (thesis 0.6 %)."
     )
     of_ours = (
         f"Ours on the same starfield and positions (the first {size.ours_one_sky:,}): {format_errors(ours.errors)} m. "
-        f"{SCALED} "
         f"The pseudo-gradient: {format_errors(descent.errors)} m."
     )
     settling = (
@@ -77,8 +88,8 @@ def fig3_10(context: Context) -> Artefact:
         text=f"{caption} {settling}\n\n{of_ours}\n\n{_ring_table(rings)}",
         columns=_ring_columns({"hull": hull, "descent": descent, "ours": ours}),
         pictures={
-            "fig3.10": _error_map(descent, 0, "Pseudo-gradient", caption),
-            "fig3.10.ours": _error_map(ours, 0, "Ours", of_ours),
+            "fig3.10": _error_map(descent, ["Pseudo-gradient"], caption),
+            "fig3.10.ours": _error_map(ours, ["Ours"], of_ours),
         },
         values={
             "thesis": {**THESIS["overall"], "never_settle": THESIS["never_settle"]},
@@ -93,20 +104,20 @@ def fig_b(context: Context) -> Artefact:
     """Figures B.1 to B.10: the ten starfields of table 3.1."""
     size = context.size
     _, descent = collect_errors(context, "figures B.1 to B.10", KUA, size.skies, size.per_sky)
-    pictures = {}
-    for k, trial in enumerate(THESIS["trials"][: size.skies]):
-        caption = (
-            f"Figure B.{k + 1}: Position error at {size.per_sky:,} sampled points in a Shackleton-style crater, "
-            f"starfield {k + 1}. {SCALED} Mean / s.d. / largest: {format_errors(descent.errors_m[k])} m; "
-            f"thesis {' / '.join(map(str, trial.values()))} m."
-        )
-        pictures[f"figB.{k + 1}"] = _error_map(descent, k, f"Starfield {k + 1}", caption)
+    caption = (
+        f"Figures B.1 to B.{size.skies}: Position error at {size.per_sky:,} sampled points in a Shackleton-style "
+        "crater under each of its starfields, above each the mean error here and in the thesis."
+    )
+    trials = [" / ".join(map(str, trial.values())) for trial in THESIS["trials"][: size.skies]]
+    errors = map(format_errors, descent.errors_m)
+    rows = [(f"B.{k}", *both) for k, both in enumerate(zip(errors, trials, strict=True), start=1)]
+    titles = [f"{name}: {here.split()[0]} m ({thesis.split()[0]})" for name, here, thesis in rows]
     return Artefact(
         name="figB",
         title="Figures B.1 to B.10: Position error in a Shackleton-style crater",
         line=f"ten starfields, pseudo-gradient {descent.errors.mean():.1f} m (thesis 34.2)",
-        text="\n\n".join(picture.caption for picture in pictures.values()),
-        pictures=pictures,
+        text=f"{caption}\n\n{markdown_table(['figure', 'mean / s.d. / largest (m)', 'thesis (m)'], rows)}",
+        pictures={"figB": _error_map(descent, titles, caption)},
         values={
             "thesis": {"trials": THESIS["trials"]},
             "reproduced": {"trials": [error_statistics(errors) for errors in descent.errors_m]},
@@ -115,26 +126,36 @@ def fig_b(context: Context) -> Artefact:
     )
 
 
-def _error_map(method: MethodErrors, sky: int, title: str, caption: str) -> Picture:
-    """Position errors over the crater's floor, point size and colour scaled to the error."""
-    errors_m = method.errors_m[sky]
+def _error_map(method: MethodErrors, titles: Sequence[str], caption: str) -> Picture:
+    """Position errors over the crater's floor: a panel with a title for each sky, in colours of common CLASSES."""
+    ends_m = np.quantile(method.errors, [share for share, *_ in CLASSES])
+    columns = min(len(titles), COLUMNS)
+    rows = -(-len(titles) // columns)
 
     def draw(figure: Figure) -> None:
         from matplotlib.patches import Circle
 
-        axes = figure.subplots()
-        order = np.argsort(errors_m, kind="stable")  # the large ones on top
-        share = errors_m[order] / errors_m.max()
-        area = (0.6 + 28.0 * share**1.5) * min(2.0, (2e4 / len(order)) ** 0.5)
-        east, north = method.positions_m[sky][order].T / 1e3
-        points = axes.scatter(east, north, s=area, c=errors_m[order], cmap="turbo", linewidths=0)
-        radius = DIAMETER_M / 2e3
-        axes.add_patch(Circle((0, 0), radius, fill=False, color="0.3", linewidth=0.8))
+        panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+        shrunk, radius = min(2.0, (2e4 / len(method.errors_m[0])) ** 0.5) / columns**0.5, DIAMETER_M / 2e3
         limits = (-1.03 * radius, 1.03 * radius)
-        axes.set(aspect="equal", xlim=limits, ylim=limits, xlabel="east (km)", ylabel="north (km)", title=title)
-        figure.colorbar(points, ax=axes, label="position error (m)", shrink=0.85)
+        for axes, title, points_m, errors_m in zip(
+            panels.flat, titles, method.positions_m, method.errors_m, strict=False
+        ):
+            class_of = np.searchsorted(ends_m, errors_m)
+            for k, ((_, words, colour, area), end_m) in enumerate(zip(CLASSES, ends_m, strict=True)):
+                east, north = points_m[class_of == k].T / 1e3
+                label = f"{words}: up to {end_m:.0f} m"
+                axes.scatter(east, north, s=shrunk * area, color=colour, linewidths=0, label=label)
+            axes.add_patch(Circle((0, 0), radius, fill=False, color="0.3", linewidth=0.8))
+            axes.set(aspect="equal", xlim=limits, ylim=limits, title=title)
+        for axes in panels[-1]:
+            axes.set_xlabel("east (km)")
+        for axes in panels[:, 0]:
+            axes.set_ylabel("north (km)")
+        entries = panels[0, 0].get_legend_handles_labels()
+        figure.legend(*entries, loc="outside upper center", ncols=min(2 * columns, 4), markerscale=2.0)
 
-    return Picture((7.0, 6.6), draw, caption)
+    return Picture((7.0, 7.4) if columns == 1 else (10.0, 1.0 + 2.1 * rows), draw, caption)
 
 
 def _ring_means(method: MethodErrors, form: str) -> list[str]:
@@ -206,14 +227,15 @@ def _sweep(
 
     def draw(figure: Figure) -> None:
         axes: Any = figure.subplots()
-        styles = (("s:", "0.6"), ("^--", "#2166ac"), ("o-", STAR), ("x", PUBLISHED))
-        for method, mean, (style, colour) in zip(SWEEP_METHODS, means.T, styles, strict=True):
-            axes.plot(x, mean, style, color=colour, label=method)
         if key == "aspect_ratio":
             axes.set_xscale("log")
         axes.set(yscale="log", xlabel=words, ylabel="mean position error (m)")
+        ends = []
+        for method, mean, (style, colour) in zip(SWEEP_METHODS, means.T, SWEEP_STYLES, strict=True):
+            axes.plot(x, mean, style, color=colour)
+            ends += [(method, (x[k], mean[k]), colour) for k in np.flatnonzero(np.isfinite(mean))[-1:]]
+        label_ends(axes, ends)
         axes.grid(alpha=0.3)
-        axes.legend()
 
     return Artefact(
         name=name,

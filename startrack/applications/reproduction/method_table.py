@@ -8,7 +8,7 @@ import numpy as np
 
 from startrack.applications.reproduction.artefact import Artefact, Context, markdown_table
 from startrack.applications.reproduction.comparison import COMPARED, ComparedErrors, ComparedMethod, methods_on
-from startrack.applications.reproduction.method_figures import answers_picture, cumulative_picture, label_of
+from startrack.applications.reproduction.method_figures import cumulative_picture, label_of
 from startrack.applications.reproduction.methods import ALL_METHODS, Task, tasks_of
 from startrack.applications.reproduction.scene import VALLEY_GROUND
 from startrack.output import Column
@@ -28,21 +28,21 @@ def method_table(context: Context) -> Artefact:
         for task in tasks_of(ALL_METHODS, context.seed, sky, size.compared_per_sky, series_every=every)
     ]
     title, places = "Every method that the thesis names, at the same places", "places of the thesis's crater"
-    return _compare(context, "methods", tasks, title, places, "the crater's edge")
+    return _compare(context, "methods", tasks, title, places)
 
 
 def map_table(context: Context) -> Artefact:
     """Errors of the methods that do not need a round crater, on the map of Shackleton."""
     title, places = "Methods that the thesis names on the map of Shackleton", "places of the map of Shackleton"
     tasks = _tasks_on(context, MAP_GROUND, context.size.compared_on_map)
-    return _compare(context, "methods.shackleton", tasks, title, places, "the circle in which the places lie")
+    return _compare(context, "methods.shackleton", tasks, title, places)
 
 
 def valley_table(context: Context) -> Artefact:
     """Errors of the methods that need neither a round crater nor the Moon, in valleys of the Earth."""
     title, places = "Methods that the thesis names in valleys of the Earth", "places in valleys near Jacksboro"
     tasks = _tasks_on(context, VALLEY_GROUND, context.size.compared_in_valley)
-    return _compare(context, "methods.valley", tasks, title, places, "a circle of the size of Shackleton")
+    return _compare(context, "methods.valley", tasks, title, places)
 
 
 def _tasks_on(context: Context, ground: str, places: int) -> list[Task]:
@@ -56,8 +56,8 @@ def _series_every(context: Context, places: int) -> int:
     return -(-places // context.size.compared_series)
 
 
-def _compare(context: Context, name: str, tasks: list[Task], title: str, places: str, edge: str) -> Artefact:
-    """The table and figures `name` of the places of `tasks`."""
+def _compare(context: Context, name: str, tasks: list[Task], title: str, places: str) -> Artefact:
+    """The table and figure `name` of the places of `tasks`."""
     found = _collect(context, name, tasks)
     statistics = {one: found.statistics(one) for one in found.names}
     skies = len({task.sky for task in tasks})
@@ -78,7 +78,7 @@ processor time of no method, since a file must not depend on the machine: `--jso
         line=f"startrack {_number(statistics['startrack']['mean_m'])} m, best {label_of(best[1])} {best[0]:.2f} m",
         text=text,
         columns=_columns(statistics),
-        pictures={name: cumulative_picture(found), f"{name}.map": answers_picture(found, edge)},
+        pictures={name: cumulative_picture(found)},
         values={
             "thesis": {one: COMPARED[one].published for one in found.names},
             "reproduced": {key: one for key, one in statistics.items() if not key.startswith("startrack")},

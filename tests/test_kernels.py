@@ -343,14 +343,17 @@ def chain_of(rng):
     likely = np.empty(len(shifts))
     obstacle_chain.chain_log_likelihoods(soft, levels, moves, shifts, 17, np.array([0, 3, 15]), likely)
     states = obstacle_chain.state_probabilities(obstacle_chain.emissions(soft, shifts[0]), moves)
-    logs = obstacle_chain.log_clear_emissions(hard, shifts.T, rng.random(SECTORS))
+    gains = obstacle_chain.gains_of_light(soft, shifts, rng.normal(0.0, 1e-3, shifts.shape))
+    lifted = np.empty(len(shifts))
+    obstacle_chain.chain_log_likelihoods(soft, levels, moves, shifts, 17, np.array([0, 3, 15]), lifted, gains)
+    logs = obstacle_chain.log_clear_emissions(hard, shifts.T, rng.random(SECTORS), gains.T)
     search = search_profiles.SearchProfiles.of(rows)
     low = rng.uniform(-0.1, 0.1, (5, SECTORS))
     found = search.bound(low, low + 0.02), search.average(low[:, ::4], low[:, ::4] + 0.02), search.integral
     moments = measure_moments(soft)
     curve = smooth_skyline.list_free_logs(hard, shifts[1], 0.2, np.array([1e-4, 1e-3]))
     assert np.isfinite(likely).all() and np.isfinite(curve).all()
-    return (*soft, *hard, likely, states, logs, *found, *moments, curve)
+    return (*soft, *hard, likely, gains, lifted, states, logs, *found, *moments, curve)
 
 
 def identification_of(rng):

@@ -9,6 +9,27 @@
 #define BLOCK 64 /* points that are computed together */
 #define LANES 8  /* their number is filled up to a multiple of it */
 
+/* As `clear_emissions`; to F at point p of sector s is added gain[s n + p], unless that is 0. */
+static void fill_clear(const struct cells *c, int64_t sectors, int64_t n, const double *restrict scale, double wrong,
+                       const double *restrict shifts, const double *restrict gain, double *restrict found)
+{
+    for (int64_t s = 0; s < sectors; s++) {
+        for (int64_t p = s * n; p < (s + 1) * n; p++) {
+            const double at = shifts[p];
+            const int64_t k = cell_at(c, s, at);
+            const double rise = c->right[k] - c->left[k];
+            double value = c->left[k] - c->free[s];
+            if (rise != 0.0 || c->bend[k] != 0.0) {
+                const double u = smaller(greater((at - c->x[k]) / (c->x[k + 1] - c->x[k]), 0.0), 1.0);
+                value += u * rise + u * (1.0 - u) * c->bend[k];
+            }
+            if (gain)
+                value += gain[p];
+            found[p] = scale[s] * ((1.0 - wrong) * exp(value) + wrong);
+        }
+    }
+}
+
 void clear_emissions(int64_t sectors, int64_t m, int64_t guides, int64_t n, const int64_t *restrict first,
                      const double *restrict x, const double *restrict left, const double *restrict right,
                      const double *restrict bend, const double *restrict free, const int32_t *restrict guide,
@@ -17,32 +38,36 @@ void clear_emissions(int64_t sectors, int64_t m, int64_t guides, int64_t n, cons
 {
     (void)m;
     const struct cells c = {first, x, left, right, bend, 0, free, guide, guides, highest};
-    for (int64_t s = 0; s < sectors; s++) {
-        for (int64_t p = s * n; p < (s + 1) * n; p++) {
-            const double at = shifts[p];
-            const int64_t k = cell_at(&c, s, at);
-            const double rise = right[k] - left[k];
-            double value = left[k];
-            if (rise != 0.0 || bend[k] != 0.0) {
-                const double u = smaller(greater((at - x[k]) / (x[k + 1] - x[k]), 0.0), 1.0);
-                value += u * rise + u * (1.0 - u) * bend[k];
-            }
-            found[p] = scale[s] * ((1.0 - wrong) * exp(value - free[s]) + wrong);
-        }
-    }
+    fill_clear(&c, sectors, n, scale, wrong, shifts, 0, found);
 }
 
-void clear_logs(int64_t sectors, int64_t m, int64_t guides, int64_t n, const int64_t *restrict first,
+void clear_logs(int64_t sectors, int64_t m, int64_t guides, int64_t n, int64_t gained, const int64_t *restrict first,
                 const double *restrict x, const double *restrict left, const double *restrict right,
                 const double *restrict bend, const double *restrict free, const int32_t *restrict guide,
                 const double *restrict scale, double highest, double wrong, const double *restrict shifts,
-                const double *restrict clear, double *restrict found)
+                const double *restrict gain, const double *restrict clear, double *restrict found)
 {
-    clear_emissions(sectors, m, guides, n, first, x, left, right, bend, free, guide, scale, highest, wrong, shifts,
-                    found);
+    (void)m;
+    const struct cells c = {first, x, left, right, bend, 0, free, guide, guides, highest};
+    fill_clear(&c, sectors, n, scale, wrong, shifts, gained > 0 ? gain : 0, found);
     for (int64_t s = 0; s < sectors; s++)
         for (int64_t p = s * n; p < (s + 1) * n; p++)
             found[p] = log(clear[s] * found[p] + 1.0 - clear[s]);
+}
+
+void gains_of_light(int64_t sectors, int64_t m, int64_t guides, int64_t n, const int64_t *restrict first,
+                    const double *restrict x, const double *restrict left, const double *restrict right,
+                    const double *restrict bend, const double *restrict free, const int32_t *restrict guide,
+                    double highest, const double *restrict shifts, const double *restrict lifts,
+                    double *restrict found)
+{
+    (void)m;
+    const struct cells c = {first, x, left, right, bend, 0, free, guide, guides, highest};
+    for (int64_t p = 0; p < n; p++)
+        for (int64_t s = 0; s < sectors; s++) {
+            const double at = shifts[p * sectors + s];
+            found[p * sectors + s] = log_at(&c, s, at + lifts[p * sectors + s]) - log_at(&c, s, at);
+        }
 }
 
 void prepare_levels(int64_t sectors, int64_t m, int64_t guides, int64_t edges, int64_t levels, int64_t nodes,
@@ -190,8 +215,8 @@ static void clear_rows(int64_t rows, row_of *restrict states)
 }
 
 void chain_log_likelihoods(int64_t sectors, int64_t m, int64_t guides, int64_t star_cells, int64_t levels,
-                           int64_t nodes, int64_t lights, int64_t n, int64_t closings, int64_t rows,
-                           const int64_t *restrict first, const double *restrict x, const double *restrict left,
+                           int64_t nodes, int64_t lights, int64_t n, int64_t gained, int64_t closings,
+                           int64_t rows, const int64_t *restrict first, const double *restrict x, const double *restrict left,
                            const double *restrict right, const double *restrict bend, const double *restrict free,
                            const int32_t *restrict guide, const double *restrict scale,
                            const int64_t *restrict star_first, const double *restrict star_x,
@@ -201,8 +226,9 @@ void chain_log_likelihoods(int64_t sectors, int64_t m, int64_t guides, int64_t s
                            double wrong, const double *restrict reach, const float *restrict table,
                            const double *restrict light, int64_t risen, double risen_start, double risen_jump,
                            double sunk_start, double sunk_jump, double stop, double keep, double near,
-                           const double *restrict shifts, int64_t cut, const int64_t *restrict closing,
-                           float *restrict states, double *restrict scratch, double *restrict found)
+                           const double *restrict shifts, const double *restrict gains, int64_t cut,
+                           const int64_t *restrict closing, float *restrict states, double *restrict scratch,
+                           double *restrict found)
 {
     const struct group groups[2] = {{1, risen + 1, (float)risen_start, (float)risen_jump},
                                     {risen + 2, levels + 2, (float)sunk_start, (float)sunk_jump}};
@@ -210,10 +236,12 @@ void chain_log_likelihoods(int64_t sectors, int64_t m, int64_t guides, int64_t s
     const int64_t height = levels + 3; /* rows of states: these and their zeros */
     row_of *restrict off = (row_of *)states, *restrict moved = off + height;
     double *restrict shift = scratch, *restrict at_skyline = shift + sectors * BLOCK;
-    double *restrict lit = at_skyline + sectors * BLOCK;
+    double *restrict lit = at_skyline + sectors * BLOCK, *restrict gain = lit + sectors * BLOCK;
+    const struct cells c = {first, x, left, right, bend, 0, free, guide, guides, highest};
     float clear[BLOCK], total[BLOCK], ended[BLOCK], part[BLOCK];
     int32_t node[BLOCK];
     double logs[BLOCK], product[BLOCK];
+    (void)m;
     (void)rows;
     for (int64_t begin = 0; begin < n; begin += BLOCK) {
         const int64_t points = least(BLOCK, n - begin), filled = (points + LANES - 1) / LANES * LANES;
@@ -221,8 +249,10 @@ void chain_log_likelihoods(int64_t sectors, int64_t m, int64_t guides, int64_t s
         for (int64_t s = 0; s < sectors; s++)
             for (int64_t p = 0; p < points; p++)
                 shift[s * points + p] = shifts[(begin + p) * sectors + s];
-        clear_emissions(sectors, m, guides, points, first, x, left, right, bend, free, guide, scale, highest, wrong,
-                        shift, at_skyline);
+        for (int64_t s = 0; s < sectors && gained > 0; s++)
+            for (int64_t p = 0; p < points; p++)
+                gain[s * points + p] = gains[(begin + p) * sectors + s];
+        fill_clear(&c, sectors, points, scale, wrong, shift, gained > 0 ? gain : 0, at_skyline);
         if (lights > 0)
             clear_emissions(sectors, star_cells, guides, points, star_first, star_x, star_left, star_right, star_bend,
                             star_free, star_guide, star_scale, highest, wrong, shift, lit);

@@ -246,12 +246,21 @@ KERNEL void clear_emissions(int64_t sectors, int64_t m, int64_t guides, int64_t 
                             double *restrict found);
 
 /* Fill `found` [sectors, n] with logarithms of likelihoods of sectors that show the map's skyline with probabilities
-   `clear` [sectors], else anything. */
-KERNEL void clear_logs(int64_t sectors, int64_t m, int64_t guides, int64_t n, const int64_t *restrict first,
+   `clear` [sectors], else anything. `gain` [0 or sectors, n]: see `gains_of_light`. */
+KERNEL void clear_logs(int64_t sectors, int64_t m, int64_t guides, int64_t n, int64_t gained,
+                       const int64_t *restrict first,
                        const double *restrict x, const double *restrict left, const double *restrict right,
                        const double *restrict bend, const double *restrict free, const int32_t *restrict guide,
                        const double *restrict scale, double highest, double wrong, const double *restrict shifts,
-                       const double *restrict clear, double *restrict found);
+                       const double *restrict gain, const double *restrict clear, double *restrict found);
+
+/* Fill `found` [n, sectors] with what the light's log-likelihoods at `shifts` [n, sectors] gain where it stands higher by
+   `lifts` [n, sectors] than the skyline. */
+KERNEL void gains_of_light(int64_t sectors, int64_t m, int64_t guides, int64_t n, const int64_t *restrict first,
+                           const double *restrict x, const double *restrict left, const double *restrict right,
+                           const double *restrict bend, const double *restrict free, const int32_t *restrict guide,
+                           double highest, const double *restrict shifts, const double *restrict lifts,
+                           double *restrict found);
 
 /* Fill `table` [sectors, levels, nodes] with likelihoods of the states but the first at shifts up to `reach` [sectors], on
    nodes closer to each other about 0. The levels' edges are `edge` [edges], each between `lower` and `upper`, which
@@ -274,11 +283,12 @@ KERNEL void emissions(int64_t sectors, int64_t m, int64_t guides, int64_t levels
 
 /* Fill `found` [n] with log-likelihoods at `shifts` [n, sectors] of the chain of states around the circle, which is cut at
    the sector `cut` and closed over its states `closing`. `table` and `reach`: see `prepare_levels`. `light` [0 or
-   sectors]: likelihoods of light with its own edge, beside the cells of the stars alone. Probabilities from sector to
-   sector: see obstacle_chain.py. Scratch: `states` [2 (levels + 3), 64], [3, sectors, 64]. */
+   sectors]: likelihoods of light with its own edge, beside the cells of the stars alone. `gains` [0 or n, sectors] of the
+   first state: see `gains_of_light`. Probabilities from sector to sector: see obstacle_chain.py. Scratch: `states`
+   [2 (levels + 3), 64], [4, sectors, 64]. */
 KERNEL void chain_log_likelihoods(int64_t sectors, int64_t m, int64_t guides, int64_t star_cells, int64_t levels,
-                                  int64_t nodes, int64_t lights, int64_t n, int64_t closings, int64_t rows,
-                                  const int64_t *restrict first, const double *restrict x, const double *restrict left,
+                                  int64_t nodes, int64_t lights, int64_t n, int64_t gained, int64_t closings,
+                                  int64_t rows, const int64_t *restrict first, const double *restrict x, const double *restrict left,
                                   const double *restrict right, const double *restrict bend,
                                   const double *restrict free, const int32_t *restrict guide,
                                   const double *restrict scale, const int64_t *restrict star_first,
@@ -289,8 +299,9 @@ KERNEL void chain_log_likelihoods(int64_t sectors, int64_t m, int64_t guides, in
                                   const double *restrict reach, const float *restrict table,
                                   const double *restrict light, int64_t risen, double risen_start, double risen_jump,
                                   double sunk_start, double sunk_jump, double stop, double keep, double near,
-                                  const double *restrict shifts, int64_t cut, const int64_t *restrict closing,
-                                  float *restrict states, double *restrict scratch, double *restrict found);
+                                  const double *restrict shifts, const double *restrict gains, int64_t cut,
+                                  const int64_t *restrict closing, float *restrict states, double *restrict scratch,
+                                  double *restrict found);
 
 /* Fill `post` [sectors, states] with the probabilities of the states of a closed chain, of likelihoods `e` and transitions
    `T` from rows to columns, by two rounds forward (which fill `f`) and backward. Scratch: [states + 2, states]. */

@@ -89,19 +89,20 @@ def _sector_logs(
     The stars alone count where the light rather has an edge of its own (`lit`) than ends at the skyline (`clear`).
     """
     moved = model.with_likely_errors(parameters[:2] + offsets, clear)
-    shifts, prior = model.with_linear_errors(model.shifts(moved))
-    logs = clear_logs(model.seen.profiles, shifts, clear)
+    shifts, lifts, prior = model.with_linear_errors(model.shifts(moved))
+    logs = clear_logs(model.seen.profiles, shifts, clear, model.seen.gains(shifts, lifts))
     if model.seen.edge is not None:
         logs = np.where(lit > clear, clear_logs(model.seen.edge.stars, shifts, np.minimum(clear + lit, 1.0)), logs)
     return logs, prior + model.basis.log_prior(moved[:, 2:])
 
 
-def clear_logs(profiles: Profiles, shifts: Array, clear: Array) -> Array:
+def clear_logs(profiles: Profiles, shifts: Array, clear: Array, gains: Array | None = None) -> Array:
     """Log-likelihoods (n, SECTORS) where sectors show the map's skyline with probabilities `clear` (SECTORS,).
 
-    `shifts` (n, SECTORS) [rad] are of the skyline, which has the `profiles`.
+    `shifts` (n, SECTORS) [rad] are of the skyline, which has the `profiles`; `gains` (n, SECTORS) are those of the
+    light by errors of the image, None: 0.
     """
-    return log_clear_emissions(profiles, shifts.T, clear).T
+    return log_clear_emissions(profiles, shifts.T, clear, None if gains is None else gains.T).T
 
 
 def _moments(offsets_m: Array, logs: Array) -> tuple[Array, Array]:

@@ -1,7 +1,8 @@
 """Errors of the skyline that are linear at any size, integrated in closed form: of the image, and waves of the map's.
 
-Where sectors see heights of the skyline with known variances, the likeliest errors follow from a linear model, and the
-integral over them is the density at these times a volume that is the same everywhere.
+At a skyline, the errors of the image are shown by the light of the sky alone, which they lift above it; the waves by
+all rows, which see the skyline where it is. Where sectors see heights with known variances, the likeliest errors follow
+from a linear model, and the integral over them is the density at these times a volume that is the same everywhere.
 
 A gross error of the waves is a seam besides: between two azimuths the map is too high or too low by one normal error,
 all pairs of SEAM_ENDS azimuths equally likely. It is integrated over its size in closed form, and summed over its ends.
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,17 +24,28 @@ from startrack.terrain import WAVES
 SEAM_ENDS = 48  # azimuths where a seam may end
 
 
+class Lifts(NamedTuple):
+    """Errors (i,) of the image, which lift the light of the sky above the skyline, and what this light alone shows."""
+
+    lift_rad: Array  # (SECTORS, i) by one unit of each
+    weight: Array  # (SECTORS,) 1 / variance of the light's height; at most that of the light and the stars together
+    above_rad: Array  # (SECTORS,) height of the light above that of light and stars together
+
+
+NO_LIFTS = Lifts(np.zeros((SECTORS, 0)), np.zeros(SECTORS), np.zeros(SECTORS))
+
+
 @dataclass(frozen=True, eq=False)
 class LinearErrors:
-    """Normal errors (j,) that raise the skyline, with the weights of the sectors that show them."""
+    """Normal errors (j,) of mean 0, first those of the image, with the weights of the sectors that show them."""
 
-    rise_rad: Array  # (SECTORS, j) by one unit of each
-    mean: Array  # (j,)
+    rise_rad: Array  # (SECTORS, j) of the skyline that light and stars together show, by one unit of each
     covariance: Array  # (j, j)
     wide_covariance: Array  # (j, j) of a normal distribution as wide as the errors with a seam
     weight: Array  # (SECTORS,) 1 / variance of the heights that the sectors see; next to 0 where the rows show none
     waves: int  # how many of them, the last ones, are waves of the map's error
     seams_rad: Array  # (SECTORS, c) by one standard deviation of each seam, of which there is one; c = 0: none
+    lifts: Lifts = NO_LIFTS
 
     @classmethod
     def of(cls, seen: SectorRows, errors: SharedErrors, gross: str, clear: Array) -> LinearErrors:
@@ -48,16 +61,26 @@ class LinearErrors:
         rise = np.column_stack([seen.image_rise, slopes.T])
         seams = WAVES.gross_sigma * list_seams() if errors.are_waves(gross) else np.zeros((SECTORS, 0))
         weight = clear * seen.moments.information / seen.moments.variance_rad2
-        return cls(rise, np.r_[image.mean, np.zeros(size - j)], plain, wide, weight, size - j, seams)
+        lifts = _lifts_of(seen, clear, weight) if j else NO_LIFTS
+        return cls(rise, plain, wide, weight, size - j, seams, lifts)
 
     def __len__(self) -> int:
-        return len(self.mean)
+        return len(self.covariance)
+
+    @property
+    def images(self) -> int:
+        """Number of the errors of the image."""
+        return len(self) - self.waves
 
     @property
     def sigma_of_waves_rad(self) -> Array:
         """Rise (SECTORS, w) [rad] of the skyline by one standard deviation of each wave."""
-        own = slice(len(self) - self.waves, None)
-        return np.asarray(self.rise_rad[:, own] * np.sqrt(np.diag(self.covariance)[own]))
+        return np.asarray(self.wave_rise_rad * np.sqrt(np.diag(self.covariance)[self.images :]))
+
+    @property
+    def wave_rise_rad(self) -> Array:
+        """Rise (SECTORS, w) [rad] of the skyline by one unit of each wave."""
+        return self.rise_rad[:, self.images :]
 
     @cached_property
     def inverse(self) -> Array:
@@ -65,19 +88,33 @@ class LinearErrors:
         return np.asarray(np.linalg.inv(self.covariance))
 
     @cached_property
-    def expected_rad(self) -> Array:
-        """Rise (SECTORS,) [rad] of the skyline by the expected errors."""
-        return np.asarray(self.rise_rad @ self.mean)
+    def weighted(self) -> Array:
+        """Information (SECTORS, j) on the errors in a height that a sector sees, light and stars alike."""
+        of_image = self.lifts.lift_rad * self.lifts.weight[:, None]
+        return np.hstack([of_image, self.wave_rise_rad * self.weight[:, None]])
 
     @cached_property
     def _information(self) -> Array:
         """Information (j, j) on the errors by the sectors and the prior."""
-        return np.asarray((self.rise_rad.T * self.weight) @ self.rise_rad + self.inverse)
+        own, waves = slice(0, self.images), slice(self.images, None)
+        found = self.inverse.copy()
+        found[own, own] += self.weighted[:, own].T @ self.lifts.lift_rad
+        found[own, waves] += self.weighted[:, own].T @ self.wave_rise_rad
+        found[waves, own] = found[own, waves].T
+        found[waves, waves] += self.weighted[:, waves].T @ self.wave_rise_rad
+        return found
 
     @cached_property
     def gain(self) -> Array:
         """Matrix (j, SECTORS) from heights that are left to the likeliest errors."""
-        return np.asarray(np.linalg.solve(self._information, self.rise_rad.T * self.weight))
+        return np.asarray(np.linalg.solve(self._information, self.weighted.T))
+
+    @cached_property
+    def _gain_of_light(self) -> Array:
+        """Matrix (j, SECTORS) to them from what the light stands higher than light and stars together."""
+        of_image = np.zeros_like(self.weighted)
+        of_image[:, : self.images] = self.weighted[:, : self.images]
+        return np.asarray(np.linalg.solve(self._information, of_image.T))
 
     @cached_property
     def log_volume(self) -> float:
@@ -85,26 +122,32 @@ class LinearErrors:
         return 0.5 * float(np.linalg.slogdet(self.inverse)[1] - np.linalg.slogdet(self._information)[1])
 
     @cached_property
-    def _score_of_seams(self) -> tuple[Array, Array]:
-        """Gradient (SECTORS, c) with the size of each seam by heights that are left, and its information (c,)."""
-        score = self.weight[:, None] * (self.seams_rad - self.rise_rad @ (self.gain @ self.seams_rad))
-        return score, 1.0 + np.sum(self.seams_rad * score, axis=0)
+    def _seams_seen(self) -> tuple[Array, Array]:
+        """Gradient (j, c) of the errors with the size of each seam, and the information (c,) on that size."""
+        seen = self.weighted.T @ self.seams_rad
+        by_sectors = np.sum(np.square(self.seams_rad) * self.weight[:, None], axis=0)
+        return seen, 1.0 + by_sectors - np.sum(seen * np.linalg.solve(self._information, seen), axis=0)
 
-    def fit(self, left_rad: Array) -> tuple[Array, Array]:
-        """Rise (n, SECTORS) [rad] by the likeliest errors, less the expected, and the logarithm (n,) of a ratio.
+    def fit(self, left_rad: Array, lifts_rad: Array | None = None) -> tuple[Array, Array | None, Array]:
+        """Rise (n, SECTORS) [rad] by the likeliest waves, lifts of the light, and the logarithm (n,) of a ratio.
 
         The ratio is that of the integral to the likelihood at these errors. `left_rad` (n, SECTORS) are the heights
-        that the sectors see above the skyline with the expected errors.
+        that the sectors see above the skyline, `lifts_rad` (n, SECTORS) are lifts by other errors; None, here and of
+        those found: 0.
         """
-        errors, seam_rad, log = self._fit(left_rad)
-        return errors @ self.rise_rad.T + seam_rad, log
+        errors, seam_rad, log = self._fit(left_rad, lifts_rad)
+        if self.images:
+            own = errors[:, : self.images] @ self.lifts.lift_rad.T
+            lifts_rad = own if lifts_rad is None else own + lifts_rad
+        return errors[:, self.images :] @ self.wave_rise_rad.T + seam_rad, lifts_rad, log
 
-    def _fit(self, left_rad: Array) -> tuple[Array, Array, Array]:
-        """Errors (n, j) less their mean, rise (n, SECTORS) by a seam, and the logarithm; see `fit`."""
+    def _fit(self, left_rad: Array, lifts_rad: Array | None) -> tuple[Array, Array, Array]:
+        """Errors (n, j), rise (n, SECTORS) by a seam, and the logarithm; see `fit`."""
         seam_rad, log = np.zeros_like(left_rad), np.full(len(left_rad), self.log_volume)
+        errors, left_rad = self.likeliest(left_rad, lifts_rad)
         if self.seams_rad.shape[1]:
-            score, information = self._score_of_seams
-            gradient = left_rad @ score
+            seen, information = self._seams_seen
+            gradient = left_rad @ (self.weight[:, None] * self.seams_rad) - errors @ seen
             logs = 0.5 * np.square(gradient) / information - 0.5 * np.log(information)
             best = np.argmax(logs, axis=1)
             best_gradient = np.take_along_axis(gradient, best[:, None], axis=1)[:, 0]
@@ -112,13 +155,28 @@ class LinearErrors:
             seam_rad = size[:, None] * self.seams_rad.T[best]
             log += np.logaddexp.reduce(logs, axis=1) - np.log(logs.shape[1])
             log -= 0.5 * (best_gradient * size + np.square(size))
-        errors = (left_rad - seam_rad) @ self.gain.T
+            errors = errors - seam_rad @ self.gain.T
         return errors, seam_rad, log - 0.5 * np.einsum("ni,ij,nj->n", errors, self.inverse, errors)
+
+    def likeliest(self, left_rad: Array, lifts_rad: Array | None = None) -> tuple[Array, Array]:
+        """Errors (n, j) without a seam, see `fit`, and the heights (n, SECTORS) that are left without the lifts."""
+        above_rad = self.lifts.above_rad
+        if lifts_rad is not None:
+            part = np.divide(self.lifts.weight, self.weight, out=np.zeros(SECTORS), where=self.weight > 0.0)
+            left_rad, above_rad = left_rad - part * lifts_rad, above_rad - (1.0 - part) * lifts_rad
+        return left_rad @ self.gain.T + above_rad @ self._gain_of_light.T, left_rad
 
     def waves_rad(self, left_rad: Array) -> Array:
         """Rise (SECTORS,) [rad] of the skyline by the likeliest waves and seam at `left_rad` (SECTORS,); see `fit`."""
-        own, (errors, seam_rad, _) = slice(len(self) - self.waves, None), self._fit(left_rad[None])
-        return np.asarray(self.rise_rad[:, own] @ errors[0, own] + seam_rad[0])
+        return np.asarray(self.fit(left_rad[None])[0][0])
+
+
+def _lifts_of(seen: SectorRows, clear: Array, weight: Array) -> Lifts:
+    """Lifts of the light in the rows `seen`; `clear` (SECTORS,) and `weight` (SECTORS,) as those of LinearErrors."""
+    alone, together, lit = seen.light.moments, seen.moments, np.zeros(SECTORS) if seen.edge is None else seen.edge.lit
+    own = (1.0 - lit) * clear * alone.information / alone.variance_rad2
+    own[np.isinf(seen.image_errors.variance_rad2)] = 0.0
+    return Lifts(seen.image_errors.raised_rad, np.minimum(own, weight), alone.mean_rad - together.mean_rad)
 
 
 def list_seams() -> Array:

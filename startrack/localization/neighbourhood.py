@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from startrack.core.statistics import interpolate_circle
-from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, ImageErrors
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Bools, Evidence, ImageErrors, sector_of
 from startrack.localization.obstacle_chain import (
     LIT_MOVES,
     MOVES,
@@ -18,6 +18,7 @@ from startrack.localization.obstacle_chain import (
     Moves,
     clear_emissions,
     emissions,
+    gains_of_light,
     prepare_levels,
 )
 from startrack.localization.shared_errors import SharedErrors
@@ -154,7 +155,11 @@ class OwnEdge(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SectorRows:
-    """The rows of an image about the skyline of a neighbourhood."""
+    """The rows of an image about the skyline of a neighbourhood.
+
+    Errors of the image lift the light of the sky above the skyline, and not the stars. Heights of the light are those
+    without the lift that is expected.
+    """
 
     around: Neighbourhood
     rows: Evidence
@@ -170,12 +175,38 @@ class SectorRows:
             near = np.flatnonzero(np.abs(above) < TRACED_RAD)
             traced = terrain.horizon_rad(self.around.reference_m[None], rows.azimuth_rad[near])
             above[near] = rows.elevation_rad[near] - np.asarray(traced).ravel()
-        return above
+        return self._without_lift(above, self.image_errors.raised_rad @ self.image_errors.mean)
+
+    def _without_lift(self, above_rad: Array, lift_rad: Array) -> Array:
+        """Heights (n,) of the rows where the light is not lifted by `lift_rad` (SECTORS,)."""
+        return np.where(self.is_light, above_rad - lift_rad[sector_of(self.rows.azimuth_rad)], above_rad)
+
+    @cached_property
+    def is_light(self) -> Bools:
+        """Whether each row (n,) is of the light of the sky, not of a star."""
+        return np.asarray(self.rows.extended_nats > 0.0)
 
     @cached_property
     def profiles(self) -> Profiles:
         """Log-likelihoods of the rows of each sector by the height of the skyline."""
         return profiles_of(self.rows, self.above_rad, self.around.map_sigma_rad)
+
+    def profiles_without(self, lift_rad: Array | None) -> Profiles:
+        """The `profiles` of light lifted by `lift_rad` (SECTORS,) beyond what is expected; None: by nothing."""
+        if lift_rad is None:
+            return self.profiles
+        return profiles_of(self.rows, self._without_lift(self.above_rad, lift_rad), self.around.map_sigma_rad)
+
+    @cached_property
+    def light(self) -> SectorRows:
+        """The rows of the light of the sky alone."""
+        if self.is_light.all():
+            return self
+        return replace(self, rows=self.rows.take(np.flatnonzero(self.is_light)), edge=None)
+
+    def gains(self, shifts: Array, lifts: Array | None) -> Array | None:
+        """What log-likelihoods of the map's skyline at `shifts` gain (n, SECTORS) by `lifts` of the light; None: 0."""
+        return None if lifts is None else gains_of_light(self.light.profiles, shifts, lifts)
 
     @cached_property
     def moments(self) -> SectorMoments:
@@ -196,9 +227,12 @@ class SectorRows:
         """Probabilities of the chain's states from sector to sector."""
         return MOVES if self.edge is None else LIT_MOVES
 
-    def emissions(self, shift: Array) -> Array:
-        """Likelihoods (SECTORS, STATES) of the chain's states at shifts (SECTORS,) [rad] of the map's skyline."""
-        found = emissions(self.profiles, shift)
+    def emissions(self, shift: Array, lift_rad: Array | None = None) -> Array:
+        """Likelihoods (SECTORS, STATES) of the chain's states at shifts (SECTORS,) [rad] of the map's skyline.
+
+        `lift_rad` (SECTORS,) is that of the light beyond what is expected; None: 0.
+        """
+        found = emissions(self.profiles_without(lift_rad), shift)
         if self.edge is not None:
             at_skyline = clear_emissions(self.edge.stars, np.ascontiguousarray(shift)[:, None])
             found[:, RISEN + 1 :] = at_skyline * self.edge.light[:, None]

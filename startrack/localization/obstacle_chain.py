@@ -98,12 +98,25 @@ def clear_emissions(profiles: Profiles, shifts: Array) -> Array:
     return found
 
 
-def log_clear_emissions(profiles: Profiles, shifts: Array, clear: Array) -> Array:
-    """Logarithms (SECTORS, n) of likelihoods of sectors that show the map's skyline with probabilities `clear`."""
+def log_clear_emissions(profiles: Profiles, shifts: Array, clear: Array, gains: Array | None = None) -> Array:
+    """Logarithms (SECTORS, n) of likelihoods of sectors that show the map's skyline with probabilities `clear`.
+
+    `gains` (SECTORS, n) are those of the light, see `gains_of_light`; None: 0.
+    """
     found = np.empty(shifts.shape)
+    more = np.zeros((0, shifts.shape[1])) if gains is None else np.ascontiguousarray(gains)
     _clear_logs(
-        *take(profiles, _VALUES), HIGH_RAD, WRONG_SECTOR, np.ascontiguousarray(shifts), np.ascontiguousarray(clear),
-        found,
+        *take(profiles, _VALUES), HIGH_RAD, WRONG_SECTOR, np.ascontiguousarray(shifts), more,
+        np.ascontiguousarray(clear), found,
+    )  # fmt: skip
+    return found
+
+
+def gains_of_light(light: Profiles, shifts: Array, lifts: Array) -> Array:
+    """What F of the `light` gains (n, SECTORS) where it stands higher than a skyline at `shifts` by `lifts` [rad]."""
+    found = np.empty(shifts.shape)
+    _gains_of_light(
+        *take(light, _LIGHT), HIGH_RAD, np.ascontiguousarray(shifts), np.ascontiguousarray(lifts), found
     )  # fmt: skip
     return found
 
@@ -118,23 +131,26 @@ def emissions(profiles: Profiles, shift: Array) -> Array:
 
 
 def chain_log_likelihoods(
-    profiles: Profiles, levels: Levels, moves: Moves, shifts: Array, cut: int, closing: Ints, found: Array
-) -> None:
+    profiles: Profiles, levels: Levels, moves: Moves, shifts: Array, cut: int, closing: Ints, found: Array,
+    gains: Array | None = None,
+) -> None:  # fmt: skip
     """Fill found (n,) with the log-likelihoods at shifts (n, SECTORS) of the map's skyline.
 
     The circle is cut at the sector `cut` and closed over its states `closing`. Blocks of points go from sector to
-    sector together, in float32, which is right to 1e-5 nats.
+    sector together, in float32, which is right to 1e-5 nats. `gains` (n, SECTORS) of the map's skyline are those of the
+    light, see `gains_of_light`; None: 0.
     """
     risen, sunk = moves.risen, moves.sunk
     _chain(
         *take(profiles, _VALUES), *take(levels.stars, _VALUES), HIGH_RAD, WRONG_SECTOR, levels.reach, levels.table,
         levels.light, RISEN, risen.start, risen.jump, sunk.start, sunk.jump, moves.stop, moves.keep, moves.near,
-        np.ascontiguousarray(shifts), cut, closing, np.empty((2 * (STATES + 2), 64), np.float32),
-        np.empty((3, shifts.shape[1], 64)), found,
+        np.ascontiguousarray(shifts), np.zeros((0, shifts.shape[1])) if gains is None else gains, cut, closing,
+        np.empty((2 * (STATES + 2), 64), np.float32), np.empty((4, shifts.shape[1], 64)), found,
     )  # fmt: skip
 
 
 _VALUES = "first x left right bend free guide scale"
+_LIGHT = "first x left right bend free guide"
 _SUMS = "first x integral free guide scale hidden"
 _ALL = "first x left right bend integral free guide scale hidden"
 _WINDOW = ("highest: float64", "wrong: float64")
@@ -147,8 +163,13 @@ _prepare_levels = kernel(
 )  # fmt: skip
 _clear_emissions = kernel("clear_emissions", *declare(_VALUES), *_WINDOW, _SHIFTS, "found: out float64[sectors, n]")
 _clear_logs = kernel(
-    "clear_logs", *declare(_VALUES), *_WINDOW, _SHIFTS, "clear: float64[sectors]", "found: out float64[sectors, n]"
-)
+    "clear_logs", *declare(_VALUES), *_WINDOW, _SHIFTS, "gain: float64[gained, n]", "clear: float64[sectors]",
+    "found: out float64[sectors, n]",
+)  # fmt: skip
+_gains_of_light = kernel(
+    "gains_of_light", *declare(_LIGHT), _WINDOW[0], "shifts: float64[n, sectors]", "lifts: float64[n, sectors]",
+    "found: out float64[n, sectors]",
+)  # fmt: skip
 _emissions = kernel(
     "emissions", *declare(_ALL), *_WINDOW, "shift: float64[sectors]", *_BANDS, "found: out float64[sectors, states]"
 )
@@ -156,8 +177,9 @@ _MOVES = ("risen_start", "risen_jump", "sunk_start", "sunk_jump", "stop", "keep"
 _chain = kernel(
     "chain_log_likelihoods", *declare(_VALUES), *declare(_VALUES, "star_", "star_cells"), *_WINDOW,
     "reach: float64[sectors]", "table: float32[sectors, levels, nodes]", "light: float64[lights]", "risen: int64",
-    *(f"{name}: float64" for name in _MOVES), "shifts: float64[n, sectors]", "cut: int64", "closing: int64[closings]",
-    "states: out float32[rows, 64]", "scratch: out float64[3, sectors, 64]", "found: out float64[n]",
+    *(f"{name}: float64" for name in _MOVES), "shifts: float64[n, sectors]", "gains: float64[gained, sectors]",
+    "cut: int64", "closing: int64[closings]", "states: out float32[rows, 64]", "scratch: out float64[4, sectors, 64]",
+    "found: out float64[n]",
 )  # fmt: skip
 
 

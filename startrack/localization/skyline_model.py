@@ -139,21 +139,26 @@ class SkylineModel:
         values = self.basis.mean + self.basis.shown @ parameters[2:]
         if self.errors.clock is not None and not self.terrain.axisymmetric:
             values[-1] = 0.0
-        left_rad = self.seen.moments.mean_rad - self.shifts(parameters[None])[0] - self.linear.expected_rad
+        left_rad = self.seen.moments.mean_rad - self.shifts(parameters[None])[0]
         by_waves = self.linear.waves_rad(left_rad)
         return np.asarray(values @ self.error_slopes_rad + by_waves + self.around.expected_rise_rad)
 
     def log_likelihood(self, parameters: Array) -> Array:
         """Log-likelihoods (n,) of parameters (n, 2 + a): position [m], and coordinates of the errors in `basis`."""
-        shifts, prior = self.with_linear_errors(self.shifts(parameters))
-        return self.log_likelihood_of(shifts) + prior
+        shifts, lifts, prior = self.with_linear_errors(self.shifts(parameters))
+        return self.log_likelihood_of(shifts, lifts) + prior
 
-    def log_likelihood_of(self, shifts: Array) -> Array:
-        """Log-likelihoods (n,) of shifts (n, SECTORS) [rad] of the map's skyline."""
+    def log_likelihood_of(self, shifts: Array, lifts: Array | None = None) -> Array:
+        """Log-likelihoods (n,) of shifts (n, SECTORS) [rad] of the map's skyline.
+
+        `lifts` (n, SECTORS) [rad] are those of the light above the skyline, beyond what is expected; None: 0. The
+        states of obstacles are wider than they are: these have the light as it is expected.
+        """
         seen, found = self.seen, np.empty(len(shifts))
         cut, closing = self._closing
         levels = self.levels.at_least(seen, shifts)
-        chain_log_likelihoods(seen.profiles, levels, seen.moves, shifts, cut, closing, found)
+        gains = seen.gains(shifts, lifts)
+        chain_log_likelihoods(seen.profiles, levels, seen.moves, shifts, cut, closing, found, gains)
         return found
 
     @cached_property
@@ -163,37 +168,45 @@ class SkylineModel:
             return self.closing
         return closing_of(self.states_at(np.zeros(SECTORS)))
 
-    def shift_of(self, parameters: Array) -> Array:
-        """Rise (SECTORS,) [rad] of the map's skyline from the reference to parameters (2 + a,), with linear errors."""
-        return np.asarray(self.with_linear_errors(self.shifts(parameters[None]))[0][0])
+    def shift_of(self, parameters: Array) -> tuple[Array, Array | None]:
+        """Rise (SECTORS,) [rad] of the map's skyline from the reference to parameters (2 + a,), with linear errors.
+
+        And the lift (SECTORS,) [rad] of the light by those of the image; None: 0.
+        """
+        shifts, lifts, _ = self.with_linear_errors(self.shifts(parameters[None]))
+        return np.asarray(shifts[0]), None if lifts is None else np.asarray(lifts[0])
 
     def states(self, parameters: Array) -> Array:
         """Probabilities (SECTORS, STATES) of the chain's states at parameters (2 + a,)."""
-        return self.states_at(self.shift_of(parameters))
+        return self.states_at(*self.shift_of(parameters))
 
     def lit(self, states: Array) -> Array:
         """Probabilities (SECTORS,) that the light has an edge of its own, by those of the `states`."""
         return states[:, RISEN + 1 :].sum(axis=1) if self.seen.edge is not None else np.zeros(SECTORS)
 
-    def states_at(self, shift: Array) -> Array:
-        """Probabilities (SECTORS, STATES) of the chain's states at a `shift` (SECTORS,) of the map's skyline."""
-        return state_probabilities(self.seen.emissions(shift), self.seen.moves)
+    def states_at(self, shift: Array, lift_rad: Array | None = None) -> Array:
+        """Probabilities (SECTORS, STATES) of the chain's states at a `shift` (SECTORS,) of the map's skyline.
+
+        `lift_rad` (SECTORS,) is that of the light beyond what is expected; None: 0.
+        """
+        return state_probabilities(self.seen.emissions(shift, lift_rad), self.seen.moves)
 
     @cached_property
     def linear(self) -> LinearErrors:
         """The errors that are integrated in closed form."""
         return LinearErrors.of(self.seen, self.errors, self.gross, self.clear)
 
-    def with_linear_errors(self, shifts: Array) -> tuple[Array, Array]:
-        """Shifts (n, SECTORS) [rad] with the likeliest linear errors added, and a logarithm (n,).
+    def with_linear_errors(self, shifts: Array, lifts: Array | None = None) -> tuple[Array, Array | None, Array]:
+        """Shifts and lifts of the light (n, SECTORS) [rad] with the likeliest linear errors added; a logarithm (n,).
 
-        The logarithm is that of the integral of the likelihood over these errors, in the likelihood at the shifts.
+        The logarithm is that of the integral of the likelihood over these errors, in the likelihood there. `lifts`,
+        here and of those found: None where there are none.
         """
         linear = self.linear
         if not len(linear):
-            return np.ascontiguousarray(shifts), np.zeros(len(shifts))
-        rise_rad, integral = linear.fit(self.seen.moments.mean_rad - shifts - linear.expected_rad)
-        return np.ascontiguousarray(shifts + linear.expected_rad + rise_rad), integral
+            return np.ascontiguousarray(shifts), lifts, np.zeros(len(shifts))
+        rise_rad, lifts, integral = linear.fit(self.seen.moments.mean_rad - shifts, lifts)
+        return np.ascontiguousarray(shifts + rise_rad), lifts, integral
 
     def solve(self) -> tuple[Array, Array, Array]:
         """Parameters (2 + a,) by the linear model of the sectors, their covariance, and weights (SECTORS,)."""
@@ -204,7 +217,7 @@ class SkylineModel:
         prior[k:, k:] = np.linalg.inv(linear.wide_covariance)
         moments = self.seen.moments
         left = moments._replace(mean_rad=moments.mean_rad - self._expected_rise)
-        found = solve_linear(left, design, np.r_[np.zeros(k), linear.mean], prior)
+        found = solve_linear(left, design, np.zeros(len(prior)), prior)
         parameters, covariance, weight = found
         return np.r_[parameters[:2] + self.around.reference_m, parameters[2:k]], covariance[:k, :k], weight
 

@@ -17,7 +17,7 @@ from startrack.core.statistics import shares
 from startrack.core.types import SECTORS, Array
 from startrack.kernels.library import kernel
 from startrack.localization.hypothesis import Hypothesis
-from startrack.localization.neighbourhood import OwnEdge, SectorRows
+from startrack.localization.neighbourhood import OwnEdge
 from startrack.localization.obstacle_chain import clear_emissions
 from startrack.localization.shared_errors import OWN_EDGE
 from startrack.localization.skyline_model import SkylineModel
@@ -66,28 +66,31 @@ def with_own_edge(plain: Hypothesis, half_m: float) -> SkylineModel | None:
     It serves positions within `half_m` of the same reference.
     """
     seen, errors = plain.model.seen, plain.model.errors
-    rows = seen.rows
-    is_light = rows.extended_nats > 0.0
+    rows, is_light = seen.rows, seen.is_light
     if is_light.all() or not is_light.any():
         return None
     around = replace(plain.model.around, half_m=half_m)
-    stars, light = (SectorRows(around, rows.take(np.flatnonzero(own))) for own in (~is_light, is_light))
+    stars, light = (
+        replace(seen, around=around, rows=rows.take(np.flatnonzero(own)), edge=None) for own in (~is_light, is_light)
+    )
     width_rad = float(np.median(rows.edge_sigma_rad[is_light]))
-    shift = plain.model.shift_of(plain.sampled.share @ plain.sampled.points)
+    shift, lift_rad = plain.model.shift_of(plain.sampled.share @ plain.sampled.points)
     logs = list_free_logs(light.profiles, shift, EDGE_REACH * width_rad, EDGE_ROUGHNESS * width_rad)
     whole, likely = logs.sum(axis=1), shares(logs.sum(axis=1)) @ logs
     likely += (np.logaddexp.reduce(whole) - np.log(len(whole)) - likely.sum()) / SECTORS  # all equally likely before
     offset = light.profiles.offset + stars.profiles.offset - seen.profiles.offset  # the same about one reference
     edge = OwnEdge(stars.profiles, np.exp(likely + offset), np.ones(SECTORS))
     by_stars = SkylineModel(replace(seen, around=around, edge=edge), errors, around.error_slopes_rad(errors), OWN_EDGE)
-    return replace(by_stars, seen=replace(by_stars.seen, edge=edge._replace(lit=_find_lit(by_stars, shift))))
+    return replace(by_stars, seen=replace(by_stars.seen, edge=edge._replace(lit=_find_lit(by_stars, shift, lift_rad))))
 
 
-def _find_lit(by_stars: SkylineModel, shift: Array) -> Array:
+def _find_lit(by_stars: SkylineModel, shift: Array, lift_rad: Array | None) -> Array:
     """Probabilities (SECTORS,) of light with its own edge at the likelier skyline: the `shift`, or that of the stars.
 
-    All light has its own edge in the linear model of `by_stars`.
+    The light is lifted by `lift_rad` (SECTORS,) above the `shift`; None: by nothing. All light has its own edge in the
+    linear model of `by_stars`.
     """
-    shifts = np.stack([shift, by_stars.shift_of(by_stars.solve()[0])])
-    likelier = shifts[int(np.argmax(by_stars.log_likelihood_of(shifts)))]
-    return by_stars.lit(by_stars.states_at(likelier))
+    shifts = np.stack([shift, by_stars.shift_of(by_stars.solve()[0])[0]])
+    lifts = None if lift_rad is None else np.stack([lift_rad, np.zeros(SECTORS)])
+    likelier = int(np.argmax(by_stars.log_likelihood_of(shifts, lifts)))
+    return by_stars.lit(by_stars.states_at(shifts[likelier], None if lifts is None else lifts[likelier]))

@@ -47,8 +47,8 @@ def require_files(found: Sequence[Hypothesis], parameters: Array) -> None:
         parameters: (2 + a,) of the likeliest position and errors.
     """
     model, whole = found[0].model, first_plain(found).model
-    shift = model.shift_of(parameters)
-    free = free_log_likelihood(whole.seen.profiles, shift)
+    shift, lift_rad = model.shift_of(parameters)
+    free = free_log_likelihood(whole.seen.profiles_without(lift_rad), shift)
     better = free + whole.seen.log_offset - _log_map(found[0], parameters) - model.seen.log_offset
     if better > 0.0:
         wrong = Blocked(1.0 - model.states(parameters)[:, 0])
@@ -77,12 +77,13 @@ def require_files(found: Sequence[Hypothesis], parameters: Array) -> None:
 def _log_map(best: Hypothesis, parameters: Array) -> float:
     """Log-likelihood of the best point; with a gross error, as of a wrong map that may have any shape in a range."""
     model = best.model
-    value = float(model.log_likelihood_of(model.shift_of(parameters)[None])[0])
+    shifts, lifts, integral = model.with_linear_errors(model.shifts(parameters[None]))
+    value = float(model.log_likelihood_of(shifts, lifts)[0])
     if not best.gross:
         return value
     if model.errors.are_waves(best.gross):
         seams = model.linear.seams_rad.shape[1]  # a free skyline steps anywhere too
-        return value + float(model.with_linear_errors(model.shifts(parameters[None]))[1][0] + np.log(seams))
+        return value + float(integral[0] + np.log(seams))
     own = model.errors.is_of_fact(best.gross)
     sigma, z = model.errors.sigma(best.gross)[own], parameters[2:] @ model.basis.shown[own].T
     return value - float(np.sum(0.5 * np.square(z / sigma) + np.log(sigma * np.sqrt(2 * np.pi) / WIDE_SHAPE)))

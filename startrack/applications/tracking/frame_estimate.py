@@ -73,15 +73,19 @@ class FrameModel:
 
     def shifts(self, parameters: Array) -> Array:
         """Shift (n, SECTORS) [rad] of the map's skyline from the reference's, without errors of the image's own."""
-        found = self.model.shifts(self.errors.to_model(parameters, self.model.seen.rows))
-        if self.errors.uses_sky:
-            found = found + np.outer(parameters[:, -1], self.rise_rad[:, -1])
-        return found
+        return self.model.shifts(self.errors.to_model(parameters, self.model.seen.rows))
+
+    def lifts(self, parameters: Array) -> Array | None:
+        """Lift (n, SECTORS) [rad] of the light above the skyline by the edge, which frames share; None: 0."""
+        raised = self.model.seen.image_errors.raised_rad
+        if not self.errors.uses_sky or not raised.shape[1]:
+            return None
+        return np.outer(self.errors.sigma[-1] * parameters[:, -1], raised[:, 0])
 
     def log_likelihood(self, parameters: Array) -> Array:
         """Log-likelihood (n,) of `parameters` (n, 2 + k), with the prior of the likeliest linear errors there."""
-        shifts, prior = self.model.with_linear_errors(self.shifts(parameters))
-        return self.model.log_likelihood_of(shifts) + prior
+        shifts, lifts, prior = self.model.with_linear_errors(self.shifts(parameters), self.lifts(parameters))
+        return self.model.log_likelihood_of(shifts, lifts) + prior
 
     def is_allowed(self, parameters: Array) -> Array:
         """Whether a camera can stand at each of `parameters` (n, 2 + k), in the neighbourhood of the reference."""
@@ -97,17 +101,23 @@ class FrameModel:
         """Change (n, SECTORS) [1/rad] of the log-likelihood with the skyline, at points with a `share` (n,) of weight.
 
         The edge of a single star is a step: the change is taken over a part of the skyline's spread. Sectors count by
-        their probability to show the map's skyline. The likeliest linear errors follow the skyline.
+        their probability to show the map's skyline. The likeliest linear errors follow the skyline: those of the
+        image, which light alone shows, are the likeliest as they are.
         """
-        linear, unraised = self.model.linear, self.shifts(parameters)
-        shifts, _ = self.model.with_linear_errors(unraised)
-        errors = (self.model.seen.moments.mean_rad - unraised - linear.expected_rad) @ linear.gain.T
+        seen, linear, waves = self.model.seen, self.model.linear, slice(self.model.linear.images, None)
+        unraised, by_edge = self.shifts(parameters), self.lifts(parameters)
+        shifts, lifts, _ = self.model.with_linear_errors(unraised, by_edge)
+        errors, _ = linear.likeliest(seen.moments.mean_rad - unraised, by_edge)
         spread = np.sqrt(share @ np.square(shifts - share @ shifts))
         step = np.maximum(STEP_SIGMAS * np.hypot(spread, self.model.around.map_sigma_rad), LEAST_STEP_RAD)
         all_clear = np.ones(SECTORS)
-        higher, lower = (clear_logs(self.model.seen.profiles, shifts + sign * step, all_clear) for sign in (1.0, -1.0))
+        higher, lower = (
+            clear_logs(seen.profiles, shifts + by * step, all_clear, seen.gains(shifts + by * step, lifts))
+            for by in (1.0, -1.0)
+        )
         slopes = self.clear * (higher - lower) / (2 * step)
-        return np.asarray(slopes - (slopes @ linear.rise_rad - errors @ linear.inverse) @ linear.gain)
+        slopes_of_waves = slopes @ linear.wave_rise_rad - errors[:, waves] @ linear.inverse[waves, waves]
+        return np.asarray(slopes - slopes_of_waves @ linear.gain[waves])
 
     @cached_property
     def design(self) -> Array:
@@ -124,17 +134,17 @@ class FrameModel:
         height = seen.moments.mean_rad - self.shifts(at_reference[None])[0]
         prior = np.diag(np.r_[np.full(2, UNKNOWN_M**-2), np.ones(d - 2), np.zeros(len(linear))])
         prior[d:, d:] = linear.inverse
-        left, mean = seen.moments._replace(mean_rad=height), np.append(np.zeros(d), linear.mean)
-        _, _, clear = solve_linear(left, np.hstack([design, linear.rise_rad]), mean, prior)
+        left = seen.moments._replace(mean_rad=height)
+        _, _, clear = solve_linear(left, np.hstack([design, linear.rise_rad]), np.zeros(len(prior)), prior)
         self.model = replace(self.model, clear=clear)
         growth = self.gradient_by_height()
-        return growth @ design, growth @ (height - linear.expected_rad)
+        return growth @ design, growth @ height
 
     def gradient_by_height(self) -> Array:
         """Growth (2 + k, SECTORS) of the gradient with the heights that sectors see, as `information` weighed them."""
         linear = self.model.linear
         weighted = self.design.T * linear.weight
-        return np.asarray(weighted - (weighted @ linear.rise_rad) @ linear.gain)
+        return np.asarray(weighted - (self.design.T @ linear.weighted) @ linear.gain)
 
 
 def sample_together(models: Sequence[FrameModel], position_m: Array, covariance_m2: Array) -> WeightedPoints:

@@ -17,7 +17,7 @@ from startrack.core.types import SECTORS, Array, Evidence, ImageErrors, Ints
 from startrack.localization.linear_errors import LinearErrors
 from startrack.localization.neighbourhood import NO_IMAGE_ERRORS, Neighbourhood, SectorRows
 from startrack.localization.obstacle_chain import RISEN, Levels, chain_log_likelihoods, closing_of, state_probabilities
-from startrack.localization.shared_errors import ErrorBasis, SharedErrors
+from startrack.localization.shared_errors import OWN_EDGE, ErrorBasis, SharedErrors
 from startrack.localization.skyline_profiles import solve_linear
 from startrack.terrain import Terrain
 
@@ -109,10 +109,10 @@ class SkylineModel:
         return replace(self, gross=gross, errors=errors, error_slopes_rad=self.around.error_slopes_rad(errors))
 
     def with_rows(self, rows: Evidence) -> SkylineModel:
-        """Model of the same neighbourhood with other `rows` and their clock."""
-        seen = replace(self.seen, rows=rows)
+        """Model of the same neighbourhood with other `rows` and their clock, whose light ends at the skyline."""
+        seen, gross = replace(self.seen, rows=rows, edge=None), "" if self.gross == OWN_EDGE else self.gross
         errors = replace(self.errors, clock=rows.clock)
-        return SkylineModel(seen, errors, self.error_slopes_rad, self.gross, self.stated_basis)
+        return SkylineModel(seen, errors, self.error_slopes_rad, gross, self.stated_basis)
 
     def with_closing(self, states: Array) -> SkylineModel:
         """Copy with the circle cut where the chain is surest of its state by `states` (SECTORS, STATES)."""

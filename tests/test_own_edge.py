@@ -19,11 +19,13 @@ from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Bools, Evidence, F
 from startrack.evidence.sky_light import LEVELS
 from startrack.evidence.skyline import Skyline, look_through, scale_across, skyline_band
 from startrack.frames import azel_from_rays
-from startrack.localization import ExactPosterior
+from startrack.localization import ExactPosterior, WeightedPoints
+from startrack.localization.hypothesis import Hypothesis
 from startrack.localization.neighbourhood import Neighbourhood, OwnEdge, SectorRows
 from startrack.localization.obstacle_chain import STATES, clear_emissions
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel
+from startrack.localization.smooth_skyline import with_own_edge
 
 NATS = 4.0  # of a cell of the light: a sky of 7 %
 STARS = 1500  # within 1.1 degrees of the skyline
@@ -84,6 +86,33 @@ def test_lit_states_are_those_of_stars_at_the_skyline_and_light_by_its_neighbour
     assert np.ptp(by_matrices) > 20.0
     lit = replace(plain, seen=seen, closing=(0, np.arange(STATES)))
     assert lit.log_likelihood_of(shifts) == pytest.approx(by_matrices, abs=0.3)
+
+
+def test_light_far_from_the_stars_has_a_finite_likelihood() -> None:
+    """By 25 nats a sector it is likelier where it has an edge of its own: four sectors are more than a float32 holds."""
+    rng = np.random.default_rng(4)
+    sky, stars = sky_rows(TRUE, rng, 100.0 * NATS), star_rows(TRUE, rng, 30 * STARS)
+    lower = replace(sky, elevation_rad=sky.elevation_rad - 3.5 / PX_PER_RAD)
+    rows = Evidence.concatenate(lower, replace(stars, llr=2.0 * stars.llr))
+    plain = SkylineModel.of(CRATER, rows, PLACE, 30.0, SharedErrors.of(CRATER, None))
+    start = Hypothesis(plain, WeightedPoints(TRUE[None], np.zeros(1), np.zeros(1)))
+    model = with_own_edge(start, 30.0)
+    assert model is not None and model.seen.edge is not None
+    own = model.log_likelihood_of(np.zeros((1, SECTORS)))[0] + model.seen.log_offset
+    ends_at_skyline = plain.log_likelihood_of(np.zeros((1, SECTORS)))[0] + plain.seen.log_offset
+    assert np.isfinite(own) and own > ends_at_skyline + 100.0
+    assert model.seen.edge.lit.min() > 0.9
+
+
+def test_other_rows_have_no_edge_of_the_former_ones() -> None:
+    rng = np.random.default_rng(6)
+    rows = Evidence.concatenate(sky_rows(TRUE, rng, NATS), star_rows(TRUE, rng, STARS))
+    plain = SkylineModel.of(CRATER, rows, PLACE, 30.0, SharedErrors.of(CRATER, None))
+    model = with_own_edge(Hypothesis(plain, WeightedPoints(TRUE[None], np.zeros(1), np.zeros(1))), 30.0)
+    assert model is not None
+    other = model.with_rows(rows)
+    shifts = np.zeros((1, SECTORS))
+    assert other.gross == "" and other.log_likelihood_of(shifts) == pytest.approx(plain.log_likelihood_of(shifts))
 
 
 def light_strip(

@@ -151,6 +151,7 @@ class OwnEdge(NamedTuple):
     stars: Profiles
     light: Array  # (SECTORS,) likelihood of the light, in which the two profiles' offsets are made up for
     lit: Array  # (SECTORS,) rough probability of it, by which the linear model leaves the light out
+    offset: Array = np.zeros(SECTORS)  # (SECTORS,) nats, by which all likelihoods of a sector are less: none overflows
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,13 +190,16 @@ class SectorRows:
     @cached_property
     def profiles(self) -> Profiles:
         """Log-likelihoods of the rows of each sector by the height of the skyline."""
-        return profiles_of(self.rows, self.above_rad, self.around.map_sigma_rad)
+        return self._profiles_of(self.above_rad)
+
+    def _profiles_of(self, above_rad: Array) -> Profiles:
+        """Profiles of the rows at heights (n,), in the scale of all likelihoods."""
+        found = profiles_of(self.rows, above_rad, self.around.map_sigma_rad)
+        return found if self.edge is None else found.scaled(self.edge.offset)
 
     def profiles_without(self, lift_rad: Array | None) -> Profiles:
         """The `profiles` of light lifted by `lift_rad` (SECTORS,) beyond what is expected; None: by nothing."""
-        if lift_rad is None:
-            return self.profiles
-        return profiles_of(self.rows, self._without_lift(self.above_rad, lift_rad), self.around.map_sigma_rad)
+        return self.profiles if lift_rad is None else self._profiles_of(self._without_lift(self.above_rad, lift_rad))
 
     @cached_property
     def light(self) -> SectorRows:

@@ -57,6 +57,11 @@ class Profiles(NamedTuple):
     hidden: Array  # (SECTORS,) exp(-N): of a sector in which everything is hidden, the stars above the window too
     offset: Array  # (SECTORS,) N: all likelihoods of a sector are less it
 
+    def scaled(self, nats: Array) -> Profiles:
+        """Copy whose likelihoods in each sector are less by so many `nats` (SECTORS,) more."""
+        less = np.exp(-nats)
+        return self._replace(scale=self.scale * less, hidden=self.hidden * less, offset=self.offset + nats)
+
 
 FORMS = {"first": "int64[sectors + 1]", "guide": "int32[sectors, guides]"}
 FORMS |= dict.fromkeys(("x", "left", "right", "bend", "integral"), "float64[m]")

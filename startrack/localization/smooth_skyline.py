@@ -78,8 +78,9 @@ def with_own_edge(plain: Hypothesis, half_m: float) -> SkylineModel | None:
     logs = list_free_logs(light.profiles, shift, EDGE_REACH * width_rad, EDGE_ROUGHNESS * width_rad)
     whole, likely = logs.sum(axis=1), shares(logs.sum(axis=1)) @ logs
     likely += (np.logaddexp.reduce(whole) - np.log(len(whole)) - likely.sum()) / SECTORS  # all equally likely before
-    offset = light.profiles.offset + stars.profiles.offset - seen.profiles.offset  # the same about one reference
-    edge = OwnEdge(stars.profiles, np.exp(likely + offset), np.ones(SECTORS))
+    likely += light.profiles.offset + stars.profiles.offset - seen.profiles.offset  # the same about one reference
+    most = np.maximum(likely, 0.0)  # where light and stars are far apart it exceeds all numbers
+    edge = OwnEdge(stars.profiles, np.exp(likely - most), np.ones(SECTORS), most)
     by_stars = SkylineModel(replace(seen, around=around, edge=edge), errors, around.error_slopes_rad(errors), OWN_EDGE)
     return replace(by_stars, seen=replace(by_stars.seen, edge=edge._replace(lit=_find_lit(by_stars, shift, lift_rad))))
 

@@ -89,7 +89,7 @@ def test_lit_states_are_those_of_stars_at_the_skyline_and_light_by_its_neighbour
 
 
 def test_light_far_from_the_stars_has_a_finite_likelihood() -> None:
-    """By 25 nats a sector it is likelier where it has an edge of its own: four sectors are more than a float32 holds."""
+    """By 25 nats a sector it is likelier with an edge of its own: four sectors are more than a float32 holds."""
     rng = np.random.default_rng(4)
     sky, stars = sky_rows(TRUE, rng, 100.0 * NATS), star_rows(TRUE, rng, 30 * STARS)
     lower = replace(sky, elevation_rad=sky.elevation_rad - 3.5 / PX_PER_RAD)

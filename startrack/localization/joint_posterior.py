@@ -136,7 +136,7 @@ class Start:
             step = len(centres_m) / MOST_BOXES
             centres_m, half_m = centres_m[(np.arange(MOST_BOXES) * step).astype(int)], half_m * np.sqrt(step)
         linear, covariance, weight = model.solve()
-        model = replace(model, clear=weight)
+        model = replace(model, sector_weight=weight)
         boxes = model.with_likely_errors(centres_m, weight)
         tried = np.vstack([boxes, linear])
         value = model.log_likelihood(tried) + model.basis.log_prior(tried[:, 2:])
@@ -188,7 +188,7 @@ def _begin_closer(model: SkylineModel, mean: Array, covariance: Array, reach_m: 
     image = model.seen.image_errors
     closer = SkylineModel.of(model.terrain, model.seen.rows, mean[:2], reach_m, model.errors, image)
     _, whole, weight = closer.solve()
-    closer = replace(closer, clear=weight)
+    closer = replace(closer, sector_weight=weight)
     wider = whole.copy()
     wider[:2, :2] = covariance[:2, :2]
     wider[:2, 2:] = wider[2:, :2] = 0.0

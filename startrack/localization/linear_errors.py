@@ -48,10 +48,10 @@ class LinearErrors:
     lifts: Lifts = NO_LIFTS
 
     @classmethod
-    def of(cls, seen: SectorRows, errors: SharedErrors, gross: str, clear: Array) -> LinearErrors:
+    def of(cls, seen: SectorRows, errors: SharedErrors, gross: str, sector_weight: Array) -> LinearErrors:
         """Linear errors of the image whose rows are `seen`, and of the waves among the shared `errors`.
 
-        `gross` names the fact with a gross error, "" none. `clear` (SECTORS,) is how much each sector counts.
+        `gross` names the fact with a gross error, "" none. `sector_weight` (SECTORS,) is how much each sector counts.
         """
         image, slopes = seen.image_errors, seen.around.wave_slopes_rad(errors)
         j, size = len(image.mean), len(image.mean) + len(errors.waves)
@@ -60,8 +60,8 @@ class LinearErrors:
             covariance[:j, :j], covariance[j:, j:] = image.covariance, np.diag(np.square(errors.waves_sigma_rad(one)))
         rise = np.column_stack([seen.image_rise, slopes.T])
         seams = WAVES.gross_sigma * list_seams() if errors.are_waves(gross) else np.zeros((SECTORS, 0))
-        weight = clear * seen.moments.information / seen.moments.variance_rad2
-        lifts = _lifts_of(seen, clear, weight) if j else NO_LIFTS
+        weight = sector_weight * seen.moments.information / seen.moments.variance_rad2
+        lifts = _lifts_of(seen, sector_weight, weight) if j else NO_LIFTS
         return cls(rise, plain, wide, weight, size - j, seams, lifts)
 
     def __len__(self) -> int:
@@ -171,10 +171,10 @@ class LinearErrors:
         return np.asarray(self.fit(left_rad[None])[0][0])
 
 
-def _lifts_of(seen: SectorRows, clear: Array, weight: Array) -> Lifts:
-    """Lifts of the light in the rows `seen`; `clear` (SECTORS,) and `weight` (SECTORS,) as those of LinearErrors."""
+def _lifts_of(seen: SectorRows, sector_weight: Array, weight: Array) -> Lifts:
+    """Lifts of the light in the rows `seen`, where sectors count by `sector_weight` (SECTORS,), with `weight` (SECTORS,)."""
     alone, together, lit = seen.light.moments, seen.moments, np.zeros(SECTORS) if seen.edge is None else seen.edge.lit
-    own = (1.0 - lit) * clear * alone.information / alone.variance_rad2
+    own = (1.0 - lit) * sector_weight * alone.information / alone.variance_rad2
     own[np.isinf(seen.image_errors.variance_rad2)] = 0.0
     return Lifts(seen.image_errors.raised_rad, np.minimum(own, weight), alone.mean_rad - together.mean_rad)
 

@@ -53,7 +53,7 @@ class SkylineModel:
     error_slopes_rad: Array  # (k, SECTORS) rise of the skyline by one unit of each shared error
     gross: str = ""  # fact that has a gross error
     stated_basis: ErrorBasis | None = None  # None: of the directions that the rows show
-    clear: Array = field(default_factory=lambda: np.ones(SECTORS))  # (SECTORS,) weight for the linear errors
+    sector_weight: Array = field(default_factory=lambda: np.ones(SECTORS))  # (SECTORS,) for the linear errors
     closing: Closing | None = None  # None: as at the reference
     levels: PreparedLevels = field(default_factory=PreparedLevels)
 
@@ -194,7 +194,7 @@ class SkylineModel:
     @cached_property
     def linear(self) -> LinearErrors:
         """The errors that are integrated in closed form."""
-        return LinearErrors.of(self.seen, self.errors, self.gross, self.clear)
+        return LinearErrors.of(self.seen, self.errors, self.gross, self.sector_weight)
 
     def with_linear_errors(self, shifts: Array, lifts: Array | None = None) -> tuple[Array, Array | None, Array]:
         """Shifts and lifts of the light (n, SECTORS) [rad] with the likeliest linear errors added; a logarithm (n,).

@@ -136,7 +136,7 @@ class FrameModel:
         prior[d:, d:] = linear.inverse
         left = seen.moments._replace(mean_rad=height)
         _, _, clear = solve_linear(left, np.hstack([design, linear.rise_rad]), np.zeros(len(prior)), prior)
-        self.model = replace(self.model, clear=clear)
+        self.model = replace(self.model, sector_weight=clear)
         growth = self.gradient_by_height()
         return growth @ design, growth @ height
 

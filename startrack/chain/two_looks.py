@@ -79,8 +79,16 @@ def _measure(first: FirstLook, settings: Settings) -> SecondLook:
     used = sectors_with_step(light) & known.terrain.is_informative(MIDDLES_RAD, light.elevation_rad)
     unused = _too_few_text(light, used) if np.count_nonzero(used) < NEEDED_SECTORS else ""
     sky = None if unused else SkyEvidence(light, used, _image_errors(known, light, used))
+    turn_rad = (known.exposure.exposure_s or 0.0) * known.clock.turn_rad_s
+    moving = measured.photometry.moving(estimate.star_motion_rad(turn_rad))
     brightness = brightness_mag_arcsec2(light, known.camera, known.R_cam_enu, known.exposure.exposure_s)
-    return SecondLook(first=first, measured=measured, sky=sky, sky_unused=unused, sky_brightness_mag_arcsec2=brightness)
+    return SecondLook(
+        first=first,
+        measured=replace(measured, photometry=moving),
+        sky=sky,
+        sky_unused=unused,
+        sky_brightness_mag_arcsec2=brightness,
+    )
 
 
 def estimate_skyline(first: FirstLook) -> SkylineEstimate:

@@ -10,8 +10,8 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.core.statistics import interpolate_circle
-from startrack.core.types import MIDDLES_RAD, Array, Bools, Ints
-from startrack.frames import off_axis_rad, rays_from_azel
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Bools, Ints
+from startrack.frames import R_from_rotvec, azel_from_rays, off_axis_rad, rays_from_azel
 from startrack.terrain import Terrain
 
 BAND_PX = 12.0  # from the skyline to the last pixels that are used; the background model has no sharper edge
@@ -74,6 +74,18 @@ class SkylineEstimate:
         )  # beyond a wall nearby the horizon is no measure
         sigma = np.sqrt(np.square(moved).sum(axis=0) + np.square(by_map))
         return cls(skyline if raised_rad is None else skyline.raised(raised_rad), sigma)
+
+    def star_motion_rad(self, turn_rad: Array) -> Array:
+        """Motion (SECTORS,) [rad] of stars across this skyline, in height above it, while the sky turns.
+
+        `turn_rad` (3,) is the rotation vector in enu of the turn, half of it before the middle of the exposure. The
+        motion is the median in each sector: where the skyline jumps only the stars at the jump move by its height.
+        """
+        azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_POINTS, endpoint=False)
+        rays = rays_from_azel(azimuth, self.skyline(azimuth))
+        ends = [azel_from_rays(rays @ R_from_rotvec(part * turn_rad).T) for part in (-0.5, 0.5)]
+        before, after = (elevation - self.skyline(azimuth) for azimuth, elevation in ends)
+        return np.asarray(np.median(np.abs(after - before).reshape(SECTORS, -1), axis=1))
 
     def is_level(self, azimuth_rad: Array) -> Bools:
         """Whether the skyline at `azimuth_rad` (n,) is so level that a small shift does not turn it."""

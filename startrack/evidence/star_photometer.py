@@ -15,7 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
-from startrack.core.types import Array, Body, Bools, Detections, Evidence, Ints, NoSolution, SmoothImage, Stars
+from startrack.core.types import (
+    Array,
+    Body,
+    Bools,
+    Detections,
+    Evidence,
+    Ints,
+    NoSolution,
+    SmoothImage,
+    Stars,
+    sector_of,
+)
 from startrack.evidence.expected_stars import BAD_PIXELS, USABLE, ExpectedStars, expect_stars
 from startrack.evidence.flux_scale import FluxScale
 from startrack.evidence.photometry import Photometry, Sources, measure
@@ -44,6 +55,7 @@ class StarPhotometry(ExpectedStars):
     flux_e: Array  # measured
     sigma_e: Array  # of the measured flux without a star
     llr: Array  # 0 where unusable
+    edge_sigma_rad: Array | float = 0.0  # (n,) of the height above the skyline, while the shutter is open
 
     @property
     def cause(self) -> NDArray[np.str_]:
@@ -81,10 +93,18 @@ class StarPhotometry(ExpectedStars):
             changed[name] = values
         return replace(self, **changed, causes=causes)
 
+    def moving(self, motion_rad: Array) -> StarPhotometry:
+        """Copy whose stars move by `motion_rad` (SECTORS,) [rad] across the skyline while the shutter is open.
+
+        All parts of the way are equally likely: a star is visible for the part above the skyline.
+        """
+        return replace(self, edge_sigma_rad=motion_rad[sector_of(self.azimuth_rad)] / np.sqrt(12.0))
+
     def evidence(self) -> Evidence:
         """Evidence of the usable stars, for the localizer."""
-        use = self.usable
-        return Evidence(azimuth_rad=self.azimuth_rad[use], elevation_rad=self.elevation_rad[use], llr=self.llr[use])
+        use, edge = self.usable, np.broadcast_to(self.edge_sigma_rad, len(self.llr))
+        rows = self.azimuth_rad[use], self.elevation_rad[use], self.llr[use], edge[use]
+        return Evidence(azimuth_rad=rows[0], elevation_rad=rows[1], llr=rows[2], edge_sigma_rad=rows[3])
 
 
 @dataclass(frozen=True)

@@ -172,7 +172,7 @@ class LinearErrors:
 
 
 def _lifts_of(seen: SectorRows, sector_weight: Array, weight: Array) -> Lifts:
-    """Lifts of the light in the rows `seen`, where sectors count by `sector_weight` (SECTORS,), with `weight` (SECTORS,)."""
+    """Lifts of the light in the rows `seen`; `sector_weight` and `weight` (SECTORS,) are those of LinearErrors."""
     alone, together, lit = seen.light.moments, seen.moments, np.zeros(SECTORS) if seen.edge is None else seen.edge.lit
     own = (1.0 - lit) * sector_weight * alone.information / alone.variance_rad2
     own[np.isinf(seen.image_errors.variance_rad2)] = 0.0

@@ -166,16 +166,15 @@ def test_a_coarser_column_has_the_means_of_its_pixels():
     assert found.across_px_rad == columns.across_px_rad
 
 
+def edge(elevation_deg: float, contrast: float, which: np.ndarray, dimming: float = 0.0, clear: float = 9.0) -> Steps:
+    values = np.radians(elevation_deg), np.radians(0.05), contrast, np.log1p(contrast), dimming, clear
+    return Steps(which, *(np.full(len(which), value) for value in values))
+
+
 def test_the_sign_of_the_step_is_a_matter_of_many_columns():
     """A bright skyline among bright ones costs nothing; a clearer dark edge of a few columns below it is not it."""
     column = np.arange(AZIMUTH_COLUMNS)
     one = np.ones(AZIMUTH_COLUMNS)
-
-    def edge(elevation_deg: float, contrast: float, which: np.ndarray) -> Steps:
-        n = len(which)
-        values = np.radians(elevation_deg), np.radians(0.05), contrast, np.log1p(contrast), 9.0
-        return Steps(which, *(np.full(n, value) for value in values))
-
     bright = np.zeros((len(KINDS), AZIMUTH_COLUMNS, len(elevations_rad())), np.float32)
     dark = bright.copy()
     add_step_log_likelihood(bright, edge(5.0, 0.5, column), 1.0)
@@ -184,6 +183,31 @@ def test_the_sign_of_the_step_is_a_matter_of_many_columns():
         mean, sigma = combine_columns(likelihood)
         np.testing.assert_allclose(np.degrees(mean), 5.0 * one, atol=0.05)
         assert np.degrees(sigma.max()) < 0.1
+
+
+@pytest.mark.parametrize(("dimming", "found_deg"), [(1.3, 5.0), (0.0, 3.0)])
+def test_lit_ground_below_a_dark_ridge_is_no_skyline(dimming, found_deg):
+    """A faint edge at 5 degrees, a clear one at which the light rises at 3: between them is dark ground, or sky."""
+    column = np.arange(AZIMUTH_COLUMNS)
+    likelihood = np.zeros((len(KINDS), AZIMUTH_COLUMNS, len(elevations_rad())), np.float32)
+    add_step_log_likelihood(likelihood, edge(5.0, -0.25, column, clear=1.5), 0.5)
+    add_step_log_likelihood(likelihood, edge(3.0, 0.25, column, dimming, 5.0), 0.5)
+    mean, _ = combine_columns(likelihood)
+    np.testing.assert_allclose(np.degrees(mean), found_deg, atol=0.1)
+
+
+def test_steps_know_how_dark_the_light_above_them_is():
+    rows, noise = 900, 1.0
+    elevation_deg = -2.0 + 0.04 * np.arange(rows)
+    light = np.select([elevation_deg < 6.0, elevation_deg < 8.0], [90.0, 50.0], 110.0)  # lit ground, a ridge, the sky
+    light[:30] = 10.0  # the darkest pixels
+    rng = np.random.default_rng(5)
+    pixels = rng.normal(size=(rows // COLUMN_SAMPLES, AZIMUTH_COLUMNS)).repeat(COLUMN_SAMPLES, axis=0) * noise
+    found = _steps_of(columns_of(light[:, None] + pixels, noise), AVERAGINGS[0])
+    at = (np.abs(np.degrees(found.elevation_rad) - 6.0) < 0.2) & (found.significance > 3.0)
+    assert len(np.unique(found.column[at])) > 0.9 * AZIMUTH_COLUMNS
+    assert np.median(found.contrast[at]) == pytest.approx(0.4, abs=0.05)
+    assert np.median(found.dimming[at]) == pytest.approx(np.log(100.0 / 40.0), abs=0.05)
 
 
 @pytest.fixture(scope="module")

@@ -37,7 +37,7 @@ def stars(azimuth_deg: float, elevation_deg: np.ndarray, llr: float, missing: fl
 
 
 def steps(column: np.ndarray, elevation_deg: float, log_ratio: float) -> Steps:
-    values = np.radians(elevation_deg), 1e-3, -0.3, log_ratio, 9.0
+    values = np.radians(elevation_deg), 1e-3, -0.3, log_ratio, 0.0, 9.0
     return Steps(column, *(np.full(len(column), value) for value in values))
 
 

@@ -63,6 +63,7 @@ class Steps:
     sigma_rad: Array
     contrast: Array  # brightness below minus above, relative to the brightest sky above
     log_ratio: Array  # logarithm of the brightness below over that of the sky right above
+    dimming: Array  # logarithm of the brightness of the brightest sky above over that of the light right above
     significance: Array
 
     def take(self, which: Bools) -> Steps:
@@ -132,10 +133,14 @@ def _steps_at(light: Contrasts, row: Ints, column: Ints) -> Steps:
     level, size = mean_above(columns, 0.0, LEVEL_RAD / columns.px_rad), round(ABOVE_RAD / columns.step_rad)
     sky = maximum_filter1d(np.nan_to_num(level), size, axis=0, origin=-(size // 2), mode="constant")
     below, above = light.below_e[row, column] - dark, light.above_e[row, column] - dark
-    contrast = (below - above) / np.maximum(sky[row, column] - dark, 1e-9)
-    log_ratio = np.log(np.clip(below / np.maximum(above, 1e-9), 1.0 / MOST_RATIO, MOST_RATIO))
+    sky = np.maximum(sky[row, column] - dark, 1e-9)
+    contrast = (below - above) / sky
+    log_ratio, dimming = (
+        np.log(np.clip(one / np.maximum(above, 1e-9), 1.0 / MOST_RATIO, MOST_RATIO)) for one in (below, sky)
+    )
     column, sigma_rad = column[good], sigma_px[good] * columns.px_rad
-    return Steps(column, elevation[good], sigma_rad, contrast[good], log_ratio[good], significance[good])
+    marks = (one[good] for one in (contrast, log_ratio, dimming, significance))
+    return Steps(column, elevation[good], sigma_rad, *marks)
 
 
 def _level_above(columns: Columns, gap_px: float, distance_px: float, dark_e: float) -> Array:

@@ -88,6 +88,8 @@ def test_positions_by_stars_and_light_agree_with_their_covariance() -> None:
     for _ in range(40):
         raised = errors.raised_rad @ rng.multivariate_normal(errors.mean, covariance)
         light, stars = lowered(sky_rows(PLACE, rng, 4.0), -raised), star_rows(PLACE, rng, STARS)
+        wrong = rng.random(STARS) < 1.0 / (1.0 + np.exp(3.0))  # as llrs of 3 state
+        stars = replace(stars, llr=np.where(wrong, -stars.llr, stars.llr), edge_sigma_rad=np.zeros(STARS))
         support = ExactPosterior()(replace(stars, is_first_look=True), CRATER).samples
         rows = replace(Evidence.concatenate(light, stars), support=support, image_errors=errors)
         try:

@@ -99,8 +99,8 @@ def test_a_track_of_one_image_states_what_locate_states(drive, tmp_path):
 
 def test_a_search_that_proved_nothing_is_stated(drive, tracked, tmp_path, capsys, monkeypatch):
     assert {one["search"] for one in json.loads((tracked / "track.json").read_text())["frames"]} == {"proven"}
-    explore = posterior.explore
-    monkeypatch.setattr(posterior, "explore", lambda rows, terrain, nats, budget: explore(rows, terrain, nats, 0.0))
+    search = posterior.search_boxes
+    monkeypatch.setattr(posterior, "search_boxes", lambda rows, terrain, nats, budget: search(rows, terrain, nats, 0.0))
     for _ in ("located", "kept"):
         assert run(min((drive / "frames").glob("*.png")), "-D", tmp_path / "out", "--no-plots") == 0
         line, _ = capsys.readouterr().out.splitlines()

@@ -63,16 +63,18 @@ def test_the_linear_model_of_lifts_waves_and_seams_is_that_of_all_heights() -> N
     lift, rise, seams = rng.normal(size=(SECTORS, 2)), rng.normal(size=(SECTORS, 3)), 2.0 * list_seams()[:, :1]
     of_light, of_stars = rng.uniform(0.5, 1.0, SECTORS), rng.uniform(0.1, 2.0, SECTORS)
     at_light, at_stars, other = rng.normal(size=(3, SECTORS))
-    whole = of_light + of_stars
+    whole, mean = of_light + of_stars, np.r_[rng.normal(size=2), np.zeros(3)]
     together = (of_light * at_light + of_stars * at_stars) / whole
     linear = LinearErrors(
-        np.hstack([lift * (of_light / whole)[:, None], rise]), np.eye(5), np.eye(5), whole, 3, seams,
+        np.hstack([lift * (of_light / whole)[:, None], rise]), mean, np.eye(5), np.eye(5), whole, 3, seams,
         Lifts(lift, of_light, at_light - together),
     )  # fmt: skip
     (risen,), lifts, _ = linear.fit(together[None], other[None])
     design = np.block([[lift, rise, seams], [np.zeros_like(lift), rise, seams]])
     weighted = design.T * np.r_[of_light, of_stars]
-    found = np.linalg.solve(weighted @ design + np.eye(6), weighted @ np.r_[at_light - other, at_stars])
+    found = np.linalg.solve(
+        weighted @ design + np.eye(6), weighted @ np.r_[at_light - other, at_stars] + np.r_[mean, 0.0]
+    )
     assert lifts is not None
     np.testing.assert_allclose(lifts[0], other + lift @ found[:2], atol=1e-9)
     np.testing.assert_allclose(risen, rise @ found[2:5] + seams @ found[5:], atol=1e-9)

@@ -53,7 +53,7 @@ def shared_of(guess: Cylinder, evidence: Evidence) -> tuple[Array, Array]:
     """Mean (k,) of the errors of the shape by the evidence, and their standard deviations."""
     method = ExactPosterior()
     found = sample_posterior(method.explore(evidence, guess), evidence, guess)[0]
-    mean, covariance = moments(found.values, np.exp(found.log_weight - found.log_weight.max()))
+    mean, covariance = moments(found.values, np.exp(found.copies_log_weight - found.copies_log_weight.max()))
     return mean, np.sqrt(np.diag(covariance))
 
 

@@ -38,7 +38,7 @@ def summary_of(*blobs: tuple[np.ndarray, np.ndarray]) -> tuple[Posterior, np.nda
 
 
 def posterior_of(points: np.ndarray, log: np.ndarray) -> Posterior:
-    one = SimpleNamespace(positions_m=points, log_weight=log, gross="")
+    one = SimpleNamespace(positions_m=points, copies_log_weight=log, gross="")
     return Posterior([one], TERRAIN)  # type: ignore[list-item]
 
 

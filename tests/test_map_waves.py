@@ -35,7 +35,15 @@ def errors_of(rng: np.random.Generator, count: int = 3) -> LinearErrors:
     """Of a few waves, seen by sectors of different weights."""
     rise = np.column_stack([np.cos(m * MIDDLES_RAD) for m in range(1, count + 1)])
     covariance = np.diag([1e-6, 4e-6, 9e-6][:count])
-    return LinearErrors(rise, covariance, covariance, rng.uniform(0.0, 2e5, SECTORS), count, np.zeros((SECTORS, 0)))
+    return LinearErrors(
+        rise,
+        np.zeros(len(covariance)),
+        covariance,
+        covariance,
+        rng.uniform(0.0, 2e5, SECTORS),
+        count,
+        np.zeros((SECTORS, 0)),
+    )
 
 
 def test_the_closed_form_is_the_integral():

@@ -7,7 +7,7 @@ or raises `NoSolution`; there is no sentinel or half-filled result, NaN only whe
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from functools import cached_property
 from typing import Any
@@ -259,6 +259,11 @@ class ImageErrors:
     mean: Array  # (j,)
     covariance: Array  # (j, j)
     variance_rad2: Array  # (sectors,) of the skyline by the light of the sky alone; infinite where it shows none
+    reference: Array = field(default_factory=lambda: np.zeros(0))  # (j,) likely ones; not given: the mean
+
+    def __post_init__(self) -> None:
+        if not len(self.reference):
+            object.__setattr__(self, "reference", self.mean)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -80,7 +80,7 @@ def pixels_near_skyline(
 ) -> SkylineBand:  # fmt: skip
     """Pixels of the `detections`' image near a skyline, which `camera` and `R_cam_enu` place in the image.
 
-    The band is as much wider as the skyline is uncertain.
+    The band is as much wider as the `estimate` of the skyline is uncertain.
     """
     to_px = scale_across(camera, R_cam_enu, estimate.skyline)
     reach_px = np.maximum(SKYLINE_SIGMAS * estimate.sigma_rad * to_px(MIDDLES_RAD), CLIP_SHIFT_PX)

@@ -37,9 +37,10 @@ NO_LIFTS = Lifts(np.zeros((SECTORS, 0)), np.zeros(SECTORS), np.zeros(SECTORS))
 
 @dataclass(frozen=True, eq=False)
 class LinearErrors:
-    """Normal errors (j,) of mean 0, first those of the image, with the weights of the sectors that show them."""
+    """Normal errors (j,), first the image's beyond their reference, with the weights of the sectors that show them."""
 
     rise_rad: Array  # (SECTORS, j) of the skyline that light and stars together show, by one unit of each
+    mean: Array  # (j,)
     covariance: Array  # (j, j)
     wide_covariance: Array  # (j, j) of a normal distribution as wide as the errors with a seam
     weight: Array  # (SECTORS,) 1 / variance of the heights that the sectors see; next to 0 where the rows show none
@@ -62,7 +63,8 @@ class LinearErrors:
         seams = WAVES.gross_sigma * list_seams() if errors.are_waves(gross) else np.zeros((SECTORS, 0))
         weight = sector_weight * seen.moments.information / seen.moments.variance_rad2
         lifts = _lifts_of(seen, sector_weight, weight) if j else NO_LIFTS
-        return cls(rise, plain, wide, weight, size - j, seams, lifts)
+        mean = np.r_[image.mean - image.reference, np.zeros(size - j)]
+        return cls(rise, mean, plain, wide, weight, size - j, seams, lifts)
 
     def __len__(self) -> int:
         return len(self.covariance)
@@ -156,15 +158,20 @@ class LinearErrors:
             log += np.logaddexp.reduce(logs, axis=1) - np.log(logs.shape[1])
             log -= 0.5 * (best_gradient * size + np.square(size))
             errors = errors - seam_rad @ self.gain.T
-        return errors, seam_rad, log - 0.5 * np.einsum("ni,ij,nj->n", errors, self.inverse, errors)
+        beyond = errors - self.mean
+        return errors, seam_rad, log - 0.5 * np.einsum("ni,ij,nj->n", beyond, self.inverse, beyond)
 
     def likeliest(self, left_rad: Array, lifts_rad: Array | None = None) -> tuple[Array, Array]:
-        """Errors (n, j) without a seam, see `fit`, and the heights (n, SECTORS) that are left without the lifts."""
+        """Errors (n, j) without a seam, and the heights (n, SECTORS) that are left without the lifts.
+
+        `left_rad` and `lifts_rad` (n, SECTORS) are those of `fit`.
+        """
         above_rad = self.lifts.above_rad
         if lifts_rad is not None:
             part = np.divide(self.lifts.weight, self.weight, out=np.zeros(SECTORS), where=self.weight > 0.0)
             left_rad, above_rad = left_rad - part * lifts_rad, above_rad - (1.0 - part) * lifts_rad
-        return left_rad @ self.gain.T + above_rad @ self._gain_of_light.T, left_rad
+        by_prior = np.linalg.solve(self._information, self.inverse @ self.mean)
+        return by_prior + left_rad @ self.gain.T + above_rad @ self._gain_of_light.T, left_rad
 
     def waves_rad(self, left_rad: Array) -> Array:
         """Rise (SECTORS,) [rad] of the skyline by the likeliest waves and seam at `left_rad` (SECTORS,); see `fit`."""

@@ -176,7 +176,7 @@ class SectorRows:
             near = np.flatnonzero(np.abs(above) < TRACED_RAD)
             traced = terrain.horizon_rad(self.around.reference_m[None], rows.azimuth_rad[near])
             above[near] = rows.elevation_rad[near] - np.asarray(traced).ravel()
-        return self._without_lift(above, self.image_errors.raised_rad @ self.image_errors.mean)
+        return self._without_lift(above, self.image_errors.raised_rad @ self.image_errors.reference)
 
     def _without_lift(self, above_rad: Array, lift_rad: Array) -> Array:
         """Heights (n,) of the rows where the light is not lifted by `lift_rad` (SECTORS,)."""

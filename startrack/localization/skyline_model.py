@@ -197,7 +197,7 @@ class SkylineModel:
         return LinearErrors.of(self.seen, self.errors, self.gross, self.sector_weight)
 
     def with_linear_errors(self, shifts: Array, lifts: Array | None = None) -> tuple[Array, Array | None, Array]:
-        """Shifts and lifts of the light (n, SECTORS) [rad] with the likeliest linear errors added; a logarithm (n,).
+        """The `shifts` and lifts of the light (n, SECTORS) [rad] with the likeliest linear errors; a logarithm (n,).
 
         The logarithm is that of the integral of the likelihood over these errors, in the likelihood there. `lifts`,
         here and of those found: None where there are none.
@@ -217,7 +217,7 @@ class SkylineModel:
         prior[k:, k:] = np.linalg.inv(linear.wide_covariance)
         moments = self.seen.moments
         left = moments._replace(mean_rad=moments.mean_rad - self._expected_rise)
-        found = solve_linear(left, design, np.zeros(len(prior)), prior)
+        found = solve_linear(left, design, np.r_[np.zeros(k), linear.mean], prior)
         parameters, covariance, weight = found
         return np.r_[parameters[:2] + self.around.reference_m, parameters[2:k]], covariance[:k, :k], weight
 

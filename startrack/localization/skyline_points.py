@@ -192,7 +192,7 @@ class SeenSkyline:
         return ImageErrors(
             raised_rad=self.attitude_slopes[errs].T, mean=self.lacking_rad[errs],
             covariance=np.diag(np.square(self.stated.attitude_sigma_rad[errs])),
-            variance_rad2=np.where(self.used, 0.0, np.inf),
+            variance_rad2=np.where(self.used, 0.0, np.inf), reference=np.zeros(np.count_nonzero(errs)),
         )  # fmt: skip
 
     @property

@@ -49,7 +49,7 @@ def test_the_likelihood_is_the_integral_over_lifts_of_the_light(wave: int, sigma
     sizes = np.linspace(-5.0, 5.0, 61)
     each = []
     for z in sizes:
-        lift = errors.raised_rad @ (errors.mean + z * sigma_px)
+        lift = errors.slopes_rad @ (errors.mean + z * sigma_px)
         each.append(log_likelihood(Evidence.concatenate(stars, lowered(light, lift)), None) - 0.5 * z * z)
     slow = np.logaddexp.reduce(each) + np.log((sizes[1] - sizes[0]) / np.sqrt(2 * np.pi))
     found = log_likelihood(Evidence.concatenate(stars, light), errors)
@@ -88,7 +88,7 @@ def test_positions_by_stars_and_light_agree_with_their_covariance() -> None:
     variance_rad2 = np.full(SECTORS, (0.1 / PX_PER_RAD) ** 2)
     errors = ImageErrors(offset_terms(MIDDLES_RAD) / PX_PER_RAD, np.zeros(5), covariance, variance_rad2)
     for _ in range(40):
-        raised = errors.raised_rad @ rng.multivariate_normal(errors.mean, covariance)
+        raised = errors.slopes_rad @ rng.multivariate_normal(errors.mean, covariance)
         light, stars = lowered(sky_rows(PLACE, rng, 4.0), -raised), star_rows(PLACE, rng, STARS)
         wrong = rng.random(STARS) < 1.0 / (1.0 + np.exp(3.0))  # as llrs of 3 state
         stars = replace(stars, llr=np.where(wrong, -stars.llr, stars.llr), edge_sigma_rad=np.zeros(STARS))

@@ -15,9 +15,10 @@ from startrack.frames import R_enu_icrs, Site, azel_from_rays, sky_rotvec_rad, u
 from startrack.frames.orientation import _earth_orientation
 from startrack.localization import ExactPosterior
 from startrack.localization.clock import clock_at as clock_of_site
-from startrack.localization.clock import clock_matters, turn_evidence
+from startrack.localization.clock import turn_evidence
 from startrack.localization.joint_posterior import sample_posterior
 from startrack.localization.other_times import WRONG_TIME_PROBABILITY, sample_other_times
+from startrack.localization.shared_errors import is_noticeable
 from startrack.terrain import HeightMap, Terrain, load_terrain
 from startrack.terrain.shape import EXACT_WAVES
 
@@ -79,8 +80,8 @@ def test_the_usual_clock_changes_nothing() -> None:
     assert exact.clock is None
     assert usual.clock is not None
     assert (usual.clock.offset_s, usual.clock.sigma_s) == (0.0, 1.0)
-    assert not clock_matters(clock_at(site, 1.0), terrain)
-    assert clock_matters(clock_at(SITES["earth"], 1.0), terrain)
+    assert not is_noticeable(clock_at(site, 1.0), 1.0, terrain)
+    assert is_noticeable(clock_at(SITES["earth"], 1.0), 1.0, terrain)
 
 
 @pytest.mark.slow

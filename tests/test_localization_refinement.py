@@ -135,7 +135,7 @@ def image_errors(rng: np.random.Generator, part: float) -> ImageErrors:
     mix = rng.normal(size=(5, 5))
     covariance = part**2 * 1e-3 * (mix @ mix.T + 5 * np.eye(5))
     return ImageErrors(
-        raised_rad=offset_terms(MIDDLES_RAD) / PX_PER_RAD, mean=np.zeros(5), covariance=covariance,
+        slopes_rad=offset_terms(MIDDLES_RAD) / PX_PER_RAD, mean=np.zeros(5), covariance=covariance,
         variance_rad2=np.full(SECTORS, EDGE_PX * CELL_PX / (60.0 * 0.28) / PX_PER_RAD**2),
     )  # fmt: skip
 
@@ -147,7 +147,7 @@ def test_errors_of_the_image_widen_the_posterior_as_in_least_squares() -> None:
     for part in (0.5, 2.0):
         errors = image_errors(np.random.default_rng(2), part)
         fix = ExactPosterior()(replace(rows, support=place, image_errors=errors), CRATER)
-        design = np.hstack([position_slopes(), errors.raised_rad]) / np.sqrt(errors.variance_rad2)[:, None]
+        design = np.hstack([position_slopes(), errors.slopes_rad]) / np.sqrt(errors.variance_rad2)[:, None]
         prior = np.zeros((7, 7))
         prior[2:, 2:] = np.linalg.inv(errors.covariance)
         expected = np.linalg.inv(design.T @ design + prior)[:2, :2]
@@ -167,7 +167,7 @@ def test_positions_agree_with_their_covariance_under_errors_of_the_image() -> No
     errors = image_errors(np.random.default_rng(2), 1.0)
     for _ in range(40):
         rows = sky_rows(PLACE, rng, 60.0)
-        raised = errors.raised_rad @ rng.multivariate_normal(errors.mean, errors.covariance)
+        raised = errors.slopes_rad @ rng.multivariate_normal(errors.mean, errors.covariance)
         shown = replace(rows, elevation_rad=rows.elevation_rad + np.repeat(raised, LEVELS))
         try:
             fix = ExactPosterior()(replace(shown, support=explored_at(), image_errors=errors), CRATER)

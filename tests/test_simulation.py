@@ -15,8 +15,10 @@ from test_evidence import without_sources
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.chain import Settings, locate, locate_rays, two_looks
+from startrack.chain.measurement import fix_roughly
 from startrack.chain.stages import StarRays
-from startrack.core.types import BadInput
+from startrack.core.types import BadInput, ClockError
+from startrack.evidence import StarPhotometry
 from startrack.evidence.photometry import Sources, half_width, measure
 from startrack.rendering import Series
 from startrack.simulation import Starlight, simulate_rays
@@ -117,8 +119,22 @@ def test_a_wrong_clock_turns_the_rays_and_not_what_is_seen(series: Series):
     assert right.photometry.llr == pytest.approx(wrong.photometry.llr, abs=0.1)
 
 
+@pytest.mark.parametrize("later_s", [0.5, 3600.0])
+def test_rays_are_turned_to_the_time_of_their_fix_where_that_moves_them(series: Series, later_s: float):
+    """Also by a clock of which one usual error moves nothing."""
+    scene, rng = series.scene(0)
+    rays = replace(simulate_rays(scene, series.catalog, rng=rng), terrain=load_terrain("shackleton"))
+    by_rays = locate_rays(simulate_rays(scene, series.catalog, rng=rng)).fix
+    turned, fix = fix_roughly(rays, lambda rows, terrain: replace(by_rays, clock=ClockError(later_s, 5.0)))
+    assert fix.clock is not None and fix.clock.offset_s == later_s
+    assert turned.clock.offset_s == (later_s if later_s > 1.0 else 0.0)
+    moved = np.abs(turned.photometry.azimuth_rad - rays.photometry.azimuth_rad)
+    assert (np.median(moved) > 0.005) == (later_s > 1.0)
+
+
 def test_the_stars_of_an_image_are_located_as_the_pipeline_locates_them(located: Any, monkeypatch: Any):
     monkeypatch.setattr(two_looks, "exceeds_noise", lambda light: False)  # no star is measured anew after a first fix
+    monkeypatch.setattr(StarPhotometry, "moving", lambda self, motion_rad: self)  # nor moves
     known, settings = located.result, Settings(evidence_sources="stars")
     catalog = load_catalog().brighter_than(7.0)
     by_stars = locate(known.exposure, known.camera, known.terrain, catalog, settings)

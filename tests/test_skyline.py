@@ -143,7 +143,7 @@ def test_the_sky_stops_where_the_skyline_is(bright: Frame, by_source: dict[str, 
     assert by_source["sky"].sky is not None
     sky, used, errors = by_source["sky"].sky
     true = CRATER.horizon_rad(bright.truth.position_enu_m[None, :2], MIDDLES_RAD)
-    off = sky.shift_px - (true + errors.raised_rad @ errors.mean - sky.elevation_rad) * sky.px_per_rad
+    off = sky.shift_px - (true + errors.slopes_rad @ errors.mean - sky.elevation_rad) * sky.px_per_rad
     assert 0.25 < np.mean((np.square(off) / sky.variance_px2)[used]) < 1.2
     assert abs(np.mean(off[used])) < 0.03
 

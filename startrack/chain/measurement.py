@@ -40,7 +40,7 @@ from startrack.localization import (
     DEFAULT_LOCALIZER,
     Localizer,
     clock_at,
-    clock_matters,
+    is_noticeable,
     require_localizer,
     settle_steepness,
 )
@@ -246,7 +246,7 @@ def fix_again(rays: AnyRays, rough: Fix, localizer: Localizer, rows: Evidence) -
 def _fix_position(rays: AnyRays, localizer: Localizer, rows: Evidence) -> tuple[AnyRays, Fix]:
     """The `rays` under the sky of the time that `rows` show, and the fix by these, which are of the same image."""
     fix = localizer(rows, rays.terrain)
-    if fix.clock is None or rays.terrain.axisymmetric or not clock_matters(rays.clock, rays.terrain):
+    later_s = 0.0 if fix.clock is None or rays.terrain.axisymmetric else fix.clock.offset_s - rays.clock.offset_s
+    if fix.clock is None or not is_noticeable(rays.clock, max(abs(later_s), rays.clock.sigma_s), rays.terrain):
         return rays, fix
-    later_s = fix.clock.offset_s - rays.clock.offset_s
     return (rays.later(later_s, SURE_SIGMAS * fix.clock.sigma_s) if later_s else rays), fix

@@ -45,11 +45,14 @@ class Run:
             self._times[name] = self._times.get(name, 0.0) + 1e3 * (time.perf_counter() - start)
 
     def finish(self, value: T) -> T:
-        """Copy of the last `value` with the times of the stages."""
+        """Copy of the run's result, its last `value`, with the times of the stages."""
         return replace(value, timing_ms=MappingProxyType(self._times))
 
     def refuse(self, cause: BadInput | NoSolution) -> Refused:
-        """The refusal that the `cause` makes of the run, with the last complete value that was reached."""
+        """The refusal that the `cause` makes of the run, with the last complete value that was reached.
+
+        Where damage of the image may be behind the cause, that is the reason.
+        """
         damage = self._reached.damage if cause.reason in HIDDEN_BY_DAMAGE else None  # of which it may be the result
         return Refused(
             reason=cause.reason if damage is None else Reason.DAMAGED_IMAGE,

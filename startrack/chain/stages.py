@@ -3,7 +3,10 @@
     Inputs -> Detected -> Identified -> Oriented -> Measured -> FirstLook -> SecondLook -> Located, or Refused
 
 Each value has the fields of the one before it and the results of one more stage; the two looks hold a `Measured`. All
-are frozen. Which value a function returns states which stages have run; no field is filled in later.
+are frozen. Which value a function returns states which stages have run; no field is filled in later. A stage that knows
+better returns other values of earlier fields: `Oriented` a corrected `camera`, `names` and `bodies` with the brightest
+sources; `Measured` masked `detections`, and `stars`, `catalog_name`, `identification` and `names` by the deeper list;
+each look the `terrain` of the steepness, and `R_enu_icrs`, `clock` and `photometry` of the time that it shows.
 """
 
 from __future__ import annotations
@@ -241,7 +244,8 @@ class SecondLook:
     """What the image shows at the skyline of a first look: all that the position is from."""
 
     first: FirstLook
-    measured: Measured  # that of the first look; stars beside the skyline without the step of the sky's light
+    measured: Measured  # of the first look; stars beside the skyline without the step of the sky's light, all of them
+    # with their way across the skyline while the shutter is open
     sky: SkyEvidence | None = None  # None: not used for the fix
     by_stars: bool = True  # whether the stars' rows are in the posterior too
     sky_unused: str = ""  # why the sky's light is not used; "" also where the settings leave it out
@@ -260,7 +264,7 @@ class SecondLook:
 class Located(Positioned, StarFix, Measured):
     """The whole solution: evidence and the position that explains it."""
 
-    sky: SkyEvidence | None = None  # None: not used for the fix
+    sky: SkyEvidence | None = None  # `used`: where it ends at the skyline of the fix; None: nowhere, or not used at all
     by_stars: bool = True  # whether the stars' rows are in the posterior too
     sky_unused: str = ""  # why the sky's light is not used, or not in all directions
     skyline: MeasuredSkyline | None = None  # that the image shows; None: not one position, or not right to its error

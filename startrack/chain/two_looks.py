@@ -148,7 +148,7 @@ def _image_errors(measured: Measured, sky: SkyLight, used: Bools) -> ImageErrors
     covariance = offsets.covariance_px2.copy()
     covariance[0, 0] += EDGE_SIGMA_PX**2
     return ImageErrors(
-        raised_rad=offset_terms(MIDDLES_RAD) / sky.px_per_rad[:, None], mean=offsets.mean_px, covariance=covariance,
+        slopes_rad=offset_terms(MIDDLES_RAD) / sky.px_per_rad[:, None], mean=offsets.mean_px, covariance=covariance,
         variance_rad2=np.where(used, sky.variance_px2 / np.square(sky.px_per_rad), np.inf),
     )  # fmt: skip
 

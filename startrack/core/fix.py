@@ -165,7 +165,11 @@ class Integrity:
 
 
 class Explored(NamedTuple):
-    """Positions that rows of evidence allow, with the posterior on equal squares: of a search, or of a fix."""
+    """Positions that rows of evidence allow, with the posterior on equal squares: of a search, or of a fix.
+
+    A search that was proven to its end has the places that fit best before its boxes. Positions of a fix are, as its
+    `at_time_m`, those before the turn and the scaling of a round crater by errors of the clock and of its width.
+    """
 
     centres_m: Array  # (n, 2) east and north
     half_m: float  # of the side of a square
@@ -186,7 +190,7 @@ class Fix(Value):
     """Posterior of the camera's position."""
 
     position_enu_m: Array = vector()  # posterior mean of the main mode (east, north) and the camera's height there
-    covariance_m2: Array = array(2, 2)  # (east, north), without gross errors; infinite of a method that states none
+    covariance_m2: Array = array(2, 2)  # (east, north) of the main mode; infinite of a method that states none
     radius95_m: float  # circle about the position that holds 95 % of the posterior
     radius999_m: float
     modes: tuple[Mode, ...]  # heaviest first; weights sum to 1

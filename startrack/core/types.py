@@ -255,7 +255,7 @@ class ImageErrors:
     Arrays over sectors of azimuth begin at north and go eastward.
     """
 
-    raised_rad: Array  # (sectors, j) by one unit of each
+    slopes_rad: Array  # (sectors, j) rise of that skyline by one unit of each
     mean: Array  # (j,)
     covariance: Array  # (j, j)
     variance_rad2: Array  # (sectors,) of the skyline by the light of the sky alone; infinite where it shows none

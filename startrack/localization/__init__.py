@@ -3,7 +3,7 @@
 from typing import Any, Protocol
 
 from startrack.core.types import Evidence, Fix
-from startrack.localization.clock import clock_at, clock_matters, duration
+from startrack.localization.clock import clock_at, duration
 from startrack.localization.conclusion import AMBIGUOUS_MASS
 from startrack.localization.convex_hull import Hull, hull_position
 from startrack.localization.importance_sampling import ENOUGH, Gaussian, WeightedPoints, moments, sample
@@ -11,7 +11,7 @@ from startrack.localization.integrity import RISK, clear_logs
 from startrack.localization.linear_errors import LinearErrors
 from startrack.localization.posterior import MIN_ROW_NATS, ExactPosterior
 from startrack.localization.pseudo_gradient import PseudoGradient, descend
-from startrack.localization.shared_errors import ErrorBasis, SharedErrors
+from startrack.localization.shared_errors import ErrorBasis, SharedErrors, is_noticeable
 from startrack.localization.skyline_model import SkylineModel
 from startrack.localization.skyline_points import SkylinePoints
 from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS, solve_linear
@@ -73,6 +73,6 @@ __all__ = [
     "AMBIGUOUS_MASS", "DEFAULT_LOCALIZER", "ENOUGH", "HIGH_RAD", "LOCALIZERS", "LOW_RAD", "MIN_ROW_NATS", "RISK",
     "ROW_NATS", "ErrorBasis", "ExactPosterior", "Gaussian", "Hull", "LinearErrors", "Localizer", "PseudoGradient",
     "SharedErrors", "SkylineModel", "SkylinePoints", "WeightedPoints", "camera_at", "clear_logs", "clock_at",
-    "clock_matters", "descend", "duration", "has_posterior", "hull_position", "localizer_name", "locate_points",
+    "descend", "duration", "has_posterior", "hull_position", "is_noticeable", "localizer_name", "locate_points",
     "moments", "require_localizer", "sample", "settle_steepness", "solve_linear",
 ]  # fmt: skip

@@ -13,7 +13,6 @@ from startrack.core.types import Array, Clock, Evidence, Explored, NotLocated
 from startrack.frames import Air, R_from_rotvec, Site, sky_rotvec_rad, turn_sky, ut1_sigma_s
 from startrack.localization.places import FIT_M, BoxModel, Place, choose_apart
 from startrack.localization.search import BEAMS, boxes_about
-from startrack.localization.shared_errors import is_noticeable
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain
 
@@ -69,11 +68,6 @@ def turn_evidence(evidence: Evidence, later_s: float, air: Air | None) -> Eviden
     _, first, of = np.unique(evidence.azimuth_rad[light], return_index=True, return_inverse=True)
     azimuth[light] = azimuth[light[first]][of]
     return replace(evidence, azimuth_rad=azimuth, elevation_rad=elevation, clock=moved)
-
-
-def clock_matters(clock: Clock | None, terrain: Terrain) -> bool:
-    """Whether the error of the clock moves a position on a terrain noticeably."""
-    return clock is not None and is_noticeable(clock, clock.sigma_s, terrain)
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,10 @@ def sample_posterior(
     """
     groups = _group_boxes(explored, 4.0 * REACH_M if terrain.axisymmetric else REACH_M)
     if not groups:
-        raise NotLocated("no position in the search area is possible: widen [search] radius_m in the terrain file?")
+        raise NotLocated(
+            "no position in the search area is possible: widen [search] radius_m in the terrain file?",
+            reason="outside_search_area",
+        )
     errors = SharedErrors.of(terrain, rows.clock)
     references_m = np.vstack([[centres_m[0] for centres_m, _ in groups], others_m])
     found: list[Hypothesis] = []

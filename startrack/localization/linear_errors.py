@@ -183,7 +183,7 @@ def _lifts_of(seen: SectorRows, sector_weight: Array, weight: Array) -> Lifts:
     alone, together, lit = seen.light.moments, seen.moments, np.zeros(SECTORS) if seen.edge is None else seen.edge.lit
     own = (1.0 - lit) * sector_weight * alone.information / alone.variance_rad2
     own[np.isinf(seen.image_errors.variance_rad2)] = 0.0
-    return Lifts(seen.image_errors.raised_rad, np.minimum(own, weight), alone.mean_rad - together.mean_rad)
+    return Lifts(seen.image_errors.slopes_rad, np.minimum(own, weight), alone.mean_rad - together.mean_rad)
 
 
 def list_seams() -> Array:

@@ -176,7 +176,7 @@ class SectorRows:
             near = np.flatnonzero(np.abs(above) < TRACED_RAD)
             traced = terrain.horizon_rad(self.around.reference_m[None], rows.azimuth_rad[near])
             above[near] = rows.elevation_rad[near] - np.asarray(traced).ravel()
-        return self._without_lift(above, self.image_errors.raised_rad @ self.image_errors.reference)
+        return self._without_lift(above, self.image_errors.slopes_rad @ self.image_errors.reference)
 
     def _without_lift(self, above_rad: Array, lift_rad: Array) -> Array:
         """Heights (n,) of the rows where the light is not lifted by `lift_rad` (SECTORS,)."""
@@ -254,9 +254,9 @@ class SectorRows:
         The share of the sky's light must not vary with its noise: errors that look like a displacement would not.
         """
         if not len(self.image_errors.mean):
-            return NO_IMAGE_ERRORS.raised_rad
+            return NO_IMAGE_ERRORS.slopes_rad
         stars = np.flatnonzero(self.rows.extended_nats == 0.0)
         by_stars = measure_moments(profiles_of(self.rows.take(stars), self.above_rad[stars], np.zeros(SECTORS)))
         share = by_stars.variance_rad2 / (by_stars.variance_rad2 + self.image_errors.variance_rad2)
         used = share if self.edge is None else share * (1.0 - self.edge.lit)
-        return np.asarray(used[:, None] * self.image_errors.raised_rad)
+        return np.asarray(used[:, None] * self.image_errors.slopes_rad)

@@ -42,7 +42,7 @@ class ExactPosterior:
 
         Raises NotLocated: insufficient_geometry, outside_search_area, inconsistent_evidence.
         """
-        terrain = settle_steepness(evidence, require_terrain(terrain))  # of the chain: it has settled it
+        terrain = settle_steepness(evidence, require_terrain(terrain))  # where the chain has settled it, the same
         informative = (np.abs(evidence.llr) > MIN_ROW_NATS) | (evidence.extended_nats > MIN_ROW_NATS)
         informative &= terrain.is_informative(evidence.azimuth_rad, evidence.elevation_rad)
         count = int(np.count_nonzero(informative))

@@ -181,7 +181,7 @@ def _known_errors(terrain: Terrain, clock: Clock | None) -> list[ShapeError]:
 
 
 def is_noticeable(clock: Clock, error_s: float, terrain: Terrain) -> bool:
-    """Whether an error of a clock moves a row noticeably over the search area of a terrain."""
+    """Whether an error `error_s` [s] of a clock moves a row noticeably over the search area of a terrain."""
     return error_s * float(np.linalg.norm(clock.turn_rad_s)) * terrain.reach_m > NEGLIGIBLE_M
 
 

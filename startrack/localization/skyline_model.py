@@ -51,7 +51,7 @@ class SkylineModel:
     seen: SectorRows
     errors: SharedErrors
     error_slopes_rad: Array  # (k, SECTORS) rise of the skyline by one unit of each shared error
-    gross: str = ""  # fact that has a gross error
+    gross: str = ""  # fact that has a gross error, or OWN_EDGE; "": neither
     stated_basis: ErrorBasis | None = None  # None: of the directions that the rows show
     sector_weight: Array = field(default_factory=lambda: np.ones(SECTORS))  # (SECTORS,) for the linear errors
     closing: Closing | None = None  # None: as at the reference

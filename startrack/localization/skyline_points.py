@@ -190,7 +190,7 @@ class SeenSkyline:
         errs = self.stated.attitude_sigma_rad > 0.0
         errs[TURN] &= not self.terrain.axisymmetric
         return ImageErrors(
-            raised_rad=self.attitude_slopes[errs].T, mean=self.lacking_rad[errs],
+            slopes_rad=self.attitude_slopes[errs].T, mean=self.lacking_rad[errs],
             covariance=np.diag(np.square(self.stated.attitude_sigma_rad[errs])),
             variance_rad2=np.where(self.used, 0.0, np.inf), reference=np.zeros(np.count_nonzero(errs)),
         )  # fmt: skip

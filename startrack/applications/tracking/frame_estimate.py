@@ -77,7 +77,7 @@ class FrameModel:
 
     def lifts(self, parameters: Array) -> Array | None:
         """Lift (n, SECTORS) [rad] of the light above the skyline by the edge, which frames share; None: 0."""
-        raised = self.model.seen.image_errors.raised_rad
+        raised = self.model.seen.image_errors.slopes_rad
         if not self.errors.uses_sky or not raised.shape[1]:
             return None
         return np.outer(self.errors.sigma[-1] * parameters[:, -1], raised[:, 0])

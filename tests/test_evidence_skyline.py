@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from startrack.camera import Camera, Pinhole, load_camera
-from startrack.core.types import MIDDLES_RAD, SECTORS, Detections, SmoothImage
+from startrack.core.types import MIDDLES_RAD, SECTORS, Detections, SmoothImage, sector_of
 from startrack.evidence import (
     Skyline,
     SkylineEstimate,
@@ -112,3 +112,24 @@ def test_the_estimate_is_raised_by_the_errors_that_a_fix_shows():
     plain, higher = (SkylineEstimate.of(PLACE, np.eye(2), CRATER, by) for by in (None, raised))
     assert higher.skyline(MIDDLES_RAD) - plain.skyline(MIDDLES_RAD) == pytest.approx(raised, abs=1e-6)
     assert np.array_equal(higher.sigma_rad, plain.sigma_rad)
+
+
+def test_stars_move_across_the_skyline_by_its_slope_and_their_rise():
+    """A turn about the zenith moves them along a wave by its slope; one about the east, straight up in the north."""
+    azimuth = np.linspace(0.0, 2 * np.pi, 7200, endpoint=False)
+    waved = SkylineEstimate(Skyline(0.1 + 0.02 * np.sin(4 * azimuth)), np.zeros(SECTORS))
+    about_zenith = waved.star_motion_rad(np.array([0.0, 0.0, 2e-3]))
+    assert about_zenith == pytest.approx(2e-3 * 0.08 * np.abs(np.cos(4 * MIDDLES_RAD)), abs=3e-6)
+    level = SkylineEstimate(Skyline(np.full(7200, 0.1)), np.zeros(SECTORS))
+    about_east = level.star_motion_rad(np.array([2e-3, 0.0, 0.0]))
+    assert about_east == pytest.approx(2e-3 * np.abs(np.cos(MIDDLES_RAD)), abs=2e-5)
+    jumping = SkylineEstimate(Skyline(np.where(azimuth < np.pi + 0.013, 0.1, 0.3)), np.zeros(SECTORS))
+    assert (jumping.star_motion_rad(np.array([0.0, 0.0, 2e-3])) < 1e-12).all()
+
+
+def test_the_rows_of_moving_stars_have_the_spread_of_their_way(located):
+    motion = 1e-4 * (1.0 + MIDDLES_RAD)
+    rows = located.result.photometry.moving(motion).evidence()
+    assert rows.edge_sigma_rad == pytest.approx(motion[sector_of(rows.azimuth_rad)] / np.sqrt(12.0))
+    later = located.result.later(60.0, 1.0).photometry.moving(motion)
+    assert len(later.evidence()) == len(rows)

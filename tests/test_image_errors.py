@@ -86,13 +86,13 @@ def test_positions_by_stars_and_light_agree_with_their_covariance() -> None:
     rng, nees, refused = np.random.default_rng(43), [], 0
     covariance = np.diag([LEVEL_PX, 2e-3, 2e-3, 1e-3, 1e-3]) ** 2
     variance_rad2 = np.full(SECTORS, (0.1 / PX_PER_RAD) ** 2)
-    errors = ImageErrors(offset_terms(MIDDLES_RAD) / PX_PER_RAD, np.zeros(5), covariance, variance_rad2)
+    errors = ImageErrors(offset_terms(MIDDLES_RAD)[:, :5] / PX_PER_RAD, np.zeros(5), covariance, variance_rad2)
     for _ in range(40):
         raised = errors.slopes_rad @ rng.multivariate_normal(errors.mean, covariance)
         light, stars = lowered(sky_rows(PLACE, rng, 4.0), -raised), star_rows(PLACE, rng, STARS)
         wrong = rng.random(STARS) < 1.0 / (1.0 + np.exp(3.0))  # as llrs of 3 state
         stars = replace(stars, llr=np.where(wrong, -stars.llr, stars.llr), edge_sigma_rad=np.zeros(STARS))
-        support = ExactPosterior()(replace(stars, is_first_look=True), CRATER).samples
+        support = ExactPosterior()(replace(stars, is_first_look=True), CRATER).support
         rows = replace(Evidence.concatenate(light, stars), support=support, image_errors=errors)
         try:
             fix = ExactPosterior()(rows, CRATER)

@@ -135,7 +135,7 @@ def image_errors(rng: np.random.Generator, part: float) -> ImageErrors:
     mix = rng.normal(size=(5, 5))
     covariance = part**2 * 1e-3 * (mix @ mix.T + 5 * np.eye(5))
     return ImageErrors(
-        slopes_rad=offset_terms(MIDDLES_RAD) / PX_PER_RAD, mean=np.zeros(5), covariance=covariance,
+        slopes_rad=offset_terms(MIDDLES_RAD)[:, :5] / PX_PER_RAD, mean=np.zeros(5), covariance=covariance,
         variance_rad2=np.full(SECTORS, EDGE_PX * CELL_PX / (60.0 * 0.28) / PX_PER_RAD**2),
     )  # fmt: skip
 

@@ -51,7 +51,9 @@ def test_an_array_with_camera_terrain_and_astropy_time_gives_the_same(solution):
         pixels, camera=exposure.camera, terrain=exposure.terrain, time=solution.time.tai,
         time_sigma=exposure.time_sigma_s,
     )  # fmt: skip
-    np.testing.assert_allclose(again.position_m, solution.position_m, atol=1e-6)
+    untimed = startrack.locate(replace(exposure, exposure_s=None))  # stars cross the skyline in the time of exposure
+    np.testing.assert_allclose(again.position_m, untimed.position_m, atol=1e-6)
+    np.testing.assert_allclose(again.position_m, solution.position_m, atol=0.1)
 
 
 def test_astropy_types_at_the_edge(solution):

@@ -49,11 +49,24 @@ def test_an_array_with_camera_terrain_and_astropy_time_gives_the_same(solution):
     pixels = exposure.pixels_adu.astype(np.uint16)
     again = startrack.locate(
         pixels, camera=exposure.camera, terrain=exposure.terrain, time=solution.time.tai,
-        time_sigma=exposure.time_sigma_s,
+        time_sigma=exposure.time_sigma_s, exposure=exposure.exposure_s * u.s,
     )  # fmt: skip
-    untimed = startrack.locate(replace(exposure, exposure_s=None))  # stars cross the skyline in the time of exposure
-    np.testing.assert_allclose(again.position_m, untimed.position_m, atol=1e-6)
-    np.testing.assert_allclose(again.position_m, solution.position_m, atol=0.1)
+    np.testing.assert_allclose(again.position_m, solution.position_m, atol=1e-6)
+
+
+def test_the_duration_of_an_exposure_may_be_seconds_or_a_quantity():
+    pixels = np.zeros((64, 64), np.uint16)
+    for given in (pixels, IMAGE, read_exposure(IMAGE)):
+        assert exposure_input(given, None, duration=90.0).exposure_s == 90.0
+        assert exposure_input(given, None, duration=1.5 * u.min).exposure_s == 90.0
+    assert exposure_input(pixels, None).exposure_s is None
+    assert exposure_input(IMAGE, None).exposure_s == read_exposure(IMAGE).exposure_s
+
+
+@pytest.mark.parametrize("given", [0.0, -1.0, np.nan, np.inf, 1e9, "long", [1.0, 2.0], 3 * u.m, [1.0, 2.0] * u.s])
+def test_an_exposure_that_is_no_duration_is_refused(given):
+    with pytest.raises(ValueError, match=r"^exposure=.*(give seconds or an astropy duration|is not above 0 s)"):
+        startrack.locate(IMAGE, exposure=given)
 
 
 def test_astropy_types_at_the_edge(solution):

@@ -36,6 +36,7 @@ def locate(
     terrain: str | Terrain | None = None,
     time: Time = None,
     time_sigma: float | Quantity | None = None,
+    exposure: float | Quantity | None = None,
     settings: Settings | None = None,
 ) -> Solution:
     """Position and attitude from one image of the stars.
@@ -48,6 +49,7 @@ def locate(
         terrain: a terrain file, the name of a shipped one, or the object.
         time: middle of the exposure: text, aware datetime, numpy datetime64 (UTC) or astropy Time (any scale).
         time_sigma: standard deviation of the clock's error: an astropy duration, or seconds.
+        exposure: duration of the exposure, in which stars cross the skyline: an astropy duration, or seconds.
         settings: stages to use instead of the usual ones.
 
     Returns:
@@ -57,11 +59,12 @@ def locate(
     Raises:
         BadInput: something is missing (no_time, no_calibration, bad_terrain) or cannot be used (exit code 4).
         TypeError: `settings` of another type.
+        ValueError: `exposure` is no duration above 0 s.
     """
     settings = chain.settings_input(settings)
-    exposure = chain.exposure_input(image, time, time_sigma)
-    known = chain.camera_input(camera, exposure), chain.terrain_input(terrain, exposure)
-    return _solution(chain.locate(exposure, *known, load_catalog(), settings), "fix")
+    picture = chain.exposure_input(image, time, time_sigma, exposure)
+    known = chain.camera_input(camera, picture), chain.terrain_input(terrain, picture)
+    return _solution(chain.locate(picture, *known, load_catalog(), settings), "fix")
 
 
 def locate_skyline(

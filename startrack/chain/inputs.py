@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from startrack.camera import Camera, load_camera
 from startrack.chain.stages import Settings
+from startrack.core import MAX_EXPOSURE_S
 from startrack.core.types import BadInput, Exposure
 from startrack.exposure import check_time_sigma_s, exposure_of, read_exposure, with_facts
 from startrack.frames import parse_utc
@@ -23,13 +24,15 @@ Time: TypeAlias = Any  # text, datetime, datetime64, astropy Time (not imported 
 MAX_LIST_COLUMNS = 4  # x, y, flux and error: an array (n, 4) is no image
 
 
-def exposure_input(image: Image, time: Time, time_sigma: Any = None) -> Exposure:
+def exposure_input(image: Image, time: Time, time_sigma: Any = None, duration: Any = None) -> Exposure:
     """The exposure of an `image`: a file, an array (H, W) or (H, W, 3), or the exposure itself.
 
-    `time` and `time_sigma` (see `time_sigma_input`) replace its own where they are given. Pixels that a masked array
-    hides do not count. Raises BadInput (bad_image, no_time).
+    `time`, `time_sigma` (see `time_sigma_input`) and `duration` (see `duration_s`) replace its own where they are
+    given. Pixels that a masked array hides do not count. Raises BadInput (bad_image, no_time), ValueError.
     """
-    given: dict[str, Any] = {"time_utc": time_input(time), "time_sigma_s": time_sigma_input(time_sigma)}
+    given: dict[str, Any] = {
+        "time_utc": time_input(time), "time_sigma_s": time_sigma_input(time_sigma), "exposure_s": duration_s(duration),
+    }  # fmt: skip
     if isinstance(image, Exposure):
         return with_facts(image, **given)
     if isinstance(image, str | os.PathLike):
@@ -94,12 +97,18 @@ def time_sigma_input(time_sigma: Any) -> float | None:
 
 
 def duration_s(duration: Any) -> float | None:
-    """A `duration` [s]: an astropy duration, or seconds; None stays None. Raises ValueError unless it is above 0."""
+    """The `duration` of an exposure [s]: an astropy duration, or seconds; None stays None.
+
+    Raises ValueError for anything else, and unless it is above 0 s and at most MAX_EXPOSURE_S.
+    """
     if duration is None:
         return None
-    seconds = float(duration.to_value("s") if hasattr(duration, "to_value") else duration)
-    if not (math.isfinite(seconds) and seconds > 0):
-        raise ValueError(f"exposure={duration!r} is not above 0 s")
+    try:
+        seconds = float(duration.to_value("s") if hasattr(duration, "to_value") else duration)
+    except (TypeError, ValueError) as cause:
+        raise ValueError(f"exposure={duration!r}: give seconds or an astropy duration") from cause
+    if not 0 < seconds <= MAX_EXPOSURE_S:
+        raise ValueError(f"exposure={duration!r} is not above 0 s and at most {MAX_EXPOSURE_S:g} s")
     return seconds
 
 

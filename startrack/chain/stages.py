@@ -230,6 +230,16 @@ class SkyEvidence(NamedTuple):
     used: Bools  # (SECTORS,) where it is used
     errors: ImageErrors  # of it
 
+    def evidence(self, stars: Evidence, by_stars: bool) -> Evidence:
+        """Rows of this light, `by_stars` after those of the `stars`; with their clock and prior in either case."""
+        light = replace(self.light.evidence(self.used), clock=stars.clock, near=stars.near)
+        return replace(Evidence.concatenate(stars, light) if by_stars else light, image_errors=self.errors)
+
+    def at_skyline(self, fix: Fix) -> Self | None:
+        """Copy that is used where this light ends at the skyline of a `fix`; None: nowhere."""
+        used = self.used if fix.lit is None else self.used & ~fix.lit.whole
+        return self._replace(used=used) if used.any() else None
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FirstLook:
@@ -247,28 +257,25 @@ class SecondLook:
     measured: Measured  # of the first look; stars beside the skyline without the step of the sky's light, all of them
     # with their way across the skyline while the shutter is open
     sky: SkyEvidence | None = None  # None: not used for the fix
+    why_no_sky: str = ""  # why not; "": it is used, or the settings leave it out
     by_stars: bool = True  # whether the stars' rows are in the posterior too
-    sky_unused: str = ""  # why the sky's light is not used; "" also where the settings leave it out
     sky_brightness_mag_arcsec2: float | None = None  # beyond that of the ground; None: no step, no zero point
 
     def evidence(self) -> Evidence:
         """Rows of the stars, of the sky's light, or of both as evidence for the localizer."""
-        rows, sky = self.measured.evidence(), self.sky
-        if sky is None:
-            return rows
-        light = replace(sky.light.evidence(sky.used), clock=rows.clock, near=rows.near)
-        return replace(Evidence.concatenate(rows, light) if self.by_stars else light, image_errors=sky.errors)
+        stars = self.measured.evidence()
+        return stars if self.sky is None else self.sky.evidence(stars, self.by_stars)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Located(Positioned, StarFix, Measured):
     """The whole solution: evidence and the position that explains it."""
 
-    sky: SkyEvidence | None = None  # `used`: where it ends at the skyline of the fix; None: nowhere, or not used at all
-    by_stars: bool = True  # whether the stars' rows are in the posterior too
-    sky_unused: str = ""  # why the sky's light is not used, or not in all directions
+    sky: SkyEvidence | None = None  # these four as in the second look
+    why_no_sky: str = ""
+    by_stars: bool = True
+    sky_brightness_mag_arcsec2: float | None = None
     skyline: MeasuredSkyline | None = None  # that the image shows; None: not one position, or not right to its error
-    sky_brightness_mag_arcsec2: float | None = None  # beyond that of the ground; None: no step, no zero point
 
     @property
     def warnings(self) -> list[str]:
@@ -276,9 +283,21 @@ class Located(Positioned, StarFix, Measured):
         return [*super().warnings, *self.position_warnings]
 
     @property
+    def sky_at_skyline(self) -> SkyEvidence | None:
+        """The sky's light where it ends at the skyline of the fix; None: nowhere, or not used."""
+        return None if self.sky is None else self.sky.at_skyline(self.fix)
+
+    @property
+    def sky_unused(self) -> str:
+        """Reason why the sky's light does not show the skyline in all directions; "": it does, or is not asked for."""
+        if self.sky is None or self.fix.lit is None:
+            return self.why_no_sky
+        return f"at azimuths {self.fix.lit.text}, where its edge is not the skyline that the stars show: lit ground?"
+
+    @property
     def evidence_source(self) -> str:
         """Source of the position: stars, sky (the light of the sky), or both."""
-        if self.sky is None:
+        if self.sky_at_skyline is None:
             return "stars"
         return "both" if self.by_stars else "sky"
 

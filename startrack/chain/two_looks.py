@@ -44,18 +44,18 @@ def look_at_skyline(first: FirstLook, settings: Settings) -> SecondLook:
     """Second look: the light of the sky at the skyline of the `first` one, and the stars beside it without its step.
 
     The stars are measured anew wherever that light is above the noise, even if too few sectors show a clear step for it
-    to count itself; `sky_unused` has the reason. Where nothing but the light of the sky counts by the `settings`, that
+    to count itself; `why_no_sky` has the reason. Where nothing but the light of the sky counts by the `settings`, that
     raises NotLocated (insufficient_geometry).
     """
     unseen = why_unseen(first)
     second = (
-        SecondLook(first=first, measured=first.measured, sky_unused=unseen) if unseen else _measure(first, settings)
+        SecondLook(first=first, measured=first.measured, why_no_sky=unseen) if unseen else _measure(first, settings)
     )
     if settings.evidence_sources == "stars":
-        return replace(second, sky=None, sky_unused="")
+        return replace(second, sky=None, why_no_sky="")
     if settings.evidence_sources == "sky":
         if second.sky is None:
-            raise NotLocated(f"the light of the sky gives no position: {second.sky_unused}")
+            raise NotLocated(f"the light of the sky gives no position: {second.why_no_sky}")
         return replace(second, by_stars=False)
     return second
 
@@ -86,7 +86,7 @@ def _measure(first: FirstLook, settings: Settings) -> SecondLook:
         first=first,
         measured=replace(measured, photometry=moving),
         sky=sky,
-        sky_unused=unused,
+        why_no_sky=unused,
         sky_brightness_mag_arcsec2=brightness,
     )
 
@@ -109,16 +109,12 @@ def fix_by_all(second: SecondLook, localizer: Localizer) -> Located:
     if known.damage is None:  # damage changes the light of stars in part, as a second skyline does
         check_single_skyline(known.photometry, known.terrain, rough.at_time_m)
     measured, fix = fix_again(known, rough, localizer, second.evidence())
-    sky, unused = second.sky, second.sky_unused
-    if sky is not None and fix.lit is not None:
-        used = sky.used & ~fix.lit.whole
-        sky = sky._replace(used=used) if used.any() else None
-        unused = f"at azimuths {fix.lit.text}, where its edge is not the skyline that the stars show: lit ground?"
-    if sky is not None and not fix.ambiguous:
-        _require_near(fix, measured.terrain, sky)
+    seen = None if second.sky is None else second.sky.at_skyline(fix)
+    if seen is not None and not fix.ambiguous:
+        _require_near(fix, measured.terrain, seen)
     return Located(
-        **vars(measured), fix=fix, sky=sky, by_stars=second.by_stars, sky_unused=unused,
-        skyline=skyline_of_image(measured, fix, sky), sky_brightness_mag_arcsec2=second.sky_brightness_mag_arcsec2,
+        **vars(measured), fix=fix, sky=second.sky, why_no_sky=second.why_no_sky, by_stars=second.by_stars,
+        sky_brightness_mag_arcsec2=second.sky_brightness_mag_arcsec2, skyline=skyline_of_image(measured, fix, seen),
     )  # fmt: skip
 
 

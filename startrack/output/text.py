@@ -212,7 +212,7 @@ def _longer_exposure(measured: Measured) -> Iterator[str]:
     seen_from = "" if isinstance(measured, Located) else " of the search area's middle"
     text = f"{longer}: {then} stars near the skyline{seen_from}, in place of {now}, would show whether they are visible"
     if isinstance(measured, Located) and not measured.fix.ambiguous and np.isfinite(measured.fix.radius95_m):
-        gain = LONGER**0.5 if measured.sky is not None else max(then, 1) / max(now, 1)
+        gain = LONGER**0.5 if measured.sky_at_skyline is not None else max(then, 1) / max(now, 1)
         stated = " if all facts were stated" if measured.fix.unstated else ""
         text += f", a 95 % circle of about {measured.fix.radius95_m / gain:.1f} m{stated}"
     yield text

@@ -83,7 +83,7 @@ def observe_frame(outcome: Outcome, errors: TrackErrors | None = None, terrain: 
         raise ValueError(f"{name}: a track needs the localizer posterior")
     terrain = terrain or value.terrain
     if errors is None:
-        errors = TrackErrors.of(terrain, value.clock, value.sky is not None)
+        errors = TrackErrors.of(terrain, value.clock, value.sky_at_skyline is not None)
         errors = errors.with_gross(facts_of(value, errors))
     missing = facts_of(value, errors) - errors.gross
     if missing:
@@ -131,11 +131,8 @@ def image_fixes(fix: Fix, terrain: Terrain) -> tuple[ImageFix, ...]:
 
 def _informative_rows(located: Located, terrain: Terrain, position_m: Array) -> Evidence:
     """The rows that say something about the skyline seen from a position (2,), with the errors of the image."""
-    stars = rows = replace(located.evidence(), near=None)
-    if located.sky is not None:
-        light = located.sky.light.evidence(located.sky.used)
-        rows = Evidence.concatenate(stars, light) if located.by_stars else light
-        rows = replace(rows, clock=stars.clock, image_errors=located.sky.errors)
+    rows, sky = replace(located.evidence(), near=None), located.sky_at_skyline
+    rows = rows if sky is None else sky.evidence(rows, located.by_stars)
     return rows_near_skyline(rows, terrain, position_m)
 
 

@@ -241,7 +241,7 @@ def _legend(value: Inputs, truth: bool, undrawn: int) -> Legend:
         found += [("ring", Ink.BODY, "planet, Sun, Earth or Moon, where it must be; dim: hidden")]
     if isinstance(value, Located) and not value.fix.ambiguous:
         found += [("line", Ink.SKYLINE, "skyline of the terrain seen from the position found")]
-        if value.sky is not None:
+        if value.sky_at_skyline is not None:
             found += [("disc", Ink.MEASURED, "skyline where the light of the sky stops")]
         around = "; circle 95 %, ellipse one sigma" if _has_circle(value) else ""
         found += [("place", Ink.POSITION, f"position{around}")]

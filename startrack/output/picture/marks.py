@@ -57,7 +57,7 @@ def overlay_of(value: Inputs) -> dict[str, Any]:
     if isinstance(value, Located):
         xy_px, imaged = _project_azel(value, AZIMUTHS_RAD, horizon_at_fix(value, AZIMUTHS_RAD))
         found["skyline"] = [_pairs(xy_px[run]) for run in known_runs(imaged)]
-        if value.sky is not None and value.skyline is not None:
+        if value.sky_at_skyline is not None and value.skyline is not None:
             by_sky = value.skyline.known & (value.skyline.source != "stars")
             angles_rad = value.skyline.azimuth_rad[by_sky], value.skyline.elevation_rad[by_sky]
             xy_px, imaged = _project_azel(value, *angles_rad)

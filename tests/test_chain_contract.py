@@ -107,7 +107,7 @@ class CountedPosterior(ExactPosterior):
     def __call__(self, evidence: Any, terrain: Any) -> Any:
         self.calls["located"] += 1
         fix = replace(super().__call__(evidence, terrain), **self.changes)
-        return replace(fix, at_time_m=fix.at_time_m + self.moved_m) if self.calls["located"] == 2 else fix
+        return replace(fix, compared_at_m=fix.compared_at_m + self.moved_m) if self.calls["located"] == 2 else fix
 
 
 @pytest.fixture

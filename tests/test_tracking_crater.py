@@ -108,7 +108,7 @@ def test_one_image_shows_the_steepness_and_the_position_over_the_width(sizes):
     found = settle_steepness(rows, known)
     assert found.depth_m / found.diameter_m == pytest.approx(DEPTH_M / DIAMETER_M, rel=0.01)
     fix, exact = ExactPosterior()(rows, known), ExactPosterior()(rows, GROUND)
-    scaled = fix.at_time_m * DIAMETER_M / known.diameter_m
+    scaled = fix.compared_at_m * DIAMETER_M / known.diameter_m
     assert np.linalg.norm(scaled - exact.position_enu_m[:2]) < exact.radius95_m
     off = fix.position_enu_m[:2] - place
     assert off @ np.linalg.solve(fix.covariance_m2, off) < 9.2

@@ -24,7 +24,7 @@ def skyline_of_image(measured: Measured, fix: Fix, sky: SkyEvidence | None) -> M
     """
     if fix.ambiguous or fix.is_approximate:
         return None
-    horizon = Skyline.trace(fix.at_time_m, measured.terrain)
+    horizon = Skyline.trace(fix.compared_at_m, measured.terrain)
     elevation, sigma = _skyline_by_stars(measured.evidence(), horizon)
     source = np.where(sigma < MOST_SIGMA_RAD, "stars", "").astype("<U9")
     if sky is not None:

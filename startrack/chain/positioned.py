@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from startrack.core.errors import Reason
-from startrack.core.types import Array, Exposure, Fix, MeasuredSkyline, PositionPrior
+from startrack.core.types import Exposure, Fix, MeasuredSkyline, PositionPrior
 from startrack.frames import Site
 from startrack.terrain import Terrain
 
@@ -19,14 +17,6 @@ class Positioned:
     terrain: Terrain
     skyline: MeasuredSkyline | None
     near: PositionPrior | None
-
-    @property
-    def position_at_time_m(self) -> Array:
-        """East and north (2,) where the skyline and the stars are compared, see `Fix.at_time_m`.
-
-        In a round crater the error of the clock spreads the position over an arc, whose mean lies beside it.
-        """
-        return np.asarray(self.fix.at_time_m)
 
     @property
     def status(self) -> str:

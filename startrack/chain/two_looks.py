@@ -96,7 +96,7 @@ def estimate_skyline(first: FirstLook) -> SkylineEstimate:
     fix, covariance = first.fix, first.fix.covariance_m2
     if fix.support is not None:  # without the arc on which an error of the clock turns a position in a round crater
         _, covariance = moments(fix.support.centres_m, relative_weights(fix.support.log_weight))
-    return SkylineEstimate.of(np.asarray(fix.at_time_m), covariance, first.measured.terrain, fix.raised_rad)
+    return SkylineEstimate.of(fix.compared_at_m, covariance, first.measured.terrain, fix.raised_rad)
 
 
 def fix_by_all(second: SecondLook, localizer: Localizer) -> Located:
@@ -107,7 +107,7 @@ def fix_by_all(second: SecondLook, localizer: Localizer) -> Located:
     """
     known, rough = second.measured, second.first.fix
     if known.damage is None:  # damage changes the light of stars in part, as a second skyline does
-        check_single_skyline(known.photometry, known.terrain, rough.at_time_m)
+        check_single_skyline(known.photometry, known.terrain, rough.compared_at_m)
     measured, fix = fix_again(known, rough, localizer, second.evidence())
     seen = None if second.sky is None else second.sky.at_skyline(fix)
     if seen is not None and not fix.ambiguous:
@@ -120,7 +120,7 @@ def fix_by_all(second: SecondLook, localizer: Localizer) -> Located:
 
 def _require_near(fix: Fix, terrain: Terrain, sky: SkyEvidence) -> None:
     """Raise NotLocated (inconsistent_evidence) where the skyline of the fix is far from where the sky was measured."""
-    skyline = terrain.horizon_rad(np.asarray(fix.at_time_m)[None], MIDDLES_RAD)
+    skyline = terrain.horizon_rad(fix.compared_at_m[None], MIDDLES_RAD)
     if fix.raised_rad is not None:
         skyline = skyline + fix.raised_rad
     moved_px = np.abs(skyline - sky.light.elevation_rad) * sky.light.px_per_rad

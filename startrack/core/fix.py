@@ -168,7 +168,7 @@ class Explored(NamedTuple):
     """Positions that rows of evidence allow, with the posterior on equal squares: of a search, or of a fix.
 
     A search that was proven to its end has the places that fit best before its boxes. Positions of a fix are, as its
-    `at_time_m`, those before the turn and the scaling of a round crater by errors of the clock and of its width.
+    `compared_at_m`, those before the turn and the scaling of a round crater by errors of the clock and of its width.
     """
 
     centres_m: Array  # (n, 2) east and north
@@ -194,9 +194,10 @@ class Fix(Value):
     radius95_m: float  # circle about the position that holds 95 % of the posterior
     radius999_m: float
     modes: tuple[Mode, ...]  # heaviest first; weights sum to 1
-    # On the ground and under the sky of the evidence, where both are compared; nan: at the position. The errors of the
-    # clock and of a crater's width that the evidence shows move the position away from there.
-    at_time_m: Array = array(2, default=np.nan, may_be_nan=True)
+    # Where skyline and evidence are compared, on the ground and under the sky of the evidence; nan: at the position.
+    # Errors of the clock and of a crater's width that the evidence shows move the position away from there; in a round
+    # crater that of the clock spreads it over an arc, whose mean lies beside it.
+    compared_at_m: Array = array(2, default=np.nan, may_be_nan=True)
     ambiguous: bool  # modes outside the main mode's 99.9 % circle hold more than 1 %
     dropped_probability: float | None = None  # bound on what the search left out of the posterior; None: none below 1
     search: str = "proven"  # no other position fits; "beam": not proven; "approximate": no posterior. Of a first look,
@@ -214,8 +215,8 @@ class Fix(Value):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if np.isnan(self.at_time_m).any():
-            object.__setattr__(self, "at_time_m", self.position_enu_m[:2])
+        if np.isnan(self.compared_at_m).any():
+            object.__setattr__(self, "compared_at_m", self.position_enu_m[:2])
 
     @property
     def is_approximate(self) -> bool:

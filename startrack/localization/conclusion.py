@@ -149,7 +149,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored) 
         horizon_error_rad=bias_rad, clock=_clock(whole), blocked=blocked if blocked else None,
         integrity=integrity, unstated=_unstated_facts(whole),
         exact_map_radius999_m=_radius_by_exact_map(whole), raised_rad=best.model.rise_rad(parameters),
-        at_time_m=parameters[:2], shown=_shown_errors(best),
+        compared_at_m=parameters[:2], shown=_shown_errors(best),
         lit=lit_up if lit_up else None,
         support=_support(best, explored, dropped),
     )  # fmt: skip

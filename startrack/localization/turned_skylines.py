@@ -79,8 +79,8 @@ def locate_points(points: SkylinePoints, terrain: Terrain) -> tuple[Fix, SeenSky
     except NotLocated as refusal:
         raise name_prior(refusal, points.near) from refusal
     if not terrain.axisymmetric:  # in a round crater a heading spreads the position over an arc
-        fix = replace(fix, at_time_m=fix.position_enu_m[:2])
-    there = replace(turned[0], position_m=fix.at_time_m)
+        fix = replace(fix, compared_at_m=fix.position_enu_m[:2])
+    there = replace(turned[0], position_m=fix.compared_at_m)
     for _ in range(SETTLED_ROUNDS):
         there = replace(there, attitude_rad=there.solve(FIXED_M)[1])
     return fix, there

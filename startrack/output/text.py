@@ -240,7 +240,7 @@ def _more_skyline(measured: Measured) -> Iterator[str]:
 
 def _skyline(measured: Measured) -> Array:
     """Elevation (n,) of the map's skyline at the position, or in the middle of the search area without one."""
-    position_m = measured.position_at_time_m if isinstance(measured, Located) else np.zeros(2)
+    position_m = measured.fix.compared_at_m if isinstance(measured, Located) else np.zeros(2)
     return np.asarray(measured.terrain.horizon_rad(position_m[None], MIDDLES_RAD)).ravel()
 
 

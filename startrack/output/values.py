@@ -43,12 +43,15 @@ def has_position(value: Any) -> bool:
     return isinstance(value, Positioned) and not value.fix.ambiguous
 
 
-def skyline_position_m(value: Positioned) -> tuple[float, float]:
-    """East and north [m] of the position whose skyline a located `value` is compared with."""
+def horizon_at_fix(value: Positioned, azimuth_rad: Array) -> Array:
+    """Elevation (n,) of the horizon at azimuths (n,) [rad], at the position of a `value`, or the likeliest of several.
+
+    That is where the skyline is compared with the evidence.
+    """
+    at_m = value.fix.compared_at_m
     if value.fix.ambiguous:
-        return value.fix.modes[0].east_m, value.fix.modes[0].north_m
-    east_m, north_m = value.position_at_time_m
-    return float(east_m), float(north_m)
+        at_m = np.array([value.fix.modes[0].east_m, value.fix.modes[0].north_m])
+    return value.terrain.horizon_rad(at_m[None], azimuth_rad)
 
 
 def boresight_rad(R_cam_icrs: Array) -> tuple[float, float, float]:
@@ -112,8 +115,8 @@ def predicted_visible(value: Located) -> int:
     """Number of stars of a located `value` that were measured and are above the skyline of the fix."""
     if value not in _predicted_visible:  # horizons of a height map take time, and several outputs need this number
         light = value.photometry
-        horizon = value.terrain.horizon_rad(np.array([skyline_position_m(value)]), light.azimuth_rad)
-        _predicted_visible[value] = int((light.usable & (light.elevation_rad > horizon)).sum())
+        is_above = light.elevation_rad > horizon_at_fix(value, light.azimuth_rad)
+        _predicted_visible[value] = int((light.usable & is_above).sum())
     return _predicted_visible[value]
 
 
@@ -203,7 +206,7 @@ def exact_lens_text(included: bool) -> str:
 
 def off_map(value: Positioned) -> Blocked:
     """The azimuths in which ground off the maps could stand above their skyline at the position of `value`."""
-    return sectors_off_map(value.terrain, value.position_at_time_m)
+    return sectors_off_map(value.terrain, value.fix.compared_at_m)
 
 
 def sectors_off_map(terrain: Terrain, position_m: Array) -> Blocked:

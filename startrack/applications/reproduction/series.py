@@ -65,7 +65,7 @@ def _observe(
             if fix.ambiguous:
                 raise NotLocated("several positions fit the first exposure")
         odometry_m2 = np.square(ODOMETRY_SIGMA_1 * np.hypot(*moves_m[:k].T)).sum()
-        at, covariance = fix.at_time_m + moved[k], fix.covariance_m2 + odometry_m2 * np.eye(2)
+        at, covariance = fix.compared_at_m + moved[k], fix.covariance_m2 + odometry_m2 * np.eye(2)
         rows = rows_near_skyline(rays.evidence(), terrain, at)
         estimate = estimate_frame(rows, terrain, shared, at, covariance)
         frames.append(ObservedFrame(f"exposure-{k:02d}", when, np.eye(3), (estimate,), rows))

@@ -38,7 +38,7 @@ class ImageFix:
     covariance_m2: Array  # (2, 2)
     radius95_m: float
     radius999_m: float
-    at_time_m: Array  # (2,) if the stated time is right
+    compared_at_m: Array  # (2,) as in `Fix`
     weight: float  # probability of the position
 
 
@@ -89,7 +89,7 @@ def observe_frame(outcome: Outcome, errors: TrackErrors | None = None, terrain: 
     if missing:
         raise ValueError(f"{name}: it shows a gross error of {', '.join(missing)}: it must be shared")
     fixes = image_fixes(value.fix, terrain)
-    rows = _informative_rows(value, terrain, fixes[0].at_time_m)
+    rows = _informative_rows(value, terrain, fixes[0].compared_at_m)
     frame = ObservedFrame(
         name, when, R, (), rows, fixes, value.fix.shown, steepness_1=value.terrain.errors.steepness_1,
         search=value.fix.search,
@@ -105,12 +105,12 @@ def facts_of(outcome: Outcome, errors: TrackErrors) -> frozenset[str]:
 
 def observe_again(frame: ObservedFrame, errors: TrackErrors, terrain: Terrain) -> ObservedFrame:
     """The `frame` by its evidence, with these shared `errors`."""
-    if frame.evidence is None:
+    if (rows := frame.evidence) is None:
         return frame
     errors = errors.on(terrain)
     modes = [
-        replace(estimate_frame(frame.evidence, terrain, errors, fix.at_time_m, fix.covariance_m2), weight=fix.weight)
-        for fix in frame.fixes
+        replace(estimate_frame(rows, terrain, errors, one.compared_at_m, one.covariance_m2), weight=one.weight)
+        for one in frame.fixes
     ]
     return replace(frame, modes=tuple(modes))
 
@@ -118,7 +118,7 @@ def observe_again(frame: ObservedFrame, errors: TrackErrors, terrain: Terrain) -
 def image_fixes(fix: Fix, terrain: Terrain) -> tuple[ImageFix, ...]:
     """The position of a `fix` by one image, or each of several."""
     if not fix.ambiguous:
-        position, at = np.asarray(fix.position_enu_m), np.asarray(fix.at_time_m)
+        position, at = np.asarray(fix.position_enu_m), np.asarray(fix.compared_at_m)
         return (ImageFix(position, np.asarray(fix.covariance_m2), fix.radius95_m, fix.radius999_m, at, 1.0),)
     found = []
     for mode in fix.modes:

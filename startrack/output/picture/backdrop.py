@@ -14,7 +14,7 @@ from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Bools
 from startrack.frames import azel_from_rays
 from startrack.output.picture.canvas import Box, Ink
-from startrack.output.values import skyline_position_m
+from startrack.output.values import horizon_at_fix
 
 Image = NDArray[np.float32]
 LONGEST_SIDE_PX, SHORTEST_SIDE_PX = 1400, 900
@@ -95,11 +95,6 @@ def _wall_mask(value: Located, size: tuple[int, int]) -> Image:
     # The signed distance is what may be interpolated; cut off afterwards, it gives a sharp and smooth edge.
     below_rad = np.asarray(cv2.resize(below.astype(np.float32), size, interpolation=cv2.INTER_LINEAR))
     return np.clip(below_rad * np.float32(1 / EDGE_RAD) + np.float32(0.5), 0, 1)
-
-
-def horizon_at_fix(value: Located, azimuth_rad: Array) -> Array:
-    """Elevation (n,) of the horizon at the fix at azimuths (n,) [rad]."""
-    return value.terrain.horizon_rad(np.array([skyline_position_m(value)]), azimuth_rad)
 
 
 def _background_and_light(value: Inputs, size: tuple[int, int], inside: Bools) -> tuple[Image, Image]:

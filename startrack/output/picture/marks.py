@@ -14,10 +14,10 @@ from startrack.core.types import Array, Bools, Ints
 from startrack.estimation.match import SIGNIFICANT_SNR
 from startrack.frames import azel_from_rays, heading_pitch_roll_from_R_body_enu, rays_from_azel
 from startrack.output.picture.axes import known_runs
-from startrack.output.picture.backdrop import AZIMUTHS_RAD, KNEE_SNR, View, horizon_at_fix
+from startrack.output.picture.backdrop import AZIMUTHS_RAD, KNEE_SNR, View
 from startrack.output.picture.canvas import LARGE_PX, TEXT_PX, TITLE_PX, Canvas, Ink, box_around, mix_colours
 from startrack.output.tables import names_of, status_of
-from startrack.output.values import R_body_enu
+from startrack.output.values import R_body_enu, horizon_at_fix
 
 DIMMEST_HIDDEN_V_MAG = 3.0  # a fainter planet behind the wall is not missed
 COMPASS_DEG = np.arange(0.0, 60.0, 0.5)  # elevations from the horizontal up at which a tick of the compass may stand

@@ -147,7 +147,7 @@ def located_picture(value: Positioned, skyline: MeasuredSkyline) -> NDArray[np.u
     """
     has_stars = isinstance(value, Measured)
     canvas = Canvas(WIDTH_PX, HEIGHT_PX + ENLARGED_PX + (0 if has_stars else MAPS_PX))
-    horizon = Skyline.trace(value.position_at_time_m, value.terrain)
+    horizon = Skyline.trace(value.fix.compared_at_m, value.terrain)
     if isinstance(value, Measured):
         light, status = value.photometry, status_of(value.photometry)
         decided = np.isin(status, ("seen", "hidden"))  # brightest first

@@ -190,11 +190,6 @@ class StarFix(StarRays):
 
     fix: Fix
 
-    @property
-    def status(self) -> str:
-        """Status: ok, or ambiguous where several positions fit."""
-        return "ambiguous" if self.fix.ambiguous else "ok"
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Measured(StarRays, Oriented):

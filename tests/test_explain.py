@@ -15,7 +15,7 @@ from stage_helpers import as_stage
 from startrack.chain.stages import Detected, Measured, Refused
 from startrack.cli.main import main
 from startrack.core.errors import Reason
-from startrack.core.types import Blocked, Mode, UnstatedFact
+from startrack.core.types import Mode, Sectors, UnstatedFact
 from startrack.output import SCHEMAS, explain
 
 SAMPLE = str(Path(__file__).parents[1] / "sample_images/near-centre.png")
@@ -73,7 +73,7 @@ def test_a_skyline_out_of_view_and_a_blocked_one_are_named(located: Any) -> None
     narrow = replace(located.result.camera, calibrated_angle_rad=np.radians(70.0))
     blocked = np.zeros(240)
     blocked[20:40] = 1.0
-    outcome = replace(with_fix(located, radius95_m=30.0, blocked=Blocked(blocked)), camera=narrow)
+    outcome = replace(with_fix(located, radius95_m=30.0, blocked=Sectors(blocked)), camera=narrow)
     _, out_of_view, ridge = explain(outcome)
     assert out_of_view.startswith("more of the skyline: azimuths ") and "wider lens" in out_of_view
     assert ridge.startswith("a free view: the skyline is not the map's at azimuths 30 to 60 degrees")

@@ -271,7 +271,7 @@ class Solution:
             return None
         from astropy.table import QTable
 
-        text = output.skyline_table_text(self.result.skyline, output.off_map(self.result).whole)
+        text = output.skyline_table_text(self.result.skyline, output.off_map(self.result).likely)
         return QTable.read(text, format="ascii.ecsv")
 
     @property

@@ -30,7 +30,7 @@ def skyline_of_image(measured: Measured, fix: Fix, sky: SkyEvidence | None) -> M
     if sky is not None:
         light, used, errors = sky
         used = used & np.isfinite(light.shift_sigma_px)
-        used = used if fix.blocked is None else used & ~fix.blocked.whole
+        used = used if fix.blocked is None else used & ~fix.blocked.likely
         by_image = np.einsum("ni,ij,nj->n", errors.slopes_rad, errors.covariance, errors.slopes_rad)
         by_sky = light.elevation_rad + light.shift_px / light.px_per_rad - errors.slopes_rad @ errors.mean
         sky_sigma = np.sqrt(light.variance_px2 / np.square(light.px_per_rad) + by_image)

@@ -160,7 +160,7 @@ def remeasure_stars(first: FirstLook, band: SkylineBand, light: SkyLight, photom
     is_reliable &= band.estimate.is_level(stars.azimuth_rad)
     wanted = (np.abs(above_px) < BAND_PX) & is_reliable
     if blocked is not None:
-        wanted &= ~blocked.hides(stars.azimuth_rad)
+        wanted &= ~blocked.contain(stars.azimuth_rad)
     around = np.abs(above_px) < BAND_PX + NEIGHBOURS_PX
     # The fix determines the visibility of neighbours better than their faint flux does, except next to the skyline.
     undecided = (np.abs(above_px) < UNDECIDED_PX) | ~is_reliable

@@ -232,7 +232,7 @@ class SkyEvidence(NamedTuple):
 
     def at_skyline(self, fix: Fix) -> Self | None:
         """Copy that is used where this light ends at the skyline of a `fix`; None: nowhere."""
-        used = self.used if fix.lit is None else self.used & ~fix.lit.whole
+        used = self.used if fix.lit is None else self.used & ~fix.lit.likely
         return self._replace(used=used) if used.any() else None
 
 

@@ -109,42 +109,39 @@ class ShownError:
 
 
 @dataclass(frozen=True, eq=False)
-class Blocked:
-    """Probability that the skyline, or the edge of the light, is not the map's, by sectors from north eastward.
+class Sectors:
+    """Sectors of azimuth from north eastward, and where something is likely, such as that the skyline is hidden."""
 
-    Something on no map hides it, or it lies below the map's.
-    """
-
-    probability: Array  # (n,)
+    probability: Array  # (n,) of it in each sector
 
     @property
-    def whole(self) -> Bools:
-        """Whether the skyline is more likely not the map's than the map's, for each sector (n,)."""
+    def likely(self) -> Bools:
+        """Whether it is more likely than not, for each sector (n,)."""
         return np.asarray(self.probability > 0.5)
 
-    def hides(self, azimuth_rad: Array) -> Bools:
-        """Whether directions (n,) at `azimuth_rad` [rad] are in sectors whose skyline is more likely not the map's."""
+    def contain(self, azimuth_rad: Array) -> Bools:
+        """Whether it is likely in the sectors of directions (n,) at `azimuth_rad` [rad]."""
         n = len(self.probability)
-        return self.whole[(azimuth_rad / (2 * np.pi) * n).astype(np.int64) % n]
+        return self.likely[(azimuth_rad / (2 * np.pi) * n).astype(np.int64) % n]
 
     def __bool__(self) -> bool:
-        return bool(self.whole.any())
+        return bool(self.likely.any())
 
     @property
     def ranges_rad(self) -> list[tuple[float, float]]:
-        """Azimuths [rad] from and to of each range of blocked sectors, eastward; across north `to` is the smaller."""
-        if self.whole.all():
+        """Azimuths [rad] from and to of each range of likely sectors, eastward; across north `to` is the smaller."""
+        if self.likely.all():
             return [(0.0, 2 * np.pi)]
-        width = 2 * np.pi / len(self.whole)
-        starts = np.flatnonzero(self.whole & ~np.roll(self.whole, 1))
-        ends = np.flatnonzero(self.whole & ~np.roll(self.whole, -1)) + 1
+        width = 2 * np.pi / len(self.likely)
+        starts = np.flatnonzero(self.likely & ~np.roll(self.likely, 1))
+        ends = np.flatnonzero(self.likely & ~np.roll(self.likely, -1)) + 1
         if len(ends) and ends[0] <= starts[0]:
             ends = np.roll(ends, -1)
         return [(float(a) * width, float(b) * width) for a, b in zip(starts, ends, strict=True)]
 
     @property
     def text(self) -> str:
-        """Text of the blocked ranges of azimuth in degrees."""
+        """Text of the likely ranges of azimuth in degrees."""
         return ", ".join(f"{a:.0f} to {b:.0f}" for a, b in np.degrees(self.ranges_rad)) + " degrees"
 
 
@@ -204,13 +201,14 @@ class Fix(Value):
     # if there was one: the second begins with its points
     horizon_error_rad: float = 0.0  # common to all azimuths: how much higher the true horizon is than the map's
     clock: ClockError | None = None  # as the evidence shows it; None: not estimated
-    blocked: Blocked | None = None  # parts of the view; None: nothing is blocked
+    blocked: Sectors | None = None  # where the skyline is not the map's: something on no map hides it, or it lies below
+    # the map's; None: nowhere
     integrity: Integrity | None = None  # None: not assessed, of several positions or without a posterior
     raised_rad: Array | None = None  # (sectors,) rise of the skyline above the map's by the shared errors
     unstated: tuple[UnstatedFact, ...] = ()  # the one that widens the circle most first
     shown: tuple[ShownError, ...] = ()  # errors beyond the defaults
     exact_map_radius999_m: float | None = None  # if the map had no waves; None: it has none
-    lit: Blocked | None = None  # where the edge of the sky's light is not the skyline; None: nowhere
+    lit: Sectors | None = None  # where the edge of the sky's light is not the skyline; None: nowhere
     support: Explored | None = None  # of the posterior, for a later fix by more rows of the image; None: there are none
 
     def __post_init__(self) -> None:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from startrack.core.errors import BadInput, NoSolution, NotIdentified, NotLocated, TooFewStars
 from startrack.core.fix import (
-    Blocked,
     Clock,
     ClockError,
     Explored,
@@ -25,6 +24,7 @@ from startrack.core.fix import (
     Integrity,
     Mode,
     PositionPrior,
+    Sectors,
     ShownError,
     UnstatedFact,
 )
@@ -32,9 +32,9 @@ from startrack.core.obstacles import Obstacles
 from startrack.core.values import Array, Bools, Ints, Rows, Value, array, rotation, vector
 
 __all__ = [
-    "Array", "Attitude", "BadInput", "Blocked", "Body", "Bools", "Centroids", "Clock", "ClockError", "Correction",
-    "Detections", "Evidence", "Explored", "Exposure", "Fix", "Identification", "ImageErrors", "Integrity", "Ints",
-    "Mask", "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified", "NotLocated", "PositionPrior", "Rows",
+    "Array", "Attitude", "BadInput", "Body", "Bools", "Centroids", "Clock", "ClockError", "Correction", "Detections",
+    "Evidence", "Explored", "Exposure", "Fix", "Identification", "ImageErrors", "Integrity", "Ints", "Mask",
+    "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified", "NotLocated", "PositionPrior", "Rows", "Sectors",
     "ShownError", "Stars", "TooFewStars", "UnstatedFact", "Value", "array", "rotation", "vector",
 ]  # fmt: skip
 

@@ -11,13 +11,13 @@ import numpy as np
 from startrack.core.statistics import relative_weights, shares
 from startrack.core.types import (
     Array,
-    Blocked,
     ClockError,
     Explored,
     Fix,
     Ints,
     Mode,
     NotLocated,
+    Sectors,
     ShownError,
     UnstatedFact,
 )
@@ -139,7 +139,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored) 
             integrity = assess_integrity(
                 best.model, parameters, own_covariance[:2, :2], clear, lit, covariance, radius999
             )
-    blocked, lit_up = Blocked(1.0 - clear - lit), Blocked(lit)
+    blocked, lit_up = Sectors(1.0 - clear - lit), Sectors(lit)
     is_bias = np.array([one.name == "bias_rad" for one in best.model.errors.listed], dtype=bool)
     bias_rad = float((shares(best.copies_log_weight) @ best.values[:, is_bias]).sum())
     return Fix(

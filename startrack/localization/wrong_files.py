@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from startrack.core.statistics import shares
-from startrack.core.types import Array, Blocked, NotLocated
+from startrack.core.types import Array, NotLocated, Sectors
 from startrack.localization.hypothesis import (
     FEW_ROUNDS,
     GROSS_ROUNDS,
@@ -30,7 +30,7 @@ def require_map_in_view(model: SkylineModel, clear: Array) -> None:
 
     `clear` (SECTORS,) is the probability that the map's skyline shows.
     """
-    hidden = Blocked(1.0 - clear).whole
+    hidden = Sectors(1.0 - clear).likely
     if np.average(hidden, weights=model.seen.moments.information) > MOST_BLOCKED:
         raise NotLocated(
             f"over {360.0 * hidden.mean():.0f} degrees the skyline is not the map's: something on no map "
@@ -51,7 +51,7 @@ def require_files(found: Sequence[Hypothesis], parameters: Array) -> None:
     free = free_log_likelihood(whole.seen.profiles_without(lift_rad), shift)
     better = free + whole.seen.log_offset - _log_map(found[0], parameters) - model.seen.log_offset
     if better > 0.0:
-        wrong = Blocked(1.0 - model.states(parameters)[:, 0])
+        wrong = Sectors(1.0 - model.states(parameters)[:, 0])
         where = f", most at azimuths {wrong.text}" if wrong else ""
         raise NotLocated(
             f"a skyline unlike the map's explains the image better, by {better:.0f} nats{where}: wrong terrain, time "

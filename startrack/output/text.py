@@ -11,7 +11,7 @@ import numpy as np
 from startrack.chain import STAGES, Detected, Identified, Located, Measured, Outcome, Positioned, Refused, last_value
 from startrack.core.errors import Reason, length_text
 from startrack.core.files import printable
-from startrack.core.types import MIDDLES_RAD, Array, Blocked
+from startrack.core.types import MIDDLES_RAD, Array, Sectors
 from startrack.evidence import DECIDABLE_SNR
 from startrack.frames import rays_from_azel
 from startrack.localization import duration
@@ -231,8 +231,8 @@ def _more_skyline(measured: Measured) -> Iterator[str]:
     rays_cam = rays_from_azel(MIDDLES_RAD, _skyline(measured)) @ measured.R_cam_enu.T
     xy_px, inside = measured.camera.project(rays_cam)
     known = inside & (measured.camera.angle_rad(xy_px) <= measured.camera.calibrated_angle_rad)
-    hidden = Blocked(np.where(known, 0.0, 1.0))
-    if 2 * np.pi * np.mean(hidden.whole) > LEAST_HIDDEN_RAD:
+    hidden = Sectors(np.where(known, 0.0, 1.0))
+    if 2 * np.pi * np.mean(hidden.likely) > LEAST_HIDDEN_RAD:
         yield f"more of the skyline: azimuths {hidden.text} are not in view; look up more steeply, or take a wider lens"
     if isinstance(measured, Located) and measured.fix.blocked is not None:
         yield f"a free view: the skyline is not the map's at azimuths {measured.fix.blocked.text}; drive on some metres"

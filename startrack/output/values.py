@@ -15,7 +15,7 @@ from startrack.catalog import catalog_rays
 from startrack.chain import Detected, Identified, Located, Measured, Oriented, Positioned
 from startrack.core.files import is_path
 from startrack.core.statistics import error_ellipse
-from startrack.core.types import MIDDLES_RAD, Array, Blocked, Fix
+from startrack.core.types import MIDDLES_RAD, Array, Fix, Sectors
 from startrack.estimation.lens_correction import smooth_shifts
 from startrack.frames import R_from_rotvec, heading_pitch_roll_from_R_body_enu, latlon_from_enu
 from startrack.terrain import Terrain
@@ -204,18 +204,18 @@ def exact_lens_text(included: bool) -> str:
     return "" if included else ", the lens taken as exact"
 
 
-def off_map(value: Positioned) -> Blocked:
+def off_map(value: Positioned) -> Sectors:
     """The azimuths in which ground off the maps could stand above their skyline at the position of `value`."""
     return sectors_off_map(value.terrain, value.fix.compared_at_m)
 
 
-def sectors_off_map(terrain: Terrain, position_m: Array) -> Blocked:
+def sectors_off_map(terrain: Terrain, position_m: Array) -> Sectors:
     """The azimuths in which ground off the maps could stand above the horizon of a `terrain` at `position_m` (2,)."""
     horizon_rad = np.ravel(terrain.horizon_rad(np.asarray(position_m)[None], MIDDLES_RAD))
-    return Blocked(np.where(terrain.unknown_below_rad(MIDDLES_RAD) > horizon_rad, 1.0, 0.0))
+    return Sectors(np.where(terrain.unknown_below_rad(MIDDLES_RAD) > horizon_rad, 1.0, 0.0))
 
 
-def ranges_deg(sectors: Blocked | None) -> list[list[float]]:
+def ranges_deg(sectors: Sectors | None) -> list[list[float]]:
     """Ranges [from, to] of azimuth [deg] of the `sectors`; none of None."""
     ranges = [] if sectors is None else sectors.ranges_rad
     return [[round(float(edge), 6) for edge in np.degrees(one)] for one in ranges]

@@ -110,7 +110,7 @@ def _write_companions(outcome: Outcome, path: Path, *, plots: bool, catalog_tabl
         has_image = plots and value.exposure.pixels_adu.size > 1  # not of a skyline's file
         files = [pool.submit(write_annotated, companion(path, ANNOTATED), outcome)] if has_image else []
         if isinstance(value, Positioned) and value.skyline is not None:
-            table = skyline_table_text(value.skyline, off_map(value).whole).encode("utf-8")
+            table = skyline_table_text(value.skyline, off_map(value).likely).encode("utf-8")
             write_atomically(companion(path, SKYLINE_TABLE), table, overwrite=True)
             if plots:
                 files.append(pool.submit(_write_panorama, companion(path, SKYLINE_PICTURE), value, value.skyline))

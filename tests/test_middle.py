@@ -66,7 +66,7 @@ def fitted(fov: float, off: np.ndarray, aspect: float, rng: np.random.Generator)
 
 
 def test_the_middle_is_that_of_the_world_coordinates_by_astropy(located) -> None:
-    value = as_stage(located.result, Oriented, terrain=None, bodies=())
+    value = as_stage(located.result, Oriented, terrain=None)
     header = fits.Header.fromstring(wcs_bytes(value).decode("ascii"))
     world = WCS(header)
     found = result_dict(value, "identification")["middle"]
@@ -83,7 +83,7 @@ def test_the_middle_is_that_of_the_world_coordinates_by_astropy(located) -> None
 
 
 def test_a_middle_beyond_the_lens_is_null(located) -> None:
-    value = as_stage(located.result, Oriented, terrain=None, bodies=())
+    value = as_stage(located.result, Oriented, terrain=None)
     camera = replace(value.camera, centre_px=(0.0, 0.0), max_angle_rad=0.2)
     away = replace(value, camera=camera)
     assert not has_middle(away)
@@ -92,7 +92,7 @@ def test_a_middle_beyond_the_lens_is_null(located) -> None:
 
 
 def test_without_a_time_the_middle_is_a_minute_of_arc_wider(located) -> None:
-    value = as_stage(located.result, Oriented, terrain=None, bodies=())
+    value = as_stage(located.result, Oriented, terrain=None)
     timeless = replace(value, exposure=replace(value.exposure, time_utc=None))
     sigma = [sky_at_middle(one).sigma_rad for one in (value, timeless)]
     assert np.sqrt(sigma[1] ** 2 - sigma[0] ** 2) == pytest.approx(np.radians(1 / 60), rel=0.01)

@@ -188,7 +188,7 @@ def test_truth_is_drawn_only_when_given(picture, located):
 
 
 def test_the_facts_of_a_sky_without_a_terrain_fit_in_the_panel(located):
-    facts = dict(_facts(as_stage(located.result, Oriented, terrain=None, bodies=())))
+    facts = dict(_facts(as_stage(located.result, Oriented, terrain=None)))
     assert "Middle" in facts
     room_px = PANEL_WIDTH - 2 * TITLE_PX - 7.5 * LARGE_PX
     assert all(text_width(fact, LARGE_PX) < room_px for fact in facts.values())
@@ -207,7 +207,7 @@ def test_every_kind_of_result_can_be_drawn(located):
         "inconsistent": make_refusal("inconsistent_evidence", "m " * 400, Measured),
         "not identified": make_refusal("not_identified", "why", Detected),
         "no stars": make_refusal("no_stars", "", Inputs),
-        "identified": as_stage(result, Oriented, terrain=None, bodies=()),
+        "identified": as_stage(result, Oriented, terrain=None),
         "detected": as_stage(result, Detected, camera=None, terrain=None),
     }
     for name, one in cases.items():

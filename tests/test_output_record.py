@@ -48,7 +48,7 @@ def fix(located):
 
 
 def remove_terrain(result):
-    return as_stage(result, Oriented, terrain=None, bodies=())
+    return as_stage(result, Oriented, terrain=None)
 
 
 def make_ambiguous(result):

@@ -129,7 +129,7 @@ def _identified(
 ) -> Identified:  # fmt: skip
     """Value after `detected`, with the stars that were `found` and the names of their sources."""
     return Identified(
-        **vars(detected) | {"camera": camera}, stars=stars, bodies=bodies, site=site, identification=found,
+        **vars(detected) | {"camera": camera}, stars=stars, site=site, identification=found,
         names=identified_names(detected.detections, found, bodies),
     )  # fmt: skip
 
@@ -170,7 +170,7 @@ def solve_orientation(identified: Identified, has_file: bool = True) -> Oriented
         oriented.detections, oriented.camera, oriented.stars, oriented.identification,
         oriented.attitude_fit.attitude.R_cam_icrs, oriented.bodies, oriented.exposure.time_utc,
     )  # fmt: skip
-    return replace(oriented, names=names, bodies=names.bodies)
+    return replace(oriented, names=names)
 
 
 def fit_orientation(identified: Identified, has_file: bool = True) -> Oriented:

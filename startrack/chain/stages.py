@@ -4,9 +4,9 @@
 
 Each value has the fields of the one before it and the results of one more stage; the two looks hold a `Measured`. All
 are frozen. Which value a function returns states which stages have run; no field is filled in later. A stage that knows
-better returns other values of earlier fields: `Oriented` a corrected `camera`, `names` and `bodies` with the brightest
-sources; `Measured` masked `detections`, and `stars`, `catalog_name`, `identification` and `names` by the deeper list;
-each look the `terrain` of the steepness, and `R_enu_icrs`, `clock` and `photometry` of the time that it shows.
+better returns other values of earlier fields: `Oriented` a corrected `camera` and `names` with the brightest sources;
+`Measured` masked `detections`, and `stars`, `catalog_name`, `identification` and `names` by the deeper list; each look
+the `terrain` of the steepness, and `R_enu_icrs`, `clock` and `photometry` of the time that it shows.
 """
 
 from __future__ import annotations
@@ -133,17 +133,21 @@ class Identified(Detected):
 
     camera: Camera  # the given one, or the one found
     stars: Stars  # the catalogue at the time of the exposure
-    bodies: tuple[Body, ...]  # planets, Sun, Moon, Earth; empty without a site and a time
     site: Site | None = None  # that the stars are seen from; None: not known
     identification: Identification
     names: SourceNames  # what the sources are; with an attitude the brightest too
+
+    @property
+    def bodies(self) -> tuple[Body, ...]:
+        """Planets, Sun, Moon and Earth; without a site those that have a source, without a time none."""
+        return self.names.bodies
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Oriented(Identified):
     """Identified stars with the attitude of the camera among the stars.
 
-    `camera` is corrected where the stars show another lens; `names` and `bodies` have the brightest sources too.
+    `camera` is corrected where the stars show another lens; `names` has the brightest sources too.
     """
 
     attitude_fit: AttitudeFit

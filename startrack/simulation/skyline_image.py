@@ -66,7 +66,7 @@ def simulate_measured(
     known, site = _identify(stars, star), require_site(terrain)
     identified = Identified(
         exposure=exposure, camera=camera, terrain=terrain, catalog_name=catalog.name,
-        detections=mask_obstacles(detections, stars.mask), stars=stars.catalog, bodies=scene.bodies, site=site,
+        detections=mask_obstacles(detections, stars.mask), stars=stars.catalog, site=site,
         identification=known, names=identified_names(detections, known, scene.bodies),
     )  # fmt: skip
     oriented, rays = fit_orientation(identified), vars(stars.rays)

@@ -161,8 +161,8 @@ def test_other_times_are_hypotheses_of_a_map_and_of_the_last_look(ground: Height
     localizer = ExactPosterior()
     found = sample_posterior(localizer.explore(rows, ground), rows, ground)
     times = sample_other_times(found)
-    stated = min(times, key=lambda one: abs(one.model.errors.later_s))
-    assert {one.gross for one in times} == {"time_sigma_s"} and stated.model.errors.later_s == 0.0
+    stated = min(times, key=lambda one: abs(one.model.errors.offset_s))
+    assert {one.gross for one in times} == {"time_sigma_s"} and stated.model.errors.offset_s == 0.0
     probability = WRONG_TIME_PROBABILITY if is_stated else clock.gross_probability
     of_prior = np.logaddexp.reduce([one.log_evidence for one in times]) - found[0].log_evidence
     assert -12.0 < of_prior < np.log(probability)  # the true time is the stated one

@@ -180,10 +180,10 @@ class StarRays:
         """Rays of the stars as evidence for the localizer."""
         return replace(self.photometry.evidence(), clock=self.clock, near=self.near)
 
-    def later(self, seconds: float, reach_s: float) -> Self:
-        """Copy under the sky of a time later by `seconds`, which is right to `reach_s` [s]."""
-        R = R_from_rotvec(seconds * self.clock.turn_rad_s)
-        clock = replace(self.clock, offset_s=self.clock.offset_s + seconds, reach_s=reach_s)
+    def later(self, later_s: float, reach_s: float) -> Self:
+        """Copy under the sky of a time later by `later_s`, which is right to `reach_s` [s]."""
+        R = R_from_rotvec(later_s * self.clock.turn_rad_s)
+        clock = replace(self.clock, offset_s=self.clock.offset_s + later_s, reach_s=reach_s)
         photometry = self.photometry.turn_frame(R, self.terrain.air)
         return replace(self, R_enu_icrs=R @ self.R_enu_icrs, photometry=photometry, clock=clock)
 

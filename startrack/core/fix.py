@@ -48,8 +48,9 @@ class PositionPrior:
 class Clock(Value):
     """Effect of an error of the clock on directions in enu, with the prior of this error.
 
-    The prior is a mixture: `sigma_s`, or with `gross_probability` the wider `gross_sigma_s`, which is also what the
-    error would be if a stated `sigma_s` were wrong.
+    A time called `offset_s` counts from the stated one, `later_s` from that of the directions. The prior is a mixture:
+    `sigma_s`, or with `gross_probability` the wider `gross_sigma_s`, which is also what the error would be if a stated
+    `sigma_s` were wrong.
     """
 
     turn_rad_s: Array = vector()  # rotation vector in enu: by one second that the true time is later

@@ -209,7 +209,7 @@ def _clock(whole: Posterior) -> ClockError | None:
     if whole.best.model.errors.clock is None:
         return ClockError(stated.offset_s, stated.sigma_s)
     core = [one for one in whole.hypotheses if one.gross == whole.best.gross]
-    later = np.concatenate([one.model.errors.later_s + one.values[:, -1] for one in core])
+    later = np.concatenate([one.model.errors.offset_s + one.values[:, -1] for one in core])
     share = shares(np.concatenate([one.copies_log_weight for one in core]))
     mean = float(share @ later)
     return ClockError(mean, float(np.sqrt(share @ np.square(later - mean))))

@@ -98,15 +98,15 @@ class OtherTimes:
 
     def _first(self) -> list[int]:
         """Indices of the stated time, of the likeliest others apart, and of its neighbours where heights allow them."""
-        fits = np.array([self._fit(later_s) for later_s in self.times_s]) + self.log_part
+        fits = np.array([self._fit(offset_s) for offset_s in self.times_s]) + self.log_part
         likely = choose_apart(self.times_s[:, None], fits, 1.5 * self.step_s, FIRST_NATS, MOST_FIRST)
         stated = len(self.times_s) // 2
         return [stated, *likely, *(at for at in (stated - 1, stated + 1) if fits[at] > fits.max() - FIRST_NATS)]
 
-    def _fit(self, later_s: float) -> float:
+    def _fit(self, offset_s: float) -> float:
         """Log-likelihood of the heights of the sectors, turned to a later time, where position and errors suit them."""
         model, around, seen = self.model, self.model.around, self.model.seen.moments
-        R = R_from_rotvec((later_s - model.errors.later_s) * self.clock.turn_rad_s)
+        R = R_from_rotvec((offset_s - model.errors.offset_s) * self.clock.turn_rad_s)
         azimuth, elevation = turn_sky(MIDDLES_RAD, around.horizon_rad + seen.mean_rad, R, model.terrain.air)
         own = ~model.errors.is_of_fact(CLOCK_FACT)
         rises = np.vstack([around.slopes, model.error_slopes_rad[own], around.expected_rise_rad])
@@ -134,9 +134,9 @@ class OtherTimes:
                 break
         return one
 
-    def _model_at(self, later_s: float) -> SkylineModel:
-        """Copy of the model with its rows turned to a time [s later], and the prior of an error about that."""
-        model = turned_model(self.model, later_s - self.model.errors.later_s)
+    def _model_at(self, offset_s: float) -> SkylineModel:
+        """Copy of the model with its rows turned to `offset_s`, and the prior of an error about that."""
+        model = turned_model(self.model, offset_s - self.model.errors.offset_s)
         *others, clock = model.errors.listed
-        about = replace(clock, mean=later_s, gross_sigma=0.5 * self.step_s, gross_probability=self.probability)
+        about = replace(clock, mean=offset_s, gross_sigma=0.5 * self.step_s, gross_probability=self.probability)
         return replace(model, errors=replace(model.errors, listed=(*others, about)))

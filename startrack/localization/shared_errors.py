@@ -101,7 +101,7 @@ class SharedErrors:
         return _sigma(self.waves, gross)
 
     @property
-    def later_s(self) -> float:
+    def offset_s(self) -> float:
         """Time [s] by which the time that the rows are turned to is later than stated."""
         return 0.0 if self.clock is None else self.clock.offset_s
 
@@ -109,7 +109,7 @@ class SharedErrors:
     def mean(self) -> Array:
         """Expected values (k,): not zero for rows turned to another time, or ground of another shape, than stated."""
         found = np.array([one.mean for one in self.listed])
-        found[-1:] -= self.later_s
+        found[-1:] -= self.offset_s
         return found
 
     @property
@@ -117,7 +117,7 @@ class SharedErrors:
         """Expected values (k,), with that of the clock as stated, also where another time is expected."""
         found = self.mean.copy()
         if self.clock is not None:
-            found[-1] = -self.later_s
+            found[-1] = -self.offset_s
         return found
 
     def log_probability(self, gross: str = "") -> float:

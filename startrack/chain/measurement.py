@@ -67,18 +67,16 @@ def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -
     """
     when, site = require_time_and_site(oriented.exposure, terrain)
     R_at_time = R_enu_icrs(site, when)
-    hipparcos = replace(oriented, detections=_mask_detections(oriented, terrain, R_at_time))
-    deep = add_gaia_stars(hipparcos, site) if settings.deep_stars else hipparcos
-    used, note = deep, ""
-    scale, photometry = _measure_stars(deep, terrain, R_at_time, settings.photometer)
-    if deep is not hipparcos and not _shows_deep_stars(photometry, deep.stars):
-        used, note = hipparcos, NO_DEEP_STARS.format(deep.catalog_name)
-        scale, photometry = _measure_stars(hipparcos, terrain, R_at_time, settings.photometer)
+    masked = replace(oriented, detections=_mask_detections(oriented, terrain, R_at_time))
+    used, note = add_gaia_stars(masked, site) if settings.deep_stars else masked, ""
+    scale, photometry = _measure_stars(used, terrain, R_at_time, settings.photometer)
+    if used is not masked and not _shows_deep_stars(photometry, used.stars):
+        used, note = masked, NO_DEEP_STARS.format(used.catalog_name)
+        scale, photometry = _measure_stars(used, terrain, R_at_time, settings.photometer)
     response = None if oriented.damage is None else measure_response(photometry)
-    above = {"terrain": terrain, "site": site}
     return Measured(
-        **vars(used) | above, R_enu_icrs=R_at_time, scale=scale, response=response, near=settings.near,
-        catalog_note=note,
+        **vars(used) | {"terrain": terrain, "site": site}, R_enu_icrs=R_at_time, scale=scale, response=response,
+        near=settings.near, catalog_note=note,
         clock=clock_at(site, when, oriented.exposure.time_sigma_s, oriented.exposure.time_sigma_is_stated),
         photometry=photometry if response is None else response.correct(photometry),
     )  # fmt: skip
@@ -96,17 +94,12 @@ def _measure_stars(
     oriented: Oriented, terrain: Terrain, R_enu_icrs: Array, photometer: StarPhotometer
 ) -> tuple[FluxScale, StarPhotometry]:
     """Scale of the light of `oriented` stars by the identified ones, and by it the photometry of all of them."""
-    scale = _flux_scale(oriented, R_enu_icrs, terrain.site)
-    return scale, _photometry(oriented, terrain, R_enu_icrs, scale, photometer, oriented.detections)
-
-
-def _flux_scale(oriented: Oriented, R_enu_icrs: Array, site: Site | None) -> FluxScale:
-    """The scale of the light of `oriented` stars by the identified ones."""
     found, stars = oriented.identification, oriented.stars
-    return flux_scale(
+    scale = flux_scale(
         oriented.detections, oriented.camera, stars, (found.detection, found.star),
-        oriented.attitude_fit.attitude.R_cam_icrs, airmass_at(stars.rays_icrs @ R_enu_icrs.T, site),
+        oriented.attitude_fit.attitude.R_cam_icrs, airmass_at(stars.rays_icrs @ R_enu_icrs.T, terrain.site),
     )  # fmt: skip
+    return scale, _photometry(oriented, terrain, R_enu_icrs, scale, photometer, oriented.detections)
 
 
 def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
@@ -248,7 +241,9 @@ def fix_again(rays: AnyRays, rough: Fix, localizer: Localizer, rows: Evidence) -
 def _fix_position(rays: AnyRays, localizer: Localizer, rows: Evidence) -> tuple[AnyRays, Fix]:
     """The `rays` under the sky of the time that `rows` show, and the fix by these, which are of the same image."""
     fix = localizer(rows, rays.terrain)
-    later_s = 0.0 if fix.clock is None or rays.terrain.axisymmetric else fix.clock.offset_s - rays.clock.offset_s
-    if fix.clock is None or not is_noticeable(rays.clock, max(abs(later_s), rays.clock.sigma_s), rays.terrain):
+    if fix.clock is None or rays.terrain.axisymmetric:
         return rays, fix
-    return (rays.later(later_s, SURE_SIGMAS * fix.clock.sigma_s) if later_s else rays), fix
+    later_s = fix.clock.offset_s - rays.clock.offset_s
+    if later_s and is_noticeable(rays.clock, max(abs(later_s), rays.clock.sigma_s), rays.terrain):
+        rays = rays.later(later_s, SURE_SIGMAS * fix.clock.sigma_s)
+    return rays, fix

@@ -15,6 +15,7 @@ from startrack.evidence import (
     NEEDED_SECTORS,
     SkyLight,
     SkylineEstimate,
+    StarPhotometer,
     brightness_mag_arcsec2,
     check_single_skyline,
     exceeds_noise,
@@ -47,10 +48,10 @@ def look_at_skyline(first: FirstLook, settings: Settings) -> SecondLook:
     to count itself; `why_no_sky` has the reason. Where nothing but the light of the sky counts by the `settings`, that
     raises NotLocated (insufficient_geometry).
     """
-    unseen = why_unseen(first)
-    second = (
-        SecondLook(first=first, measured=first.measured, why_no_sky=unseen) if unseen else _measure(first, settings)
-    )
+    if unseen := why_unseen(first):
+        second = SecondLook(first=first, measured=first.measured, why_no_sky=unseen)
+    else:
+        second = _measure_skyline(first, settings.photometer)
     if settings.evidence_sources == "stars":
         return replace(second, sky=None, why_no_sky="")
     if settings.evidence_sources == "sky":
@@ -70,25 +71,22 @@ def why_unseen(first: FirstLook) -> str:
     return "the method of localization has no posterior" if first.fix.is_approximate else ""
 
 
-def _measure(first: FirstLook, settings: Settings) -> SecondLook:
+def _measure_skyline(first: FirstLook, photometer: StarPhotometer) -> SecondLook:
     """Light of the sky and stars beside the skyline of the `first` look, one position, in an image with levels."""
     known, estimate = first.measured, estimate_skyline(first)
     band = pixels_near_skyline(known.detections, known.camera, known.R_cam_enu, estimate)
     light = measure_sky_light(band.without_stars(known.photometry), estimate.skyline)
-    measured = remeasure_stars(first, band, light, settings.photometer) if exceeds_noise(light) else known
+    measured = remeasure_stars(first, band, light, photometer) if exceeds_noise(light) else known
     used = sectors_with_step(light) & known.terrain.is_informative(MIDDLES_RAD, light.elevation_rad)
-    unused = _too_few_text(light, used) if np.count_nonzero(used) < NEEDED_SECTORS else ""
-    sky = None if unused else SkyEvidence(light, used, _image_errors(known, light, used))
+    why_no_sky = _too_few_text(light, used) if np.count_nonzero(used) < NEEDED_SECTORS else ""
+    sky = None if why_no_sky else SkyEvidence(light, used, _image_errors(known, light, used))
     turn_rad = (known.exposure.exposure_s or 0.0) * known.clock.turn_rad_s
     moving = measured.photometry.moving(estimate.star_motion_rad(turn_rad))
     brightness = brightness_mag_arcsec2(light, known.camera, known.R_cam_enu, known.exposure.exposure_s)
     return SecondLook(
-        first=first,
-        measured=replace(measured, photometry=moving),
-        sky=sky,
-        why_no_sky=unused,
+        first=first, measured=replace(measured, photometry=moving), sky=sky, why_no_sky=why_no_sky,
         sky_brightness_mag_arcsec2=brightness,
-    )
+    )  # fmt: skip
 
 
 def estimate_skyline(first: FirstLook) -> SkylineEstimate:

@@ -30,9 +30,8 @@ def exposure_input(image: Image, time: Time, time_sigma: Any = None, duration: A
     `time`, `time_sigma` (see `time_sigma_input`) and `duration` (see `duration_s`) replace its own where they are
     given. Pixels that a masked array hides do not count. Raises BadInput (bad_image, no_time), ValueError.
     """
-    given: dict[str, Any] = {
-        "time_utc": time_input(time), "time_sigma_s": time_sigma_input(time_sigma), "exposure_s": duration_s(duration),
-    }  # fmt: skip
+    given: dict[str, Any] = {"time_utc": time_input(time), "time_sigma_s": time_sigma_input(time_sigma)}
+    given["exposure_s"] = duration_s(duration)
     if isinstance(image, Exposure):
         return with_facts(image, **given)
     if isinstance(image, str | os.PathLike):

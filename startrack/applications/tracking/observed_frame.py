@@ -24,7 +24,7 @@ from startrack.estimation.trajectory import SIGMAS_95
 from startrack.localization import HIGH_RAD, LOW_RAD, MIN_ROW_NATS, camera_at
 from startrack.terrain import Terrain
 
-FRAME_FORMAT = "startrack.observed-frame/5"
+FRAME_FORMAT = "startrack.observed-frame/6"
 ROWS = ("azimuth_rad", "elevation_rad", "llr", "edge_sigma_rad", "extended_nats")
 MODE_SIGMA_M = 10.0  # of a mode whose circle is not known
 T = TypeVar("T")

@@ -105,10 +105,9 @@ def _measure_stars(
 def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
     """Copy with the stars of the deeper Gaia list, if that is installed and the frame is deep enough to need it.
 
-    `site` is where the camera stands, for the aberration. How deep the frame is shows the scale of its light by
-    Hipparcos, through the air; that of the photometry is by the list that is used, and above the air. Returns
-    `oriented` itself where nothing changes: also with stars that are not the whole shipped catalogue, which are a
-    choice of the caller's.
+    `site` is where the camera stands, for the aberration. The scale by Hipparcos, through the air, tells how deep the
+    frame is; that of the photometry is by the list that is used, above the air. Returns `oriented` itself where nothing
+    changes: also with stars that are not the whole shipped catalogue, which are a choice of the caller's.
     """
     found, when = oriented.identification, oriented.exposure.time_utc
     if when is None or not has_deep_catalog() or not np.array_equal(oriented.stars.hip, load_catalog().hip):

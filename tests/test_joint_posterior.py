@@ -79,14 +79,14 @@ def test_the_chain_is_the_trace_of_its_matrix_product(obstructed: SkylineModel) 
     rng = np.random.default_rng(2)
     smooth = np.cos(np.outer(rng.uniform(1, 4, 30), MIDDLES_RAD) + rng.uniform(0, 6, (30, 1)))
     shifts = np.radians(0.06) * rng.normal(size=(30, 1)) * smooth
-    by_matrices = slow_chain(np.array([emissions(obstructed.seen.profiles, shift) for shift in shifts]))
+    by_matrices = slow_chain(np.array([obstructed.seen.emissions(shift) for shift in shifts]))
     assert np.ptp(by_matrices) > 20.0
     likely = by_matrices > by_matrices.max() - 6.0  # of others the sector of the cut may be in a notch
     assert obstructed.log_likelihood_of(shifts)[likely] == pytest.approx(by_matrices[likely], abs=0.05)
 
 
 def test_states_have_the_probabilities_of_all_paths(obstructed: SkylineModel) -> None:
-    e, T = emissions(obstructed.seen.profiles, np.zeros(SECTORS)), transitions()
+    e, T = obstructed.seen.emissions(np.zeros(SECTORS)), transitions()
     found = state_probabilities(e)
     assert found.sum(axis=1) == pytest.approx(np.ones(SECTORS))
     for sector in (0, 46, 60, 75, 180):
@@ -320,7 +320,7 @@ def test_a_free_skyline_is_preferred_to_a_wrong_crater_only() -> None:
             points = PLACE + np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
             best = points[np.argmax(model.log_likelihood(points))]
             shift = model.shifts(best[None])
-            gains[kind].append(free_log_likelihood(model.seen.profiles, shift[0]) - model.log_likelihood_of(shift)[0])
+            gains[kind].append(free_log_likelihood(model.seen, shift[0]) - model.log_likelihood_of(shift)[0])
     assert max(gains["true"]) < np.log(0.1)
     assert np.mean(np.array(gains["obstacle"]) < np.log(0.1)) > 0.8
     assert min(gains["wrong"]) > np.log(0.1)
@@ -328,7 +328,7 @@ def test_a_free_skyline_is_preferred_to_a_wrong_crater_only() -> None:
 
 def test_levels_and_the_wrong_sector_leave_no_sector_without_likelihood(obstructed: SkylineModel) -> None:
     """However wrong a sector is, it costs no more than the logarithm of the wrong sector's probability."""
-    far = emissions(obstructed.seen.profiles, np.full(SECTORS, np.radians(-5.0)))
+    far = obstructed.seen.emissions(np.full(SECTORS, np.radians(-5.0)))
     assert far.min() >= WRONG_SECTOR
     assert np.all(np.diff(LEVELS_RAD) > 0)
 
@@ -337,5 +337,5 @@ def test_prepared_levels_are_the_emissions_at_their_nodes(obstructed: SkylineMod
     profiles, reach = obstructed.seen.profiles, np.radians(np.where(np.arange(SECTORS) % 7, 0.3, 15.0))
     table = prepare_levels(profiles, reach)
     for node, u in enumerate(np.linspace(-1.0, 1.0, NODES)):
-        at_node = emissions(profiles, reach * u * abs(u))[:, 1:]
+        at_node = emissions(profiles, reach * u * abs(u), np.zeros(SECTORS))[:, 1:]
         np.testing.assert_allclose(table[:, :, node], at_node, rtol=1e-4, atol=1e-6)

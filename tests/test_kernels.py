@@ -342,18 +342,18 @@ def chain_of(rng):
     levels = obstacle_chain.Levels(reach, obstacle_chain.prepare_levels(soft, reach), hard, rng.random(SECTORS))
     likely = np.empty(len(shifts))
     obstacle_chain.chain_log_likelihoods(soft, levels, moves, shifts, 17, np.array([0, 3, 15]), likely)
-    states = obstacle_chain.state_probabilities(obstacle_chain.emissions(soft, shifts[0]), moves)
     gains = obstacle_chain.gains_of_light(soft, shifts, rng.normal(0.0, 1e-3, shifts.shape))
+    states = obstacle_chain.state_probabilities(obstacle_chain.emissions(soft, shifts[0], gains[0]), moves)
     lifted = np.empty(len(shifts))
     obstacle_chain.chain_log_likelihoods(soft, levels, moves, shifts, 17, np.array([0, 3, 15]), lifted, gains)
-    logs = obstacle_chain.log_clear_emissions(hard, shifts.T, rng.random(SECTORS), gains.T)
+    clear = obstacle_chain.clear_emissions(hard, shifts, gains)
     search = search_profiles.SearchProfiles.of(rows)
     low = rng.uniform(-0.1, 0.1, (5, SECTORS))
     found = search.bound(low, low + 0.02), search.average(low[:, ::4], low[:, ::4] + 0.02), search.integral
     moments = measure_moments(soft)
-    curve = smooth_skyline.list_free_logs(hard, shifts[1], 0.2, np.array([1e-4, 1e-3]))
+    curve = smooth_skyline.list_free_logs(clear, 0.2 * np.linspace(-1.0, 1.0, len(clear)), np.array([1e-4, 1e-3]))
     assert np.isfinite(likely).all() and np.isfinite(curve).all()
-    return (*soft, *hard, likely, gains, lifted, states, logs, *found, *moments, curve)
+    return (*soft, *hard, likely, gains, lifted, states, clear, *found, *moments, curve)
 
 
 def identification_of(rng):

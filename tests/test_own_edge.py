@@ -75,12 +75,12 @@ def test_lit_states_are_those_of_stars_at_the_skyline_and_light_by_its_neighbour
     plain = SkylineModel.of(CRATER, Evidence.concatenate(sky, stars), PLACE, 30.0, SharedErrors.of(CRATER, None))
     by_stars = SectorRows(plain.around, stars).profiles
     edge = OwnEdge(
-        by_stars,
+        plain.seen,
         rng.uniform(0.01, 2.0, SECTORS) * np.exp(by_stars.offset - plain.seen.profiles.offset),
         np.ones(SECTORS),
     )
     seen, shifts = replace(plain.seen, edge=edge), np.radians(rng.uniform(-0.05, 0.05, (5, 1)) * np.ones(SECTORS))
-    expected = clear_emissions(by_stars, shifts.T.copy())[:, 0] * edge.light
+    expected = clear_emissions(by_stars, shifts)[0] * edge.light
     np.testing.assert_allclose(seen.emissions(shifts[0])[:, -1], expected)
     by_matrices = slow_chain(np.array([seen.emissions(shift) for shift in shifts]), seen.moves)
     assert np.ptp(by_matrices) > 20.0
@@ -166,7 +166,7 @@ def test_the_linear_model_leaves_light_with_another_edge_out(lit: float) -> None
     raised = ImageErrors(np.ones((SECTORS, 1)), np.zeros(1), np.eye(1), np.full(SECTORS, 1e-8))
     plain = SectorRows(Neighbourhood(CRATER, PLACE, 30.0), Evidence.concatenate(sky, stars), raised)
     alone = SectorRows(plain.around, stars)
-    seen = replace(plain, edge=OwnEdge(alone.profiles, np.ones(SECTORS), np.full(SECTORS, lit)))
+    seen = replace(plain, edge=OwnEdge(plain, np.ones(SECTORS), np.full(SECTORS, lit)))
     np.testing.assert_allclose(seen.image_rise, (1.0 - lit) * plain.image_rise)
     drawn = rng.random(200_000) < lit
     first, second = (one.moments for one in (plain, alone))

@@ -9,7 +9,7 @@
 #define BLOCK 64 /* points that are computed together */
 #define LANES 8  /* their number is filled up to a multiple of it */
 
-/* As `clear_emissions`; to F at point p of sector s is added gain[s n + p], unless that is 0. */
+/* As `clear_emissions`; `gain` may be 0: none. */
 static void fill_clear(const struct cells *c, int64_t sectors, int64_t n, const double *restrict scale, double wrong,
                        const double *restrict shifts, const double *restrict gain, double *restrict found)
 {
@@ -30,29 +30,16 @@ static void fill_clear(const struct cells *c, int64_t sectors, int64_t n, const 
     }
 }
 
-void clear_emissions(int64_t sectors, int64_t m, int64_t guides, int64_t n, const int64_t *restrict first,
-                     const double *restrict x, const double *restrict left, const double *restrict right,
+void clear_emissions(int64_t sectors, int64_t m, int64_t guides, int64_t n, int64_t gained,
+                     const int64_t *restrict first, const double *restrict x, const double *restrict left,
+                     const double *restrict right,
                      const double *restrict bend, const double *restrict free, const int32_t *restrict guide,
                      const double *restrict scale, double highest, double wrong, const double *restrict shifts,
-                     double *restrict found)
-{
-    (void)m;
-    const struct cells c = {first, x, left, right, bend, 0, free, guide, guides, highest};
-    fill_clear(&c, sectors, n, scale, wrong, shifts, 0, found);
-}
-
-void clear_logs(int64_t sectors, int64_t m, int64_t guides, int64_t n, int64_t gained, const int64_t *restrict first,
-                const double *restrict x, const double *restrict left, const double *restrict right,
-                const double *restrict bend, const double *restrict free, const int32_t *restrict guide,
-                const double *restrict scale, double highest, double wrong, const double *restrict shifts,
-                const double *restrict gain, const double *restrict clear, double *restrict found)
+                     const double *restrict gain, double *restrict found)
 {
     (void)m;
     const struct cells c = {first, x, left, right, bend, 0, free, guide, guides, highest};
     fill_clear(&c, sectors, n, scale, wrong, shifts, gained > 0 ? gain : 0, found);
-    for (int64_t s = 0; s < sectors; s++)
-        for (int64_t p = s * n; p < (s + 1) * n; p++)
-            found[p] = log(clear[s] * found[p] + 1.0 - clear[s]);
 }
 
 void gains_of_light(int64_t sectors, int64_t m, int64_t guides, int64_t n, const int64_t *restrict first,
@@ -114,13 +101,14 @@ void emissions(int64_t sectors, int64_t m, int64_t guides, int64_t levels, int64
                const double *restrict right, const double *restrict bend, const double *restrict integral,
                const double *restrict free, const int32_t *restrict guide, const double *restrict scale,
                const double *restrict hidden, double highest, double wrong, const double *restrict shift,
-               const double *restrict from, const double *restrict until, int64_t risen, double *restrict found)
+               const double *restrict gain, const double *restrict from, const double *restrict until, int64_t risen,
+               double *restrict found)
 {
     (void)m;
     const struct cells c = {first, x, left, right, bend, integral, free, guide, guides, highest};
     for (int64_t s = 0; s < sectors; s++) {
         double *restrict to = found + s * states;
-        to[0] = scale[s] * ((1.0 - wrong) * exp(log_at(&c, s, shift[s])) + wrong);
+        to[0] = scale[s] * ((1.0 - wrong) * exp(log_at(&c, s, shift[s]) + gain[s]) + wrong);
         for (int64_t j = 0; j < levels; j++) {
             double mean = hidden[s];
             if (j != risen - 1) {
@@ -254,8 +242,8 @@ void chain_log_likelihoods(int64_t sectors, int64_t m, int64_t guides, int64_t s
                 gain[s * points + p] = gains[(begin + p) * sectors + s];
         fill_clear(&c, sectors, points, scale, wrong, shift, gained > 0 ? gain : 0, at_skyline);
         if (lights > 0)
-            clear_emissions(sectors, star_cells, guides, points, star_first, star_x, star_left, star_right, star_bend,
-                            star_free, star_guide, star_scale, highest, wrong, shift, lit);
+            clear_emissions(sectors, star_cells, guides, points, 0, star_first, star_x, star_left, star_right, star_bend,
+                            star_free, star_guide, star_scale, highest, wrong, shift, 0, lit);
         for (int64_t p = 0; p < points; p++)
             to[p] = -INFINITY;
         for (int64_t q = 0; q < closings; q++) {

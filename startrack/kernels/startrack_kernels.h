@@ -238,21 +238,12 @@ KERNEL void unfilter_colour_16(int64_t height, int64_t length, int64_t room, int
 /* localization.c */
 
 /* Fill `found` [sectors, n] with likelihoods at `shifts` of sectors whose skyline is the map's; `wrong`: probability that
-   it is anywhere. */
-KERNEL void clear_emissions(int64_t sectors, int64_t m, int64_t guides, int64_t n, const int64_t *restrict first,
-                            const double *restrict x, const double *restrict left, const double *restrict right,
-                            const double *restrict bend, const double *restrict free, const int32_t *restrict guide,
-                            const double *restrict scale, double highest, double wrong, const double *restrict shifts,
-                            double *restrict found);
-
-/* Fill `found` [sectors, n] with logarithms of likelihoods of sectors that show the map's skyline with probabilities
-   `clear` [sectors], else anything. `gain` [0 or sectors, n]: see `gains_of_light`. */
-KERNEL void clear_logs(int64_t sectors, int64_t m, int64_t guides, int64_t n, int64_t gained,
-                       const int64_t *restrict first,
-                       const double *restrict x, const double *restrict left, const double *restrict right,
-                       const double *restrict bend, const double *restrict free, const int32_t *restrict guide,
-                       const double *restrict scale, double highest, double wrong, const double *restrict shifts,
-                       const double *restrict gain, const double *restrict clear, double *restrict found);
+   it is anywhere. `gain` [0 or sectors, n] is added to F: see `gains_of_light`. */
+KERNEL void clear_emissions(int64_t sectors, int64_t m, int64_t guides, int64_t n, int64_t gained,
+                            const int64_t *restrict first, const double *restrict x, const double *restrict left,
+                            const double *restrict right, const double *restrict bend, const double *restrict free,
+                            const int32_t *restrict guide, const double *restrict scale, double highest, double wrong,
+                            const double *restrict shifts, const double *restrict gain, double *restrict found);
 
 /* Fill `found` [n, sectors] with what the light's log-likelihoods at `shifts` [n, sectors] gain where it stands higher by
    `lifts` [n, sectors] than the skyline. */
@@ -273,13 +264,15 @@ KERNEL void prepare_levels(int64_t sectors, int64_t m, int64_t guides, int64_t e
                            const double *restrict from, const double *restrict until, int64_t risen,
                            double *restrict scratch, float *restrict table);
 
-/* Fill `found` [sectors, states] with likelihoods of all states at shifts [sectors]; levels = states - 1. */
+/* Fill `found` [sectors, states] with likelihoods of all states at shifts [sectors]; levels = states - 1. `gain` [sectors]
+   is added to F of the first state: see `gains_of_light`. */
 KERNEL void emissions(int64_t sectors, int64_t m, int64_t guides, int64_t levels, int64_t states,
                       const int64_t *restrict first, const double *restrict x, const double *restrict left,
                       const double *restrict right, const double *restrict bend, const double *restrict integral,
                       const double *restrict free, const int32_t *restrict guide, const double *restrict scale,
                       const double *restrict hidden, double highest, double wrong, const double *restrict shift,
-                      const double *restrict from, const double *restrict until, int64_t risen, double *restrict found);
+                      const double *restrict gain, const double *restrict from, const double *restrict until,
+                      int64_t risen, double *restrict found);
 
 /* Fill `found` [n] with log-likelihoods at `shifts` [n, sectors] of the chain of states around the circle, which is cut at
    the sector `cut` and closed over its states `closing`. `table` and `reach`: see `prepare_levels`. `light` [0 or

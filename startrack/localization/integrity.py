@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.core.types import SECTORS, Array, Bools, Integrity
-from startrack.localization.obstacle_chain import log_clear_emissions
+from startrack.localization.obstacle_chain import clear_emissions
 from startrack.localization.skyline_model import SkylineModel
 from startrack.localization.skyline_profiles import Profiles
 
@@ -92,7 +92,7 @@ def _sector_logs(
     shifts, lifts, prior = model.with_linear_errors(model.shifts(moved))
     logs = clear_logs(model.seen.profiles, shifts, clear, model.seen.gains(shifts, lifts))
     if model.seen.edge is not None:
-        logs = np.where(lit > clear, clear_logs(model.seen.edge.stars, shifts, np.minimum(clear + lit, 1.0)), logs)
+        logs = np.where(lit > clear, clear_logs(model.seen.stars.profiles, shifts, np.minimum(clear + lit, 1.0)), logs)
     return logs, prior + model.basis.log_prior(moved[:, 2:])
 
 
@@ -102,7 +102,7 @@ def clear_logs(profiles: Profiles, shifts: Array, clear: Array, gains: Array | N
     `shifts` (n, SECTORS) [rad] are of the skyline, which has the `profiles`; `gains` (n, SECTORS) are those of the
     light by errors of the image, None: 0.
     """
-    return log_clear_emissions(profiles, shifts.T, clear, None if gains is None else gains.T).T
+    return np.asarray(np.log(clear * clear_emissions(profiles, shifts, gains) + 1.0 - clear))
 
 
 def _moments(offsets_m: Array, logs: Array) -> tuple[Array, Array]:

@@ -148,7 +148,7 @@ def independent_sigma(covariance: Array) -> Array:
 class OwnEdge(NamedTuple):
     """Likelihoods where the sky's light has an edge of its own, and the stars alone show the skyline."""
 
-    stars: Profiles
+    plain: SectorRows  # the same rows about the same reference, where the light ends at the skyline
     light: Array  # (SECTORS,) likelihood of the light, in which the two profiles' offsets are made up for
     lit: Array  # (SECTORS,) rough probability of it, by which the linear model leaves the light out
     offset: Array = np.zeros(SECTORS)  # (SECTORS,) nats, by which all likelihoods of a sector are less: none overflows
@@ -176,11 +176,8 @@ class SectorRows:
             near = np.flatnonzero(np.abs(above) < TRACED_RAD)
             traced = terrain.horizon_rad(self.around.reference_m[None], rows.azimuth_rad[near])
             above[near] = rows.elevation_rad[near] - np.asarray(traced).ravel()
-        return self._without_lift(above, self.image_errors.slopes_rad @ self.image_errors.reference)
-
-    def _without_lift(self, above_rad: Array, lift_rad: Array) -> Array:
-        """Heights (n,) of the rows where the light is not lifted by `lift_rad` (SECTORS,)."""
-        return np.where(self.is_light, above_rad - lift_rad[sector_of(self.rows.azimuth_rad)], above_rad)
+        lift_rad = self.image_errors.slopes_rad @ self.image_errors.reference
+        return np.where(self.is_light, above - lift_rad[sector_of(rows.azimuth_rad)], above)
 
     @cached_property
     def is_light(self) -> Bools:
@@ -190,23 +187,23 @@ class SectorRows:
     @cached_property
     def profiles(self) -> Profiles:
         """Log-likelihoods of the rows of each sector by the height of the skyline."""
-        return self._profiles_of(self.above_rad)
-
-    def _profiles_of(self, above_rad: Array) -> Profiles:
-        """Profiles of the rows at heights (n,), in the scale of all likelihoods."""
-        found = profiles_of(self.rows, above_rad, self.around.map_sigma_rad)
-        return found if self.edge is None else found.scaled(self.edge.offset)
-
-    def profiles_without(self, lift_rad: Array | None) -> Profiles:
-        """The `profiles` of light lifted by `lift_rad` (SECTORS,) beyond what is expected; None: by nothing."""
-        return self.profiles if lift_rad is None else self._profiles_of(self._without_lift(self.above_rad, lift_rad))
+        if self.edge is not None:
+            return self.edge.plain.profiles.scaled(self.edge.offset)
+        return profiles_of(self.rows, self.above_rad, self.around.map_sigma_rad)
 
     @cached_property
     def light(self) -> SectorRows:
         """The rows of the light of the sky alone."""
-        if self.is_light.all():
-            return self
-        return replace(self, rows=self.rows.take(np.flatnonzero(self.is_light)), edge=None)
+        return self._take(self.is_light) if self.edge is None else self.edge.plain.light
+
+    @cached_property
+    def stars(self) -> SectorRows:
+        """The rows of the stars alone."""
+        return self._take(~self.is_light) if self.edge is None else self.edge.plain.stars
+
+    def _take(self, chosen: Bools) -> SectorRows:
+        """The `chosen` rows alone."""
+        return self if chosen.all() else replace(self, rows=self.rows.take(np.flatnonzero(chosen)))
 
     def gains(self, shifts: Array, lifts: Array | None) -> Array | None:
         """What log-likelihoods of the map's skyline at `shifts` gain (n, SECTORS) by `lifts` of the light; None: 0."""
@@ -218,8 +215,7 @@ class SectorRows:
         together = measure_moments(self.profiles)
         if self.edge is None:
             return together
-        by_stars = measure_moments(self.edge.stars)
-        return together.mix(by_stars, self.edge.lit)
+        return together.mix(self.stars.moments, self.edge.lit)
 
     @cached_property
     def log_offset(self) -> float:
@@ -236,27 +232,32 @@ class SectorRows:
 
         `lift_rad` (SECTORS,) is that of the light beyond what is expected; None: 0.
         """
-        found = emissions(self.profiles_without(lift_rad), shift)
+        gains = self.gains(shift[None], None if lift_rad is None else lift_rad[None])
+        found = emissions(self.profiles, shift, np.zeros(SECTORS) if gains is None else gains[0])
         if self.edge is not None:
-            at_skyline = clear_emissions(self.edge.stars, np.ascontiguousarray(shift)[:, None])
-            found[:, RISEN + 1 :] = at_skyline * self.edge.light[:, None]
-        return np.asarray(found)
+            at_skyline = clear_emissions(self.stars.profiles, shift[None])[0] * self.edge.light
+            found[:, RISEN + 1 :] = at_skyline[:, None]
+        return found
 
     def prepare_levels(self, reach: Array) -> Levels:
         """The emissions of all states but the first at shifts up to `reach` (SECTORS,)."""
-        stars, light = (self.profiles, np.zeros(0)) if self.edge is None else self.edge[:2]
-        return Levels(reach, prepare_levels(self.profiles, reach), stars, light)
+        seen, light = (self, np.zeros(0)) if self.edge is None else (self.stars, self.edge.light)
+        return Levels(reach, prepare_levels(self.profiles, reach), seen.profiles, light)
 
     @cached_property
     def image_rise(self) -> Array:
-        """Rise (SECTORS, j) [rad] of the skyline by stars and sky's light together, by one unit of each image error.
-
-        The share of the sky's light must not vary with its noise: errors that look like a displacement would not.
-        """
+        """Rise (SECTORS, j) [rad] of the skyline by stars and sky's light together, by one unit of each image error."""
         if not len(self.image_errors.mean):
             return NO_IMAGE_ERRORS.slopes_rad
-        stars = np.flatnonzero(self.rows.extended_nats == 0.0)
-        by_stars = measure_moments(profiles_of(self.rows.take(stars), self.above_rad[stars], np.zeros(SECTORS)))
-        share = by_stars.variance_rad2 / (by_stars.variance_rad2 + self.image_errors.variance_rad2)
-        used = share if self.edge is None else share * (1.0 - self.edge.lit)
+        used = self._share_of_light if self.edge is None else self.edge.plain._share_of_light * (1.0 - self.edge.lit)
         return np.asarray(used[:, None] * self.image_errors.slopes_rad)
+
+    @cached_property
+    def _share_of_light(self) -> Array:
+        """Share (SECTORS,) of the sky's light in what stars and light show together.
+
+        It must not vary with the noise of the light: errors that look like a displacement would not.
+        """
+        stars = self.stars
+        by_stars = measure_moments(profiles_of(stars.rows, stars.above_rad, np.zeros(SECTORS)))
+        return np.asarray(by_stars.variance_rad2 / (by_stars.variance_rad2 + self.image_errors.variance_rad2))

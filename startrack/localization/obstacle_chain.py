@@ -91,25 +91,15 @@ def prepare_levels(profiles: Profiles, reach: Array) -> NDArray[np.float32]:
     return table
 
 
-def clear_emissions(profiles: Profiles, shifts: Array) -> Array:
-    """Likelihoods (SECTORS, n) of sectors whose skyline is the map's, at shifts (SECTORS, n) [rad]."""
-    found = np.empty(shifts.shape)
-    _clear_emissions(*take(profiles, _VALUES), HIGH_RAD, WRONG_SECTOR, np.ascontiguousarray(shifts), found)
-    return found
+def clear_emissions(profiles: Profiles, shifts: Array, gains: Array | None = None) -> Array:
+    """Likelihoods (n, SECTORS) of sectors whose skyline is the map's, at shifts (n, SECTORS) [rad].
 
-
-def log_clear_emissions(profiles: Profiles, shifts: Array, clear: Array, gains: Array | None = None) -> Array:
-    """Logarithms (SECTORS, n) of likelihoods of sectors that show the map's skyline with probabilities `clear`.
-
-    `gains` (SECTORS, n) are those of the light, see `gains_of_light`; None: 0.
+    `gains` (n, SECTORS) are those of the light, see `gains_of_light`; None: 0.
     """
-    found = np.empty(shifts.shape)
-    more = np.zeros((0, shifts.shape[1])) if gains is None else np.ascontiguousarray(gains)
-    _clear_logs(
-        *take(profiles, _VALUES), HIGH_RAD, WRONG_SECTOR, np.ascontiguousarray(shifts), more,
-        np.ascontiguousarray(clear), found,
-    )  # fmt: skip
-    return found
+    found = np.empty(shifts.shape[::-1])
+    more = np.zeros((0, len(shifts))) if gains is None else np.ascontiguousarray(gains.T)
+    _clear_emissions(*take(profiles, _VALUES), HIGH_RAD, WRONG_SECTOR, np.ascontiguousarray(shifts.T), more, found)
+    return found.T
 
 
 def gains_of_light(light: Profiles, shifts: Array, lifts: Array) -> Array:
@@ -121,12 +111,16 @@ def gains_of_light(light: Profiles, shifts: Array, lifts: Array) -> Array:
     return found
 
 
-def emissions(profiles: Profiles, shift: Array) -> Array:
-    """Likelihoods (SECTORS, STATES) of the states at shifts (SECTORS,) [rad] of the map's skyline."""
+def emissions(profiles: Profiles, shift: Array, gain: Array) -> Array:
+    """Likelihoods (SECTORS, STATES) of the states at shifts (SECTORS,) [rad] of the map's skyline.
+
+    `gain` (SECTORS,) is that of the light, see `gains_of_light`.
+    """
     found = np.empty((len(shift), STATES))
     _emissions(
-        *take(profiles, _ALL), HIGH_RAD, WRONG_SECTOR, np.ascontiguousarray(shift), FROM_RAD, TO_RAD, RISEN, found
-    )
+        *take(profiles, _ALL), HIGH_RAD, WRONG_SECTOR, np.ascontiguousarray(shift), np.ascontiguousarray(gain),
+        FROM_RAD, TO_RAD, RISEN, found,
+    )  # fmt: skip
     return found
 
 
@@ -155,15 +149,13 @@ _SUMS = "first x integral free guide scale hidden"
 _ALL = "first x left right bend integral free guide scale hidden"
 _WINDOW = ("highest: float64", "wrong: float64")
 _BANDS = ("from: float64[levels]", "until: float64[levels]", "risen: int64")
-_SHIFTS = "shifts: float64[sectors, n]"
 _prepare_levels = kernel(
     "prepare_levels", *declare(_SUMS), *_WINDOW, "reach: float64[sectors]", "edge: float64[edges]",
     "lower: int64[levels]", "upper: int64[levels]", *_BANDS, "scratch: out float64[edges + 1, nodes]",
     "table: out float32[sectors, levels, nodes]",
 )  # fmt: skip
-_clear_emissions = kernel("clear_emissions", *declare(_VALUES), *_WINDOW, _SHIFTS, "found: out float64[sectors, n]")
-_clear_logs = kernel(
-    "clear_logs", *declare(_VALUES), *_WINDOW, _SHIFTS, "gain: float64[gained, n]", "clear: float64[sectors]",
+_clear_emissions = kernel(
+    "clear_emissions", *declare(_VALUES), *_WINDOW, "shifts: float64[sectors, n]", "gain: float64[gained, n]",
     "found: out float64[sectors, n]",
 )  # fmt: skip
 _gains_of_light = kernel(
@@ -171,8 +163,9 @@ _gains_of_light = kernel(
     "found: out float64[n, sectors]",
 )  # fmt: skip
 _emissions = kernel(
-    "emissions", *declare(_ALL), *_WINDOW, "shift: float64[sectors]", *_BANDS, "found: out float64[sectors, states]"
-)
+    "emissions", *declare(_ALL), *_WINDOW, "shift: float64[sectors]", "gain: float64[sectors]", *_BANDS,
+    "found: out float64[sectors, states]",
+)  # fmt: skip
 _MOVES = ("risen_start", "risen_jump", "sunk_start", "sunk_jump", "stop", "keep", "near")
 _chain = kernel(
     "chain_log_likelihoods", *declare(_VALUES), *declare(_VALUES, "star_", "star_cells"), *_WINDOW,

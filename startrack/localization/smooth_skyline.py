@@ -17,11 +17,11 @@ from startrack.core.statistics import shares
 from startrack.core.types import SECTORS, Array
 from startrack.kernels.library import kernel
 from startrack.localization.hypothesis import Hypothesis
-from startrack.localization.neighbourhood import OwnEdge
+from startrack.localization.neighbourhood import OwnEdge, SectorRows
 from startrack.localization.obstacle_chain import clear_emissions
 from startrack.localization.shared_errors import OWN_EDGE
 from startrack.localization.skyline_model import SkylineModel
-from startrack.localization.skyline_profiles import LOW_RAD, Profiles
+from startrack.localization.skyline_profiles import LOW_RAD
 
 FREE_HEIGHTS, SPREAD = 121, 6.5  # of heights about the map's skyline, closer about it
 ROUGHNESS_RAD = np.radians([0.003, 0.01, 0.03, 0.1])  # mean steps from sector to sector, equally likely
@@ -31,20 +31,25 @@ EDGE_REACH = 5.0  # of heights of the light's own edge, in its width: the cells 
 EDGE_ROUGHNESS = np.array([0.01, 0.03, 0.1, 0.3])  # mean steps from sector to sector, in its width, equally likely
 
 
-def free_log_likelihood(profiles: Profiles, shift: Array) -> float:
-    """Log-likelihood of the rows if the skyline is the map's, higher by `shift` (SECTORS,), and any smooth curve."""
-    logs = list_free_logs(profiles, shift, -LOW_RAD, ROUGHNESS_RAD).sum(axis=1)
+def free_log_likelihood(seen: SectorRows, shift: Array, lift_rad: Array | None = None) -> float:
+    """Log-likelihood of the rows if the skyline is the map's, higher by `shift` (SECTORS,), and any smooth curve.
+
+    `lift_rad` (SECTORS,) is that of the light beyond what is expected; None: 0.
+    """
+    heights = -LOW_RAD * HEIGHTS
+    shifts = shift + heights[:, None]
+    gains = seen.gains(shifts, None if lift_rad is None else np.tile(lift_rad, (len(heights), 1)))
+    logs = list_free_logs(clear_emissions(seen.profiles, shifts, gains), heights, ROUGHNESS_RAD).sum(axis=1)
     return float(np.logaddexp.reduce(logs)) - log(len(logs))
 
 
-def list_free_logs(profiles: Profiles, shift: Array, reach_rad: float, roughness_rad: Array) -> Array:
+def list_free_logs(likelihoods: Array, heights: Array, roughness_rad: Array) -> Array:
     """Log-likelihoods (n, SECTORS) of each sector by the sectors before it, for each roughness (n,) of the curve.
 
-    The skyline is the map's, higher by `shift` (SECTORS,), and a curve within `reach_rad` of zero.
+    The skyline is a curve at any of the `heights` (k,) of each sector, which have the `likelihoods` (k, SECTORS).
     """
-    heights = reach_rad * HEIGHTS
-    likelihood, cells = clear_emissions(profiles, shift[:, None] + heights), np.gradient(heights)
-    return np.array([_pass(likelihood, heights, cells, rough) for rough in roughness_rad])
+    by_sector, cells = np.ascontiguousarray(likelihoods.T), np.gradient(heights)
+    return np.array([_pass(by_sector, heights, cells, rough) for rough in roughness_rad])
 
 
 def _pass(likelihood: Array, heights: Array, cells: Array, rough: float) -> Array:
@@ -66,21 +71,20 @@ def with_own_edge(plain: Hypothesis, half_m: float) -> SkylineModel | None:
     It serves positions within `half_m` of the same reference.
     """
     seen, errors = plain.model.seen, plain.model.errors
-    rows, is_light = seen.rows, seen.is_light
-    if is_light.all() or not is_light.any():
+    stars, light = seen.stars, seen.light
+    if not len(stars.rows) or not len(light.rows):
         return None
     around = replace(plain.model.around, half_m=half_m)
-    stars, light = (
-        replace(seen, around=around, rows=rows.take(np.flatnonzero(own)), edge=None) for own in (~is_light, is_light)
-    )
-    width_rad = float(np.median(rows.edge_sigma_rad[is_light]))
+    width_rad = float(np.median(light.rows.edge_sigma_rad))
     shift, lift_rad = plain.model.shift_of(plain.sampled.share @ plain.sampled.points)
-    logs = list_free_logs(light.profiles, shift, EDGE_REACH * width_rad, EDGE_ROUGHNESS * width_rad)
+    heights = EDGE_REACH * width_rad * HEIGHTS
+    at_heights = clear_emissions(light.profiles, shift + heights[:, None])
+    logs = list_free_logs(at_heights, heights, EDGE_ROUGHNESS * width_rad)
     whole, likely = logs.sum(axis=1), shares(logs.sum(axis=1)) @ logs
     likely += (np.logaddexp.reduce(whole) - np.log(len(whole)) - likely.sum()) / SECTORS  # all equally likely before
     likely += light.profiles.offset + stars.profiles.offset - seen.profiles.offset  # the same about one reference
     most = np.maximum(likely, 0.0)  # where light and stars are far apart it exceeds all numbers
-    edge = OwnEdge(stars.profiles, np.exp(likely - most), np.ones(SECTORS), most)
+    edge = OwnEdge(seen, np.exp(likely - most), np.ones(SECTORS), most)
     by_stars = SkylineModel(replace(seen, around=around, edge=edge), errors, around.error_slopes_rad(errors), OWN_EDGE)
     return replace(by_stars, seen=replace(by_stars.seen, edge=edge._replace(lit=_find_lit(by_stars, shift, lift_rad))))
 

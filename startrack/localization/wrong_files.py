@@ -48,7 +48,7 @@ def require_files(found: Sequence[Hypothesis], parameters: Array) -> None:
     """
     model, whole = found[0].model, first_plain(found).model
     shift, lift_rad = model.shift_of(parameters)
-    free = free_log_likelihood(whole.seen.profiles_without(lift_rad), shift)
+    free = free_log_likelihood(whole.seen, shift, lift_rad)
     better = free + whole.seen.log_offset - _log_map(found[0], parameters) - model.seen.log_offset
     if better > 0.0:
         wrong = Sectors(1.0 - model.states(parameters)[:, 0])

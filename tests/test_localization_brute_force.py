@@ -12,8 +12,10 @@ from scipy.stats import norm
 
 from startrack.core.types import Evidence, Fix, NotLocated
 from startrack.localization import ExactPosterior, Hull, PseudoGradient
+from startrack.localization.places import BoxModel
 from startrack.localization.pseudo_gradient import descend
 from startrack.localization.rim_plane import points_of_rays
+from startrack.localization.search import BEAMS, Proof, log_sum
 from startrack.localization.skyline_profiles import ROW_NATS
 from startrack.terrain import Cylinder, load_terrain
 
@@ -105,11 +107,13 @@ def test_the_search_leaves_the_boxes_that_matter(seed: int) -> None:
     places = grid()
     weight = shares(log_likelihood(places, evidence))
     for nats in (12.0, 20.0, 60.0):
-        method = ExactPosterior(prune_nats=nats)
-        centres, half, log_weight, log_dropped, *_ = method.explore(evidence, PIT)
-        kept = cKDTree(centres).query(places, p=np.inf)[0] <= half
-        total = np.log(np.sum(np.exp(log_weight - log_weight.max())) * 4 * half**2) + log_weight.max()
-        admitted = np.exp(log_dropped - np.logaddexp(log_dropped, total))
+        model = BoxModel.of(evidence, PIT)
+        proof = Proof(model, prune_nats=nats, budget_horizons=np.inf)
+        found = proof.run(model.fit_places(*model.last_boxes(*BEAMS[0]), most=1))
+        assert found is not None
+        kept = cKDTree(found.centres_m).query(places, p=np.inf)[0] <= found.half_m
+        total = log_sum(found.log_weight) + np.log(4 * found.half_m**2)
+        admitted = np.exp(proof.log_dropped - np.logaddexp(proof.log_dropped, total))
         assert weight[~kept].sum() <= admitted + 0.01
 
 

@@ -130,7 +130,7 @@ def test_the_groups_named_are_those_that_hold_the_rows(groups: list[int], is_bou
     place = np.array([3000.0, -2000.0])
     line = np.linspace(-120.0, 120.0, 25)
     about = Explored(
-        place + np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2), 5.0, np.zeros(625), -100.0, "proven"
+        place + np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2), 5.0, np.zeros(625), 0.0, "proven"
     )
     rows = replace(sky_rows(place, np.random.default_rng(5), 60.0), support=about)
     part = rows.take(np.isin((rows.azimuth_rad / WIDTH_RAD).astype(int), groups))

@@ -184,7 +184,7 @@ def explored_at() -> Explored:
     """Boxes about the place, as a fix by the stars leaves them."""
     line = np.linspace(-12.0, 12.0, 25)
     centres = PLACE + np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    return Explored(centres, 0.5, -0.5 * np.square((centres - PLACE) / 5.0).sum(axis=1), -100.0, "proven")
+    return Explored(centres, 0.5, -0.5 * np.square((centres - PLACE) / 5.0).sum(axis=1), 0.0, "proven")
 
 
 def test_evidence_without_a_place_to_stand_is_refused() -> None:

@@ -172,9 +172,8 @@ class Explored(NamedTuple):
     centres_m: Array  # (n, 2) east and north
     half_m: float  # of the side of a square
     log_weight: Array  # (n,) of the squares in the posterior, up to a constant; of a search the log-density [1/m2]
-    log_dropped: float  # logarithm of a bound of the mass [m2] that was dropped
+    dropped_probability: float  # bound of the part of the posterior that the search left out; 1: it has none
     search: str  # "proven" or "beam"
-    dropped_probability: float | None = None  # of the whole search, known before; None: by `log_dropped`
 
 
 UNPROVEN = (

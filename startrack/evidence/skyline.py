@@ -19,6 +19,7 @@ CLIP_SHIFT_PX = 1.0  # by which any prediction may be wrong
 SKYLINE_SIGMAS = 2.0  # of the prediction
 MOST_REACH_PX = 6.0  # of a skyline that is known well enough to be measured
 SKYLINE_POINTS = 1440
+AROUND_RAD = np.linspace(0.0, 2 * np.pi, SKYLINE_POINTS, endpoint=False)
 SKYLINE_SAMPLES = 5 * SKYLINE_POINTS  # one in 3 arcmin: half a pixel of a 180-degree fisheye
 ELEVATION_STEP_RAD = 1e-3  # of derivatives
 MAX_SLOPE = 1.0
@@ -81,16 +82,14 @@ class SkylineEstimate:
         `turn_rad` (3,) is the rotation vector in enu of the turn, half of it before the middle of the exposure. The
         motion is the median in each sector: where the skyline jumps only the stars at the jump move by its height.
         """
-        azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_POINTS, endpoint=False)
-        rays = rays_from_azel(azimuth, self.skyline(azimuth))
+        rays = rays_from_azel(AROUND_RAD, self.skyline(AROUND_RAD))
         ends = [azel_from_rays(rays @ R_from_rotvec(part * turn_rad).T) for part in (-0.5, 0.5)]
         before, after = (elevation - self.skyline(azimuth) for azimuth, elevation in ends)
         return np.asarray(np.median(np.abs(after - before).reshape(SECTORS, -1), axis=1))
 
     def is_level(self, azimuth_rad: Array) -> Bools:
         """Whether the skyline at `azimuth_rad` (n,) is so level that a small shift does not turn it."""
-        azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_POINTS, endpoint=False)
-        here = self.skyline(azimuth)
+        here = self.skyline(AROUND_RAD)
         run = 2 * np.pi / SKYLINE_POINTS * np.cos(here)
         steep = np.abs(np.roll(here, -1) - np.roll(here, 1)) / (2 * run)
         at = np.rint(azimuth_rad / (2 * np.pi) * SKYLINE_POINTS).astype(np.int64) % SKYLINE_POINTS
@@ -103,13 +102,12 @@ def scale_across(camera: Camera, R_cam_enu: Array, horizon: Horizon) -> Skyline:
     Across, not upwards: a steep skyline is closer than it is high. `camera` and `R_cam_enu` place it in the image. Out
     of the view it is the median of that in view.
     """
-    azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_POINTS, endpoint=False)
-    elevation = horizon(azimuth)
-    rays_cam = rays_from_azel(azimuth, elevation) @ R_cam_enu.T
+    elevation = horizon(AROUND_RAD)
+    rays_cam = rays_from_azel(AROUND_RAD, elevation) @ R_cam_enu.T
     seen = off_axis_rad(rays_cam) < min(camera.max_angle_rad, camera.lens.max_invertible_rad)
 
     def pixels(turned: int, raised_rad: float) -> Array:
-        rays_enu = rays_from_azel(np.roll(azimuth, turned), np.roll(elevation, turned) + raised_rad)
+        rays_enu = rays_from_azel(np.roll(AROUND_RAD, turned), np.roll(elevation, turned) + raised_rad)
         return camera.project_unlimited((rays_enu @ R_cam_enu.T)[seen])
 
     up = (pixels(0, ELEVATION_STEP_RAD) - pixels(0, -ELEVATION_STEP_RAD)) / (2 * ELEVATION_STEP_RAD)
@@ -128,8 +126,7 @@ def skyline_band(
 
     `camera` and `R_cam_enu` place the skyline in the image.
     """
-    azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_POINTS, endpoint=False)
-    xy, inside = camera.project(rays_from_azel(azimuth, horizon(azimuth)) @ R_cam_enu.T)
+    xy, inside = camera.project(rays_from_azel(AROUND_RAD, horizon(AROUND_RAD)) @ R_cam_enu.T)
     picture = np.full(shape, 0, dtype=np.uint8)  # np.zeros would take small memory pages
     points = np.rint(xy).astype(np.int32)
     both = np.flatnonzero(inside & np.roll(inside, 1))

@@ -23,8 +23,8 @@ NEAR_SKYLINE_PX = 60.0  # from the skyline to the stars that are used: five degr
 FIRST_CLIPPED_PX, CLIPPING_ROUNDS = 1.0, 3  # of offsets from the terms fitted so far: blends
 # Of the offset around the image. Of frames with lens errors of 0.2 px (waves 2 to 4) under a sky of 90 %, 6 of 20 are
 # beyond their 99.9 % circles with 2 waves, and 0 of the same and 3 of 20 others with 4, at a third of the error.
-WAVES = 4
-TERMS = 1 + 2 * WAVES
+MOST_TURNS = 4
+TERMS = 1 + 2 * MOST_TURNS
 SIGNIFICANT_CHI2 = 27.9  # of all terms: one in a thousand; below, the lens is as its file says
 LEAST_SIGMA_PX = 1e-3  # of a term
 # Of a term of a calibrated lens, from night to night: beyond what one calibration can know of it. Positions by four
@@ -46,7 +46,7 @@ class StarOffsets:
 
 def offset_terms(azimuth_rad: Array) -> Array:
     """Terms (n, TERMS) of an offset as a function of `azimuth_rad` (n,): its mean, cosine and sine of each wave."""
-    waves = [wave(k * azimuth_rad) for k in range(1, WAVES + 1) for wave in (np.cos, np.sin)]
+    waves = [wave(k * azimuth_rad) for k in range(1, MOST_TURNS + 1) for wave in (np.cos, np.sin)]
     return np.stack([np.ones_like(azimuth_rad), *waves], axis=1)
 
 

@@ -102,9 +102,13 @@ class StarPhotometry(ExpectedStars):
 
     def evidence(self) -> Evidence:
         """Evidence of the usable stars, for the localizer."""
-        use, edge = self.usable, np.broadcast_to(self.edge_sigma_rad, len(self.llr))
-        rows = self.azimuth_rad[use], self.elevation_rad[use], self.llr[use], edge[use]
-        return Evidence(azimuth_rad=rows[0], elevation_rad=rows[1], llr=rows[2], edge_sigma_rad=rows[3])
+        use = self.usable
+        return Evidence(
+            azimuth_rad=self.azimuth_rad[use],
+            elevation_rad=self.elevation_rad[use],
+            llr=self.llr[use],
+            edge_sigma_rad=np.broadcast_to(self.edge_sigma_rad, len(use))[use],
+        )
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,6 @@ from startrack.core.types import (
 from startrack.localization.hypothesis import Hypothesis
 from startrack.localization.importance_sampling import moments
 from startrack.localization.integrity import assess_integrity
-from startrack.localization.search import bound_dropped
 from startrack.localization.summary import camera_at, link_points, require_inside
 from startrack.localization.wrong_files import require_files, require_map_in_view
 from startrack.terrain import DIAMETER, Terrain
@@ -132,7 +131,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored) 
     if not ambiguous and radius95 > widest_m and whole.unscaled_radius95_m > widest_m:
         raise NotLocated(_useless_text(whole))
     require_map_in_view(best.model, clear + lit)
-    dropped, integrity = bound_dropped(explored), None
+    dropped, integrity = explored.dropped_probability, None
     if not best.model.seen.rows.is_first_look:
         require_files(found, best.sampled.likeliest(own))
         if not ambiguous:
@@ -151,7 +150,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored) 
         exact_map_radius999_m=_radius_by_exact_map(whole), raised_rad=best.model.rise_rad(parameters),
         compared_at_m=parameters[:2], shown=_shown_errors(best),
         lit=lit_up if lit_up else None,
-        support=_support(best, explored, dropped),
+        support=_support(best, explored),
     )  # fmt: skip
 
 
@@ -274,12 +273,12 @@ def _shown_errors(best: Hypothesis) -> tuple[ShownError, ...]:
     )
 
 
-def _support(best: Hypothesis, explored: Explored, dropped: float) -> Explored:
+def _support(best: Hypothesis, explored: Explored) -> Explored:
     """The SUPPORT points (n, 2) [m, enu] of most weight of the best hypothesis, where a later search begins.
 
-    `explored` is left by the search of this one, with a bound of the probability that it `dropped`.
+    `explored` is left by the search of this one.
     """
     order = np.argsort(-best.sampled.log_weight)[:SUPPORT]
     points, log = best.sampled.points[order, :2], best.sampled.log_weight[order]
     spread = np.sqrt(max(float(np.linalg.eigvalsh(moments(points, relative_weights(log))[1])[1]), 1e-6))
-    return explored._replace(centres_m=points, half_m=0.5 * spread, log_weight=log, dropped_probability=dropped)
+    return explored._replace(centres_m=points, half_m=0.5 * spread, log_weight=log)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from startrack.core.types import Array
+from startrack.core.types import Array, Bools
 from startrack.localization.importance_sampling import FEW, Gaussian, WeightedPoints, moments, normal_sequence, sample
 from startrack.localization.shared_errors import CLOCK_FACT
 from startrack.localization.skyline_model import SkylineModel
@@ -18,6 +18,24 @@ HIDDEN_COPIES = 6  # of each point, with values of the errors that the rows do n
 WIDER, LINEAR_PART = 2.0, 0.01  # variance of the first points, in that of the plain and of the linear solution
 GROSS_ROUNDS = (120, 160, 200, 300, 400, 500)  # points; FEW effective ones end them
 FEW_ROUNDS = GROSS_ROUNDS[:1]  # by which hypotheses are screened: of 34 refused with GROSS_ROUNDS it leaves 32
+
+
+class Cell(NamedTuple):
+    """Positions that are nearer to a reference than to any other one."""
+
+    reference_m: Array  # (2,)
+    others_m: Array  # (g, 2)
+
+    @classmethod
+    def of_each(cls, references_m: Sequence[Array], others_m: Array) -> list[Cell]:
+        """Cells of several references (2,), beside `others_m` (n, 2) that have none."""
+        whole = np.vstack([*references_m, others_m])
+        return [cls(one, np.delete(whole, number, axis=0)) for number, one in enumerate(references_m)]
+
+    def contains(self, positions_m: Array) -> Bools:
+        """Whether each position (n, 2) is in the cell."""
+        away = np.linalg.norm(positions_m[:, None] - self.others_m, axis=2).min(axis=1, initial=np.inf)
+        return np.asarray(np.linalg.norm(positions_m - self.reference_m, axis=1) <= away)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +56,7 @@ class Hypothesis:
 
     @property
     def gross(self) -> str:
-        """Fact with the gross error; "": none."""
+        """Fact with the gross error, or OWN_EDGE; "": neither."""
         return self.model.gross
 
     @cached_property
@@ -90,16 +108,16 @@ def first_plain(found: Sequence[Hypothesis]) -> Hypothesis:
     return min(first_group(found), key=lambda one: one.gross != "")
 
 
-def sample_hypothesis(model: SkylineModel, references_m: Array, modes: Sequence[Gaussian], **how: Any) -> Hypothesis:
-    """Hypothesis that is sampled, as `sample` is told `how`, where its reference is the nearest of all (g, 2)."""
-    near, basis, reference_m = model.seen.rows.near, model.basis, model.around.reference_m
+def sample_hypothesis(model: SkylineModel, cell: Cell | None, modes: Sequence[Gaussian], **how: Any) -> Hypothesis:
+    """Hypothesis that is sampled, as `sample` is told `how`, in a `cell`; None: anywhere."""
+    near, basis = model.seen.rows.near, model.basis
     area = float(np.log(np.pi * model.terrain.reach_m**2))
 
     def log_density(parameters: Array) -> Array:
         position = parameters[:, :2]
         inside = np.asarray(model.terrain.allowed(position))
-        away = np.linalg.norm(position[:, None] - references_m, axis=2)
-        inside &= away.min(axis=1) == np.linalg.norm(position - reference_m, axis=1)
+        if cell is not None:
+            inside &= cell.contains(position)
         value = np.full(len(parameters), -np.inf)
         if inside.any():
             value[inside] = model.log_likelihood(parameters[inside]) + model.seen.log_offset - area
@@ -111,7 +129,7 @@ def sample_hypothesis(model: SkylineModel, references_m: Array, modes: Sequence[
     return Hypothesis(model, sample(log_density, modes, **how))
 
 
-def sample_gross_errors(plain: Hypothesis, references_m: Array) -> list[Hypothesis]:
+def sample_gross_errors(plain: Hypothesis, cell: Cell) -> list[Hypothesis]:
     """The hypotheses of one gross error each; for the clock on real ground see `sample_other_times`."""
     model, found = plain.model, []
     for gross in model.errors.facts:
@@ -122,16 +140,16 @@ def sample_gross_errors(plain: Hypothesis, references_m: Array) -> list[Hypothes
             less = other.basis.log_probability - model.basis.log_probability
             found.append(replace(plain, model=other).weighed(less))
         else:
-            found.append(sample_gross_error(plain, other, references_m))
+            found.append(sample_gross_error(plain, other, cell))
     return found
 
 
 def sample_gross_error(
-    plain: Hypothesis, other: SkylineModel, references_m: Array, rounds: Sequence[int] = GROSS_ROUNDS
+    plain: Hypothesis, other: SkylineModel, cell: Cell | None, rounds: Sequence[int] = GROSS_ROUNDS
 ) -> Hypothesis:
     """Hypothesis of one gross error, that of the model `other`, sampled from the points of a `plain` one."""
     modes = _gross_modes(plain, other)
-    return sample_hypothesis(other, references_m, modes, rounds=[len(modes) * count for count in rounds], enough=FEW)
+    return sample_hypothesis(other, cell, modes, rounds=[len(modes) * count for count in rounds], enough=FEW)
 
 
 def _gross_modes(plain: Hypothesis, other: SkylineModel) -> list[Gaussian]:

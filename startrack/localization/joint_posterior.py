@@ -8,7 +8,14 @@ from functools import partial
 import numpy as np
 
 from startrack.core.types import Array, Evidence, Explored, NotLocated
-from startrack.localization.hypothesis import WIDER, Hypothesis, heaviest_first, sample_gross_errors, sample_hypothesis
+from startrack.localization.hypothesis import (
+    WIDER,
+    Cell,
+    Hypothesis,
+    heaviest_first,
+    sample_gross_errors,
+    sample_hypothesis,
+)
 from startrack.localization.importance_sampling import (
     ENOUGH,
     FEW,
@@ -40,6 +47,7 @@ def sample_posterior(
 ) -> list[Hypothesis]:
     """Hypotheses with their weighted points, the heaviest first; none nearer to a position of `others_m` (n, 2).
 
+    Each group of boxes has the positions that are nearest to where its sampling starts.
     Raises NotLocated (outside_search_area) where no box is left.
     """
     groups = _group_boxes(explored, 4.0 * REACH_M if terrain.axisymmetric else REACH_M)
@@ -49,30 +57,33 @@ def sample_posterior(
             reason="outside_search_area",
         )
     errors = SharedErrors.of(terrain, rows.clock)
-    references_m = np.vstack([[centres_m[0] for centres_m, _ in groups], others_m])
-    found: list[Hypothesis] = []
-    for number, (centres_m, reach_m) in enumerate(groups):
-        start = _begin_group(terrain, rows, errors, centres_m, max(reach_m, FIT_M), explored.half_m)
-        if start is None:
-            continue
-        references_m[number] = start.model.around.reference_m
-        best = max((one.log_evidence for one in found), default=-np.inf)
-        plain = _sample_group(start, references_m, best, is_first=number == 0)
-        references_m[number] = plain.model.around.reference_m
-        found.append(plain)
-        if plain.log_evidence >= best - NATS:
-            found.extend(sample_gross_errors(plain, references_m))
-            found.extend(_sample_own_edge(plain, start.model.around.half_m, explored, references_m))
-    if not found:
-        raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
-    best = max(one.log_evidence for one in found)
-    found = [
-        sample_hypothesis(one.model, references_m, [_moments_of(one)])
-        if one.sampled.effective < FEW and one.log_evidence > best - NATS
-        else one
-        for one in found
+    begun = [
+        _begin_group(terrain, rows, errors, centres_m, max(reach_m, FIT_M), explored.half_m)
+        for centres_m, reach_m in groups
     ]
-    return heaviest_first(found)
+    starts = [one for one in begun if one is not None]
+    if not starts:
+        raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
+    found: list[tuple[Cell, Hypothesis]] = []
+    for start, cell in zip(
+        starts, Cell.of_each([one.model.around.reference_m for one in starts], others_m), strict=True
+    ):
+        best = max((one.log_evidence for _, one in found), default=-np.inf)
+        plain = _sample_group(start, cell, best)
+        own = [plain]
+        if plain.log_evidence >= best - NATS:
+            own += sample_gross_errors(plain, cell)
+            own += _sample_own_edge(plain, start.model.around.half_m, explored, cell)
+        found += [(cell, one) for one in own]
+    best = max(one.log_evidence for _, one in found)
+    return heaviest_first([_sample_again(one, cell, best) for cell, one in found])
+
+
+def _sample_again(one: Hypothesis, cell: Cell, best: float) -> Hypothesis:
+    """The hypothesis `one`, sampled again where few points count and it may matter beside the `best` log-evidence."""
+    if one.sampled.effective >= FEW or one.log_evidence <= best - NATS:
+        return one
+    return sample_hypothesis(one.model, cell, [_moments_of(one)])
 
 
 def _begin_group(
@@ -94,18 +105,18 @@ def _begin_group(
     return start
 
 
-def _sample_own_edge(plain: Hypothesis, half_m: float, explored: Explored, references_m: Array) -> list[Hypothesis]:
+def _sample_own_edge(plain: Hypothesis, half_m: float, explored: Explored, cell: Cell) -> list[Hypothesis]:
     """Hypothesis that the sky's light has an edge of its own, within `half_m` of the plain one's reference; or none.
 
-    Its points are drawn from all boxes that the search has left.
+    Its points are drawn from all boxes that the search has left, as far as they are in the `cell`.
     """
     model = with_own_edge(plain, half_m)
     start = None if model is None else Start.among_boxes(model, explored.centres_m, explored.half_m)
     if start is None:
         return []
-    found = sample_hypothesis(start.model, references_m, start.modes, first=[start.boxes], enough=FEW)
+    found = sample_hypothesis(start.model, cell, start.modes, first=[start.boxes], enough=FEW)
     if found.log_evidence > plain.log_evidence:
-        found = sample_hypothesis(found.model, references_m, [_moments_of(found)])
+        found = sample_hypothesis(found.model, cell, [_moments_of(found)])
     return [found]
 
 
@@ -163,16 +174,16 @@ class Start:
         return cls(model.with_closing(model.states(best)), modes, drawn, best[:2])
 
 
-def _sample_group(start: Start, references_m: Array, best: float, is_first: bool) -> Hypothesis:
-    """The plain hypothesis of a group of boxes, whose reference, one of all (g, 2), may move.
+def _sample_group(start: Start, cell: Cell, best: float) -> Hypothesis:
+    """The plain hypothesis of a group of boxes, in its `cell`.
 
-    A further group is left at its first rounds where it is less likely than the `best` by NATS. On a height map
+    A group is left at its first rounds where it is less likely than the `best` one before it by NATS. On a height map
     the last rounds are in a neighbourhood as small as the posterior, because horizons are interpolated in it.
     """
     model = start.model
     enough = FEW if model.seen.rows.is_first_look else ENOUGH
-    sample_at_start = partial(sample_hypothesis, model, references_m, start.modes, first=[start.boxes], enough=enough)
-    if is_first and model.terrain.axisymmetric:
+    sample_at_start = partial(sample_hypothesis, model, cell, start.modes, first=[start.boxes], enough=enough)
+    if best == -np.inf and model.terrain.axisymmetric:
         return sample_at_start()
     plain = sample_at_start(rounds=FIRST_ROUNDS)
     if plain.log_evidence < best - NATS:
@@ -181,9 +192,8 @@ def _sample_group(start: Start, references_m: Array, best: float, is_first: bool
     reach_m = max(NEIGHBOURHOOD_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1])), SMALLEST_M)
     if model.terrain.axisymmetric or reach_m > 0.5 * model.around.half_m:
         return sample_at_start()
-    is_own = (references_m == model.around.reference_m).all(axis=1)
     closer, mode = _begin_closer(model, mean, covariance, reach_m)
-    return sample_hypothesis(closer, np.where(is_own[:, None], mean[:2], references_m), [mode], enough=enough)
+    return sample_hypothesis(closer, cell, [mode], enough=enough)
 
 
 def _begin_closer(model: SkylineModel, mean: Array, covariance: Array, reach_m: float) -> tuple[SkylineModel, Gaussian]:

@@ -98,13 +98,10 @@ class LinearErrors:
     @cached_property
     def _information(self) -> Array:
         """Information (j, j) on the errors by the sectors and the prior."""
+        by_sectors = self.weighted.T @ np.hstack([self.lifts.lift_rad, self.wave_rise_rad])
         own, waves = slice(0, self.images), slice(self.images, None)
-        found = self.inverse.copy()
-        found[own, own] += self.weighted[:, own].T @ self.lifts.lift_rad
-        found[own, waves] += self.weighted[:, own].T @ self.wave_rise_rad
-        found[waves, own] = found[own, waves].T
-        found[waves, waves] += self.weighted[:, waves].T @ self.wave_rise_rad
-        return found
+        by_sectors[waves, own] = by_sectors[own, waves].T  # what they share is seen by the light alone
+        return np.asarray(self.inverse + by_sectors)
 
     @cached_property
     def gain(self) -> Array:
@@ -117,6 +114,11 @@ class LinearErrors:
         of_image = np.zeros_like(self.weighted)
         of_image[:, : self.images] = self.weighted[:, : self.images]
         return np.asarray(np.linalg.solve(self._information, of_image.T))
+
+    @cached_property
+    def _by_prior(self) -> Array:
+        """Part (j,) of the prior in the likeliest errors."""
+        return np.asarray(np.linalg.solve(self._information, self.inverse @ self.mean))
 
     @cached_property
     def log_volume(self) -> float:
@@ -170,8 +172,7 @@ class LinearErrors:
         if lifts_rad is not None:
             part = np.divide(self.lifts.weight, self.weight, out=np.zeros(SECTORS), where=self.weight > 0.0)
             left_rad, above_rad = left_rad - part * lifts_rad, above_rad - (1.0 - part) * lifts_rad
-        by_prior = np.linalg.solve(self._information, self.inverse @ self.mean)
-        return by_prior + left_rad @ self.gain.T + above_rad @ self._gain_of_light.T, left_rad
+        return self._by_prior + left_rad @ self.gain.T + above_rad @ self._gain_of_light.T, left_rad
 
     def waves_rad(self, left_rad: Array) -> Array:
         """Rise (SECTORS,) [rad] of the skyline by the likeliest waves and seam at `left_rad` (SECTORS,); see `fit`."""

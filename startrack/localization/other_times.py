@@ -128,7 +128,7 @@ class OtherTimes:
         if neighbour is None:
             modes.append((linear, WIDER * covariance))
         for rounds in FEW_ROUNDS, GROSS_ROUNDS:
-            one = sample_hypothesis(model, model.around.reference_m[None], modes, rounds=rounds, enough=FEW)
+            one = sample_hypothesis(model, None, modes, rounds=rounds, enough=FEW)
             one = one.weighed(self.log_part[at])
             if one.log_evidence < self.log_evidence + np.log(FULL_SHARE):
                 break

@@ -50,19 +50,19 @@ class ExactPosterior:
             raise NotLocated(f"only {count} rays carry information about the skyline: expose longer")
         rows = evidence if count == len(evidence) else evidence.take(informative)
         try:
-            return weigh_parts([Part(*one) for one in self._explore_times(rows, terrain)], terrain)
+            return weigh_parts(self._explore_parts(rows, terrain), terrain)
         except NotLocated as refusal:
             raise name_prior(refusal, rows.near) from refusal
 
-    def _explore_times(self, rows: Evidence, terrain: Terrain) -> list[tuple[Evidence, Explored]]:
-        """Pairs of the rows at a likely time, and of the boxes that may matter there."""
+    def _explore_parts(self, rows: Evidence, terrain: Terrain) -> list[Part]:
+        """The rows at each likely time, with the boxes that may matter there."""
         if rows.support is not None:
-            return [(rows, rows.support)]
+            return [Part(rows, rows.support)]
         if rows.near is not None:
-            return [(rows, self._explore_near(rows, terrain, rows.near))]
+            return [Part(rows, self._explore_near(rows, terrain, rows.near))]
         if rows.clock is not None and is_wide(rows.clock, terrain):
-            return explore_times(rows, terrain, rows.clock)
-        return [(rows, self.explore(rows, terrain))]
+            return [Part(*one) for one in explore_times(rows, terrain, rows.clock)]
+        return [Part(rows, self.explore(rows, terrain))]
 
     def explore(self, evidence: Evidence, terrain: Terrain) -> Explored:
         """The boxes of the `terrain` that may matter by `evidence`."""

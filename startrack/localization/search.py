@@ -44,18 +44,6 @@ def log_sum(values: Array) -> float:
     return float(np.logaddexp.reduce(values, initial=-np.inf))
 
 
-def bound_dropped(explored: Explored, log_known: float = -np.inf) -> float:
-    """Bound of the part of the posterior that a search left out; 1 where nothing is known.
-
-    `log_known` is the logarithm of the integral of the likelihood [m2] about known places: where rows are strong it is
-    more than the boxes hold by their averages.
-    """
-    if explored.dropped_probability is not None:
-        return explored.dropped_probability
-    log_mass = max(log_sum(explored.log_weight) + float(np.log(4 * explored.half_m**2)), log_known)
-    return float(np.exp(min(explored.log_dropped + SLACK_NATS - log_mass, 0.0)))
-
-
 def boxes_about(places: list[Place], terrain: Terrain) -> Explored:
     """Boxes about the likely ones of `places`, where no proof excludes all others."""
     likely = [one for one in places if one.log_likelihood > places[0].log_likelihood - NATS]
@@ -65,7 +53,7 @@ def boxes_about(places: list[Place], terrain: Terrain) -> Explored:
     centres = np.concatenate([one.position_m + off for one in likely])
     score = np.concatenate([one.log_likelihood - less for one in likely])
     allowed = np.asarray(terrain.allowed(centres))
-    return Explored(centres[allowed], reach_m / (BOXES_ACROSS - 1), score[allowed], np.inf, "beam")
+    return Explored(centres[allowed], reach_m / (BOXES_ACROSS - 1), score[allowed], 1.0, "beam")
 
 
 def search_boxes(
@@ -79,11 +67,13 @@ def search_boxes(
     """
     model = BoxModel.of(rows, terrain)
     places = model.fit_places(*model.last_boxes(*BEAMS[0]), most=1)
-    found = Proof(model.raised_as(places), prune_nats, budget_horizons).run(places)
+    proof = Proof(model.raised_as(places), prune_nats, budget_horizons)
+    found = proof.run(places)
     if found is None or found.search != "proven":
         for beam in BEAMS[1:]:
             places = merge_places(places, model.fit_places(*model.last_boxes(*beam)))
-        found = Proof(model.raised_as(places), prune_nats, budget_horizons).run(places)
+        proof = Proof(model.raised_as(places), prune_nats, budget_horizons)
+        found = proof.run(places)
     if found is None:
         raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
     if found.search == "proven":
@@ -96,7 +86,7 @@ def search_boxes(
         found = found._replace(  # the best place is the first reference of the sampling
             centres_m=np.vstack([points, found.centres_m]),
             log_weight=np.append(log_likelihood, found.log_weight),
-            dropped_probability=bound_dropped(found, max(log_masses)) if places else None,
+            dropped_probability=proof.bound_dropped(found.log_weight, found.half_m, max(log_masses, default=-np.inf)),
         )
     return found, places
 
@@ -141,9 +131,9 @@ class Proof:
                 centres, average = centres[order], average[order]
                 keep = average > average[0] - self.prune_nats
                 if half <= finest_m or np.mean(keep) > 0.5:
-                    return Explored(
-                        centres[keep], half, average[keep], self._with_dropped(average[~keep], half), "proven"
-                    )
+                    self.log_dropped = self._with_dropped(average[~keep], half)
+                    dropped = self.bound_dropped(average[keep], half)
+                    return Explored(centres[keep], half, average[keep], dropped, "proven")
             quarters = split_boxes(centres, half, terrain)
             if not len(quarters) and not places:
                 raise NotLocated(
@@ -174,6 +164,15 @@ class Proof:
         keep = upper > best - nats
         self.log_dropped = self._with_dropped(upper[~keep], half)
         return centres[keep]
+
+    def bound_dropped(self, log_weight: Array, half_m: float, log_known: float = -np.inf) -> float:
+        """Bound of the part of the posterior outside the boxes that are left, of `log_weight` (n,); 1: it has none.
+
+        `log_known` is the logarithm of the integral of the likelihood [m2] about known places: where rows are strong
+        it is more than the boxes hold by their averages.
+        """
+        log_mass = max(log_sum(log_weight) + float(np.log(4 * half_m**2)), log_known)
+        return float(np.exp(min(self.log_dropped + SLACK_NATS - log_mass, 0.0)))
 
     def _work_of(self, boxes: float) -> float:
         """Cost of the bounds of so many boxes, in horizons traced."""

@@ -30,9 +30,7 @@ from startrack.core.types import Evidence, NoSolution
 from startrack.exposure import read_exposure
 from startrack.frames import R_from_quat_xyzw
 from startrack.localization import PseudoGradient
-from startrack.localization.convex_hull import hull_position
-from startrack.localization.pseudo_gradient import descend
-from startrack.localization.rim_plane import stars_on_rim_plane
+from startrack.localization.thesis_methods import descend, hull_position, stars_on_rim_plane
 from startrack.rendering import Series, render
 from startrack.terrain import Cylinder, load_terrain
 

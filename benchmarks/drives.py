@@ -24,7 +24,7 @@ from _drive_frames import Course, draw_course, frames_by_evidence, frames_by_pix
 from _map_draws import draw_ground
 from _results import table, write_section
 
-from startrack.applications.tracking.moves import Moves
+from startrack.applications.tracking.odometry import Moves
 from startrack.applications.tracking.positions import conclude, filter_positions, positions_at_rest
 from startrack.core import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.types import Array

@@ -19,10 +19,10 @@ from startrack.core.files import data_dir
 from startrack.core.types import Array
 from startrack.frames import enu_from_latlon
 from startrack.terrain import HeightMap, load_terrain, read_map
-from startrack.terrain.imports.comparison import compare_maps
-from startrack.terrain.imports.crest_errors import (
+from startrack.terrain.imports.comparison import (
     Correlation,
     average_posts,
+    compare_maps,
     correlate_with_coarser,
     map_of_rim,
 )

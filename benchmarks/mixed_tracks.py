@@ -30,7 +30,7 @@ from startrack.frames import (
     quat_xyzw_from_R,
     rays_from_azel,
 )
-from startrack.rendering.drive import draw_odometry
+from startrack.rendering.series import draw_odometry
 from startrack.terrain import load_terrain
 
 FRAMES, SPACING_M, EVERY_S = 7, 80.0, 1600.0

@@ -19,7 +19,7 @@ from _drive_frames import frames_by_evidence
 from _results import table, write_section
 from drives import Case, course_of, odometry
 
-from startrack.applications.tracking.moves import Moves
+from startrack.applications.tracking.odometry import Moves
 from startrack.applications.tracking.positions import filter_positions
 from startrack.estimation.trajectory import smooth
 

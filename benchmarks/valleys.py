@@ -27,7 +27,7 @@ from _map_draws import draw_ground
 from _results import table, write_section
 from _sky_view import Hazard, Rng, View, expose, smooth_noise, turn
 
-from startrack.applications.reproduction.valley import BELOW_RAD, DARK_RAD, draw_floor, draw_time, jacksboro
+from startrack.applications.reproduction.scene import BELOW_RAD, DARK_RAD, draw_floor, draw_time, jacksboro
 from startrack.applications.tracking import TrackErrors, observe_frame
 from startrack.applications.tracking.positions import positions_at_rest
 from startrack.camera import Camera, load_camera

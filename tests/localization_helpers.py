@@ -11,7 +11,7 @@ from scipy.special import ndtr
 from startrack.core.errors import Reason
 from startrack.core.types import SECTORS, Array, Evidence, Fix, NotLocated
 from startrack.localization import ExactPosterior
-from startrack.localization.obstacle_chain import (
+from startrack.localization.likelihood.obstacle_chain import (
     LEVELS_RAD,
     MOVES,
     NOTCH_LEVELS_RAD,
@@ -22,8 +22,8 @@ from startrack.localization.obstacle_chain import (
     Moves,
     transitions,
 )
+from startrack.localization.likelihood.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS, Profiles, sector_of
 from startrack.localization.search_profiles import HIDE, SEARCH_EPSILON
-from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS, Profiles, sector_of
 from startrack.terrain import Cylinder, ForwardingTerrain, Terrain, load_terrain
 
 TERRAIN = load_terrain("shackleton-thesis")

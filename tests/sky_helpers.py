@@ -13,7 +13,7 @@ from scipy.special import ndtr
 
 from startrack.core.types import SECTORS, Array
 from startrack.evidence import BAND_PX
-from startrack.evidence.sky_pixels import SkyPixels
+from startrack.evidence.sky_levels import SkyPixels
 from startrack.evidence.skyline import CLIP_SHIFT_PX
 
 EDGE_PX = 1.04  # a PSF of 1 px, and the pixel

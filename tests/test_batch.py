@@ -28,7 +28,7 @@ from startrack.cli.main import main
 from startrack.core.errors import BadInput
 from startrack.exposure import write_exposure, write_sidecar
 from startrack.localization import LOCALIZERS
-from startrack.localization.rim_plane import point_fix
+from startrack.localization.thesis_methods import point_fix
 from startrack.rendering import Series, render
 from startrack.terrain import load_terrain
 

@@ -16,8 +16,8 @@ from startrack.applications.calibration.initial_states import BoardState, initia
 from startrack.camera import Camera, KannalaBrandt, load_camera
 from startrack.cli.main import main
 from startrack.core.types import Exposure, NotIdentified
+from startrack.estimation.adjust import observations
 from startrack.estimation.lens_fit import fit_state
-from startrack.estimation.normal_equations import observations
 from startrack.exposure import write_exposure
 
 SIZE_PX = (640, 480)

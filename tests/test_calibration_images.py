@@ -24,8 +24,7 @@ from scipy.spatial import cKDTree
 
 from startrack.applications.calibration import calibrate
 from startrack.applications.calibration.acceptance import joint_log_p_value
-from startrack.applications.calibration.plots import _draw_vectors
-from startrack.applications.calibration.report import _report_html, write_report
+from startrack.applications.calibration.report import _draw_vectors, _report_html, write_report
 from startrack.applications.calibration.static_parts import find_obstructions
 from startrack.applications.calibration.verify import Verification, verify, verify_dict, verify_line
 from startrack.camera import load_camera, save_camera

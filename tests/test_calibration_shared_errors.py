@@ -16,7 +16,7 @@ from startrack.applications.calibration.shared_errors import FLOOR_PX, birge_rat
 from startrack.applications.calibration.verify import CHANGED_SIGMAS
 from startrack.camera import Camera, cap_grid, difference_px, projection_covariance_px2
 from startrack.core.types import Array
-from startrack.estimation.joint_fit import JointFit
+from startrack.estimation.frame_matching import JointFit
 
 SIGMA_PX, STARS = 0.15, 500
 FIRST_NIGHT = datetime(2030, 6, 1, 22, tzinfo=UTC)

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from startrack.applications.calibration import KnownSensor, calibrate
-from startrack.applications.calibration.photometry import measure_photometry
-from startrack.applications.calibration.sensor import fit_photon_transfer
+from startrack.applications.calibration.sensor import fit_photon_transfer, measure_photometry
 from startrack.applications.calibration.throughput import StarFluxes, fit_throughput
 from startrack.camera import Camera, KannalaBrandt, Sensor, cap_grid, difference_px
 from startrack.catalog import load_catalog

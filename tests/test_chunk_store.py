@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from startrack.core import chunk_store
-from startrack.core.chunk_store import ChunkStore
+from startrack.applications import chunk_store
+from startrack.applications.chunk_store import ChunkStore
 from startrack.core.errors import BadOutput
 from startrack.core.stored import read_json_object, read_sealed, write_sealed
 

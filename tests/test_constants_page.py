@@ -56,7 +56,7 @@ def test_constants_are_listed_once() -> None:
 def test_the_text_has_the_values_of_the_table() -> None:
     """The sections that explain the constants repeat some of them."""
     values = {row[0].strip("`").partition(".")[2]: row[1] for row in CONSTANTS}
-    chain = "obstacle_chain."
+    chain = "likelihood.obstacle_chain."
     started = float(values[chain + "START"]) * 240
     for text in (
         f"probability {started:g} / 240 / 13",
@@ -66,7 +66,7 @@ def test_the_text_has_the_values_of_the_table() -> None:
         f"probability {float(values[chain + 'NOTCH_START']) * 240:.2g} / 240 / 6",
         f"e = {values['search_profiles.SEARCH_EPSILON']}:",
         f"{values['search_profiles.SLACK_NATS']} nats, which are 29 degrees",
-        f"limited to {values['skyline_profiles.ROW_NATS']} nats",
+        f"limited to {values['likelihood.skyline_profiles.ROW_NATS']} nats",
         f"rounds ({values['importance_sampling.ROUNDS']} points)",
     ):
         assert text in METHOD, text

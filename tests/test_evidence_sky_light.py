@@ -14,9 +14,16 @@ from sky_helpers import EDGE_PX, ELEVATION_RAD, GROUND_E, NOISE_E, PX_PER_RAD, l
 from startrack.core.statistics import CDF_REACH, CDF_STEPS, NORMAL_CDF
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, sector_of
 from startrack.evidence import BAND_PX, Skyline, SkylineEstimate
-from startrack.evidence.sky_levels import GROUND, LEVEL_SECTORS, SKY, SkyLevels, measure_levels
+from startrack.evidence.sky_levels import (
+    GROUND,
+    LEVEL_SECTORS,
+    SKY,
+    SkyLevels,
+    SkyPixels,
+    measure_levels,
+    pixels_near_skyline,
+)
 from startrack.evidence.sky_light import CELL_PX, LEVELS, SkyLight, measure_sky_light, sectors_with_step
-from startrack.evidence.sky_pixels import SkyPixels, pixels_near_skyline
 from startrack.evidence.skyline import CLIP_SHIFT_PX, MOST_REACH_PX, scale_across
 from startrack.frames import rays_from_azel
 

@@ -26,7 +26,7 @@ from startrack.cli.inputs.horizon import UNTESTED
 from startrack.cli.main import main
 from startrack.core.errors import BadInput, NoSolution
 from startrack.core.types import MeasuredSkyline
-from startrack.estimation.joint_fit import fit_frames
+from startrack.estimation.frame_matching import fit_frames
 from startrack.exposure import read_exposure
 from startrack.frames import Site
 from startrack.output import SCHEMAS

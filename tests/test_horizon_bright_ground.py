@@ -22,8 +22,7 @@ from startrack.applications.horizon.columns import (
 )
 from startrack.applications.horizon.measure import _has_step, measure_frames
 from startrack.applications.horizon.posterior import KINDS, add_step_log_likelihood, combine_columns
-from startrack.applications.horizon.skylight import Steps, _steps_of
-from startrack.applications.horizon.starlight import measure_stars
+from startrack.applications.horizon.skylight import Steps, _steps_of, measure_stars
 from startrack.catalog import load_catalog
 from startrack.core.types import MeasuredSkyline
 

@@ -11,10 +11,9 @@ from horizon_helpers import CAMERA, SITE, painted_frame, skyline_deg
 from startrack.applications.horizon import measure_skyline
 from startrack.applications.horizon.clouds import cloud_density, cloud_probability, cloud_sigma_rad, layer_depth
 from startrack.applications.horizon.columns import AZIMUTH_COLUMNS
-from startrack.applications.horizon.join import join_skylines
+from startrack.applications.horizon.measure import join_skylines
 from startrack.applications.horizon.posterior import sky_likelihood_ratio
-from startrack.applications.horizon.skylight import Steps
-from startrack.applications.horizon.starlight import StarLight
+from startrack.applications.horizon.skylight import StarLight, Steps
 from startrack.catalog import load_catalog
 from startrack.core.types import Evidence, MeasuredSkyline
 

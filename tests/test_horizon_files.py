@@ -11,8 +11,7 @@ import pytest
 from astropy.table import Table
 from horizon_helpers import LOWELL, small_skyline
 
-from startrack.applications.horizon.landscape import interpolate_unknown
-from startrack.applications.horizon.write import check_outputs, csv_text, nina_text, write_skyline
+from startrack.applications.horizon.write import check_outputs, csv_text, interpolate_unknown, nina_text, write_skyline
 from startrack.core.errors import BadInput, BadOutput
 from startrack.output import Ink, horizon_picture, skyline_picture, skyline_table_text
 from startrack.terrain import load_terrain

@@ -14,9 +14,9 @@ from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, ImageErr
 from startrack.evidence import offset_terms
 from startrack.evidence.sky_light import LEVELS
 from startrack.localization import ExactPosterior, LinearErrors
-from startrack.localization.linear_errors import Lifts, list_seams
-from startrack.localization.shared_errors import SharedErrors
-from startrack.localization.skyline_model import SkylineModel
+from startrack.localization.likelihood.linear_errors import Lifts, list_seams
+from startrack.localization.likelihood.shared_errors import SharedErrors
+from startrack.localization.likelihood.skyline_model import SkylineModel
 
 NATS = 60.0  # of a cell of the light
 STARS = 4000  # within 1.1 degrees of the skyline: a frame to V 8

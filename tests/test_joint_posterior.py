@@ -18,8 +18,8 @@ from startrack.localization import ExactPosterior, importance_sampling
 from startrack.localization.clock import turn_evidence
 from startrack.localization.importance_sampling import moments
 from startrack.localization.joint_posterior import sample_posterior
-from startrack.localization.neighbourhood import Neighbourhood
-from startrack.localization.obstacle_chain import (
+from startrack.localization.likelihood.neighbourhood import Neighbourhood
+from startrack.localization.likelihood.obstacle_chain import (
     LEVELS_RAD,
     NODES,
     RISEN,
@@ -30,10 +30,10 @@ from startrack.localization.obstacle_chain import (
     state_probabilities,
     transitions,
 )
-from startrack.localization.shared_errors import SharedErrors
-from startrack.localization.skyline_model import SkylineModel
-from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS, profiles_of
-from startrack.localization.smooth_skyline import free_log_likelihood
+from startrack.localization.likelihood.shared_errors import SharedErrors
+from startrack.localization.likelihood.skyline_model import SkylineModel
+from startrack.localization.likelihood.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS, profiles_of
+from startrack.localization.likelihood.smooth_skyline import free_log_likelihood
 from startrack.terrain import Cylinder, Terrain, load_terrain
 
 CRATER = load_terrain("shackleton-thesis")

@@ -325,8 +325,9 @@ def small_frames_of(rng):
 def chain_of(rng):
     """Profiles of random stars and sky light, and the likelihoods of skylines by them."""
     from startrack.core.types import MIDDLES_RAD, SECTORS, Evidence
-    from startrack.localization import obstacle_chain, search_profiles, smooth_skyline
-    from startrack.localization.skyline_profiles import measure_moments, profiles_of
+    from startrack.localization import search_profiles
+    from startrack.localization.likelihood import obstacle_chain, smooth_skyline
+    from startrack.localization.likelihood.skyline_profiles import measure_moments, profiles_of
 
     stars, height = 3000, 0.02 * np.linspace(-1.0, 1.0, 13)
     rows = Evidence(

@@ -8,10 +8,11 @@ from scipy.special import ndtr
 
 from startrack.core import statistics
 from startrack.core.statistics import NORMAL_CDF
-from startrack.evidence import sky_levels, sky_light, sky_pixels
+from startrack.evidence import sky_levels, sky_light
 from startrack.frames import wahba
 from startrack.identification import attitude_refinement, star_grid
-from startrack.localization import search_profiles, smooth_skyline
+from startrack.localization import search_profiles
+from startrack.localization.likelihood import smooth_skyline
 
 SEEDS = range(3)
 
@@ -40,11 +41,11 @@ def test_disks_are_cleared_whose_middle_is_set_or_that_are_large(seed):
     count = [0, 1, 30][seed]
     xy, radius = rng.integers(-20, 80, (count, 2)), rng.integers(0, 14, count)
     found, expected = before.copy(), before.copy()
-    sky_pixels._clear_disks(found, xy, radius)
+    sky_levels._clear_disks(found, xy, radius)
     row, column = np.indices(before.shape)
     for (x, y), r in zip(xy, radius, strict=True):
         inside = 0 <= x < 60 and 0 <= y < 40
-        if r > sky_pixels.BAND_PX / 2 or (inside and before[y, x]):
+        if r > sky_levels.BAND_PX / 2 or (inside and before[y, x]):
             expected &= (column - x) ** 2 + (row - y) ** 2 > r * r
     np.testing.assert_array_equal(found, expected)
 

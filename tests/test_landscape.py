@@ -13,7 +13,7 @@ import pytest
 from horizon_helpers import CAMERA, R_CAM_ENU, SITE, painted_frame, skyline_deg
 
 from startrack.applications.horizon import measure_skyline, write_skyline
-from startrack.applications.horizon.landscape import landscape_picture
+from startrack.applications.horizon.write import landscape_picture
 from startrack.catalog import load_catalog
 from startrack.core.types import BadInput
 from startrack.frames import rays_from_azel

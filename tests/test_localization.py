@@ -23,7 +23,7 @@ from localization_helpers import (
 from startrack.chain import Settings
 from startrack.core.types import Array, Evidence, NotLocated
 from startrack.localization import ExactPosterior, Hull, Localizer, PseudoGradient
-from startrack.localization.places import BoxModel
+from startrack.localization.search import BoxModel
 from startrack.terrain import Cylinder, ForwardingTerrain
 
 

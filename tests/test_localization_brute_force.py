@@ -12,11 +12,9 @@ from scipy.stats import norm
 
 from startrack.core.types import Evidence, Fix, NotLocated
 from startrack.localization import ExactPosterior, Hull, PseudoGradient
-from startrack.localization.places import BoxModel
-from startrack.localization.pseudo_gradient import descend
-from startrack.localization.rim_plane import points_of_rays
-from startrack.localization.search import BEAMS, Proof, log_sum
-from startrack.localization.skyline_profiles import ROW_NATS
+from startrack.localization.likelihood.skyline_profiles import ROW_NATS
+from startrack.localization.search import BEAMS, BoxModel, Proof, log_sum
+from startrack.localization.thesis_methods import descend, points_of_rays
 from startrack.terrain import Cylinder, load_terrain
 
 THESIS = load_terrain("shackleton-thesis")

@@ -14,11 +14,10 @@ from startrack.core.types import Array, Clock, Evidence, Fix, NotLocated, Positi
 from startrack.frames import R_enu_icrs, Site, azel_from_rays, sky_rotvec_rad, ut1_sigma_s
 from startrack.frames.orientation import _earth_orientation
 from startrack.localization import ExactPosterior
+from startrack.localization.clock import WRONG_TIME_PROBABILITY, sample_other_times, turn_evidence
 from startrack.localization.clock import clock_at as clock_of_site
-from startrack.localization.clock import turn_evidence
 from startrack.localization.joint_posterior import sample_posterior
-from startrack.localization.other_times import WRONG_TIME_PROBABILITY, sample_other_times
-from startrack.localization.shared_errors import is_noticeable
+from startrack.localization.likelihood.shared_errors import is_noticeable
 from startrack.terrain import HeightMap, Terrain, load_terrain
 from startrack.terrain.shape import EXACT_WAVES
 

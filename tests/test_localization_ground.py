@@ -11,9 +11,8 @@ from localization_helpers import WRAPPERS, best_levels, capped_llr, search_score
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Clock, Evidence, NotLocated, sector_of
 from startrack.localization import ExactPosterior, posterior
 from startrack.localization.conclusion import conclude
-from startrack.localization.places import BoxModel
-from startrack.localization.search import BEAMS
-from startrack.localization.skyline_model import SkylineModel
+from startrack.localization.likelihood.skyline_model import SkylineModel
+from startrack.localization.search import BEAMS, BoxModel
 from startrack.terrain import HeightMap, load_terrain
 from startrack.terrain.shape import EXACT_WAVES
 

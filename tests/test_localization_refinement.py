@@ -15,7 +15,7 @@ from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, Explored
 from startrack.evidence.sky_light import CELL_PX, LEVELS
 from startrack.evidence.star_offsets import offset_terms
 from startrack.localization import ExactPosterior
-from startrack.localization.skyline_profiles import SkyProfiles
+from startrack.localization.likelihood.skyline_profiles import SkyProfiles
 
 PLACE = np.array([3000.0, -2000.0])
 

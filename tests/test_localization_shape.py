@@ -12,7 +12,7 @@ from startrack.core.types import Array, Evidence, NotLocated
 from startrack.localization import ExactPosterior
 from startrack.localization.importance_sampling import moments
 from startrack.localization.joint_posterior import sample_posterior
-from startrack.localization.shared_errors import SharedErrors
+from startrack.localization.likelihood.shared_errors import SharedErrors
 from startrack.terrain import Cylinder, GroundErrors, load_terrain
 
 TRUE = load_terrain("shackleton-thesis")

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from startrack.core.types import NotLocated
-from startrack.localization.conclusion import Posterior, label_modes
-from startrack.localization.summary import require_inside
+from startrack.localization.conclusion import Posterior, label_modes, require_inside
 from startrack.terrain import Cylinder, load_terrain
 
 TERRAIN = load_terrain("shackleton-thesis")

@@ -14,9 +14,9 @@ from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence
 from startrack.estimation.observations import Steps
 from startrack.estimation.trajectory import smooth
 from startrack.localization import ExactPosterior, LinearErrors
-from startrack.localization.linear_errors import list_seams
-from startrack.localization.neighbourhood import Neighbourhood, SectorRows
-from startrack.localization.shared_errors import SharedErrors
+from startrack.localization.likelihood.linear_errors import list_seams
+from startrack.localization.likelihood.neighbourhood import Neighbourhood, SectorRows
+from startrack.localization.likelihood.shared_errors import SharedErrors
 from startrack.terrain import HeightMap, Terrain, load_terrain
 from startrack.terrain.shape import EXACT_WAVES, WAVES
 

@@ -13,8 +13,7 @@ from startrack.core.errors import BadInput
 from startrack.core.types import MIDDLES_RAD, SECTORS
 from startrack.frames import R_from_rotvec, azel_from_rays, turn_azel
 from startrack.localization import SkylinePoints, locate_points
-from startrack.localization.skyline_points import SeenSkyline
-from startrack.localization.turned_skylines import find_peaks
+from startrack.localization.skyline_points import SeenSkyline, find_peaks
 
 PLACE_M = np.array([150.0, -80.0])
 DEG = np.radians(1.0)
@@ -120,7 +119,7 @@ def test_rows_are_normal_near_the_height_that_was_measured():
     seen = SeenSkyline.at(points_of(terrain, PLACE_M, correlation_deg=0.0, step_deg=1.5), terrain, PLACE_M, np.zeros(3))
     from localization_helpers import log_at
 
-    from startrack.localization.skyline_profiles import profiles_of
+    from startrack.localization.likelihood.skyline_profiles import profiles_of
 
     rows = seen.rows()
     height = np.ravel(terrain.horizon_rad(PLACE_M[None], MIDDLES_RAD))

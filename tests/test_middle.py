@@ -20,12 +20,12 @@ from startrack.camera import Camera, Decentring, KannalaBrandt, Pinhole
 from startrack.catalog import load_catalog
 from startrack.chain import Oriented, identify_blind
 from startrack.core.types import Exposure, NotIdentified
+from startrack.estimation.adjust import observations_of_image
 from startrack.estimation.attitude import solve_attitude
 from startrack.estimation.lens_correction import solve_with_misfit
-from startrack.estimation.normal_equations import observations_of_image
 from startrack.exposure import read_exposure
-from startrack.identification.found_lens import fit_found_lens
 from startrack.identification.unknown_lens import identify_unknown_lens
+from startrack.identification.verify_unknown_lens import fit_found_lens
 from startrack.output import result_dict
 from startrack.output.values import has_middle, sky_at_middle
 from startrack.output.wcs import wcs_bytes

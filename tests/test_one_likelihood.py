@@ -7,9 +7,9 @@ import pytest
 
 from startrack.core.types import MIDDLES_RAD, SECTORS, Evidence
 from startrack.localization import ROW_NATS
-from startrack.localization.places import sum_contributions
+from startrack.localization.likelihood.skyline_profiles import profiles_of
+from startrack.localization.search import sum_contributions
 from startrack.localization.search_profiles import SearchProfiles
-from startrack.localization.skyline_profiles import profiles_of
 from startrack.output.html.details import PAGE_SECTORS, _nats_by_sector
 
 SECTOR = 60

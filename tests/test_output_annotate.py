@@ -17,7 +17,7 @@ from startrack.camera import Camera, Pinhole
 from startrack.chain import pipeline
 from startrack.chain.stages import Detected, Inputs, Measured, Oriented, Refused
 from startrack.core.types import Mode
-from startrack.localization.rim_plane import point_fix
+from startrack.localization.thesis_methods import point_fix
 from startrack.output import write_annotated
 from startrack.output.picture.annotate import PANEL_WIDTH, STATUS, _facts, _legend, annotate
 from startrack.output.picture.backdrop import View, fit_to_canvas, remove_hot_pixels

@@ -11,9 +11,8 @@ import pytest
 from startrack.core.types import Fix, Mode
 from startrack.frames import Site
 from startrack.output import relief_picture
-from startrack.output.picture.axes import nice_step
 from startrack.output.picture.backdrop import View
-from startrack.output.picture.canvas import Canvas, Ink, mix_colours, printable, text_width, wrap_text
+from startrack.output.picture.canvas import Canvas, Ink, mix_colours, nice_step, printable, text_width, wrap_text
 from startrack.output.picture.maps import Map, distance_text, draw_overview, draw_zoom
 from startrack.terrain import Terrain
 

@@ -22,7 +22,7 @@ from startrack.cli.main import main
 from startrack.cli.pictures.report import write_page_of_images
 from startrack.core.errors import Reason
 from startrack.exposure import insert_png_chunks
-from startrack.localization.rim_plane import point_fix
+from startrack.localization.thesis_methods import point_fix
 from startrack.output import page_text, result_at, result_dict, results_under, write_json, write_results
 from startrack.output.html.details import SOURCES, ground_map, skyline_of
 from startrack.output.html.rows import COLUMNS, facts_of

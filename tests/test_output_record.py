@@ -14,7 +14,7 @@ from startrack.catalog import load_catalog
 from startrack.chain import pipeline
 from startrack.chain.stages import Oriented
 from startrack.core.types import BadInput, Mode
-from startrack.localization.rim_plane import point_fix
+from startrack.localization.thesis_methods import point_fix
 from startrack.output import (
     boresight_rad,
     refused_dict,

@@ -10,7 +10,7 @@ from stage_helpers import as_stage
 
 from startrack.chain.stages import Detected, Oriented, Refused
 from startrack.core.types import Mode
-from startrack.localization.rim_plane import point_fix
+from startrack.localization.thesis_methods import point_fix
 from startrack.output import refusal_line, summary_line, verbose_text
 from startrack.output.values import chance_text
 

@@ -21,11 +21,11 @@ from startrack.evidence.skyline import Skyline, look_through, scale_across, skyl
 from startrack.frames import azel_from_rays
 from startrack.localization import ExactPosterior, WeightedPoints
 from startrack.localization.hypothesis import Hypothesis
-from startrack.localization.neighbourhood import Neighbourhood, OwnEdge, SectorRows
-from startrack.localization.obstacle_chain import STATES, clear_emissions
-from startrack.localization.shared_errors import SharedErrors
-from startrack.localization.skyline_model import SkylineModel
-from startrack.localization.smooth_skyline import with_own_edge
+from startrack.localization.likelihood.neighbourhood import Neighbourhood, OwnEdge, SectorRows
+from startrack.localization.likelihood.obstacle_chain import STATES, clear_emissions
+from startrack.localization.likelihood.shared_errors import SharedErrors
+from startrack.localization.likelihood.skyline_model import SkylineModel
+from startrack.localization.likelihood.smooth_skyline import with_own_edge
 
 NATS = 4.0  # of a cell of the light: a sky of 7 %
 STARS = 1500  # within 1.1 degrees of the skyline

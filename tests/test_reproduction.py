@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from scipy import stats
 
+from startrack.applications import chunk_store
 from startrack.applications.reproduction import (
     ARTEFACTS,
     FULL,
@@ -26,7 +27,6 @@ from startrack.applications.reproduction import (
     methods,
     scene,
     simulator,
-    valley,
     write_artefact,
 )
 from startrack.applications.reproduction.error_figures import _error_map
@@ -52,7 +52,7 @@ from startrack.applications.reproduction.simulator import (
 from startrack.cli.console import Progress, progress
 from startrack.cli.main import main
 from startrack.cli.studies import ARTEFACT_NAMES
-from startrack.core import chunk_store, runner
+from startrack.core import runner
 from startrack.core.files import hold_lock
 from startrack.localization import ExactPosterior, Hull, PseudoGradient
 
@@ -76,8 +76,8 @@ def small_grounds():
     """Within the block few skylines of a map are traced, which take minutes, and no method runs for its time alone."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene, "traced_grid", lru_cache(maxsize=1)(partial(MapGrid.trace, step_m=COARSE_M)))
-        patch.setattr(scene, "valleys", lru_cache(maxsize=1)(valley.jacksboro))
-        patch.setattr(valley, "VALLEY_RADIUS_M", VALLEY_M)
+        patch.setattr(scene, "valleys", lru_cache(maxsize=1)(scene.jacksboro))
+        patch.setattr(scene, "VALLEY_RADIUS_M", VALLEY_M)
         patch.setattr(comparison, "_warm_up", lambda ground: None)
         scene.terrain_of.cache_clear()
         yield

@@ -10,12 +10,17 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from startrack.applications.reproduction import QUICK, Context, fix_store, write_artefact
-from startrack.applications.reproduction.comparison import COMPARED, ComparedErrors, compare_places, methods_on
-from startrack.applications.reproduction.method_figures import cumulative_picture, label_of
-from startrack.applications.reproduction.method_table import MAP_GROUND, method_table
+from startrack.applications.reproduction.comparison import (
+    COMPARED,
+    ComparedErrors,
+    compare_places,
+    locate_by_rest,
+    locate_by_stops,
+    methods_on,
+)
+from startrack.applications.reproduction.method_results import MAP_GROUND, cumulative_picture, label_of, method_table
 from startrack.applications.reproduction.methods import ALL_METHODS, KUA, Task, compute_chunk
 from startrack.applications.reproduction.scene import VALLEY_GROUND, Scene
-from startrack.applications.reproduction.series import locate_by_rest, locate_by_stops
 from startrack.applications.reproduction.simulator import draw_positions
 from startrack.chain import Inputs, Refused
 from startrack.cli.console import Progress

@@ -21,8 +21,7 @@ from startrack.core.errors import Reason
 from startrack.core.types import MIDDLES_RAD, Exposure
 from startrack.localization import PseudoGradient
 from startrack.output import prepare_folder, write_results
-from startrack.output.picture.axes import GAP_PX
-from startrack.output.picture.canvas import Ink
+from startrack.output.picture.canvas import GAP_PX, Ink
 from startrack.output.picture.panorama import (
     ABOVE_PX,
     ENLARGED_PX,
@@ -216,7 +215,7 @@ def test_the_skyline_is_measured_once(
     def fail(*given: object) -> None:
         raise AssertionError("the skyline is measured again")
 
-    monkeypatch.setattr("startrack.chain.image_skyline.skyline_of_image", fail)
+    monkeypatch.setattr("startrack.chain.two_looks.skyline_of_image", fail)
     monkeypatch.setattr("startrack.chain.two_looks.skyline_of_image", fail)
     write_results(by_source["both"], tmp_path / "frame.fix.json")
     assert Solution(by_source["both"]).skyline is not None

@@ -11,7 +11,7 @@ from map_helpers import polar_stereographic
 from startrack.core.types import Array
 from startrack.frames import Site
 from startrack.terrain import HeightMap, Raster
-from startrack.terrain.imports.crest_errors import (
+from startrack.terrain.imports.comparison import (
     CREST_AZIMUTHS,
     Correlation,
     CrestErrors,

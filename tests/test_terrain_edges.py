@@ -13,9 +13,8 @@ from hazard_helpers import catalog_to, rays_of, small_camera
 
 from startrack.chain import StarRays, locate_rays
 from startrack.core.types import SECTORS, Fix, NoSolution
-from startrack.localization.neighbourhood import Neighbourhood
-from startrack.localization.places import BoxModel, Place
-from startrack.localization.search import Proof
+from startrack.localization.likelihood.neighbourhood import Neighbourhood
+from startrack.localization.search import BoxModel, Place, Proof
 from startrack.rendering import Series
 from startrack.simulation import simulate_rays
 from startrack.terrain import NO_POST, Cylinder, load_terrain

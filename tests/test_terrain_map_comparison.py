@@ -16,8 +16,7 @@ from startrack.core.types import Array, Evidence
 from startrack.frames import enu_from_latlon
 from startrack.localization import ExactPosterior
 from startrack.terrain import STEREOGRAPHIC, HeightMap, Projection, Raster, load_terrain, read_map, write_map
-from startrack.terrain.imports.comparison import MapComparison, compare_maps
-from startrack.terrain.imports.crest_errors import measure_waves
+from startrack.terrain.imports.comparison import MapComparison, compare_maps, measure_waves
 from startrack.terrain.maps.projections import ORTHOGRAPHIC
 
 DATA = Path(__file__).parent / "data"

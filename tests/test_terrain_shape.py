@@ -14,7 +14,7 @@ from test_terrain_files import HILL, hill, terrain_file
 from startrack.core.files import data_dir
 from startrack.core.types import MIDDLES_RAD, BadInput
 from startrack.frames import Site
-from startrack.localization.shared_errors import SharedErrors
+from startrack.localization.likelihood.shared_errors import SharedErrors
 from startrack.simulation import draw_ground
 from startrack.simulation.ground_errors import ErringGround
 from startrack.terrain import (

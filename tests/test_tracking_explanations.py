@@ -24,7 +24,7 @@ from startrack.applications.tracking.explanations import (
     Explanations,
 )
 from startrack.applications.tracking.files import tum_text
-from startrack.applications.tracking.moves import LEG_SIGMA_1, Moves
+from startrack.applications.tracking.odometry import LEG_SIGMA_1, Moves
 from startrack.core.errors import BadInput
 from startrack.core.types import Array
 from startrack.estimation.observations import FrameEstimate, OdometryErrors, Steps

@@ -16,8 +16,8 @@ from test_tracking_explanations import estimate_at
 from tracking_helpers import SHARED, attitudes, observed, odometry_of
 
 from startrack.applications.tracking import TRACK, ObservedFrame, Odometry, estimate_track, track_page, track_record
-from startrack.applications.tracking.moves import odometry_moves
 from startrack.applications.tracking.observed_frame import ImageFix
+from startrack.applications.tracking.odometry import odometry_moves
 from startrack.applications.tracking.track import slipped_legs
 from startrack.core.types import Array
 from startrack.estimation.observations import USUAL_ODOMETRY

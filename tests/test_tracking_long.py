@@ -12,7 +12,7 @@ from startrack.applications.tracking import ObservedFrame, Odometry, TrackSessio
 from startrack.applications.tracking import session as session_module
 from startrack.applications.tracking.explanations import BEGINS, CONTINUES, MOST_WAITING, explain
 from startrack.applications.tracking.explanations import WINDOW as SETTLED_AFTER
-from startrack.applications.tracking.moves import Moves, odometry_moves
+from startrack.applications.tracking.odometry import Moves, odometry_moves
 from startrack.applications.tracking.positions import OnlineTrack, filter_positions
 from startrack.core.errors import BadInput
 from startrack.core.types import Array

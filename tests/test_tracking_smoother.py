@@ -8,7 +8,7 @@ import pytest
 from tracking_helpers import STEP_SIGMA_M, Drive, mean_nees, shifted, simulate_drive, with_slips
 
 from startrack.applications.tracking.explanations import explain
-from startrack.applications.tracking.moves import Moves
+from startrack.applications.tracking.odometry import Moves
 from startrack.applications.tracking.positions import OnlineTrack, RobustTrack, conclude, filter_positions
 from startrack.estimation import trajectory
 from startrack.estimation.observations import FrameEstimate, Steps

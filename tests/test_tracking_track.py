@@ -9,7 +9,7 @@ import pytest
 from tracking_helpers import HEIGHT_SIGMA_M, SHARED, attitudes, observed, odometry_of, shifted, simulate_drive
 
 from startrack.applications.tracking import ObservedFrame, Track, estimate_track
-from startrack.applications.tracking.moves import odometry_moves
+from startrack.applications.tracking.odometry import odometry_moves
 from startrack.core.errors import BadInput
 from startrack.estimation.observations import OdometryErrors, Steps
 from startrack.terrain import HeightMap, load_terrain

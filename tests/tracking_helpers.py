@@ -12,7 +12,7 @@ from startrack.applications.tracking import ObservedFrame, Odometry, TrackErrors
 from startrack.core.types import Array, Ints
 from startrack.estimation.observations import FrameEstimate, Steps
 from startrack.frames import R_body_enu_from_heading_pitch_roll, quat_xyzw_from_R
-from startrack.localization.shared_errors import SharedErrors
+from startrack.localization.likelihood.shared_errors import SharedErrors
 from startrack.terrain import ShapeError
 
 HEIGHT_SIGMA_M = 5.0

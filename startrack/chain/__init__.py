@@ -28,6 +28,7 @@ from startrack.chain.measurement import CERTAIN_PROBABILITY, COMPLETE_V_MAG, loc
 from startrack.chain.near_attitude import NearAttitude, read_near_attitude
 from startrack.chain.orientation import fit_orientation
 from startrack.chain.pipeline import (
+    add_timing,
     detect,
     identify,
     identify_blind,
@@ -36,10 +37,7 @@ from startrack.chain.pipeline import (
     locate_exposure,
     locate_measured,
 )  # fmt: skip
-from startrack.chain.positioned import Positioned
-from startrack.chain.run import add_timing
 from startrack.chain.sky_state import stating_sky
-from startrack.chain.source_names import identified_names
 from startrack.chain.stages import (
     STAGES,
     Detected,
@@ -50,11 +48,13 @@ from startrack.chain.stages import (
     Measured,
     Oriented,
     Outcome,
+    Positioned,
     Refused,
     SecondLook,
     Settings,
     StarFix,
     StarRays,
+    identified_names,
     last_value,
 )
 from startrack.chain.two_looks import EDGE_SIGMA_PX

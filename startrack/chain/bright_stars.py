@@ -14,7 +14,7 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.catalog import bodies_from_centre
-from startrack.chain.source_names import NamedStars, SourceNames, identified_names
+from startrack.chain.stages import NamedStars, SourceNames, identified_names
 from startrack.core.types import Array, Body, Bools, Detections, Identification, Ints, Stars
 from startrack.detection import disc_px, find_blobs, light_at
 from startrack.estimation.false_alarm import coincidence_probability

@@ -16,9 +16,8 @@ from numpy.typing import ArrayLike
 from startrack.camera import Camera
 from startrack.chain.inputs import angle_rad
 from startrack.chain.near_attitude import REASON, read_near_attitude
-from startrack.chain.positioned import Positioned
-from startrack.chain.run import Run
-from startrack.chain.stages import Inputs, Refused
+from startrack.chain.pipeline import Run
+from startrack.chain.stages import Inputs, Positioned, Refused
 from startrack.core.errors import BadInput, NoSolution
 from startrack.core.files import FilePath, printable
 from startrack.core.limits import limited_time

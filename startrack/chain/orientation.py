@@ -13,8 +13,7 @@ from startrack.catalog import StarCatalog, apparent_bodies, apparent_stars, is_b
 from startrack.chain.bright_stars import name_bright_sources
 from startrack.chain.second_field import check_single_field
 from startrack.chain.sky_state import stating_sky
-from startrack.chain.source_names import identified_names
-from startrack.chain.stages import Detected, Identified, Inputs, Oriented, Settings
+from startrack.chain.stages import Detected, Identified, Inputs, Oriented, Settings, identified_names
 from startrack.core import FIELD_TOLERANCE_1
 from startrack.core.types import (
     BadInput,

@@ -21,8 +21,6 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.catalog import daylight_warnings
 from startrack.chain.near_attitude import NearAttitude
-from startrack.chain.positioned import Positioned
-from startrack.chain.source_names import SourceNames
 from startrack.core.errors import Reason
 from startrack.core.types import (
     Array,
@@ -36,9 +34,12 @@ from startrack.core.types import (
     Fix,
     Identification,
     ImageErrors,
+    Ints,
     MeasuredSkyline,
     PositionPrior,
+    Rows,
     Stars,
+    array,
 )  # fmt: skip
 from startrack.detection import Damage, Detector
 from startrack.estimation.attitude import AttitudeFit
@@ -51,6 +52,70 @@ from startrack.terrain import Terrain
 EVIDENCE_SOURCES = ("both", "stars", "sky")  # of a position; "sky" begins with a fix by the stars
 SHOWN_CHANGE_PX = 0.1  # of the lens, from which a warning states it
 STAGES = ("read", "detect", "identify", "attitude", "evidence", "locate")  # keys of `timing_ms`
+
+
+@dataclass(frozen=True, kw_only=True)
+class NamedStars(Rows):
+    """Sources with the names of stars; one-to-one."""
+
+    star: Ints = array("n", dtype=np.int64)  # index into Stars
+    xy_px: Array = array("n", 2)  # as measured
+    saturated: Bools = array("n", dtype=np.bool_)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SourceNames:
+    """Names of the sources of an image."""
+
+    stars: NamedStars
+    bodies: tuple[Body, ...]  # planets, Sun, Moon, Earth; without a site those that have a source
+    is_nameless: Bools  # (n,) which detections are neither a star nor a body
+    unexplained: int  # significant detections that neither a catalogue star nor a body explains
+
+
+def identified_names(sources: Detections, known: Identification, bodies: tuple[Body, ...]) -> SourceNames:
+    """Names that the identification `known` gives to `sources`; `bodies` are those over the site."""
+    is_nameless = np.ones(len(sources), dtype=bool)
+    is_nameless[known.detection] = False
+    return SourceNames(
+        stars=NamedStars(
+            star=known.star, xy_px=sources.xy_px[known.detection], saturated=sources.saturated[known.detection]
+        ),
+        bodies=bodies, is_nameless=is_nameless, unexplained=known.unexplained,
+    )  # fmt: skip
+
+
+class Positioned:
+    """The position of a camera above a terrain: a base of the values that have one."""
+
+    exposure: Exposure
+    fix: Fix
+    site: Site
+    terrain: Terrain
+    skyline: MeasuredSkyline | None
+    near: PositionPrior | None
+
+    @property
+    def status(self) -> str:
+        """Status: ok, or ambiguous where several positions fit."""
+        return "ambiguous" if self.fix.ambiguous else "ok"
+
+    @property
+    def reason(self) -> Reason | None:
+        """Reason `ambiguous` where several positions fit, else None."""
+        return Reason.AMBIGUOUS if self.fix.ambiguous else None
+
+    @property
+    def message(self) -> str:
+        """Number of positions that fit, if there are several."""
+        return f"{len(self.fix.modes)} positions fit" if self.fix.ambiguous else ""
+
+    @property
+    def position_warnings(self) -> list[str]:
+        """Warnings of what blocks the view, and of errors beyond the defaults of facts that no file states."""
+        blocked = [f"not the map's skyline, and left out: {self.fix.blocked.text}"] if self.fix.blocked else []
+        shown = [f"the image shows {one.text}, which no file states: it is estimated" for one in self.fix.shown]
+        return [*blocked, *shown, *self.fix.cautions]
 
 
 @dataclass(frozen=True)

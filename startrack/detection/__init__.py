@@ -1,12 +1,10 @@
 """Exposure to point sources; damage of its noise."""
 
-from startrack.detection.background import smallest_step
-from startrack.detection.blobs import disc_px, find_blobs, light_at
+from startrack.detection.background import image_circle, smallest_step
 from startrack.detection.damage import ROUNDED, Damage, find_damage, is_rounded
-from startrack.detection.detector import Detector
+from startrack.detection.detector import Detector, PositionDetector, source_variances
 from startrack.detection.frame import MIN_BINNED_SIGMA_PX, electrons
-from startrack.detection.image_circle import image_circle
-from startrack.detection.positions import PositionDetector, source_variances
+from startrack.detection.peaks import disc_px, find_blobs, light_at
 from startrack.detection.psf_width import WIDTH_TOLERANCE
 
 __all__ = [

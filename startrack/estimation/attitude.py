@@ -8,8 +8,16 @@ import numpy as np
 
 from startrack.camera import Camera, lens_jacobian
 from startrack.core.types import Array, Attitude, Bools, NotIdentified
-from startrack.estimation.adjust import HUBER_WITH_CUT, MIN_ATTITUDE_STARS, STAR_OUTLIER_CHI2, Scheme, State, adjust
-from startrack.estimation.normal_equations import Terms, observations_of_image
+from startrack.estimation.adjust import (
+    HUBER_WITH_CUT,
+    MIN_ATTITUDE_STARS,
+    STAR_OUTLIER_CHI2,
+    Scheme,
+    State,
+    Terms,
+    adjust,
+    observations_of_image,
+)
 
 MIN_FOR_SCATTER = 30  # stars from which the scatter of the residuals is a better covariance than the stated one
 UNKNOWN_TIME_SIGMA_RAD = np.radians(60 / 3600)  # aberration and proper motion left out

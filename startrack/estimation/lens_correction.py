@@ -20,8 +20,8 @@ import numpy as np
 
 from startrack.camera import Camera, cap_grid, compensating_rotation, lens_jacobian, with_covariance, with_update
 from startrack.core.types import Array, Ints
+from startrack.estimation.adjust import Terms
 from startrack.estimation.attitude import MIN_FOR_SCATTER, AttitudeFit, Misfit, solve_attitude
-from startrack.estimation.normal_equations import Terms
 from startrack.estimation.prior_choice import PriorChoice, root_of, solve_with_best_prior, solve_with_prior
 
 LENGTHS = (0.25, 0.5, 1.0)  # over which the displacement changes, in halves of the frame's longer side

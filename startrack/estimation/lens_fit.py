@@ -17,6 +17,7 @@ from startrack.estimation.adjust import (
     SMALLEST_EXTRA_PX2,
     SQUARES,
     CameraState,
+    Observations,
     Scheme,
     Solution,
     State,
@@ -26,7 +27,6 @@ from startrack.estimation.adjust import (
     extra_variance_px2,
     inverse_covariance,
 )
-from startrack.estimation.normal_equations import Observations
 from startrack.frames import off_axis_rad
 
 LENS_FOLDS = 10

@@ -21,15 +21,17 @@ from startrack.evidence.photometry import (
     order_by_cell,
     profiles_of,
 )
+from startrack.evidence.sky_levels import SkylineBand, SkyPixels, pixels_near_skyline
 from startrack.evidence.sky_light import (
     NEEDED_SECTORS,
     SkyLight,
     average_shifts,
+    brightness_mag_arcsec2,
+    exceeds_noise,
     measure_sky_light,
     sectors_with_step,
+    take_out_sky_step,
 )
-from startrack.evidence.sky_pixels import SkylineBand, SkyPixels, pixels_near_skyline
-from startrack.evidence.sky_step import brightness_mag_arcsec2, exceeds_noise, take_out_sky_step
 from startrack.evidence.skyline import (
     BAND_PX,
     SKYLINE_POINTS,

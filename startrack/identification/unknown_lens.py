@@ -12,11 +12,10 @@ from startrack.camera import Camera
 from startrack.core import FIELD_TOLERANCE_1, NARROWEST_DEG, WIDEST_DEG
 from startrack.core.limits import check_time, stating_work
 from startrack.core.types import Array, Centroids, Identification, ImageCircle, NotIdentified, Stars
+from startrack.estimation.adjust import observations_of_image
 from startrack.estimation.false_alarm import probability
-from startrack.estimation.normal_equations import observations_of_image
 from startrack.estimation.radial_fit import radius_of
 from startrack.identification.attitude_search import MIN_MATCHES
-from startrack.identification.found_lens import fit_found_lens
 from startrack.identification.hypotheses import (
     MOST_DETECTIONS,
     HypothesisSearch,
@@ -28,7 +27,7 @@ from startrack.identification.lens_view import grow
 from startrack.identification.lost_in_space import MAX_FALSE_ALARM
 from startrack.identification.near_sky import NearSky
 from startrack.identification.similar_triangles import BENT, LONG, STRAIGHT, PatternKind, patterns_for
-from startrack.identification.verify_unknown_lens import VerifiedLens, Verifier
+from startrack.identification.verify_unknown_lens import VerifiedLens, Verifier, fit_found_lens
 
 MIN_WIDE, MIN_NARROW = 2 * MIN_MATCHES, MIN_MATCHES + 1  # of a lens with many unknowns, and with its focal length alone
 # The brightest; those after them, as hot pixels may be brighter than stars; and more of all.

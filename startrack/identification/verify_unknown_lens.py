@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
-from startrack.camera import Camera
+from startrack.camera import Camera, Decentring, with_covariance
 from startrack.core.types import Array, Bools, Centroids, Ints, Stars
-from startrack.estimation.adjust import Scheme, State, adjust, cauchy_loss
+from startrack.estimation.adjust import (
+    HUBER_WITH_CUT,
+    Observations,
+    Prior,
+    Scheme,
+    Solution,
+    State,
+    adjust,
+    cauchy_loss,
+    observations_of_image,
+)
 from startrack.estimation.false_alarm import (
     PATTERN_MATCHES,
     coincidence_probability,
@@ -16,11 +27,10 @@ from startrack.estimation.false_alarm import (
     log_p_value,
 )
 from startrack.estimation.match import CandidatePairs, PhotometricScale
-from startrack.estimation.normal_equations import observations_of_image
+from startrack.estimation.prior_choice import solve_with_best_prior
 from startrack.estimation.radial_fit import HALF_WEIGHT_CHI2, PINHOLE_BEND
 from startrack.identification.attitude_refinement import agreement_of
 from startrack.identification.attitude_search import GATE_PX, INLIER_PX, ONE_SOURCE_SIGMAS
-from startrack.identification.found_lens import prior_of
 from startrack.identification.lens_guesses import Field
 from startrack.identification.lens_view import (
     FEWEST,
@@ -30,6 +40,11 @@ from startrack.identification.lens_view import (
     LensView,
 )
 
+LENGTH_SIGMAS = {"f": 0.1, "fy": 0.1, "cx": 0.06, "cy": 0.06}  # prior sigmas in focal lengths; "fy": of fy - fx
+# Of the polynomial, and of decentring, which also describes refraction that differs over a narrow field.
+PRIOR_SIGMAS = {"k1": 0.1, "k2": 0.1, "k3": 0.05, "k4": 0.02, "p1": 0.002, "p2": 0.002}
+SCHEME = Scheme(loss=HUBER_WITH_CUT, steps=12, settled_px=3e-4, estimates_extra=True)
+CHOICES = (("cx", "cy"), ("fy",), ("p1", "p2"))  # what an ideal lens does not have; "fy": beyond the ratio of 1
 BENT_GATES_PX, STRAIGHT_GATES_PX = (4.0, 2.5, 2.0, INLIER_PX), (INLIER_PX,)  # of the fits, in turn
 TESTED = 400  # brightest detections that the p-value rests on
 SMALLEST_COINCIDENCE_PX, RADIUS_SIGMAS = 0.6, 2.5
@@ -45,6 +60,68 @@ MATCHES_FOR_SCALE = 200  # brightest matches used for the photometric scale
 SMALLEST_ERROR_PX = 0.1  # of a centroid against the lens
 DISTORTED_RMS_1 = 0.7  # a distorted lens leaves less than this part of the residual of a pinhole
 FIT = Scheme(loss=cauchy_loss(HALF_WEIGHT_CHI2), steps=4, settled_px=1e-3)
+
+
+def fit_found_lens(
+    camera: Camera, R_cam_icrs: Array, points: Observations, centre_px: tuple[float, float]
+) -> tuple[Camera, Array]:
+    """Camera with its marginal covariance, and attitude (3, 3), from least squares over both.
+
+    `camera` and `R_cam_icrs` (3, 3) are roughly right for the stars `points` of one image; `centre_px` is where the
+    lens's centre is expected. Raises NotIdentified where fewer than 3 stars agree.
+    """
+    free = ("f", "fy", "cx", "cy", *camera.lens.parameters, "p1", "p2")
+    focal_px = camera.focal_px[0]
+    expected = replace(camera, centre_px=centre_px, focal_px=(focal_px, focal_px), decentring=Decentring())
+    whole = _fit(camera, R_cam_icrs, points, free, expected)
+    prior = prior_of(whole.state.camera, expected, free)
+    normal = np.asarray(np.linalg.inv(whole.equations.lens_covariance), dtype=np.float64)
+    right, sigma = -normal @ prior.offset, prior.sigma.tolist()  # about the expected lens
+    sets = [{name for names, shows in zip(CHOICES, shown, strict=True) if not shows for name in names}
+            for shown in product((False, True), repeat=len(CHOICES))]  # fmt: skip
+    roots = [np.diag([0.0 if name in fixed else s for name, s in zip(free, sigma, strict=True)]) for fixed in sets]
+    fixed = sets[solve_with_best_prior(normal - np.diag(prior.precision), right, roots).prior]
+    last = whole
+    if fixed:
+        start = whole.state.camera
+        if "cx" in fixed:
+            start = replace(start, centre_px=expected.centre_px)
+        if "fy" in fixed:
+            start = replace(start, focal_px=(start.focal_px[0], start.focal_px[0]))
+        if "p1" in fixed:
+            start = replace(start, decentring=expected.decentring)
+        shown = tuple(name for name in free if name not in fixed)
+        last = _fit(start, whole.state.R_cam_icrs[0], points, shown, expected)
+    # About the lens that is stated, which may be off the mean of the unknown one.
+    off = prior_of(whole.state.camera, last.state.camera, free).offset
+    covariance = whole.equations.lens_covariance + np.outer(off, off)
+    fitted = last.state.camera
+    widest = fitted.lens.max_invertible_rad
+    fitted = replace(
+        fitted,
+        max_angle_rad=min(camera.max_angle_rad, widest),
+        calibrated_angle_rad=min(camera.calibrated_angle_rad, widest),
+    )
+    return with_covariance(fitted, free, covariance), last.state.R_cam_icrs[0]
+
+
+def _fit(camera: Camera, R_cam_icrs: Array, points: Observations, free: tuple[str, ...], expected: Camera) -> Solution:
+    """Adjustment of the `free` parameters and the attitude to `points`, with the prior of the camera `expected`."""
+    start = State(camera=camera, R_cam_icrs=R_cam_icrs[None])
+    return adjust(start, points, free, SCHEME, prior=prior_of(camera, expected, free))
+
+
+def prior_of(camera: Camera, expected: Camera, free: tuple[str, ...]) -> Prior:
+    """Prior of the free parameters: that of the camera `expected`, the adjustment starting at `camera`."""
+    sigma = PRIOR_SIGMAS | {name: part * expected.focal_px[0] for name, part in LENGTH_SIGMAS.items()}
+    now, then = (
+        {
+            "f": c.focal_px[0], "fy": c.focal_px[1] - c.focal_px[0], "cx": c.centre_px[0], "cy": c.centre_px[1],
+            "p1": c.decentring.p1, "p2": c.decentring.p2, **c.lens.parameters,
+        }
+        for c in (camera, expected)
+    )  # fmt: skip
+    return Prior(np.array([sigma[n] for n in free]), np.array([then[n] - now[n] for n in free]))
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 /* Log-likelihoods F of the skyline's height in each sector, in cells of heights in which they are quadratic.
 
-   Cell k of a sector reaches from x[k] to x[k + 1]; the last one is a sentinel. See localization/skyline_profiles.py. */
+   Cell k of a sector reaches from x[k] to x[k + 1]; the last one is a sentinel. See localization/likelihood/skyline_profiles.py. */
 
 #ifndef STARTRACK_PROFILES_H
 #define STARTRACK_PROFILES_H

@@ -4,20 +4,16 @@ from typing import Any, Protocol
 
 from startrack.core.types import Evidence, Fix
 from startrack.localization.clock import clock_at, duration
-from startrack.localization.conclusion import AMBIGUOUS_MASS
-from startrack.localization.convex_hull import Hull, hull_position
+from startrack.localization.conclusion import AMBIGUOUS_MASS, camera_at
 from startrack.localization.importance_sampling import ENOUGH, Gaussian, WeightedPoints, moments, sample
 from startrack.localization.integrity import RISK, clear_logs
-from startrack.localization.linear_errors import LinearErrors
-from startrack.localization.posterior import MIN_ROW_NATS, ExactPosterior
-from startrack.localization.pseudo_gradient import PseudoGradient, descend
-from startrack.localization.shared_errors import ErrorBasis, SharedErrors, is_noticeable
-from startrack.localization.skyline_model import SkylineModel
-from startrack.localization.skyline_points import SkylinePoints
-from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS, solve_linear
-from startrack.localization.steepness import settle_steepness
-from startrack.localization.summary import camera_at
-from startrack.localization.turned_skylines import locate_points
+from startrack.localization.likelihood.linear_errors import LinearErrors
+from startrack.localization.likelihood.shared_errors import ErrorBasis, SharedErrors, is_noticeable
+from startrack.localization.likelihood.skyline_model import SkylineModel
+from startrack.localization.likelihood.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS, solve_linear
+from startrack.localization.posterior import MIN_ROW_NATS, ExactPosterior, settle_steepness
+from startrack.localization.skyline_points import SkylinePoints, locate_points
+from startrack.localization.thesis_methods import Hull, PseudoGradient, descend, hull_position
 from startrack.terrain import Terrain
 
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from startrack.core.types import Array, Bools
 from startrack.localization.importance_sampling import FEW, Gaussian, WeightedPoints, moments, normal_sequence, sample
-from startrack.localization.shared_errors import CLOCK_FACT
-from startrack.localization.skyline_model import SkylineModel
+from startrack.localization.likelihood.shared_errors import CLOCK_FACT
+from startrack.localization.likelihood.skyline_model import SkylineModel
 
 HIDDEN_COPIES = 6  # of each point, with values of the errors that the rows do not show
 WIDER, LINEAR_PART = 2.0, 0.01  # variance of the first points, in that of the plain and of the linear solution

@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.core.types import SECTORS, Array, Bools, Integrity
-from startrack.localization.obstacle_chain import clear_emissions
-from startrack.localization.skyline_model import SkylineModel
-from startrack.localization.skyline_profiles import Profiles
+from startrack.localization.likelihood.obstacle_chain import clear_emissions
+from startrack.localization.likelihood.skyline_model import SkylineModel
+from startrack.localization.likelihood.skyline_profiles import Profiles
 
 GROUPS = 8  # of azimuth, 45 degrees wide
 DIVISIONS = 3  # into such groups, each turned by 15 degrees: an obstacle of up to 30 degrees is wholly in one group

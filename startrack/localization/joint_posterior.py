@@ -25,11 +25,10 @@ from startrack.localization.importance_sampling import (
     moments,
     temper_weights,
 )
-from startrack.localization.places import FIT_M, choose_apart
-from startrack.localization.search import NATS
-from startrack.localization.shared_errors import SharedErrors
-from startrack.localization.skyline_model import SkylineModel
-from startrack.localization.smooth_skyline import with_own_edge
+from startrack.localization.likelihood.shared_errors import SharedErrors
+from startrack.localization.likelihood.skyline_model import SkylineModel
+from startrack.localization.likelihood.smooth_skyline import with_own_edge
+from startrack.localization.search import FIT_M, NATS, choose_apart
 from startrack.terrain import Terrain
 
 REACH_M = 300.0  # of a group of boxes about its best one, with one neighbourhood

@@ -1,27 +1,152 @@
-"""The posterior of the position: searched over the whole area, then sampled with shared errors and obstacles."""
+"""The posterior of the position: searched over the whole area or near a prior, then sampled with all errors.
+
+Before that, the rows of one image decide how steep a crater is whose depth and width are not known.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from startrack.core.types import Array, Evidence, Explored, Fix, NotLocated, PositionPrior
-from startrack.localization.clock import explore_times, is_wide
+from startrack.core.types import Array, Bools, Evidence, Explored, Fix, NotLocated, PositionPrior
+from startrack.localization.clock import explore_times, is_wide, sample_other_times
 from startrack.localization.conclusion import conclude
 from startrack.localization.hypothesis import Hypothesis, heaviest_first
 from startrack.localization.joint_posterior import NO_OTHERS, sample_posterior
-from startrack.localization.other_times import sample_other_times
-from startrack.localization.position_prior import SearchedNear, name_prior, require_agreement, require_prior_inside
-from startrack.localization.search import NATS, search_boxes
+from startrack.localization.search import BEAMS, NATS, BoxModel, Place, search_boxes
 from startrack.localization.search_profiles import SLACK_NATS
-from startrack.localization.steepness import settle_steepness
-from startrack.terrain import Terrain, require_terrain
+from startrack.terrain import ForwardingTerrain, Terrain, require_terrain
 
+DISK_SIGMAS = 6.0  # of the prior, to the edge of the first disk
+LEAST_REACH_M = 300.0  # of that radius: in a smaller disk few edges of evidence show which way is likelier
+EDGE_PART, ENLARGED = 0.7, 3.0  # of the disk's radius, where its edge begins; factor of the next radius
+CONTRADICTED_SIGMAS = 4.5  # of evidence and prior together: a true prior is farther off once in 25,000 images
+STEEPNESS_SIGMAS = 3.0  # of what is stated, to the last steepness that is tried
+STEEPNESS_STEP = 0.08  # of its logarithm, between two that are tried: the likelihood falls evenly over thirty of them
+FINEST_STEP = 1e-3  # the shape's errors are expanded about the one found
+MOST_STEEPNESSES = 3  # that the likelihood is followed from
 MIN_ROWS = 8
 MIN_ROW_NATS = 1e-3  # |llr| below which a row is left out
+
+
+class SearchedNear(ForwardingTerrain):
+    """A terrain of which the neighbourhood of a prior's mean is searched."""
+
+    def __init__(self, whole: Terrain, near: PositionPrior, radius_m: float | None = None) -> None:
+        super().__init__(whole)
+        self.near_prior, self.radius_m = near, radius_m or max(DISK_SIGMAS * near.sigma_m, LEAST_REACH_M)
+
+    @property
+    def searched(self) -> tuple[float, float, float]:  # type: ignore[override]
+        """Disk of the prior: east and north of its middle, and its radius [m]."""
+        return float(self.near_prior.east_m), float(self.near_prior.north_m), float(self.radius_m)
+
+    def allowed(self, points_m: Array) -> Bools:
+        """Whether a camera could stand at the points (..., 2), within the disk."""
+        east, north, reach = self.searched
+        inside = np.hypot(points_m[..., 0] - east, points_m[..., 1] - north) <= reach
+        return np.asarray(inside & self.whole.allowed(points_m))
+
+    def is_at_edge(self, places: list[Place]) -> bool:
+        """Whether the likeliest of `places` is at the edge of the disk, within the search area."""
+        if self.radius_m > 2 * self.reach_m or not places:
+            return False
+        return bool(np.linalg.norm(places[0].position_m - self.near_prior.mean_m) > EDGE_PART * self.radius_m)
+
+    def enlarged(self) -> SearchedNear:
+        """Copy of this terrain with a larger disk."""
+        return SearchedNear(self.whole, self.near_prior, ENLARGED * self.radius_m)
+
+
+def require_prior_inside(nearby: SearchedNear) -> None:
+    """Raise NotLocated (outside_search_area) where no part of the disk of a prior is in the search area."""
+    east_m, north_m, radius_m = nearby.searched
+    away_m = float(np.hypot(east_m, north_m))
+    if away_m > nearby.reach_m + radius_m:
+        raise NotLocated(
+            f"--near {nearby.near_prior} is {away_m:.0f} m from the origin of the terrain, and the radius of its "
+            f"search area is {nearby.search_radius_m:.0f} m",
+            reason="outside_search_area",
+        )
+
+
+def require_agreement(places: list[Place], near: PositionPrior) -> None:
+    """Raise NotLocated (inconsistent_evidence) where the prior contradicts the likely `places`, the best first.
+
+    Of two normal distributions the maximum of the product lies chi^2 / 2 below the product of the maxima.
+    """
+    if not places:
+        return
+    off = np.array([one.position_m for one in places]) - near.mean_m
+    both = np.array([one.covariance_m2 for one in places]) + near.sigma_m**2 * np.eye(2)
+    chi2 = np.einsum("ni,ni->n", off, np.linalg.solve(both, off[:, :, None])[:, :, 0])
+    lost = places[0].log_likelihood - max(one.log_likelihood - 0.5 * c for one, c in zip(places, chi2, strict=True))
+    if lost > 0.5 * CONTRADICTED_SIGMAS**2:
+        raise contradiction(near, f"lie {np.sqrt(2 * lost):.1f} sigma from it")
+
+
+def contradiction(near: PositionPrior, how: str) -> NotLocated:
+    """The refusal of evidence that contradicts the prior."""
+    return NotLocated(
+        f"the positions that the image allows {how}, the prior --near {near}: is it right, and its sigma large enough?",
+        reason="inconsistent_evidence",
+    )
+
+
+def name_prior(refusal: NotLocated, near: PositionPrior | None) -> NotLocated:
+    """The `refusal`, with the prior in its message where there is one: a wrong prior causes it too."""
+    if near is None or "--near" in str(refusal):
+        return refusal
+    evidence: dict[str, Any] = refusal.evidence
+    return NotLocated(
+        f"{refusal} (searched within 6 sigma of --near {near}: is it right?)", reason=refusal.reason, **evidence
+    )
+
+
+def settle_steepness(evidence: Evidence, terrain: Terrain) -> Terrain:
+    """The `terrain`, or where its steepness is not known, that of the steepness that `evidence` shows.
+
+    Raises NotLocated (outside_search_area, insufficient_geometry) where there is none, or more than one.
+    """
+    sigma = terrain.errors.unknown_steepness_1
+    if not sigma:
+        return terrain
+    steps = int(np.ceil(STEEPNESS_SIGMAS * sigma / STEEPNESS_STEP))
+    tried = STEEPNESS_STEP * np.arange(-steps, steps + 1)
+    fits = np.array([_fit(one, evidence, terrain, sigma) for one in tried])
+    if not np.isfinite(fits).any():
+        raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
+    higher = np.pad(fits, 1, constant_values=-np.inf)
+    peaks = np.flatnonzero((fits >= higher[:-2]) & (fits >= higher[2:]) & np.isfinite(fits))
+    peaks = peaks[np.argsort(-fits[peaks], kind="stable")][:MOST_STEEPNESSES]
+    found = sorted((_climb(tried[at], fits[at], evidence, terrain, sigma) for at in peaks), reverse=True)
+    (best, log_steepness), *others = found
+    if any(fit > best - NATS and abs(other - log_steepness) > STEEPNESS_STEP for fit, other in others):
+        raise NotLocated(
+            "craters of more than one shape fit the image: state depth_m and diameter_m of the terrain file and their "
+            "sigmas more exactly"
+        )
+    return terrain.with_steepness(float(np.exp(log_steepness)))
+
+
+def _climb(log_steepness: float, fit: float, evidence: Evidence, terrain: Terrain, sigma: float) -> tuple[float, float]:
+    """The fit and the logarithm of the steepness of the peak near one, in ever smaller steps."""
+    step = 0.5 * STEEPNESS_STEP
+    while step > FINEST_STEP:
+        sides = [(_fit(log_steepness + side, evidence, terrain, sigma), log_steepness + side) for side in (-step, step)]
+        fit, log_steepness = max((fit, log_steepness), *sides)
+        step /= 2
+    return fit, log_steepness
+
+
+def _fit(log_steepness: float, evidence: Evidence, terrain: Terrain, sigma: float) -> float:
+    """Log-likelihood of the best place of a beam at this steepness, with the prior of that."""
+    model = BoxModel.of(evidence, terrain.with_steepness(float(np.exp(log_steepness))))
+    places = model.fit_places(*model.last_boxes(*BEAMS[0]), most=1)
+    return places[0].log_likelihood - 0.5 * (log_steepness / sigma) ** 2 if places else -np.inf
 
 
 @dataclass(frozen=True)

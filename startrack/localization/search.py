@@ -1,27 +1,37 @@
-"""The search for positions: likely places by a beam over ever smaller boxes, then branch and bound."""
+"""The search for positions: likely places by a beam over ever smaller boxes, then branch and bound.
+
+Boxes of positions are ranked by the search's likelihood, and places are fitted by the published model.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import ceil, log2
+from typing import NamedTuple
 
 import numpy as np
 
 from startrack.core.limits import check_time
-from startrack.core.types import SECTORS, Array, Evidence, Explored, NotLocated
-from startrack.localization.places import (
-    FINEST_M,
-    FINEST_PART,
-    PLACES_APART,
-    BoxModel,
-    Place,
-    choose_apart,
-    split_boxes,
-    square_grid,
-)
-from startrack.localization.search_profiles import SLACK_NATS
-from startrack.terrain import Terrain
+from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Evidence, Explored, NotLocated, sector_of
+from startrack.localization.likelihood.shared_errors import SharedErrors
+from startrack.localization.likelihood.skyline_model import SkylineModel
+from startrack.localization.likelihood.skyline_profiles import EDGE_SIGMAS
+from startrack.localization.search_profiles import SLACK_NATS, SearchProfiles, sum_contributions
+from startrack.terrain import Terrain, require_bounds
 
+WITHIN_RAD = np.pi / SECTORS  # from the middle of a sector to its ends
+MAP_SIGMAS = 6.0  # of errors of the map by which bounds are wider
+NARROWEST_RAD = 1e-6  # of a range of skylines
+TRACED_EVERY = 3  # sectors: a traced horizon costs a hundred times a look-up
+SMALL_BOX_M = 20.0  # half side up to which boxes are tested for allowed ground point by point
+QUARTERS = np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])  # of half a side
+TRACED_BELOW_M = 400.0  # half side; the horizons of smaller boxes may be traced instead of looked up
+FINEST_M, FINEST_PART = 12.0, 0.01  # half side of boxes that may be the last ones: at most, and in the half square
+LAST_HALF_M = {False: SMALL_BOX_M, True: FINEST_M}  # of the last boxes, looked up or traced: smaller ones rank alike
+FITTED, PLACES_APART = 4, 4.0  # boxes at which the model is fitted, and their distance in halves of boxes
+FIT_M = 40.0  # half side of a neighbourhood, at least
+FOLLOWED, FIT_NATS = 6, 0.5  # how often a fit follows its solution, and for what gain
+POINT_M = 0.01  # half side of a box that stands for a point
 NATS = 16.0  # positions that are e^-16 as likely as the best are dropped
 # How many boxes are kept at each level, and whether the horizons of small boxes are traced. Looked-up horizons rank
 # most positions right. Beside near crests they are too wide: of 9 positions on Shackleton's floor and walls they miss
@@ -37,6 +47,164 @@ BOXES_AT_ONCE = 2000  # so that memory stays flat
 FORESEEN_PART, FORESEEN_BUDGETS = 1 / 30, 2.0
 LOOK_UP_COST = 0.08  # of a bound, in horizons traced
 LAST_MOST_BOXES = 16_000  # of a level: it is the last one
+
+
+class Place(NamedTuple):
+    """A position that explains the rows, by the linear model of its neighbourhood."""
+
+    position_m: Array  # (2,)
+    covariance_m2: Array  # (2, 2)
+    log_likelihood: float  # of the published model, its shared errors integrated
+    raised_rad: Array  # (SECTORS,) by how much errors that all azimuths share raise the skyline
+    later_s: float  # how much later than that of the rows the true time is
+
+
+def split_boxes(centres_m: Array, half_m: float, terrain: Terrain) -> Array:
+    """Centres (m, 2) of the quarters of boxes that touch the searched disk and may hold ground for a camera.
+
+    Small ones are tested on a grid that is closer than slopes change: at most single metres of a box's ground are
+    missed.
+    """
+    centres = (centres_m[:, None] + half_m * QUARTERS).reshape(-1, 2)
+    east_m, north_m, reach_m = terrain.searched
+    beyond = np.maximum(np.abs(centres - [east_m, north_m]) - 0.5 * half_m, 0.0)
+    centres = centres[np.hypot(beyond[:, 0], beyond[:, 1]) <= reach_m]
+    if half_m > 2 * SMALL_BOX_M:
+        return centres
+    points = centres[:, None] + square_grid(0.5 * half_m, 5)
+    return centres[np.any(terrain.allowed(points), axis=1)]
+
+
+def square_grid(half_m: float, across: int) -> Array:
+    """Points (across^2, 2) of an even grid about the origin, up to `half_m` from it along each axis."""
+    line = np.linspace(-half_m, half_m, across)
+    return np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+
+
+def choose_apart(points: Array, score: Array, apart: float, nats: float = np.inf, most: int | None = None) -> list[int]:
+    """Indices of the best points (n, d) by a score (n,) that are farther than `apart` from each other on an axis.
+
+    Those that are worse than the best by more than `nats` do not count; `most` of them are chosen.
+    """
+    chosen: list[int] = []
+    for i in np.argsort(-score, kind="stable"):
+        if score[i] < score.max() - nats or len(chosen) == most:
+            break
+        if all(np.abs(points[i] - points[k]).max() > apart for k in chosen):
+            chosen.append(int(i))
+    return chosen
+
+
+@dataclass(frozen=True, eq=False)
+class BoxModel:
+    """Model of the likelihood of `rows` on a `terrain`: over boxes that of the search, at places the published one."""
+
+    rows: Evidence
+    terrain: Terrain
+    profiles: SearchProfiles
+    errors: SharedErrors  # that all azimuths share
+    raised_rad: Array | float = 0.0  # (SECTORS,) by how much these raise the skyline
+
+    @classmethod
+    def of(cls, rows: Evidence, terrain: Terrain) -> BoxModel:
+        """Model of `rows` on a `terrain` with the shared errors at zero."""
+        return cls(rows, terrain, SearchProfiles.of(rows), SharedErrors.of(terrain, rows.clock))
+
+    def raised_as(self, places: list[Place]) -> BoxModel:
+        """Copy of this model with the errors that the first and best of `places` shows; itself without places."""
+        return replace(self, raised_rad=places[0].raised_rad) if places else self
+
+    def bounds(self, centres_m: Array, half_m: float) -> Array:
+        """Upper bounds (n,) of the search's log-likelihood over boxes (n, 2)."""
+        boxes = centres_m[:, None, :]
+        low, high = self.terrain.horizon_bounds_rad(boxes, np.array(half_m), MIDDLES_RAD, WITHIN_RAD)
+        require_bounds(self.terrain, low, high)
+        wider = MAP_SIGMAS * self.terrain.errors.most_sigma_rad(boxes, half_m, MIDDLES_RAD, WITHIN_RAD)
+        return self.profiles.bound(low + self.raised_rad - wider, high + self.raised_rad + wider)
+
+    def score_place(self, point_m: Array) -> float:
+        """Log-likelihood of the search at a position (2,), each row beside the horizon at its own azimuth."""
+        rows, sector = self.rows, sector_of(self.rows.azimuth_rad)
+        raised = np.broadcast_to(self.raised_rad, SECTORS)[sector]
+        low, high = self.terrain.horizon_bounds_rad(point_m[None, None], np.array(POINT_M), MIDDLES_RAD, WITHIN_RAD)
+        horizon = 0.5 * (low + high)[0, sector] + raised
+        near = np.abs(rows.elevation_rad - horizon) <= 0.5 * (high - low)[0, sector] + EDGE_SIGMAS * rows.edge_sigma_rad
+        horizon[near] = np.ravel(self.terrain.horizon_rad(point_m[None], rows.azimuth_rad[near])) + raised[near]
+        return self.profiles.score(sum_contributions(rows, rows.elevation_rad - horizon))
+
+    def averages(self, centres_m: Array, half_m: float, is_traced: bool = False) -> Array:
+        """Mean log-likelihoods (n,) of the search over boxes (n, 2).
+
+        By bounds of the horizon, or, if it `is_traced`, by its estimated spread about that of each centre in every
+        third sector.
+        """
+        azimuth, boxes = MIDDLES_RAD[:: TRACED_EVERY if is_traced else 1], centres_m[:, None, :]
+        if is_traced:
+            middle, width = self.terrain.horizon_spread_rad(boxes, half_m, azimuth)
+            low, high = middle - width, middle + width
+        else:
+            low, high = self.terrain.horizon_bounds_rad(boxes, np.array(half_m), azimuth, WITHIN_RAD)
+            require_bounds(self.terrain, low, high)
+        if self.terrain.errors.height_sigma_m > 0.0:
+            sigma = self.terrain.errors.most_sigma_rad(boxes, half_m, azimuth, WITHIN_RAD)
+            low, high = low - sigma, high + sigma
+        raised = np.broadcast_to(self.raised_rad, SECTORS)[:: SECTORS // len(azimuth)]
+        return self.profiles.average(low + raised - NARROWEST_RAD, high + raised + NARROWEST_RAD)
+
+    def last_boxes(self, width: int, is_traced: bool) -> tuple[Array, float]:
+        """Centres (n, 2) of the last boxes, the best average first, and half their side [m].
+
+        Of ever smaller boxes those with the best average are quartered.
+        """
+        terrain, (east_m, north_m, half) = self.terrain, self.terrain.searched
+        centres = np.array([[east_m, north_m]])
+        while half > LAST_HALF_M[is_traced] and len(centres):
+            check_time()
+            centres, half = split_boxes(centres, half, terrain), half / 2
+            score = self.averages(centres, half, is_traced and half < TRACED_BELOW_M)
+            centres = centres[np.argsort(-score, kind="stable")[:width]]
+        return centres, half
+
+    def fit_places(self, centres_m: Array, half_m: float, most: int = FITTED) -> list[Place]:
+        """The places near the first of boxes (n, 2) that are apart, the likeliest first; none where none is allowed."""
+        order = -np.arange(len(centres_m), dtype=np.float64)
+        chosen = choose_apart(centres_m, order, PLACES_APART * half_m, most=most)
+        found = [self._fit(centres_m[i], half_m) for i in chosen]
+        return sorted((one for one in found if one is not None), key=lambda one: -one.log_likelihood)
+
+    def _fit(self, centre_m: Array, half_m: float) -> Place | None:
+        """The likeliest place that linear solutions lead to from a box; None where no ground of it is allowed."""
+        points = centre_m + square_grid(half_m, 5)
+        points = points[np.asarray(self.terrain.allowed(points))]
+        if not len(points):
+            return None
+        at_m, best = points[np.argmin(np.linalg.norm(points - centre_m, axis=1))], None
+        for _ in range(FOLLOWED):
+            check_time()
+            model = SkylineModel.of(self.terrain, self.rows, at_m, 0.0, self.errors, self.rows.image_errors)
+            found = _place_of(model)
+            gained = np.inf if best is None else found.log_likelihood - best.log_likelihood
+            if gained > 0.0:
+                best = found
+            if gained < FIT_NATS or (found.position_m == at_m).all():
+                break
+            at_m = found.position_m
+        return best
+
+
+def _place_of(model: SkylineModel) -> Place:
+    """Place at the likelier of a model's reference and the linear solution about it, if that is allowed."""
+    linear, covariance, weight = model.solve()
+    tried = model.with_likely_errors(model.around.reference_m[None], weight)
+    if bool(model.terrain.allowed(linear[None, :2])[0]):
+        tried = np.vstack([tried, linear])
+    value = model.log_likelihood(tried) - 0.5 * np.square(tried[:, 2:]).sum(axis=1)
+    best = tried[np.argmax(value)]
+    of_errors = 0.5 * float(np.linalg.slogdet(covariance[2:, 2:])[1])
+    errors = model.basis.mean + model.basis.shown @ best[2:]
+    later_s = float(errors[-1]) if model.errors.clock is not None else 0.0
+    raised, fit = errors @ model.error_slopes_rad, float(value.max()) + of_errors + model.seen.log_offset
+    return Place(best[:2], covariance[:2, :2], fit, raised, later_s)
 
 
 def log_sum(values: Array) -> float:

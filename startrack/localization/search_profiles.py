@@ -16,8 +16,8 @@ import numpy as np
 
 from startrack.core.types import SECTORS, Array, Evidence, Ints, sector_of
 from startrack.kernels.library import kernel
-from startrack.localization.obstacle_chain import STOP
-from startrack.localization.skyline_profiles import EDGE_SIGMAS, ROW_NATS, declare, profiles_of, take
+from startrack.localization.likelihood.obstacle_chain import STOP
+from startrack.localization.likelihood.skyline_profiles import EDGE_SIGMAS, ROW_NATS, declare, profiles_of, take
 
 SEARCH_EPSILON = 0.1  # e: an obstacle costs the true position 2.3 nats a sector
 LOWEST_RAD, HIGHEST_RAD = np.radians(-20.0), np.radians(92.0)  # elevations of skylines

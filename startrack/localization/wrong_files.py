@@ -16,9 +16,9 @@ from startrack.localization.hypothesis import (
     first_plain,
     sample_gross_error,
 )
-from startrack.localization.shared_errors import CLOCK_FACT, OWN_EDGE, OWN_EDGE_PROBABILITY, SharedErrors
-from startrack.localization.skyline_model import SkylineModel
-from startrack.localization.smooth_skyline import free_log_likelihood
+from startrack.localization.likelihood.shared_errors import CLOCK_FACT, OWN_EDGE, OWN_EDGE_PROBABILITY, SharedErrors
+from startrack.localization.likelihood.skyline_model import SkylineModel
+from startrack.localization.likelihood.smooth_skyline import free_log_likelihood
 
 WRONG_FACT_NATS = 3.0  # by which a gross error of a stated fact must explain the rows better: 1 of 100 clean skies
 MOST_BLOCKED = 0.5  # of the skyline that the rows show: where more is on no map, another place may explain them as well

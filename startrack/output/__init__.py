@@ -6,10 +6,10 @@ from startrack.output.html import fill_frame, page_text, write_page
 from startrack.output.html.details import ground_map
 from startrack.output.html.rows import Found, result_at, results_under
 from startrack.output.picture.annotate import annotate
-from startrack.output.picture.axes import Axes, nice_step
 from startrack.output.picture.canvas import (
     TEXT_PX,
     TITLE_PX,
+    Axes,
     Box,
     Canvas,
     Colour,
@@ -18,6 +18,7 @@ from startrack.output.picture.canvas import (
     box_around,
     encoded_bytes,
     mix_colours,
+    nice_step,
     png_bytes,
 )
 from startrack.output.picture.maps import MARGIN_PX, SIDE_PX, Map, draw_overview, ellipse_m, relief_picture

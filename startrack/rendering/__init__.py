@@ -1,9 +1,17 @@
 """An exposure and its truth from catalogue, camera, terrain and a true pose."""
 
 from startrack.rendering.compose import draw_hot_pixels, light_e, read_out, render, truth_of, truth_paths, write_truth
-from startrack.rendering.drive import STEP_ROUNDING_1, Drive, draw_odometry, read_drive
 from startrack.rendering.scene import HotPixels, Scene, Truth
-from startrack.rendering.series import FAINTEST_V_MAG, Pose, Series, load_sky_catalog
+from startrack.rendering.series import (
+    FAINTEST_V_MAG,
+    STEP_ROUNDING_1,
+    Drive,
+    Pose,
+    Series,
+    draw_odometry,
+    load_sky_catalog,
+    read_drive,
+)
 from startrack.rendering.sky import EDGE_WIDTH_SIGMAS, diffuse_at_e, sky_e_per_s, sky_gradient
 from startrack.rendering.sources import (
     draw_field_stars,

@@ -2,8 +2,7 @@
 
 from startrack.simulation.ground_errors import draw_ground
 from startrack.simulation.skyline_image import draw_band, draw_camera, simulate_measured
-from startrack.simulation.star_rays import simulate_rays, simulate_stars
-from startrack.simulation.starlight import Starlight
+from startrack.simulation.star_rays import Starlight, simulate_rays, simulate_stars
 
 __all__ = [
     "Starlight", "draw_band", "draw_camera", "draw_ground", "simulate_measured", "simulate_rays", "simulate_stars",

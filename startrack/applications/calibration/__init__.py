@@ -5,8 +5,9 @@
 
 from startrack.applications.calibration.board import Board, calibrate_board
 from startrack.applications.calibration.initial_states import initial_state
-from startrack.applications.calibration.photometry import KnownSensor
 from startrack.applications.calibration.record import (
+    CALIBRATION,
+    VERIFICATION,
     board_dict,
     board_line,
     calibration_dict,
@@ -17,7 +18,7 @@ from startrack.applications.calibration.record import (
 )
 from startrack.applications.calibration.report import write_report
 from startrack.applications.calibration.run import Calibration, calibrate, count_steps
-from startrack.applications.calibration.schema import CALIBRATION, VERIFICATION
+from startrack.applications.calibration.sensor import KnownSensor
 from startrack.applications.calibration.verify import (
     VERIFICATION_FORMAT,
     Verification,
@@ -25,8 +26,8 @@ from startrack.applications.calibration.verify import (
     verify_dict,
     verify_line,
 )
+from startrack.estimation.adjust import observations
 from startrack.estimation.lens_fit import fit_lens
-from startrack.estimation.normal_equations import observations
 
 __all__ = [
     "CALIBRATION", "VERIFICATION", "VERIFICATION_FORMAT", "Board", "Calibration", "KnownSensor", "Verification",

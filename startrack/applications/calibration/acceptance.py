@@ -11,10 +11,9 @@ from startrack.applications.calibration.initial_states import fit_attitudes
 from startrack.camera import Camera, cap_grid
 from startrack.catalog import MOST_BELOW_PART, StarCatalog, is_below_horizon, sky_at
 from startrack.core.types import Array, Bools, Ints
+from startrack.estimation.adjust import Observations
 from startrack.estimation.false_alarm import log_p_value_poisson
-from startrack.estimation.frame_matching import Frame, FrameMatches, match_frames
-from startrack.estimation.joint_fit import JointFit
-from startrack.estimation.normal_equations import Observations
+from startrack.estimation.frame_matching import Frame, FrameMatches, JointFit, match_frames
 from startrack.frames import R_from_rotvec, Site
 from startrack.identification import MAX_FALSE_ALARM
 

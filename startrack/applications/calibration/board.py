@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from startrack.applications.calibration import acceptance
-from startrack.applications.calibration.field_of_view import corner_angle_rad
-from startrack.applications.calibration.initial_states import initial_board_state
+from startrack.applications.calibration.initial_states import corner_angle_rad, initial_board_state
 from startrack.core.types import Array, BadInput, Exposure, NotIdentified
+from startrack.estimation.adjust import Observations, observations
 from startrack.estimation.lens_fit import LensFit, fit_state
-from startrack.estimation.normal_equations import Observations, observations
 
 MIN_PICTURES = 3
 MIN_CORNERS = 100

@@ -1,4 +1,4 @@
-"""Initial states of the adjustments: cameras and attitudes from matched stars, or from flat boards."""
+"""Beginnings of a calibration: the field of view, and cameras and attitudes from matched stars or from flat boards."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.camera import Camera, lens_jacobian, lens_kinds
-from startrack.core.types import Array, NotIdentified
-from startrack.estimation.adjust import State
-from startrack.estimation.normal_equations import Observations, Terms
+from startrack.core.types import Array, BadInput, NotIdentified
+from startrack.estimation.adjust import Observations, State, Terms
 from startrack.frames import R_from_rotvec, angle_between_rad, nearest_rotation, wahba
+from startrack.identification import WIDE_FIELD_RAD
 
 PAIR_STARS = 80  # of an image, whose pairs give the focal length
 NEAR_PAIRS_QUANTILE = 0.3
@@ -22,6 +22,36 @@ OUTLIER_RAD = np.radians(4.0)  # larger errors of a ray count as this one
 SMALLEST_TOLERANCE_RAD = 1e-4
 LARGEST_ERROR_RAD = 0.05  # median error of the corners' rays with a usable initial camera
 FOCAL_PARTS = (0.33, 1.0)  # of the frame's width: initial focal lengths
+
+
+def field_of_view_rad(camera: Camera | None, fov_rad: float | None) -> float:
+    """Field of view [rad]: `fov_rad`, else of the approximate camera: image circle if wide, else frame width.
+
+    Raises BadInput no_calibration where there is neither.
+    """
+    if fov_rad is not None:
+        return fov_rad
+    if camera is None:
+        raise BadInput("no_calibration", "give the field of view (--fov DEG) or an approximate camera file (-c)")
+    if 2.0 * camera.max_angle_rad >= WIDE_FIELD_RAD:
+        return 2.0 * camera.max_angle_rad
+    width, height = camera.size_px
+    sides = np.array([[-0.5, (height - 1) / 2], [width - 0.5, (height - 1) / 2]])
+    return float(min(np.sum(camera.angle_rad(sides)), 0.99 * WIDE_FIELD_RAD))
+
+
+def corner_angle_rad(camera: Camera) -> float:
+    """The largest angle off the axis [rad] of the frame's corners."""
+    right, bottom = (side - 0.5 for side in camera.size_px)
+    return float(np.max(camera.angle_rad(np.array([[x, y] for x in (-0.5, right) for y in (-0.5, bottom)]))))
+
+
+def largest_angle_rad(fitted: Camera, start: Camera | None, fov_rad: float | None) -> float:
+    """Edge of the image circle [rad]: as given, else the corner; at most the turning point of the polynomial."""
+    edge = corner_angle_rad(fitted) if start is None else start.max_angle_rad
+    if start is None and fov_rad is not None and fov_rad >= WIDE_FIELD_RAD:
+        edge = 0.5 * fov_rad
+    return float(max(min(edge, fitted.lens.max_invertible_rad), fitted.calibrated_angle_rad))
 
 
 def initial_state(points: Observations, size_px: tuple[int, int]) -> State:

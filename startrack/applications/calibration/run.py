@@ -16,8 +16,8 @@ from startrack.applications.calibration.acceptance import (
     check_acceptance,
     horizon_checks,
 )
-from startrack.applications.calibration.field_of_view import field_of_view_rad, largest_angle_rad
-from startrack.applications.calibration.photometry import KnownSensor, Photometry, measure_photometry
+from startrack.applications.calibration.initial_states import field_of_view_rad, largest_angle_rad
+from startrack.applications.calibration.sensor import KnownSensor, Photometry, measure_photometry
 from startrack.applications.calibration.shared_errors import widen_covariance
 from startrack.applications.calibration.static_parts import find_obstructions, remove_static_sources
 from startrack.camera import REFRACTION_CONTAINED, REFRACTION_REMOVED, Camera
@@ -28,8 +28,16 @@ from startrack.core.runner import map_in_threads
 from startrack.core.types import Array, BadInput, Bools, Exposure, Identification, NotIdentified, TooFewStars
 from startrack.detection import Detector
 from startrack.estimation.fixed_camera import find_disagreeing
-from startrack.estimation.frame_matching import Frame, frame_of, require_body, require_time
-from startrack.estimation.joint_fit import FINAL_ROUNDS, JointFit, fit_frames, grow_from_matches
+from startrack.estimation.frame_matching import (
+    FINAL_ROUNDS,
+    Frame,
+    JointFit,
+    fit_frames,
+    frame_of,
+    grow_from_matches,
+    require_body,
+    require_time,
+)
 from startrack.exposure import combine_masks, with_facts
 from startrack.frames import Site
 from startrack.identification import Identifier, identify_unknown_lens

@@ -15,10 +15,9 @@ import numpy as np
 from startrack.applications.calibration.acceptance import IMAGE_RINGS, IMAGE_SECTORS, STARS_PER_RING, rings_and_sectors
 from startrack.camera import cap_grid, projection_covariance_px2
 from startrack.core.types import Ints
-from startrack.estimation.adjust import SMALLEST_EXTRA_PX2, inverse_covariance
-from startrack.estimation.joint_fit import JointFit
+from startrack.estimation.adjust import SMALLEST_EXTRA_PX2, Observations, inverse_covariance
+from startrack.estimation.frame_matching import JointFit
 from startrack.estimation.lens_fit import LensFit, is_chance
-from startrack.estimation.normal_equations import Observations
 
 # RMS of the projection, per calibration. All-sky camera of the Lowell Discovery Telescope, nights of 2018-06-29 and
 # 2018-08-06, each calibrated alone: within 80 degrees the projections differ by 0.063 px; the stars explain 0.021 px.

@@ -12,8 +12,7 @@ from startrack.camera import Camera
 from startrack.core.runner import map_in_threads
 from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Bools, Ints
-from startrack.estimation.frame_matching import BrightStars, Frame, match_frames
-from startrack.estimation.joint_fit import JointFit
+from startrack.estimation.frame_matching import BrightStars, Frame, JointFit, match_frames
 from startrack.exposure import combine_masks
 
 SAME_PX = 0.7

@@ -15,7 +15,7 @@ from startrack.camera import MIN_THROUGHPUT_1, Sensor
 from startrack.core.limits import check_time
 from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Ints, Rows, array
-from startrack.estimation.joint_fit import JointFit
+from startrack.estimation.frame_matching import JointFit
 from startrack.frames import airmass
 
 MIN_THROUGHPUT_STARS = 30

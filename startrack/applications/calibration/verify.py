@@ -16,7 +16,7 @@ from startrack.catalog import StarCatalog
 from startrack.chain import stating_sky
 from startrack.core.files import printable
 from startrack.core.types import Exposure, NotIdentified
-from startrack.estimation.joint_fit import fit_frames, grow_from_matches
+from startrack.estimation.frame_matching import fit_frames, grow_from_matches
 from startrack.frames import Site
 
 VERIFICATION_FORMAT = "startrack.verification/1"

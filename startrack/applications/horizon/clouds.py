@@ -12,8 +12,7 @@ import numpy as np
 
 from startrack.applications.horizon.columns import AZIMUTH_COLUMNS, COLUMNS_PER_AZIMUTH, SKYLINE_AZIMUTHS
 from startrack.applications.horizon.posterior import NEAR_EDGE_RAD, limited_rows, sky_likelihood_ratio
-from startrack.applications.horizon.skylight import Steps
-from startrack.applications.horizon.starlight import StarLight
+from startrack.applications.horizon.skylight import StarLight, Steps
 from startrack.core.types import Array
 
 # Of the edges counted: dark ones below a brighter sky, in the widest averages of single pixels, where stars are none.

@@ -24,8 +24,7 @@ from startrack.core.types import Array, Body, Detections, Exposure, Ints
 from startrack.detection import Damage, find_damage
 from startrack.estimation.false_alarm import log_p_value_poisson
 from startrack.estimation.fixed_camera import find_disagreeing
-from startrack.estimation.frame_matching import frame_of, require_body, require_time
-from startrack.estimation.joint_fit import JointFit, fit_frames
+from startrack.estimation.frame_matching import JointFit, fit_frames, frame_of, require_body, require_time
 from startrack.frames import R_enu_icrs, Site
 from startrack.identification import WIDE_FIELD_RAD
 

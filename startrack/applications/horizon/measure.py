@@ -18,7 +18,6 @@ from startrack.applications.horizon.columns import (
     SKYLINE_AZIMUTHS,
 )
 from startrack.applications.horizon.frames import LeftOut, Progress, SkyFrame, orient_frames
-from startrack.applications.horizon.join import join_skylines
 from startrack.applications.horizon.posterior import (
     HIGH_RAD,
     KINDS,
@@ -29,8 +28,7 @@ from startrack.applications.horizon.posterior import (
     star_log_likelihood,
     steps_at,
 )
-from startrack.applications.horizon.skylight import Steps, find_steps
-from startrack.applications.horizon.starlight import StarLight, measure_stars
+from startrack.applications.horizon.skylight import StarLight, Steps, find_steps, measure_stars
 from startrack.camera import Camera
 from startrack.catalog import StarCatalog
 from startrack.core.errors import NoSolution
@@ -39,6 +37,10 @@ from startrack.core.runner import map_in_threads
 from startrack.core.types import Array, Bools, Exposure, Ints, MeasuredSkyline
 from startrack.frames import Site, off_axis_rad, rays_from_azel
 
+# Of a bin whose skyline is another one in another picture (a dome, a crane, a branch). Of 14 pictures the highest edges
+# at a rotating dome are clouds' with probabilities of 0.001 to 0.01, those of clouds elsewhere with 0.02 to 0.65.
+MOVED_PROBABILITY = 0.007
+MOVED_RAD = np.radians(20.0)  # by anything up to this
 UNKNOWN_SIGMA_RAD = np.radians(2.0)  # a wider posterior is no measurement, nor is a star farther away
 PLACE_SIGMA_RAD = np.radians(0.04)  # a quarter of a usual pixel: the edge's place depends on how the ground is lit
 WALL_RAD = np.radians(1.0)  # variation from which one elevation does not describe a bin
@@ -53,6 +55,41 @@ MOST_NATS = 50.0
 CLOUD_STEPS = 2  # which of the AVERAGINGS shows the edges of clouds: the widest one of single pixels
 
 Light = tuple[StarLight, list[Steps]]  # of one picture: stars, and steps of each width
+
+
+def join_skylines(together: MeasuredSkyline, alone: Sequence[MeasuredSkyline]) -> MeasuredSkyline:
+    """The skyline of all pictures `together`, with what each picture `alone` shows and they do not show alike.
+
+    Where the highest and the lowest edge of two pictures more probably differ because something moved than by their
+    errors, and more probably than because the highest is a cloud's, the bin has the highest edge, its sigma, and the
+    source "varies". A bin that only single pictures know has the value of the most accurate of them, and the scatter
+    of them all adds to its sigma.
+
+    Args:
+        together: skyline (n,) of all pictures.
+        alone: skylines (n,) of the pictures, one by one.
+    """
+    elevation, sigma, cloud, sources = (
+        np.stack([getattr(one, name) for one in alone])
+        for name in ("elevation_rad", "sigma_rad", "cloud_probability", "source")
+    )
+    bins, shown = np.arange(len(together)), np.isfinite(elevation)
+    high, low = (np.argmax(np.where(shown, way * elevation, -np.inf), axis=0) for way in (1.0, -1.0))
+    with np.errstate(invalid="ignore"):
+        apart, both = elevation[high, bins] - elevation[low, bins], np.hypot(sigma[high, bins], sigma[low, bins])
+        same = np.exp(-0.5 * np.square(apart / both)) / (both * np.sqrt(2.0 * np.pi))
+        varies = (same < MOVED_PROBABILITY / MOVED_RAD) & (cloud[high, bins] < MOVED_PROBABILITY)
+    chosen = np.where(varies, high, np.argmin(sigma, axis=0))
+    one = shown.any(axis=0) & (varies | ~together.known)
+    off = np.where(shown & ~varies, elevation - elevation[chosen, bins], 0.0)
+    scatter = np.sqrt(np.square(off).sum(axis=0) / np.maximum(shown.sum(axis=0) - 1, 1))
+    return MeasuredSkyline(
+        azimuth_rad=together.azimuth_rad,
+        elevation_rad=np.where(one, elevation[chosen, bins], together.elevation_rad),
+        sigma_rad=np.where(one, np.hypot(sigma[chosen, bins], scatter), together.sigma_rad),
+        source=np.select([varies, one], ["varies", sources[chosen, bins]], together.source),
+        cloud_probability=np.where(one, cloud[chosen, bins], together.cloud_probability),
+    )
 
 
 @dataclass(frozen=True)

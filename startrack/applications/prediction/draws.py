@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from startrack.applications.chunk_store import Chunk, ChunkStore, Progress, settings_digest
 from startrack.camera import Camera, load_camera
 from startrack.catalog import StarCatalog, has_deep_catalog, load_catalog, load_deep_catalog
 from startrack.chain import COMPLETE_V_MAG, Settings, locate_measured
 from startrack.core import MAX_COUNT
-from startrack.core.chunk_store import Chunk, ChunkStore, Progress, settings_digest
 from startrack.core.runner import TASK_LIMIT_S
 from startrack.core.types import TIME_SIGMA_S, Array, BadInput, NoSolution, Stars
 from startrack.localization import require_localizer

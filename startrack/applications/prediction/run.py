@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from startrack.applications.chunk_store import Chunk, ChunkStore
 from startrack.applications.prediction.draws import (
     Conditions,
     Place,
@@ -29,7 +30,6 @@ from startrack.applications.prediction.quantities import (
     summarize_cells,
 )
 from startrack.camera import Camera, load_camera
-from startrack.core.chunk_store import Chunk, ChunkStore
 from startrack.core.statistics import error_ellipse
 from startrack.core.types import Array, Bools
 from startrack.estimation.observations import (

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from startrack.applications.reproduction.artefact import FULL, QUICK, Artefact, Context, Size, write_artefact
-from startrack.applications.reproduction.distance_figures import fig3_7, fig3_8, fig3_9, fig_a2
 from startrack.applications.reproduction.error_figures import (
     aspect_ratio_sweep,
     fig3_4,
@@ -13,10 +12,19 @@ from startrack.applications.reproduction.error_figures import (
     fig_b,
     magnitude_sweep,
 )
-from startrack.applications.reproduction.method_table import map_table, method_table, valley_table
+from startrack.applications.reproduction.method_results import map_table, method_table, valley_table
 from startrack.applications.reproduction.methods import fix_store
 from startrack.applications.reproduction.proposals import proposals
-from startrack.applications.reproduction.sky_figures import fig3_3, fig3_5, fig3_6, fig_a1
+from startrack.applications.reproduction.starfield_figures import (
+    fig3_3,
+    fig3_5,
+    fig3_6,
+    fig3_7,
+    fig3_8,
+    fig3_9,
+    fig_a1,
+    fig_a2,
+)
 from startrack.applications.reproduction.table31 import table31
 
 ARTEFACTS: dict[str, Callable[[Context], Artefact]] = {

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from startrack.applications.chunk_store import ChunkStore
 from startrack.applications.reproduction.simulator import directions
-from startrack.core.chunk_store import ChunkStore
 from startrack.core.files import write_atomically
 from startrack.core.types import Array
 from startrack.output import Column, ecsv_text

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from startrack.applications.chunk_store import Chunk, ChunkStore, Progress, settings_digest
 from startrack.applications.reproduction import simulator
 from startrack.applications.reproduction.artefact import Context
 from startrack.applications.reproduction.comparison import compare_places
 from startrack.applications.reproduction.scene import THESIS_GROUND
-from startrack.core.chunk_store import Chunk, ChunkStore, Progress, settings_digest
 from startrack.core.types import Array, Bools, Fix, NotLocated
 from startrack.localization import ExactPosterior, descend, hull_position
 from startrack.terrain import Cylinder
@@ -28,8 +28,8 @@ FIX_SOURCES = (  # their content is part of a chunk's key
 )  # fmt: skip
 COMPARED_SOURCES = (  # of the chunks of all methods too
     "applications/reproduction/comparison.py", "applications/reproduction/scene.py",
-    "applications/reproduction/published/*.py", "applications/reproduction/series.py",
-    "applications/reproduction/valley.py", "applications/tracking/*.py", "chain/*.py", "detection/*.py",
+    "applications/reproduction/published/*.py", "applications/reproduction/comparison.py",
+    "applications/reproduction/scene.py", "applications/tracking/*.py", "chain/*.py", "detection/*.py",
     "estimation/*.py", "evidence/*.py", "identification/*.py", "rendering/*.py", "simulation/*.py", "terrain/**/*.py",
 )  # fmt: skip
 KUA, OURS, BOUND = "kua", "ours", "bound"  # the thesis's two steps; ours; the limit for a perfect list

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from startrack.applications.tracking.moves import FREEDOMS, LEG_FREEDOMS, Moves, turned
+from startrack.applications.tracking.odometry import FREEDOMS, LEG_FREEDOMS, Moves, turned
 from startrack.core.types import Array, Bools, Ints
 from startrack.estimation.observations import FrameEstimate, Steps
 from startrack.estimation.trajectory import TrackFilter, log_normal

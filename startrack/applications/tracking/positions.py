@@ -18,8 +18,8 @@ from startrack.applications.tracking.frame_estimate import (
     observe_together,
     sample_together,
 )
-from startrack.applications.tracking.moves import FREEDOMS, LEG_FREEDOMS, Moves
 from startrack.applications.tracking.observed_frame import ObservedFrame
+from startrack.applications.tracking.odometry import FREEDOMS, LEG_FREEDOMS, Moves
 from startrack.applications.tracking.track_errors import DEPTH, SIZE_ROUNDS, WIDTH, TrackErrors
 from startrack.core.types import Array, BadInput, Bools, Ints
 from startrack.estimation.observations import UNKNOWN_M, FrameEstimate, Steps

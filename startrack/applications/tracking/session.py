@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from startrack.applications.tracking.explanations import WINDOW
-from startrack.applications.tracking.moves import odometry_moves, times_s
 from startrack.applications.tracking.observed_frame import (
     FrameStore,
     ObservedFrame,
@@ -23,7 +22,7 @@ from startrack.applications.tracking.observed_frame import (
     observe_again,
     observe_frame,
 )
-from startrack.applications.tracking.odometry import SPAN_TOLERANCE_S, Odometry
+from startrack.applications.tracking.odometry import SPAN_TOLERANCE_S, Odometry, odometry_moves, times_s
 from startrack.applications.tracking.positions import OnlineTrack, place_modes
 from startrack.applications.tracking.track import Track, estimate_track, track_of_newest
 from startrack.applications.tracking.track_errors import TrackErrors

@@ -9,9 +9,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from startrack.applications.tracking.moves import odometry_moves, times_s
 from startrack.applications.tracking.observed_frame import ImageFix, ObservedFrame
-from startrack.applications.tracking.odometry import Odometry
+from startrack.applications.tracking.odometry import Odometry, odometry_moves, times_s
 from startrack.applications.tracking.positions import (
     SIZES,
     OnlineTrack,

@@ -21,9 +21,9 @@ from startrack.core.errors import BadInput
 from startrack.core.stored import finite_json
 from startrack.estimation.attitude import AttitudeFit
 from startrack.exposure import insert_png_chunks, png_chunks
-from startrack.output.picture.axes import GAP_PX, multiples, nice_step
 from startrack.output.picture.backdrop import View, bare_picture, fit_to_canvas
 from startrack.output.picture.canvas import (
+    GAP_PX,
     LARGE_PX,
     LINE_PX,
     QUALITY,
@@ -35,6 +35,8 @@ from startrack.output.picture.canvas import (
     Legend,
     encoded_bytes,
     mix_colours,
+    multiples,
+    nice_step,
     png_bytes,
     text_width,
     wrap_text,

@@ -12,8 +12,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from startrack.core.errors import length_text
 from startrack.core.types import Array, Bools, Fix
-from startrack.output.picture.axes import GAP_PX, NICE, multiples, nice_step
-from startrack.output.picture.canvas import TEXT_PX, Box, Canvas, Colour, Ink, box_around, mix_colours
+from startrack.output.picture.canvas import (
+    GAP_PX,
+    NICE,
+    TEXT_PX,
+    Box,
+    Canvas,
+    Colour,
+    Ink,
+    box_around,
+    mix_colours,
+    multiples,
+    nice_step,
+)
 from startrack.terrain import Terrain
 
 Image = NDArray[np.float32]

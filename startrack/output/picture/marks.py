@@ -13,9 +13,17 @@ from startrack.chain import Detected, Identified, Inputs, Located, Measured, Ori
 from startrack.core.types import Array, Bools, Ints
 from startrack.estimation.match import SIGNIFICANT_SNR
 from startrack.frames import azel_from_rays, heading_pitch_roll_from_R_body_enu, rays_from_azel
-from startrack.output.picture.axes import known_runs
 from startrack.output.picture.backdrop import AZIMUTHS_RAD, KNEE_SNR, View
-from startrack.output.picture.canvas import LARGE_PX, TEXT_PX, TITLE_PX, Canvas, Ink, box_around, mix_colours
+from startrack.output.picture.canvas import (
+    LARGE_PX,
+    TEXT_PX,
+    TITLE_PX,
+    Canvas,
+    Ink,
+    box_around,
+    known_runs,
+    mix_colours,
+)
 from startrack.output.tables import names_of, status_of
 from startrack.output.values import R_body_enu, horizon_at_fix
 

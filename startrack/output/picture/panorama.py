@@ -11,8 +11,20 @@ from numpy.typing import NDArray
 from startrack.chain import Measured, Positioned
 from startrack.core.types import Array, MeasuredSkyline
 from startrack.evidence import Skyline
-from startrack.output.picture.axes import GAP_PX, Axes, known_runs, multiples, nice_step
-from startrack.output.picture.canvas import TEXT_PX, Canvas, Colour, Ink, mix_colours, text_box, text_width
+from startrack.output.picture.canvas import (
+    GAP_PX,
+    TEXT_PX,
+    Axes,
+    Canvas,
+    Colour,
+    Ink,
+    known_runs,
+    mix_colours,
+    multiples,
+    nice_step,
+    text_box,
+    text_width,
+)
 from startrack.output.picture.maps import MARGIN_PX, draw_overview, draw_zoom
 from startrack.output.picture.marks import COMPASS
 from startrack.output.record import image_name

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from startrack.core.errors import length_text
 from startrack.core.types import Array, Bools
 from startrack.frames import Site, latlon_from_enu
-from startrack.output.picture.axes import NICE, Axes
-from startrack.output.picture.canvas import LINE_PX, TEXT_PX, TITLE_PX, Canvas, Colour, Ink, rgb_colours
+from startrack.output.picture.canvas import LINE_PX, NICE, TEXT_PX, TITLE_PX, Axes, Canvas, Colour, Ink, rgb_colours
 from startrack.output.picture.maps import (
     BELOW_PX,
     MARGIN_PX,

@@ -18,8 +18,13 @@ from startrack.frames import Site
 from startrack.terrain.ground import fill_cut_out
 from startrack.terrain.height_map import HeightMap
 from startrack.terrain.horizon_table import AZIMUTH_BINS
-from startrack.terrain.imports.comparison import compare_with_finest, offsets_of_maps_m
-from startrack.terrain.imports.crest_errors import Correlation, map_of_rim, measure_waves
+from startrack.terrain.imports.comparison import (
+    Correlation,
+    compare_with_finest,
+    map_of_rim,
+    measure_waves,
+    offsets_of_maps_m,
+)
 from startrack.terrain.imports.roughness import carried_spacing, error_between_posts_m, find_product
 from startrack.terrain.io import site_of_keys, terrain_from_dict
 from startrack.terrain.maps.ellipsoid import ELLIPSOID, Geoid, geoid_at, maps_above_ellipsoid

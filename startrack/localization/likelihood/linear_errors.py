@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from startrack.core.types import SECTORS, Array
-from startrack.localization.neighbourhood import SectorRows
-from startrack.localization.shared_errors import SharedErrors
+from startrack.localization.likelihood.neighbourhood import SectorRows
+from startrack.localization.likelihood.shared_errors import SharedErrors
 from startrack.terrain import WAVES
 
 SEAM_ENDS = 48  # azimuths where a seam may end

@@ -17,7 +17,7 @@ import numpy as np
 
 from startrack.core.types import Array, Bools, Clock, Ints
 from startrack.frames import R_from_rotvec, turn_sky
-from startrack.localization.skyline_profiles import SectorMoments
+from startrack.localization.likelihood.skyline_profiles import SectorMoments
 from startrack.terrain import ShapeError, Terrain
 
 LEAST_SIZE = 1e-3  # of a crater, in the stated one: a normal error reaches beyond

@@ -14,11 +14,17 @@ from functools import cached_property
 import numpy as np
 
 from startrack.core.types import SECTORS, Array, Evidence, ImageErrors, Ints
-from startrack.localization.linear_errors import LinearErrors
-from startrack.localization.neighbourhood import NO_IMAGE_ERRORS, Neighbourhood, SectorRows
-from startrack.localization.obstacle_chain import RISEN, Levels, chain_log_likelihoods, closing_of, state_probabilities
-from startrack.localization.shared_errors import OWN_EDGE, ErrorBasis, SharedErrors
-from startrack.localization.skyline_profiles import solve_linear
+from startrack.localization.likelihood.linear_errors import LinearErrors
+from startrack.localization.likelihood.neighbourhood import NO_IMAGE_ERRORS, Neighbourhood, SectorRows
+from startrack.localization.likelihood.obstacle_chain import (
+    RISEN,
+    Levels,
+    chain_log_likelihoods,
+    closing_of,
+    state_probabilities,
+)
+from startrack.localization.likelihood.shared_errors import OWN_EDGE, ErrorBasis, SharedErrors
+from startrack.localization.likelihood.skyline_profiles import solve_linear
 from startrack.terrain import Terrain
 
 LEAST_REACH_RAD = np.radians(0.1)  # of shifts, for which levels are prepared

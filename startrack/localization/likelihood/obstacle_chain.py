@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from startrack.core.types import SECTORS, Array, Ints
 from startrack.kernels.library import kernel
-from startrack.localization.skyline_profiles import HIGH_RAD, Profiles, declare, take
+from startrack.localization.likelihood.skyline_profiles import HIGH_RAD, Profiles, declare, take
 
 LEVELS_RAD = np.radians([0.04, 0.08, 0.14, 0.24, 0.4, 0.65, 1.0, 1.6, 2.5, 4.0, 6.5, 10.0, 16.0])  # edges
 NOTCH_LEVELS_RAD = np.radians([0.04, 0.1, 0.25, 0.65, 1.6, 4.0, 8.0])  # edges, below the map's skyline

@@ -10,7 +10,7 @@ import numpy as np
 
 from startrack.core.statistics import interpolate_circle
 from startrack.core.types import MIDDLES_RAD, SECTORS, Array, Bools, Evidence, ImageErrors, sector_of
-from startrack.localization.obstacle_chain import (
+from startrack.localization.likelihood.obstacle_chain import (
     LIT_MOVES,
     MOVES,
     RISEN,
@@ -21,8 +21,8 @@ from startrack.localization.obstacle_chain import (
     gains_of_light,
     prepare_levels,
 )
-from startrack.localization.shared_errors import SharedErrors
-from startrack.localization.skyline_profiles import Profiles, SectorMoments, measure_moments, profiles_of
+from startrack.localization.likelihood.shared_errors import SharedErrors
+from startrack.localization.likelihood.skyline_profiles import Profiles, SectorMoments, measure_moments, profiles_of
 from startrack.terrain import NO_POST, ExpectedCrests, Terrain, require_horizons
 
 SAMPLES = 6 * SECTORS  # of the skyline around the reference, between which rows are compared with it

@@ -17,11 +17,11 @@ from startrack.core.statistics import shares
 from startrack.core.types import SECTORS, Array
 from startrack.kernels.library import kernel
 from startrack.localization.hypothesis import Hypothesis
-from startrack.localization.neighbourhood import OwnEdge, SectorRows
-from startrack.localization.obstacle_chain import clear_emissions
-from startrack.localization.shared_errors import OWN_EDGE
-from startrack.localization.skyline_model import SkylineModel
-from startrack.localization.skyline_profiles import LOW_RAD
+from startrack.localization.likelihood.neighbourhood import OwnEdge, SectorRows
+from startrack.localization.likelihood.obstacle_chain import clear_emissions
+from startrack.localization.likelihood.shared_errors import OWN_EDGE
+from startrack.localization.likelihood.skyline_model import SkylineModel
+from startrack.localization.likelihood.skyline_profiles import LOW_RAD
 
 FREE_HEIGHTS, SPREAD = 121, 6.5  # of heights about the map's skyline, closer about it
 ROUGHNESS_RAD = np.radians([0.003, 0.01, 0.03, 0.1])  # mean steps from sector to sector, equally likely

@@ -1,4 +1,4 @@
-"""The size of the house: what a stranger must read to follow one image, and each product apart. It may fall, not grow."""
+"""The size of the house: what a stranger reads to follow one image, and each product apart. It may fall, not grow."""
 
 import subprocess
 import sys

@@ -142,7 +142,7 @@ def test_a_soft_edge_below_a_noisy_sky_is_found_where_it_is(softness: float) -> 
     pixels = paint_pixels(rng, 90.0, edge_px=softness * EDGE_PX)
     sky_noise = 5 * NOISE_E * (pixels.height_px > softness * EDGE_PX) * rng.normal(size=len(pixels.light_e))
     found = sky_of(replace(pixels, light_e=pixels.light_e + sky_noise))
-    assert found.edge_px == pytest.approx(np.hypot(softness * EDGE_PX, CELL_PX / np.sqrt(12)), rel=0.1)
+    assert found.cell_edge_px == pytest.approx(np.hypot(softness * EDGE_PX, CELL_PX / np.sqrt(12)), rel=0.1)
     sigma = found.shift_sigma_px / np.sqrt(SECTORS)
     assert abs(found.shift_px.mean()) < 4 * sigma.mean() + 0.02
 
@@ -188,7 +188,7 @@ def test_cells_have_the_likelihood_of_their_pixels() -> None:
         visible = ndtr((h - shifts[:, None]) / EDGE_PX)
         rest = np.square(light - ground - (full - ground) * visible) - np.square(light - ground)
         by_pixels += np.sum((-0.5 * rest / variance / levels.correlation)[:, usual], axis=1)
-        visible = ndtr((sky.height_px[s] - shifts[:, None]) / sky.edge_px)
+        visible = ndtr((sky.height_px[s] - shifts[:, None]) / sky.cell_edge_px)
         by_cells += np.sum(visible * (sky.llr[s] + 0.5 * sky.extended_nats[s] * (1 - visible)), axis=1)
     assert by_cells - by_cells[2] == pytest.approx(by_pixels - by_pixels[2], rel=0.06)
     assert np.argmax(by_cells) == 2
@@ -201,7 +201,7 @@ def test_rows_of_evidence() -> None:
     sector = sector_of(rows.azimuth_rad)
     assert np.array_equal(np.unique(sector), np.flatnonzero(chosen))
     assert len(rows) == LEVELS * np.count_nonzero(chosen)
-    assert rows.edge_sigma_rad == pytest.approx(np.full(len(rows), sky.edge_px / PX_PER_RAD))
+    assert rows.edge_sigma_rad == pytest.approx(np.full(len(rows), sky.cell_edge_px / PX_PER_RAD))
     height_px = (rows.elevation_rad - ELEVATION_RAD) * PX_PER_RAD
     assert height_px == pytest.approx(sky.height_px[chosen].ravel())
     # The variance of the shift by these rows is that of the sector with its levels.

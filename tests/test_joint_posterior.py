@@ -249,7 +249,7 @@ def test_references_are_comparable() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_evidence_and_moments_are_those_of_a_grid(seed: int) -> None:
     rows = evidence_at((3000.0, -2000.0), seed)
-    found = sample_posterior(ExactPosterior().explore(rows, CRATER), rows, CRATER)[0]
+    found = sample_posterior(rows, ExactPosterior().explore(rows, CRATER), CRATER)[0]
     share = np.exp(found.copies_log_weight - found.copies_log_weight.max())
     centre, spread = moments(found.positions_m, share)
     line, root = np.linspace(-6, 6, 161), np.linalg.cholesky(spread)

@@ -158,14 +158,14 @@ def test_other_times_are_hypotheses_of_a_map_and_of_the_last_look(ground: Height
     clock = clock_of_site(SITES["shackleton"], TIME, 1.0, is_stated=is_stated)
     rows = replace(simulate_rays(ground, np.array([120.0, -80.0]), np.random.default_rng(3), 3000, 0.0), clock=clock)
     localizer = ExactPosterior()
-    found = sample_posterior(localizer.explore(rows, ground), rows, ground)
+    found = sample_posterior(rows, localizer.explore(rows, ground), ground)
     times = sample_other_times(found)
     stated = min(times, key=lambda one: abs(one.model.errors.offset_s))
     assert {one.gross for one in times} == {"time_sigma_s"} and stated.model.errors.offset_s == 0.0
     probability = WRONG_TIME_PROBABILITY if is_stated else clock.gross_probability
     of_prior = np.logaddexp.reduce([one.log_evidence for one in times]) - found[0].log_evidence
     assert -12.0 < of_prior < np.log(probability)  # the true time is the stated one
-    first = sample_posterior(localizer.explore(rows, ground), replace(rows, is_first_look=True), ground)
+    first = sample_posterior(replace(rows, is_first_look=True), localizer.explore(rows, ground), ground)
     assert bool(sample_other_times(first)) == (not is_stated)
 
 
@@ -173,7 +173,7 @@ def test_a_round_crater_has_no_other_times() -> None:
     terrain = load_terrain("shackleton-thesis")
     rows = replace(evidence_at((3000.0, -2000.0), 5), clock=clock_of_site(SITES["shackleton"], TIME, 1.0))
     localizer = ExactPosterior()
-    assert sample_other_times(sample_posterior(localizer.explore(rows, terrain), rows, terrain)) == []
+    assert sample_other_times(sample_posterior(rows, localizer.explore(rows, terrain), terrain)) == []
 
 
 @pytest.mark.slow

@@ -52,7 +52,7 @@ def test_a_crater_too_deep_or_shallow_is_refused(place_m: tuple[float, float], s
 def shared_of(guess: Cylinder, evidence: Evidence) -> tuple[Array, Array]:
     """Mean (k,) of the errors of the shape by the evidence, and their standard deviations."""
     method = ExactPosterior()
-    found = sample_posterior(method.explore(evidence, guess), evidence, guess)[0]
+    found = sample_posterior(evidence, method.explore(evidence, guess), guess)[0]
     mean, covariance = moments(found.values, np.exp(found.copies_log_weight - found.copies_log_weight.max()))
     return mean, np.sqrt(np.diag(covariance))
 

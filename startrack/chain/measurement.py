@@ -68,7 +68,8 @@ def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -
     when, site = require_time_and_site(oriented.exposure, terrain)
     R_at_time = R_enu_icrs(site, when)
     masked = replace(oriented, detections=_mask_detections(oriented, terrain, R_at_time))
-    used, note = add_gaia_stars(masked, site) if settings.deep_stars else masked, ""
+    used = add_gaia_stars(masked, site) if settings.deep_stars else masked
+    note = ""
     scale, photometry = _measure_stars(used, terrain, R_at_time, settings.photometer)
     if used is not masked and not _shows_deep_stars(photometry, used.stars):
         used, note = masked, NO_DEEP_STARS.format(used.catalog_name)
@@ -238,7 +239,10 @@ def fix_again(rays: AnyRays, rough: Fix, localizer: Localizer, rows: Evidence) -
 
 
 def _fix_position(rays: AnyRays, localizer: Localizer, rows: Evidence) -> tuple[AnyRays, Fix]:
-    """The `rays` under the sky of the time that `rows` show, and the fix by these, which are of the same image."""
+    """The `rays` under the sky of the time that `rows` show, and the fix by these, which are of the same image.
+
+    In a round crater, where an error of the clock turns the position alone, the sky stays that of the stated time.
+    """
     fix = localizer(rows, rays.terrain)
     if fix.clock is None or rays.terrain.axisymmetric:
         return rays, fix

@@ -236,7 +236,7 @@ class StarRays:
     """Photometry of the catalogue's stars above a terrain: all that a position by the stars needs."""
 
     terrain: Terrain
-    R_enu_icrs: Array  # (3, 3) at the likeliest time
+    R_enu_icrs: Array  # (3, 3) at the likeliest time; in a round crater at the stated one
     clock: Clock
     photometry: StarPhotometry
     near: PositionPrior | None = None  # of the position

@@ -78,8 +78,7 @@ class Detector:
         candidates = self._candidates(source, self.psf_sigma_px or known)
         frame, sigma, side = candidates.frame, candidates.sigma, candidates.side
         complete = partial(
-            Detections, image_e=source.image, dead=source.unusable, background=frame.background, noise=frame.noise,
-            mask=mask,
+            Detections, image_e=source.image, dead=source.unusable, mask=mask,
         )  # fmt: skip
         centres = side * candidates.fitted.stamps.centres + side // 2
         if are_elongated(frame, centres) and (streaks := find_streaks(frame)) is not None:
@@ -90,6 +89,7 @@ class Detector:
                 xy_px=streaks.xy_px, covariance_px2=streaks.covariance_px2, flux_e=streaks.flux,
                 flux_sigma_e=streaks.flux_sigma, snr=streaks.flux / streaks.flux_sigma,
                 saturated=np.zeros(len(streaks.flux), dtype=bool), psf_sigma_px=streaks.psf_sigma_px,
+                background=frame.background, noise=frame.noise,
             )  # fmt: skip
         stars = self._select_stars(frame, candidates.fitted, side, sigma)
         covered_px = len(stars.flux) * np.pi * np.square(WINGS_SIGMAS * sigma)  # overlaps counted twice

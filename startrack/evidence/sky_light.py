@@ -85,7 +85,7 @@ def take_out_sky_step(band: SkylineBand, sky: SkyLight) -> Detections:
     image, level, sigma = (values.reshape(-1) for values in (band.detections.image_e, background, noise))
     before_px2 = np.square(band.estimate.sigma_rad * band.to_px(MIDDLES_RAD)) + PREDICTED_SIGMA_PX**2
     shift_px = sky.shift_px * before_px2 / (before_px2 + sky.variance_px2)
-    visible = ndtr((height_px - shift_px[s]) / sky.width_px)
+    visible = ndtr((height_px - shift_px[s]) / sky.edge_px)
     low, high = (levels.level_e[side, s] + levels.slope_e[side, s] * height_px for side in (GROUND, SKY))
     off = image[pixel] - (low + (high - low) * visible)
     # Faint stars, which the levels leave out, are in the background and the noise; both of all sectors together.
@@ -115,16 +115,16 @@ class SkyLight:
     height_px: Array  # (SECTORS, cells) of the cells above the predicted skyline, means by information
     llr: Array  # (SECTORS, cells)
     extended_nats: Array  # (SECTORS, cells)
-    width_px: float  # of the edge in pixels
+    edge_px: float  # width of the edge in the image
     fades: bool  # over more than the edge of a skyline
     shift_px: Array  # (SECTORS,) how much higher than predicted the skyline stands
     shift_sigma_px: Array  # (SECTORS,) infinite where the sector by itself excludes hardly any height
     misfit_nats: Array  # (SECTORS,) by which the best cells exceed the best skyline
 
     @property
-    def edge_px(self) -> float:
-        """Width [px] of the edge in cells."""
-        return float(_widened(self.width_px))
+    def cell_edge_px(self) -> float:
+        """Width [px] of the edge in the cells, which are wide themselves."""
+        return float(_widened(self.edge_px))
 
     @cached_property
     def variance_px2(self) -> Array:
@@ -140,8 +140,8 @@ class SkyLight:
         """
         from scipy.special import ndtr
 
-        at = (self.height_px - self.shift_px[:, None]) / self.edge_px
-        visible, slope = ndtr(at), np.exp(-0.5 * np.square(at)) / (np.sqrt(2 * np.pi) * self.edge_px)
+        at = (self.height_px - self.shift_px[:, None]) / self.cell_edge_px
+        visible, slope = ndtr(at), np.exp(-0.5 * np.square(at)) / (np.sqrt(2 * np.pi) * self.cell_edge_px)
         weight = self.extended_nats * slope
         information = np.maximum((weight * slope).sum(axis=1), 1e-12)
         per_sky, per_ground = ((weight * part).sum(axis=1) / information for part in (visible, 1.0 - visible))
@@ -161,7 +161,7 @@ class SkyLight:
             elevation_rad=self.elevation_rad[s] + self.height_px[s, h] / self.px_per_rad[s],
             llr=self.llr[s, h] / factor[s],
             extended_nats=self.extended_nats[s, h] / factor[s],
-            edge_sigma_rad=self.edge_px / self.px_per_rad[s],
+            edge_sigma_rad=self.cell_edge_px / self.px_per_rad[s],
         )
 
 
@@ -169,18 +169,18 @@ def measure_sky_light(pixels: SkyPixels, horizon: Horizon) -> SkyLight:
     """The light of the sky by `pixels` near a predicted `horizon`, above which their heights are."""
     sector = sector_of(pixels.azimuth_rad)
     levels = measure_levels(pixels, sector)
-    width_px = pixels.edge_px
+    edge_px = pixels.edge_px
     beyond_px = float(pixels.reach_px[levels.covered].max(initial=CLIP_SHIFT_PX)) - CLIP_SHIFT_PX
     for _ in range(EDGE_ROUNDS):
-        cells, scale = _sum_pixels(pixels, sector, levels, width_px, LEVELS + 2 * ceil(beyond_px / CELL_PX))
+        cells, scale = _sum_pixels(pixels, sector, levels, edge_px, LEVELS + 2 * ceil(beyond_px / CELL_PX))
         height_px, llr, extended = cells
-        shift, sigma, misfit = _shifts(*cells, _widened(width_px), SHIFT_PX + beyond_px)
-        informed, before = np.isfinite(sigma), width_px
+        shift, sigma, misfit = _shifts(*cells, _widened(edge_px), SHIFT_PX + beyond_px)
+        informed, before = np.isfinite(sigma), edge_px
         if informed.any():
             shifted = height_px[informed] - shift[informed, None], llr[informed], extended[informed]
             nats = [_nats(*shifted, one) for one in _widened(pixels.edge_px * SOFTNESS)]
-            width_px = pixels.edge_px * float(SOFTNESS[int(np.argmax(nats))])
-        if width_px == before:
+            edge_px = pixels.edge_px * float(SOFTNESS[int(np.argmax(nats))])
+        if edge_px == before:
             break
     seen = scale[:, 0] > 0
     return SkyLight(
@@ -192,8 +192,8 @@ def measure_sky_light(pixels: SkyPixels, horizon: Horizon) -> SkyLight:
         height_px=height_px,
         llr=llr,
         extended_nats=extended,
-        width_px=width_px,
-        fades=width_px >= SOFTNESS[-1] * pixels.edge_px,
+        edge_px=edge_px,
+        fades=edge_px >= SOFTNESS[-1] * pixels.edge_px,
         shift_px=np.where(seen, shift, 0.0),
         shift_sigma_px=np.where(seen, sigma, np.inf),
         misfit_nats=misfit,
@@ -201,22 +201,22 @@ def measure_sky_light(pixels: SkyPixels, horizon: Horizon) -> SkyLight:
 
 
 def _sum_pixels(
-    pixels: SkyPixels, sector: Ints, levels: SkyLevels, width_px: float, cells: int
+    pixels: SkyPixels, sector: Ints, levels: SkyLevels, edge_px: float, cells: int
 ) -> tuple[tuple[Array, Array, Array], Array]:
     """Heights, l and c (SECTORS, cells) of `pixels` (n,) beside an edge of that width; pixel counts and scales."""
     sums, scale = np.zeros((SECTORS, cells, 3)), np.zeros((SECTORS, 2))
     _sum_cells(
         sector, pixels.height_px, pixels.light_e, pixels.px_per_rad, levels.covered, levels.level_e, levels.slope_e,
-        np.square(levels.noise_e) * levels.correlation, levels.correlation, width_px, pixels.reach_px,
+        np.square(levels.noise_e) * levels.correlation, levels.correlation, edge_px, pixels.reach_px,
         CLIP_SIGMAS, CELL_PX, NORMAL_CDF, sums, scale,
     )  # fmt: skip
     llr, extended, moment = np.moveaxis(sums, -1, 0)
     return (moment / np.where(extended > 0, extended, 1.0), llr, extended), scale
 
 
-def _widened(width_px: Any) -> Any:
+def _widened(edge_px: Any) -> Any:
     """Width of an edge in cells, whose pixels spread over their height."""
-    return np.sqrt(np.square(width_px) + CELL_PX**2 / 12)
+    return np.sqrt(np.square(edge_px) + CELL_PX**2 / 12)
 
 
 def _nats(height_px: Array, llr: Array, extended: Array, edge_px: float) -> float:

@@ -305,7 +305,7 @@ class OtherTimes:
     def _sample_time(self, at: int, neighbour: Hypothesis | None) -> Hypothesis:
         """The hypothesis of one time; sampling begins at the points of a `neighbour`, if there is one."""
         model, begin = self._model_at(float(self.times_s[at])), neighbour or self.plain
-        linear, covariance, weight = model.solve()
+        linear, covariance, weight = model.solve_linear()
         mean, spread = moments(begin.sampled.points[:, :2], begin.sampled.share)
         wide = WIDER * covariance
         wide[:2, :2] += WIDER * spread

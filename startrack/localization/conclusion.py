@@ -78,7 +78,7 @@ def link_points(points_m: Array, gap_m: float) -> Ints:
 
 
 @dataclass(frozen=True, eq=False)
-class Posterior:
+class WeightedHypotheses:
     """The posterior by all hypotheses together, the heaviest first."""
 
     hypotheses: Sequence[Hypothesis]
@@ -159,7 +159,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored) 
     A first look is not compared with other explanations of what it shows, and has no protection level.
     Raises NotLocated: outside_search_area, insufficient_geometry, inconsistent_evidence.
     """
-    whole = Posterior(found, terrain)
+    whole = WeightedHypotheses(found, terrain)
     require_inside(whole.positions_m, whole.share, terrain)
     middle, covariance = moments(whole.positions_m[whole.main], whole.share[whole.main])
     radius95, radius999 = whole.radii(whole.positions_m, whole.share, middle)
@@ -196,7 +196,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored) 
     )  # fmt: skip
 
 
-def _own_main(whole: Posterior) -> Array:
+def _own_main(whole: WeightedHypotheses) -> Array:
     """Whether points of the best hypothesis (n,) are in the main mode, with most of their copies; all if none is."""
     best = whole.best
     copies = whole.main[: len(best.copies_log_weight)].reshape(-1, best.copies)
@@ -204,7 +204,7 @@ def _own_main(whole: Posterior) -> Array:
     return np.asarray(own if own.any() else np.ones(len(own), dtype=bool))
 
 
-def _useless_text(whole: Posterior) -> str:
+def _useless_text(whole: WeightedHypotheses) -> str:
     """Text of the refusal of a posterior that leaves most of the search area open."""
     clock = whole.best.model.errors.clock
     if clock is not None and clock.sigma_s > 60.0:
@@ -217,7 +217,7 @@ def _useless_text(whole: Posterior) -> str:
     return "the rays leave most of the search area open: is the skyline in the picture?"
 
 
-def _share_beyond_circle(whole: Posterior, middle: Array) -> float:
+def _share_beyond_circle(whole: WeightedHypotheses, middle: Array) -> float:
     """Part of the core's probability beyond the main mode's own 99.9 % circle."""
     core = whole.share[whole.is_core].sum()
     _, radius = whole.radii(whole.positions_m[whole.main], whole.share[whole.main], middle)
@@ -225,7 +225,7 @@ def _share_beyond_circle(whole: Posterior, middle: Array) -> float:
     return float(whole.share[whole.is_core & away & (whole.label > 0)].sum() / core)
 
 
-def _list_modes(whole: Posterior) -> tuple[Mode, ...]:
+def _list_modes(whole: WeightedHypotheses) -> tuple[Mode, ...]:
     """Modes of the posterior, the heaviest first."""
     core = whole.share[whole.is_core].sum()
     modes = []
@@ -242,7 +242,7 @@ def _list_modes(whole: Posterior) -> tuple[Mode, ...]:
     return tuple(sorted(modes, key=lambda mode: -mode.weight))
 
 
-def _clock(whole: Posterior) -> ClockError | None:
+def _clock(whole: WeightedHypotheses) -> ClockError | None:
     """Error of the clock by the points of the core; None where the rows have no clock."""
     stated = whole.best.model.seen.rows.clock
     if stated is None:
@@ -256,7 +256,7 @@ def _clock(whole: Posterior) -> ClockError | None:
     return ClockError(mean, float(np.sqrt(share @ np.square(later - mean))))
 
 
-def _unstated_facts(whole: Posterior) -> tuple[UnstatedFact, ...]:
+def _unstated_facts(whole: WeightedHypotheses) -> tuple[UnstatedFact, ...]:
     """The facts that no file states, the one that widens the 99.9 % circle most first."""
     found = []
     for fact in whole.best.model.errors.unstated_facts:
@@ -286,7 +286,7 @@ def _positions_without_fact(one: Hypothesis, fact: str) -> Array:
     return one.model.errors.true_positions(one.unturned_m - one.values[:, own] @ drift, values)
 
 
-def _radius_by_exact_map(whole: Posterior) -> float | None:
+def _radius_by_exact_map(whole: WeightedHypotheses) -> float | None:
     """Radius [m] of the 99.9 % circle if the map had no waves, by the heaviest hypothesis; None where it has none."""
     best = whole.best
     if not best.model.errors.waves:
@@ -298,7 +298,7 @@ def _radius_by_exact_map(whole: Posterior) -> float | None:
 def _positions_without_waves(one: Hypothesis) -> Array:
     """Positions (n, 2) of a hypothesis's points about their mean, narrower as in the linear model without waves."""
     exact = replace(one.model, errors=replace(one.model.errors, waves=()))
-    wide, narrow = (np.linalg.cholesky(model.solve()[1][:2, :2]) for model in (one.model, exact))
+    wide, narrow = (np.linalg.cholesky(model.solve_linear().covariance[:2, :2]) for model in (one.model, exact))
     mean = shares(one.copies_log_weight) @ one.positions_m
     return np.asarray(mean + (one.positions_m - mean) @ np.linalg.solve(wide.T, narrow.T))
 

@@ -94,7 +94,7 @@ class Hypothesis:
 
 
 def heaviest_first(found: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """The hypotheses that were `found` by falling evidence."""
+    """The hypotheses that were `found`, the one of the greatest `log_evidence` first."""
     return sorted(found, key=lambda one: -one.log_evidence)
 
 
@@ -159,7 +159,7 @@ def _gross_modes(plain: Hypothesis, other: SkylineModel) -> list[Gaussian]:
     leads far; too far where the skyline is not linear. How position and other errors follow is told by the linear
     model, whose own solution may be far off.
     """
-    _, linear, _ = other.solve()
+    linear = other.solve_linear().covariance
     points = plain.sampled.points
     off = points[:, 2:] @ plain.model.basis.shown.T  # errors that the rows do not show keep their prior: 0 in the mean
     errors = np.zeros((len(off), len(other.errors)))

@@ -89,11 +89,11 @@ def _sector_logs(
     The stars alone count where the light rather has an edge of its own (`lit`) than ends at the skyline (`clear`).
     """
     moved = model.with_likely_errors(parameters[:2] + offsets, clear)
-    shifts, lifts, prior = model.with_linear_errors(model.shifts(moved))
+    shifts, lifts, log_integral = model.with_linear_errors(model.shifts(moved))
     logs = clear_logs(model.seen.profiles, shifts, clear, model.seen.gains(shifts, lifts))
     if model.seen.edge is not None:
         logs = np.where(lit > clear, clear_logs(model.seen.stars.profiles, shifts, np.minimum(clear + lit, 1.0)), logs)
-    return logs, prior + model.basis.log_prior(moved[:, 2:])
+    return logs, log_integral + model.basis.log_prior(moved[:, 2:])
 
 
 def clear_logs(profiles: Profiles, shifts: Array, clear: Array, gains: Array | None = None) -> Array:

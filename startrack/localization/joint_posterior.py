@@ -42,7 +42,7 @@ FEW_BOXES = 6.0  # that count at least, of the distribution of boxes
 
 
 def sample_posterior(
-    explored: Explored, rows: Evidence, terrain: Terrain, others_m: Array = NO_OTHERS
+    rows: Evidence, explored: Explored, terrain: Terrain, others_m: Array = NO_OTHERS
 ) -> list[Hypothesis]:
     """Hypotheses with their weighted points, the heaviest first; none nearer to a position of `others_m` (n, 2).
 
@@ -148,7 +148,7 @@ class Start:
         if len(centres_m) > MOST_BOXES:
             step = len(centres_m) / MOST_BOXES
             centres_m, half_m = centres_m[(np.arange(MOST_BOXES) * step).astype(int)], half_m * np.sqrt(step)
-        linear, covariance, weight = model.solve()
+        linear, covariance, weight = model.solve_linear()
         model = replace(model, sector_weight=weight)
         boxes = model.with_likely_errors(centres_m, weight)
         tried = np.vstack([boxes, linear])
@@ -199,7 +199,7 @@ def _begin_closer(model: SkylineModel, mean: Array, covariance: Array, reach_m: 
     """The model of a closer neighbourhood, whose directions of errors may be others, and the mode there."""
     image = model.seen.image_errors
     closer = SkylineModel.of(model.terrain, model.seen.rows, mean[:2], reach_m, model.errors, image)
-    _, whole, weight = closer.solve()
+    _, whole, weight = closer.solve_linear()
     closer = replace(closer, sector_weight=weight)
     wider = whole.copy()
     wider[:2, :2] = covariance[:2, :2]
@@ -210,5 +210,4 @@ def _begin_closer(model: SkylineModel, mean: Array, covariance: Array, reach_m: 
 def _moments_of(one: Hypothesis) -> Gaussian:
     """Mean and covariance of a hypothesis by its points, wide enough where few count."""
     mean, covariance = moments(one.sampled.points, one.sampled.share)
-    _, linear, _ = one.model.solve()
-    return mean, covariance + 0.05 * linear
+    return mean, covariance + 0.05 * one.model.solve_linear().covariance

@@ -156,7 +156,7 @@ class ExactPosterior:
     A branch and bound over the search area leaves the boxes that may matter. Its sectors are independent of each other
     and lose little by an obstacle, so that boxes are dropped only where they are less likely than the best place by
     `prune_nats`. In what is left the published model, the chain of obstacles, is sampled. Where the proof would trace
-    more horizons than the budget allows, the neighbourhoods of the best places known are, with `search` "beam".
+    more horizons than the budget allows, the neighbourhoods of the best places known are: `Fix.search` is then "beam".
     """
 
     prune_nats: float = NATS + SLACK_NATS
@@ -180,7 +180,10 @@ class ExactPosterior:
             raise name_prior(refusal, rows.near) from refusal
 
     def _explore_parts(self, rows: Evidence, terrain: Terrain) -> list[Part]:
-        """The rows at each likely time, with the boxes that may matter there."""
+        """The rows at each likely time, with the boxes that may matter there.
+
+        Where an earlier fix gives them nothing is searched: its points stand for boxes, the heaviest first.
+        """
         if rows.support is not None:
             return [Part(rows, rows.support)]
         if rows.near is not None:
@@ -230,7 +233,7 @@ def weigh_parts(parts: Sequence[Part], terrain: Terrain, of_one_sky: bool = True
 
     Raises NotLocated: insufficient_geometry, outside_search_area, inconsistent_evidence.
     """
-    found = [one for part in parts for one in sample_posterior(part.explored, part.rows, terrain, part.others_m)]
+    found = [one for part in parts for one in sample_posterior(*part[:2], terrain, part.others_m)]
     at_stated = heaviest_first(found if of_one_sky else _weigh_against_free(found))
     return conclude(heaviest_first([*at_stated, *sample_other_times(at_stated)]), terrain, parts[0].explored)
 

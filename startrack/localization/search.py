@@ -1,6 +1,6 @@
 """The search for positions: likely places by a beam over ever smaller boxes, then branch and bound.
 
-Boxes of positions are ranked by the search's likelihood, and places are fitted by the published model.
+Boxes of positions are ranked by the search's likelihood, and places are fitted by the published one, of SkylineModel.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Place(NamedTuple):
 
     position_m: Array  # (2,)
     covariance_m2: Array  # (2, 2)
-    log_likelihood: float  # of the published model, its shared errors integrated
+    log_likelihood: float  # of SkylineModel, its shared errors integrated: not that of the search
     raised_rad: Array  # (SECTORS,) by how much errors that all azimuths share raise the skyline
     later_s: float  # how much later than that of the rows the true time is
 
@@ -97,7 +97,7 @@ def choose_apart(points: Array, score: Array, apart: float, nats: float = np.inf
 
 @dataclass(frozen=True, eq=False)
 class BoxModel:
-    """Model of the likelihood of `rows` on a `terrain`: over boxes that of the search, at places the published one."""
+    """Model of the search's likelihood of `rows` on a `terrain`; `fit_places` alone has that of SkylineModel."""
 
     rows: Evidence
     terrain: Terrain
@@ -122,7 +122,7 @@ class BoxModel:
         wider = MAP_SIGMAS * self.terrain.errors.most_sigma_rad(boxes, half_m, MIDDLES_RAD, WITHIN_RAD)
         return self.profiles.bound(low + self.raised_rad - wider, high + self.raised_rad + wider)
 
-    def score_place(self, point_m: Array) -> float:
+    def search_score_at(self, point_m: Array) -> float:
         """Log-likelihood of the search at a position (2,), each row beside the horizon at its own azimuth."""
         rows, sector = self.rows, sector_of(self.rows.azimuth_rad)
         raised = np.broadcast_to(self.raised_rad, SECTORS)[sector]
@@ -194,16 +194,16 @@ class BoxModel:
 
 def _place_of(model: SkylineModel) -> Place:
     """Place at the likelier of a model's reference and the linear solution about it, if that is allowed."""
-    linear, covariance, weight = model.solve()
+    linear, covariance, weight = model.solve_linear()
     tried = model.with_likely_errors(model.around.reference_m[None], weight)
     if bool(model.terrain.allowed(linear[None, :2])[0]):
         tried = np.vstack([tried, linear])
     value = model.log_likelihood(tried) - 0.5 * np.square(tried[:, 2:]).sum(axis=1)
     best = tried[np.argmax(value)]
-    of_errors = 0.5 * float(np.linalg.slogdet(covariance[2:, 2:])[1])
+    log_spread = 0.5 * float(np.linalg.slogdet(covariance[2:, 2:])[1])  # of the errors: alike for places that compete
     errors = model.basis.mean + model.basis.shown @ best[2:]
     later_s = float(errors[-1]) if model.errors.clock is not None else 0.0
-    raised, fit = errors @ model.error_slopes_rad, float(value.max()) + of_errors + model.seen.log_offset
+    raised, fit = errors @ model.error_slopes_rad, float(value.max()) + log_spread + model.seen.log_offset
     return Place(best[:2], covariance[:2, :2], fit, raised, later_s)
 
 
@@ -247,8 +247,8 @@ def search_boxes(
     if found.search == "proven":
         if not places or np.abs(places[0].position_m - found.centres_m[0]).max() > PLACES_APART * found.half_m:
             places = merge_places(places, model.fit_places(found.centres_m, found.half_m, most=1))
-        points, raised = np.reshape([one.position_m for one in places], (-1, 2)), model.raised_as(places)
-        log_likelihood = [raised.score_place(one) for one in points]
+        points = np.reshape([one.position_m for one in places], (-1, 2))
+        log_likelihood = [proof.model.search_score_at(one) for one in points]  # as the boxes'
         areas_m2 = [2 * np.pi * np.sqrt(np.linalg.det(one.covariance_m2)) for one in places]
         log_masses = np.add(log_likelihood, np.log(areas_m2))
         found = found._replace(  # the best place is the first reference of the sampling
@@ -286,12 +286,12 @@ class Proof:
         Raises NotLocated (outside_search_area).
         """
         terrain = self.model.terrain
-        best = max((self.model.score_place(one.position_m) for one in places), default=-np.inf)
+        best = max((self.model.search_score_at(one.position_m) for one in places), default=-np.inf)
         centres, half = np.array([terrain.searched[:2]]), terrain.searched[2]
         finest_m = min(FINEST_M, FINEST_PART * half)
         while True:
             count = len(centres)
-            centres = self._bound(centres, half, best)
+            centres = self._prune(centres, half, best)
             is_last = 4 * len(centres) > LAST_MOST_BOXES
             if len(centres) and (half <= finest_m or is_last):
                 average = self.model.averages(centres, half)
@@ -302,6 +302,8 @@ class Proof:
                     self.log_dropped = self._with_dropped(average[~keep], half)
                     dropped = self.bound_dropped(average[keep], half)
                     return Explored(centres[keep], half, average[keep], dropped, "proven")
+                if is_last:
+                    return boxes_about(places, terrain) if places else None
             quarters = split_boxes(centres, half, terrain)
             if not len(quarters) and not places:
                 raise NotLocated(
@@ -314,12 +316,12 @@ class Proof:
             is_hopeless = (
                 half < FORESEEN_PART * terrain.searched[2] and coming > FORESEEN_BUDGETS * self.budget_horizons
             )
-            if is_last or is_hopeless or not len(quarters) or self.work > self.budget_horizons:
+            if is_hopeless or not len(quarters) or self.work > self.budget_horizons:
                 return boxes_about(places, terrain) if places else None
             centres, half = quarters, half / 2
 
-    def _bound(self, centres: Array, half: float, best: float) -> Array:
-        """Centres (n, 2) of the boxes that may matter.
+    def _prune(self, centres: Array, half: float, best: float) -> Array:
+        """Centres (n, 2) of the boxes that may matter; the others are added to what is dropped.
 
         A large box is kept at a smaller likelihood: it holds more probability.
         """

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,8 +34,19 @@ MARGIN = 1.5  # of the shifts that are met
 Closing = tuple[int, Ints]  # sector where the circle is cut, and the states over which it is closed
 
 
+class LinearSolution(NamedTuple):
+    """Parameters by a linear model of the sectors."""
+
+    parameters: Array  # (2 + a,)
+    covariance: Array  # (2 + a, 2 + a)
+    sector_weight: Array  # (SECTORS,) how much each sector counts
+
+
 class PreparedLevels:
-    """The emissions of the chain's levels, prepared anew where larger shifts are met."""
+    """The emissions of the chain's levels, prepared anew where larger shifts are met.
+
+    Copies of a model share them: they hold as long as the profiles and the light's own edge are the same.
+    """
 
     _known: Levels | None = None
 
@@ -150,9 +162,12 @@ class SkylineModel:
         return np.asarray(values @ self.error_slopes_rad + by_waves + self.around.expected_rise_rad)
 
     def log_likelihood(self, parameters: Array) -> Array:
-        """Log-likelihoods (n,) of parameters (n, 2 + a): position [m], and coordinates of the errors in `basis`."""
-        shifts, lifts, prior = self.with_linear_errors(self.shifts(parameters))
-        return self.log_likelihood_of(shifts, lifts) + prior
+        """Log-likelihoods (n,) of parameters (n, 2 + a): position [m], and coordinates of the errors in `basis`.
+
+        Errors of the image and waves are integrated.
+        """
+        shifts, lifts, log_integral = self.with_linear_errors(self.shifts(parameters))
+        return self.log_likelihood_of(shifts, lifts) + log_integral
 
     def log_likelihood_of(self, shifts: Array, lifts: Array | None = None) -> Array:
         """Log-likelihoods (n,) of shifts (n, SECTORS) [rad] of the map's skyline.
@@ -214,8 +229,8 @@ class SkylineModel:
         rise_rad, lifts, integral = linear.fit(self.seen.moments.mean_rad - shifts, lifts)
         return np.ascontiguousarray(shifts + rise_rad), lifts, integral
 
-    def solve(self) -> tuple[Array, Array, Array]:
-        """Parameters (2 + a,) by the linear model of the sectors, their covariance, and weights (SECTORS,)."""
+    def solve_linear(self) -> LinearSolution:
+        """The parameters by the linear model of the sectors."""
         linear, k = self.linear, 2 + len(self.basis)
         design = np.vstack([self.around.slopes, self.slopes_rad, linear.rise_rad.T]).T
         prior = np.zeros((design.shape[1], design.shape[1]))
@@ -223,9 +238,9 @@ class SkylineModel:
         prior[k:, k:] = np.linalg.inv(linear.wide_covariance)
         moments = self.seen.moments
         left = moments._replace(mean_rad=moments.mean_rad - self._expected_rise)
-        found = solve_linear(left, design, np.r_[np.zeros(k), linear.mean], prior)
-        parameters, covariance, weight = found
-        return np.r_[parameters[:2] + self.around.reference_m, parameters[2:k]], covariance[:k, :k], weight
+        parameters, covariance, weight = solve_linear(left, design, np.r_[np.zeros(k), linear.mean], prior)
+        at = np.r_[parameters[:2] + self.around.reference_m, parameters[2:k]]
+        return LinearSolution(at, covariance[:k, :k], weight)
 
     def with_likely_errors(self, points_m: Array, weight: Array) -> Array:
         """Parameters (n, 2 + a) of `points_m` (n, 2) with the shared errors that suit each, by the linear model.

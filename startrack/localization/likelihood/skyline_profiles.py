@@ -42,7 +42,9 @@ REWEIGHTINGS = 6
 class Profiles(NamedTuple):
     """F of each sector in cells of heights, quadratic in each, as the kernels read it.
 
-    Cell k reaches from x[k] to x[k + 1]; the last one of a sector is a sentinel.
+    Cell k reaches from x[k] to x[k + 1]; the last one of a sector is a sentinel. F is the log-likelihood of a skyline
+    by the rows in the window of heights, R the logarithm of its mean over the window, H the sum of the stars above the
+    window, and N the greater of R + H and 0, by which all log-likelihoods of a sector are less: none overflows.
     """
 
     first: Ints  # (SECTORS + 1,) cell where each sector begins
@@ -53,9 +55,9 @@ class Profiles(NamedTuple):
     integral: Array  # (m,) of exp(F - free) from the lowest height to x
     free: Array  # (SECTORS,) R
     guide: Ints  # (SECTORS, 2 GUIDE + 1) cells of heights closer to each other about 0, where a search begins
-    scale: Array  # (SECTORS,) exp(R + H - N); H: the sum of the stars above the window, N: the greater of R + H and 0
+    scale: Array  # (SECTORS,) exp(R + H - N): of a skyline that is anywhere
     hidden: Array  # (SECTORS,) exp(-N): of a sector in which everything is hidden, the stars above the window too
-    offset: Array  # (SECTORS,) N: all likelihoods of a sector are less it
+    offset: Array  # (SECTORS,) N
 
     def scaled(self, nats: Array) -> Profiles:
         """Copy whose likelihoods in each sector are less by so many `nats` (SECTORS,) more."""
@@ -142,7 +144,7 @@ def profiles_of(
 ) -> Profiles:
     """Profiles of rows (n,) that stand `above_rad` (n,) [rad] above the skyline, averaged over map errors (SECTORS,).
 
-    `window_rad`: lowest and highest height.
+    `window_rad`: lowest and highest height; another one than the usual only where there are no errors to average over.
     """
     extended = rows.extended_nats * rows.edge_sigma_rad > 0.0
     star = np.flatnonzero(~extended & (above_rad > window_rad[0]) & (above_rad < window_rad[1]))

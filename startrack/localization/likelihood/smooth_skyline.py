@@ -95,7 +95,7 @@ def _find_lit(by_stars: SkylineModel, shift: Array, lift_rad: Array | None) -> A
     The light is lifted by `lift_rad` (SECTORS,) above the `shift`; None: by nothing. All light has its own edge in the
     linear model of `by_stars`.
     """
-    shifts = np.stack([shift, by_stars.shift_of(by_stars.solve()[0])[0]])
+    shifts = np.stack([shift, by_stars.shift_of(by_stars.solve_linear().parameters)[0]])
     lifts = None if lift_rad is None else np.stack([lift_rad, np.zeros(SECTORS)])
     likelier = int(np.argmax(by_stars.log_likelihood_of(shifts, lifts)))
     return by_stars.lit(by_stars.states_at(shifts[likelier], None if lifts is None else lifts[likelier]))

@@ -32,6 +32,14 @@ class Located:
     heading_pitch_roll_deg: tuple[float, float, float]
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Where bytecode is kept out of the tree, it goes to pytest's cache: else each process compiles all modules anew."""
+    if sys.dont_write_bytecode and hasattr(config, "cache"):
+        os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix = str(config.cache.mkdir("bytecode"))
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+        sys.dont_write_bytecode = False
+
+
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
     """A browser, where one is installed."""

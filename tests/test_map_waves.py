@@ -57,7 +57,7 @@ def test_the_closed_form_is_the_integral():
     def log_likelihood(values: Array) -> Array:
         return -0.5 * np.square(left - values @ linear.rise_rad.T) @ linear.weight
 
-    axes = [np.linspace(-6 * s, 6 * s, 801) for s in (1e-3, 2e-3)]
+    axes = [np.linspace(-4 * s, 4 * s, 535) for s in (1e-3, 2e-3)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     prior = -0.5 * np.square(grid / [1e-3, 2e-3]).sum(axis=1) - np.log(2 * np.pi * 1e-3 * 2e-3)
     cell = float(np.prod([a[1] - a[0] for a in axes]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from datetime import datetime
+from functools import cache
 
 import numpy as np
 from star_painter import paint
@@ -56,6 +57,22 @@ def cloud_part(azimuth_deg: np.ndarray, elevation_deg: np.ndarray) -> np.ndarray
     return part
 
 
+@cache
+def _quarters() -> list[tuple[np.ndarray, ...]]:
+    """Azimuth [0, 360) and elevation in degrees of the quarters of all pixels; whether they see the sky, and are lit."""
+    width, height = CAMERA.size_px
+    found = []
+    for dx in (-0.25, 0.25):
+        for dy in (-0.25, 0.25):
+            x, y = np.meshgrid(np.arange(width) + dx, np.arange(height) + dy)
+            px = np.stack([x, y], axis=-1)
+            azimuth, elevation = azel_from_rays(CAMERA.unproject(px) @ R_CAM_ENU)
+            is_sky = np.degrees(elevation) > skyline_deg(np.degrees(azimuth))
+            lit = CAMERA.angle_rad(px) < CAMERA.max_angle_rad
+            found.append((np.degrees(azimuth) % 360, np.degrees(elevation), is_sky, lit))
+    return found
+
+
 def painted_frame(
     seed: int = 1, time_utc: datetime = TIME, with_stars: bool = True, with_clouds: bool = False,
     ground: Light | None = None, sky: Light | None = None, faintest_mag: float = 7.5,
@@ -68,18 +85,12 @@ def painted_frame(
     rng = np.random.default_rng(seed)
     width, height = CAMERA.size_px
     light = np.full((height, width), PEDESTAL)
-    for dx in (-0.25, 0.25):
-        for dy in (-0.25, 0.25):
-            x, y = np.meshgrid(np.arange(width) + dx, np.arange(height) + dy)
-            px = np.stack([x, y], axis=-1)
-            azimuth, elevation = azel_from_rays(CAMERA.unproject(px) @ R_CAM_ENU)
-            is_sky = np.degrees(elevation) > skyline_deg(np.degrees(azimuth))
-            lit = CAMERA.angle_rad(px) < CAMERA.max_angle_rad
-            place = np.degrees(azimuth) % 360, np.degrees(elevation)
-            clear = SKY if sky is None else sky(*place)
-            above = clear * cloud_part(*place) if with_clouds else clear
-            below = usual if ground is None else ground(*place)
-            light += np.where(lit, np.where(is_sky, above, below), 0.0) / 4
+    for azimuth_deg, elevation_deg, is_sky, lit in _quarters():
+        place = azimuth_deg, elevation_deg
+        clear = SKY if sky is None else sky(*place)
+        above = clear * cloud_part(*place) if with_clouds else clear
+        below = usual if ground is None else ground(*place)
+        light += np.where(lit, np.where(is_sky, above, below), 0.0) / 4
     if with_stars:
         _paint_stars(light, time_utc, with_clouds, faintest_mag)
     light += rng.normal(size=light.shape) * np.sqrt(light + READ_NOISE**2)

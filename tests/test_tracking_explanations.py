@@ -30,7 +30,7 @@ from startrack.core.types import Array
 from startrack.estimation.observations import FrameEstimate, OdometryErrors, Steps
 
 FRAMES, STEP_M, SIGMA_M = 7, 80.0, 5.0
-DRAWS = 20
+DRAWS = 12
 STRAIGHT_1 = 1.0 - SLIP_PROBABILITY - LEG_PROBABILITY
 
 
@@ -162,7 +162,7 @@ def test_moves_share_errors_of_scale_and_heading(scale, turn_deg):
         worst.append(worst_in_circles(track, position))
         off_m.append(np.linalg.norm(track.smoothed.position_enu_m[:, :2] - position, axis=1).mean())
     assert max(worst) < 1.5
-    assert np.count_nonzero(np.array(worst) > 1.0) <= 2
+    assert np.count_nonzero(np.array(worst) > 1.0) <= 1
     assert np.mean(off_m) < 0.9 * SIGMA_M  # single images: 1.25 sigma
 
 

@@ -33,7 +33,7 @@ class Located:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Where bytecode is kept out of the tree, it goes to pytest's cache: else each process compiles all modules anew."""
+    """Where bytecode is kept out of the tree, it goes to pytest's cache: else each process compiles all anew."""
     if sys.dont_write_bytecode and hasattr(config, "cache"):
         os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix = str(config.cache.mkdir("bytecode"))
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

@@ -59,7 +59,7 @@ def cloud_part(azimuth_deg: np.ndarray, elevation_deg: np.ndarray) -> np.ndarray
 
 @cache
 def _quarters() -> list[tuple[np.ndarray, ...]]:
-    """Azimuth [0, 360) and elevation in degrees of the quarters of all pixels; whether they see the sky, and are lit."""
+    """Azimuth [0, 360) and elevation in degrees of the quarters of all pixels; whether they see the sky, are lit."""
     width, height = CAMERA.size_px
     found = []
     for dx in (-0.25, 0.25):

@@ -323,13 +323,16 @@ def test_a_folder_in_place_of_a_table_is_named(tmp_path, capsys):
 
 @contextmanager
 def file_limit(largest_kb: int) -> Iterator[None]:
-    """In the block no file may be larger: stands for a full disk."""
+    """In the block no file may be larger: stands for a full disk. Bytecode that is cut would spoil later imports."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1024 * largest_kb, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "dont_write_bytecode", True)
+        patch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1024 * largest_kb, limits[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 @pytest.mark.parametrize("largest_kb", [4, 100, 900])

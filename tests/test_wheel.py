@@ -66,7 +66,8 @@ def run_elsewhere(unpacked, folder, *words):
     """`python words` with the wheel's content alone, in another folder."""
     done = subprocess.run(
         [sys.executable, *words], cwd=folder, capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": str(unpacked), "XDG_CACHE_HOME": str(unpacked.parent / "cache")},
+        env={**os.environ, "PYTHONPATH": str(unpacked), "XDG_CACHE_HOME": str(unpacked.parent / "cache"),
+             "PYTHONPYCACHEPREFIX": ""},
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -135,7 +136,7 @@ class Environment:
             pytest.skip("no index of packages is reached")
 
     def finish(self, *words, **more):
-        clean = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+        clean = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "PYTHONPYCACHEPREFIX")}
         clean |= {"XDG_CACHE_HOME": str(self.folder / "cache"), **more}
         return subprocess.run(list(map(str, words)), cwd=self.folder, capture_output=True, text=True, env=clean)
 

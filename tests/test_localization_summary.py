@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from startrack.core.types import NotLocated
-from startrack.localization.conclusion import Posterior, label_modes, require_inside
+from startrack.localization.conclusion import WeightedHypotheses, label_modes, require_inside
 from startrack.terrain import Cylinder, load_terrain
 
 TERRAIN = load_terrain("shackleton-thesis")
@@ -28,7 +28,7 @@ def blob(middle: tuple[float, float], sigma_m: tuple[float, float], part: float)
     return offset + np.array(middle), log - np.log(np.exp(log).sum()) + np.log(part)
 
 
-def summary_of(*blobs: tuple[np.ndarray, np.ndarray]) -> tuple[Posterior, np.ndarray, tuple[float, float]]:
+def summary_of(*blobs: tuple[np.ndarray, np.ndarray]) -> tuple[WeightedHypotheses, np.ndarray, tuple[float, float]]:
     """All points of a posterior, its main position (2,) and the radii of its circles."""
     points, log = (np.concatenate(part) for part in zip(*blobs, strict=True))
     whole = posterior_of(points, log)
@@ -36,9 +36,9 @@ def summary_of(*blobs: tuple[np.ndarray, np.ndarray]) -> tuple[Posterior, np.nda
     return whole, middle, whole.radii(points, whole.share, middle)
 
 
-def posterior_of(points: np.ndarray, log: np.ndarray) -> Posterior:
+def posterior_of(points: np.ndarray, log: np.ndarray) -> WeightedHypotheses:
     one = SimpleNamespace(positions_m=points, copies_log_weight=log, gross="")
-    return Posterior([one], TERRAIN)  # type: ignore[list-item]
+    return WeightedHypotheses([one], TERRAIN)  # type: ignore[list-item]
 
 
 def test_one_gaussian() -> None:

@@ -26,7 +26,6 @@ from startrack.applications.reproduction import (
     fix_store,
     methods,
     scene,
-    series,
     simulator,
     write_artefact,
 )
@@ -80,7 +79,7 @@ def small_grounds():
         patch.setattr(scene, "valleys", lru_cache(maxsize=1)(scene.jacksboro))
         patch.setattr(scene, "VALLEY_RADIUS_M", VALLEY_M)
         patch.setattr(comparison, "_warm_up", lambda ground: None)
-        patch.setattr(series, "REST_EXPOSURES", 2)
+        patch.setattr(comparison, "REST_EXPOSURES", 2)
         scene.terrain_of.cache_clear()
         yield
     scene.terrain_of.cache_clear()

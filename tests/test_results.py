@@ -71,7 +71,7 @@ def test_what_a_benchmark_loads_is_among_its_sources(sources):
     loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     known = {str(path) for path in sources.sources_of(ROOT / "benchmarks/one_frame.py")}
     faces = {str(path) for path in (ROOT / "startrack").rglob("__init__.py")}  # that only gather names
-    unused = {"camera/virtualsky.py", "detection/detector.py"}  # their packages gather all names
+    unused = {"camera/virtualsky.py"}  # its package gathers all names
     assert {Path(one).relative_to(ROOT / "startrack").as_posix() for one in {*loaded.split()} - known - faces} == unused
 
 

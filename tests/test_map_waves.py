@@ -116,6 +116,7 @@ def test_sectors_whose_rows_show_nothing_tell_of_no_wave():
     assert other == pytest.approx(risen, abs=1e-9) and log[1] == pytest.approx(log[0], abs=1e-3)
 
 
+@pytest.mark.slow
 def test_the_circle_holds_what_waves_do():
     stated = replace(floor(), waves_sigma_rad=SIGMA_RAD)
     exact = replace(stated, waves_sigma_rad=EXACT_WAVES)

@@ -238,6 +238,7 @@ def light_1(rng: np.random.Generator, hidden: Bools, level_1: float) -> Array:
     return np.where(hidden, level_1, 1.0) * rng.normal(1.0, 0.1, hidden.shape)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("darkest", [0.0, 0.7])
 def test_open_sky_is_hardly_ever_proposed_for_the_mask(darkest):
     """However dark it is."""

@@ -104,6 +104,7 @@ def test_few_stars_suffice(camera: Camera, how: dict[str, float], least_with: in
     assert without <= most_without
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", [TEN_DEGREES, FISHEYE])
 def test_a_wrong_part_of_the_sky_gives_no_identification(camera: Camera) -> None:
     rng, answers = np.random.default_rng(8), 0

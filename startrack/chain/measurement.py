@@ -241,7 +241,8 @@ def fix_again(rays: AnyRays, rough: Fix, localizer: Localizer, rows: Evidence) -
 def _fix_position(rays: AnyRays, localizer: Localizer, rows: Evidence) -> tuple[AnyRays, Fix]:
     """The `rays` under the sky of the time that `rows` show, and the fix by these, which are of the same image.
 
-    In a round crater, where an error of the clock turns the position alone, the sky stays that of the stated time.
+    In a round crater, where the vertical part of a clock's turn moves the position alone, the sky stays that of the
+    stated time.
     """
     fix = localizer(rows, rays.terrain)
     if fix.clock is None or rays.terrain.axisymmetric:

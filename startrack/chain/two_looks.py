@@ -110,7 +110,7 @@ def _measure_skyline(first: FirstLook, photometer: StarPhotometer) -> SecondLook
 def estimate_skyline(first: FirstLook) -> SkylineEstimate:
     """The skyline as it stands by the one position of a `first` look, and how well it is known."""
     fix, covariance = first.fix, first.fix.covariance_m2
-    if fix.support is not None:  # without the arc on which an error of the clock turns a position in a round crater
+    if fix.support is not None:  # points before the turn on an arc, by an error of the clock, in a round crater
         _, covariance = moments(fix.support.centres_m, relative_weights(fix.support.log_weight))
     return SkylineEstimate.of(fix.compared_at_m, covariance, first.measured.terrain, fix.raised_rad)
 

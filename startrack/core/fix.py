@@ -204,7 +204,7 @@ class Fix(Value):
     blocked: Sectors | None = None  # where the skyline is not the map's: something on no map hides it, or it lies below
     # the map's; None: nowhere
     integrity: Integrity | None = None  # None: not assessed, of several positions or without a posterior
-    raised_rad: Array | None = None  # (sectors,) rise of the skyline above the map's by the shared errors
+    raised_rad: Array | None = None  # (sectors,) rise of the skyline above the map's by shared errors, waves and posts
     unstated: tuple[UnstatedFact, ...] = ()  # the one that widens the circle most first
     shown: tuple[ShownError, ...] = ()  # errors beyond the defaults
     exact_map_radius999_m: float | None = None  # if the map had no waves; None: it has none

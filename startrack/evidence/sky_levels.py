@@ -235,7 +235,7 @@ def measure_levels(pixels: SkyPixels, sector: Ints) -> SkyLevels:
     slope, limit = np.zeros((2, SECTORS)), FIRST_CLIP_SIGMAS * noise
     limit[GROUND] += np.abs(level[GROUND] - [np.roll(level[GROUND], k) for k in (-1, 1)]).max(axis=0)  # a patch's end
     for _ in range(LEVEL_ROUNDS):
-        sums = np.zeros((2, 6, SECTORS))
+        sums = np.zeros((2, 6, SECTORS))  # of 1, h, h^2, q, q h, q^2; heights h, what pixels exceed the level by q
         _sum_sides(side, sector, height, light, level, slope, limit, sums)
         sums *= covered
         noise = _noise_of_sides(sums)
@@ -250,7 +250,7 @@ def measure_levels(pixels: SkyPixels, sector: Ints) -> SkyLevels:
         change[GROUND] = patch_levels(level[GROUND] + own_e[GROUND], error_e2) - level[GROUND]
         level, slope, limit = level + change, slope + more, CLIP_SIGMAS * noise
     covered &= np.asarray((sums[:, 0] > MIN_KEPT * counts).all(axis=0))
-    own_e -= change
+    own_e -= change  # they were less the former level
     own_sigma, variance = _level_errors(sums, own_e, independent, correlation, kept, covered)
     return SkyLevels(
         covered=covered, level_e=level, slope_e=slope, own_e=own_e, own_sigma_e=own_sigma, variance_e2=variance,

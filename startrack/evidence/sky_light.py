@@ -82,6 +82,7 @@ def take_out_sky_step(band: SkylineBand, sky: SkyLight) -> Detections:
     known = np.flatnonzero(levels.covered[sector])
     s, height_px, pixel = sector[known], band.height_px[known], band.pixel[known]
     background, noise = band.detections.background_e.copy(), band.detections.noise_e.copy()
+    # Views: what is written into `level` and `sigma` below is in `background` and `noise`.
     image, level, sigma = (values.reshape(-1) for values in (band.detections.image_e, background, noise))
     before_px2 = np.square(band.estimate.sigma_rad * band.to_px(MIDDLES_RAD)) + PREDICTED_SIGMA_PX**2
     shift_px = sky.shift_px * before_px2 / (before_px2 + sky.variance_px2)

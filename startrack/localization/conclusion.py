@@ -107,7 +107,7 @@ class WeightedHypotheses:
 
     @cached_property
     def is_core(self) -> Array:
-        """Whether points (n,) are of hypotheses with the gross error of the best one, if it has any."""
+        """Whether points (n,) are of hypotheses with the same gross error as the best one, or like it with none."""
         gross = self.best.gross
         return np.concatenate([np.full(len(one.copies_log_weight), one.gross == gross) for one in self.hypotheses])
 
@@ -199,7 +199,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored) 
 def _own_main(whole: WeightedHypotheses) -> Array:
     """Whether points of the best hypothesis (n,) are in the main mode, with most of their copies; all if none is."""
     best = whole.best
-    copies = whole.main[: len(best.copies_log_weight)].reshape(-1, best.copies)
+    copies = whole.main[: len(best.copies_log_weight)].reshape(-1, best.copies)  # the best one's points are the first
     own = copies.mean(axis=1) > 0.5
     return np.asarray(own if own.any() else np.ones(len(own), dtype=bool))
 

@@ -99,7 +99,7 @@ def heaviest_first(found: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 
 def first_group(found: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Hypotheses of those `found` that have the reference of the first one."""
+    """Hypotheses of those `found` that have the reference of the first one: all of a group share this array."""
     return [one for one in found if one.model.around.reference_m is found[0].model.around.reference_m]
 
 

@@ -136,7 +136,7 @@ class WeightedPoints:
 
     points: Array
     log_weight: Array
-    log_drawn: Array  # (n,) logarithm of the density that the points were drawn with, less a constant
+    log_drawn: Array  # (n,) logarithm of the density that the points were drawn with, times their number
 
     @property
     def log_evidence(self) -> float:

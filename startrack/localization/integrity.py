@@ -122,7 +122,10 @@ def _masses(logs: Array) -> Array:
 def _conclude(
     best: Array, covariance: Array, mean: Array, without: Array, whole_m2: Array, radius999_m: float
 ) -> Integrity:
-    """Integrity from the posterior by all rows, and from those without each group: means (m, 2), nan if it is open."""
+    """Integrity from the posterior by all rows, and from those without each group: means (m, 2), nan if it is open.
+
+    `without` (m, 2, 2) are their covariances, `covariance` that by all rows.
+    """
     held = np.isfinite(mean[:, 0])
     shared, level = _positive_part(whole_m2 - covariance), np.full(len(mean), np.inf)
     spread = np.sqrt(-2.0 * np.log(0.5 * RISK / WRONG_GROUP) * np.linalg.eigvalsh(without[held] + shared)[:, 1])

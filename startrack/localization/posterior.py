@@ -182,7 +182,7 @@ class ExactPosterior:
     def _explore_parts(self, rows: Evidence, terrain: Terrain) -> list[Part]:
         """The rows at each likely time, with the boxes that may matter there.
 
-        Where an earlier fix gives them nothing is searched: its points stand for boxes, the heaviest first.
+        After an earlier fix nothing is searched: its points stand for boxes, the heaviest first.
         """
         if rows.support is not None:
             return [Part(rows, rows.support)]

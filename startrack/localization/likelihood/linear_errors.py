@@ -37,7 +37,10 @@ NO_LIFTS = Lifts(np.zeros((SECTORS, 0)), np.zeros(SECTORS), np.zeros(SECTORS))
 
 @dataclass(frozen=True, eq=False)
 class LinearErrors:
-    """Normal errors (j,), first the image's beyond their reference, with the weights of the sectors that show them."""
+    """Normal errors (j,), first the image's beyond their reference, with the weights of the sectors that show them.
+
+    The reference is the lift that is expected: it is taken out of the heights of the light.
+    """
 
     rise_rad: Array  # (SECTORS, j) of the skyline that light and stars together show, by one unit of each
     mean: Array  # (j,)
@@ -166,7 +169,8 @@ class LinearErrors:
     def likeliest(self, left_rad: Array, lifts_rad: Array | None = None) -> tuple[Array, Array]:
         """Errors (n, j) without a seam, and the heights (n, SECTORS) that are left without the lifts.
 
-        `left_rad` and `lifts_rad` (n, SECTORS) are those of `fit`.
+        `left_rad` and `lifts_rad` (n, SECTORS) are those of `fit`. The light stands `left_rad + above_rad` above the
+        skyline, which the errors of the image follow; the waves follow `left_rad`.
         """
         above_rad = self.lifts.above_rad
         if lifts_rad is not None:

@@ -74,7 +74,7 @@ class Levels(NamedTuple):
 
     reach: Array  # (SECTORS,) largest shift
     table: NDArray[np.float32]  # (SECTORS, STATES - 1, NODES)
-    stars: Profiles  # of the stars alone, where the light may have its own edge
+    stars: Profiles  # of the stars alone, where the light may have its own edge; else of all rows, and not used
     light: Array  # (SECTORS,) likelihood of light with its own edge; (0,): it has none
 
 

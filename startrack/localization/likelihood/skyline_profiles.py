@@ -155,7 +155,8 @@ def profiles_of(
     low, step, cell, sky = _sky_knots(rows, above_rad, np.flatnonzero(extended))
     count = np.maximum(np.bincount(sector, minlength=SECTORS), 1)
     own = np.bincount(sector, weights=np.square(rows.edge_sigma_rad[order]), minlength=SECTORS) / count
-    beside_light = np.where(step > 0.0, np.sqrt(own), 0.0)  # the edges of stars, which the light does not share
+    # The edges of stars are averaged over before the light is added, which does not share them; else with the map's.
+    beside_light = np.where(step > 0.0, np.sqrt(own), 0.0)
     is_high = ~extended & (above_rad >= window_rad[1])
     above = np.zeros(SECTORS)
     np.add.at(above, sector_of(rows.azimuth_rad[is_high]), np.clip(rows.llr[is_high], -ROW_NATS, ROW_NATS))

@@ -53,7 +53,7 @@ def test_a_picture_below_the_air_is_located_with_the_air_alone() -> None:
     assert outcome.warnings == []
     without = solve(exposure, replace(CRATER, site=replace(SITE, stated_air=NO_AIR)))
     if without.status == "ok":  # the light, which shows the air too, does not count
-        assert without.sky is None and np.linalg.norm(miss_m(without, scene)) < without.fix.radius999_m
+        assert without.sky_at_skyline is None and np.linalg.norm(miss_m(without, scene)) < without.fix.radius999_m
     else:
         assert without.reason == "inconsistent_evidence"
 

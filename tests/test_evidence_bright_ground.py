@@ -142,7 +142,7 @@ def test_a_frame_with_moonlit_snow_is_located() -> None:
     exposure, truth = render(scene, rng=rng)
     located = pipeline.locate(exposure, series.camera, terrain, catalog_to(8.0))
     assert isinstance(located, Located)
-    assert located.sky is not None
+    assert located.sky_at_skyline is not None
     level = located.sky.light.levels.level_e
     assert np.mean(level[SKY] < level[GROUND]) == pytest.approx(0.6, abs=0.3)
     off_m = np.hypot(*(located.fix.position_enu_m - truth.position_enu_m)[:2])

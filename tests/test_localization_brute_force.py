@@ -13,7 +13,7 @@ from scipy.stats import norm
 from startrack.core.types import Evidence, Fix, NotLocated
 from startrack.localization import ExactPosterior, Hull, PseudoGradient
 from startrack.localization.likelihood.skyline_profiles import ROW_NATS
-from startrack.localization.search import BEAMS, BoxModel, Proof, log_sum
+from startrack.localization.search import BEAMS, BoxModel, Proof, log_sum, search_boxes
 from startrack.localization.thesis_methods import descend, points_of_rays
 from startrack.terrain import Cylinder, load_terrain
 
@@ -113,6 +113,9 @@ def test_the_search_leaves_the_boxes_that_matter(seed: int) -> None:
         total = log_sum(found.log_weight) + np.log(4 * found.half_m**2)
         admitted = np.exp(proof.log_dropped - np.logaddexp(proof.log_dropped, total))
         assert weight[~kept].sum() <= admitted + 0.01
+    explored, _ = search_boxes(evidence, PIT, 60.0, np.inf)
+    kept = cKDTree(explored.centres_m).query(places, p=np.inf)[0] <= explored.half_m
+    assert weight[~kept].sum() <= explored.dropped_probability + 0.01
 
 
 @pytest.mark.parametrize("n", [1, 5, 7])

@@ -25,7 +25,7 @@ from startrack.localization.likelihood.neighbourhood import Neighbourhood, OwnEd
 from startrack.localization.likelihood.obstacle_chain import STATES, clear_emissions
 from startrack.localization.likelihood.shared_errors import SharedErrors
 from startrack.localization.likelihood.skyline_model import SkylineModel
-from startrack.localization.likelihood.smooth_skyline import with_own_edge
+from startrack.localization.likelihood.smooth_skyline import free_log_likelihood, with_own_edge
 
 NATS = 4.0  # of a cell of the light: a sky of 7 %
 STARS = 1500  # within 1.1 degrees of the skyline
@@ -86,6 +86,27 @@ def test_lit_states_are_those_of_stars_at_the_skyline_and_light_by_its_neighbour
     assert np.ptp(by_matrices) > 20.0
     lit = replace(plain, seen=seen, closing=(0, np.arange(STATES)))
     assert lit.log_likelihood_of(shifts) == pytest.approx(by_matrices, abs=0.3)
+
+
+@pytest.mark.parametrize("has_edge", [False, True])
+def test_a_lift_of_the_light_counts_in_the_states_as_in_the_chain(has_edge: bool) -> None:
+    """The chain's likelihood at lifts is a product of matrices; the lifts are those of errors of the image."""
+    rng = np.random.default_rng(7)
+    rows = Evidence.concatenate(sky_rows(TRUE, rng, NATS), star_rows(TRUE, rng, STARS))
+    plain = SkylineModel.of(CRATER, rows, PLACE, 30.0, SharedErrors.of(CRATER, None))
+    edge = OwnEdge(plain.seen, rng.uniform(0.01, 2.0, SECTORS) * np.exp(-plain.seen.profiles.offset), np.ones(SECTORS))
+    seen = replace(plain.seen, edge=edge) if has_edge else plain.seen
+    model = replace(plain, seen=seen, closing=(0, np.arange(STATES)))
+    shifts, lifts = np.radians(rng.uniform(-0.02, 0.02, (2, 6, 1)) * np.ones(SECTORS))
+    found = model.log_likelihood_of(shifts, lifts)
+    by_matrices = [seen.emissions(shift, lift) for shift, lift in zip(shifts, lifts, strict=True)]
+    assert found == pytest.approx(slow_chain(np.array(by_matrices), seen.moves), abs=0.3)
+    assert np.abs(found - model.log_likelihood_of(shifts)).max() > 3.0
+    raised = replace(rows, elevation_rad=rows.elevation_rad + np.where(seen.is_light, lifts[0, 0], 0.0))
+    other = SkylineModel.of(CRATER, raised, PLACE, 30.0, SharedErrors.of(CRATER, None)).seen
+    assert free_log_likelihood(plain.seen, shifts[0], -lifts[0]) == pytest.approx(
+        free_log_likelihood(other, shifts[0]), abs=2.0
+    )
 
 
 def test_light_far_from_the_stars_has_a_finite_likelihood() -> None:

@@ -124,7 +124,7 @@ def test_a_stated_depth_that_the_light_of_the_sky_contradicts_is_refused(
     result = locate_again(located, catalog, depth_m=depth_m * (1 + error), depth_sigma_m=0.0)
     if isinstance(result, Located):
         away = np.linalg.norm(result.fix.position_enu_m[:2] - located.truth.position_enu_m[:2])
-        assert (abs(error) < 0.005 or result.sky is None) and away < 2 * result.fix.radius999_m
+        assert (abs(error) < 0.005 or result.sky_at_skyline is None) and away < 2 * result.fix.radius999_m
     else:
         assert result.reason == "inconsistent_evidence"
 

@@ -100,7 +100,7 @@ def test_the_light_of_the_sky_makes_the_fix_better(bright: Frame, by_source: dic
         off = (found.fix.position_enu_m - bright.truth.position_enu_m)[:2]
         assert off @ np.linalg.solve(found.fix.covariance_m2, off) < 18.4  # 99.99 %
         assert np.linalg.norm(found.fix.position_enu_m - both.fix.position_enu_m) < stars.fix.radius95_m
-        assert np.count_nonzero(found.sky.used) > 180
+        assert np.count_nonzero(found.sky_at_skyline.used) > 180
         assert found.fix.blocked is None
     assert stars.sky is None
     assert both.fix.search == stars.fix.search == "proven"
@@ -130,7 +130,7 @@ def test_the_measured_skyline_is_the_true_one(bright: Frame, by_source: dict[str
         names = set(np.unique(found.source)) - {""}
         assert names == {"stars"} if source == "stars" else "sky light" in names | {"sky light"} - {"stars"}
         if source != "stars":
-            used = by_source[source].sky.used
+            used = by_source[source].sky_at_skyline.used
             assert np.isin(found.source[used], ("sky light", "both")).all()
             assert (found.source[~used] != "sky light").all()
     sigma = [np.median(by_source[source].skyline.sigma_rad) for source in ("both", "stars")]
@@ -140,7 +140,7 @@ def test_the_measured_skyline_is_the_true_one(bright: Frame, by_source: dict[str
 def test_the_sky_stops_where_the_skyline_is(bright: Frame, by_source: dict[str, Located]) -> None:
     """The heights of the sectors scatter as their pixels' noise and their levels' errors let them, about the truth."""
     assert by_source["sky"].sky is not None
-    sky, used, errors = by_source["sky"].sky
+    sky, used, errors = by_source["sky"].sky_at_skyline
     true = CRATER.horizon_rad(bright.truth.position_enu_m[None, :2], MIDDLES_RAD)
     off = sky.shift_px - (true + errors.slopes_rad @ errors.mean - sky.elevation_rad) * sky.px_per_rad
     assert 0.25 < np.mean((np.square(off) / sky.variance_px2)[used]) < 1.2
@@ -215,7 +215,6 @@ def test_the_skyline_is_measured_once(
     def fail(*given: object) -> None:
         raise AssertionError("the skyline is measured again")
 
-    monkeypatch.setattr("startrack.chain.two_looks.skyline_of_image", fail)
     monkeypatch.setattr("startrack.chain.two_looks.skyline_of_image", fail)
     write_results(by_source["both"], tmp_path / "frame.fix.json")
     assert Solution(by_source["both"]).skyline is not None

@@ -208,7 +208,7 @@ def test_a_located_image_becomes_an_observation(located):
     np.testing.assert_array_equal(again.modes[0].mean, found.modes[0].mean)
     np.testing.assert_array_equal(again.fixes[0].covariance_m2, fix.covariance_m2)
     assert again.fixes[0].radius999_m == fix.radius999_m
-    errors = TrackErrors.of(located.result.terrain, located.result.clock, located.result.sky is not None)
+    errors = TrackErrors.of(located.result.terrain, located.result.clock, located.result.sky_at_skyline is not None)
     np.testing.assert_array_equal(
         observe_again(again, errors, located.result.terrain).modes[0].mean, found.modes[0].mean
     )

@@ -1,4 +1,4 @@
-"""Positions from evidence and terrain. Every method is one file and one line in LOCALIZERS."""
+"""Positions from evidence and terrain. Every method is one class and one line in LOCALIZERS."""
 
 from typing import Any, Protocol
 

@@ -1,6 +1,6 @@
 """Camera calibration from the stars: lens with covariance, throughput, sensor, and acceptance checks.
 
-`run.py` tells the story; `lens_fit.py` and `joint_fit.py` of the estimation fit the lens. Boards: `board.py`.
+`run.py` tells the story; `lens_fit.py` and `frame_matching.py` of the estimation fit the lens. Boards: `board.py`.
 """
 
 from startrack.applications.calibration.board import Board, calibrate_board

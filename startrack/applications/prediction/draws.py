@@ -26,7 +26,7 @@ from startrack.terrain import Terrain, load_terrain
 DRAW_FOLDER = ".predict"
 LOCATED = "radius95_m", "covariance_m2", "offset_m", "protection_level_m"  # of draws with one position
 DRAW_SOURCES = (  # their content is part of a chunk's key
-    "localization/*.py", "simulation/*.py", "evidence/*.py", "rendering/*.py", "terrain/**/*.py", "chain/*.py",
+    "localization/**/*.py", "simulation/*.py", "evidence/*.py", "rendering/*.py", "terrain/**/*.py", "chain/*.py",
     "estimation/*.py", "detection/*.py", "camera/*.py", "frames/*.py", "core/*.py", "psf.py",
     "applications/prediction/draws.py",
 )  # fmt: skip

@@ -23,13 +23,12 @@ from startrack.terrain import Cylinder
 
 FIX_FOLDER = ".chunks"
 FIX_SOURCES = (  # their content is part of a chunk's key
-    "localization/*.py", "terrain/cylinder.py", "applications/reproduction/simulator.py",
+    "localization/**/*.py", "terrain/cylinder.py", "applications/reproduction/simulator.py",
     "applications/reproduction/methods.py",
 )  # fmt: skip
 COMPARED_SOURCES = (  # of the chunks of all methods too
     "applications/reproduction/comparison.py", "applications/reproduction/scene.py",
-    "applications/reproduction/published/*.py", "applications/reproduction/comparison.py",
-    "applications/reproduction/scene.py", "applications/tracking/*.py", "chain/*.py", "detection/*.py",
+    "applications/reproduction/published/*.py", "applications/tracking/*.py", "chain/*.py", "detection/*.py",
     "estimation/*.py", "evidence/*.py", "identification/*.py", "rendering/*.py", "simulation/*.py", "terrain/**/*.py",
 )  # fmt: skip
 KUA, OURS, BOUND = "kua", "ours", "bound"  # the thesis's two steps; ours; the limit for a perfect list

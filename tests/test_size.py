@@ -22,7 +22,7 @@ MOST_LINES = {  # of Python, by folder; what is new is paid by its own product
 }
 MOST_C_LINES, MOST_FILES = 5_740, 280
 MOST_IN_A_FOLDER, MOST_IN_A_FILE = 14, 500
-MOST_TO_FOLLOW_AN_IMAGE = 25_950  # lines that the chain and the renderer load
+MOST_TO_FOLLOW_AN_IMAGE = 26_000  # lines that the chain and the renderer load
 LOADED = (
     "import sys, startrack.chain.pipeline, startrack.rendering; "
     "print(*(one.__file__ for name, one in sys.modules.items() if name.split('.')[0] == 'startrack'), sep='\\n')"

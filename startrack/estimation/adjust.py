@@ -1,4 +1,10 @@
-"""Least-squares adjustment of attitudes and lens parameters to measured pixels, by the Schur complement."""
+"""Least-squares adjustment of attitudes and lens parameters to measured pixels, robust if requested.
+
+One loop serves the attitude of a calibrated camera, the lens of an unknown one and a calibration of many images.
+Callers choose the free lens parameters, the loss, a prior, and whether the variance beyond the stated centroid errors
+(lens, blends, catalogue) is estimated on the way so that the chi-square fits. The images have only the lens in common,
+so that each image's attitude is eliminated alone (the Schur complement): the cost grows linearly with their number.
+"""
 
 from __future__ import annotations
 

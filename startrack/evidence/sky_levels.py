@@ -1,4 +1,10 @@
-"""Pixels of the sky and of the ground beside a skyline, and their levels, as they vary along it, with their noise."""
+"""Pixels of the sky and of the ground beside a skyline, and their levels, as they vary along it, with their noise.
+
+The ground has patches, each of any brightness, darker or brighter than the sky or as it. From sector to sector its
+level drifts a little, or with a small probability it is that of another patch: anything. The posterior of each sector's
+level, given all sectors, is the sum over where its patch begins and ends (a forward and a backward pass around the
+circle); each term is that of a Kalman smoother.
+"""
 
 from __future__ import annotations
 

@@ -4,6 +4,9 @@ The ground is darker or brighter than the sky, or as bright. A pixel q above the
 sky would be t above it (t of either sign), contributes l V + c V (1 - V) / 2 with l = (q t - t^2 / 2) / s^2 and c = t^2
 / s^2, s^2 its variance and V the fraction of the sky that it shows. The pixels of a narrow sector at equal heights
 above the predicted skyline show the same V, wherever the true skyline is nearby: their sums are one row.
+
+A star beside the edge is measured on half a step, which would add light to the one on its brighter side and take it
+from the one on its darker side: it is measured in an image without the step.
 """
 
 from __future__ import annotations

@@ -1,4 +1,9 @@
-"""The clock: its error turns the sky about the axis of the body; the times that real ground and the rows allow."""
+"""The clock: its error turns the sky about the axis of the body; the times that real ground and the rows allow.
+
+The normal distribution of a gross error of the clock is a sum of narrow ones, a step apart. Each is a hypothesis whose
+rows are turned to its time. Only times that may hold a part of the probability are sampled: the stated one, the
+likeliest by the heights that the rows show, and from these on one step after the other while they hold enough.
+"""
 
 from __future__ import annotations
 

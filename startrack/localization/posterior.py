@@ -1,6 +1,8 @@
 """The posterior of the position: searched over the whole area or near a prior, then sampled with all errors.
 
-Before that, the rows of one image decide how steep a crater is whose depth and width are not known.
+Before that, the rows of one image decide how steep a crater is whose depth and width are not known: a round crater of
+another size looks the same from a position as much farther from its axis. Rows so show its depth over its width, and
+the position over its width. The tangent of the skyline is searched in steps, over all positions.
 """
 
 from __future__ import annotations

@@ -1,6 +1,9 @@
 """A skyline that was measured directly, as rows of evidence: heights with sigmas, and an attitude that they share.
 
-Where heading and tilt err, both are searched with the position, and then weighed as always.
+Where heading and tilt err, boxes of positions are ranked with each heading by how well the horizon in them suits the
+points, the likeliest tilt taken out. From the best ones linear solutions lead to the likely positions and attitudes.
+About each of these the points are rows of evidence, and what the attitude still lacks is one of the errors that all
+azimuths share.
 """
 
 from __future__ import annotations

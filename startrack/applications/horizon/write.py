@@ -1,4 +1,8 @@
-"""A measured skyline in the formats of other programs: CSV, ECSV, N.I.N.A., landscapes for Stellarium, a picture."""
+"""A measured skyline in the formats of other programs: CSV, ECSV, N.I.N.A., landscapes for Stellarium, a picture.
+
+The texture of a spherical landscape begins at the east and runs through south, west and north: its column of an azimuth
+A [deg] is (A - 90) / 360 of its width with `angle_rotatez = 0` (`LandscapeSpherical::getOpacity` of Stellarium).
+"""
 
 from __future__ import annotations
 

@@ -110,8 +110,8 @@ def test_ci_runs_the_slow_tests_after_the_command(tmp_path, quick, slow):
     path = f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}"
     ran = subprocess.run([tmp_path / ".ci/run"], env={**os.environ, "PATH": path}, capture_output=True, text=True)
     printed = [line for line in ran.stdout.splitlines() if line.startswith("pytest")]
-    assert printed == ["pytest -n auto", "pytest -n auto -m slow"]
-    assert ran.stdout.endswith("pytest -n auto -m slow\n")
+    assert printed == ["pytest -n auto", "pytest -n auto --dist loadfile -m slow"]
+    assert ran.stdout.endswith("loadfile -m slow\n")
     assert (ran.returncode == 0) == (quick == slow == 0)
 
 

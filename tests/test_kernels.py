@@ -193,10 +193,10 @@ def test_a_size_has_the_least_value_that_its_declaration_states():
 def test_a_number_beyond_64_bits_is_a_type_error(radius):
     call = library.kernel(
         "unfilter_grey_8", "rows: uint8[height, length + 1]", "pixel_bytes: int64", "scratch: out uint8[2, room]",
-        "found: out float32[height, samples]", result="bool",
+        "found: out float32[height, samples]",
     )  # fmt: skip
     room = np.zeros((0, 2), np.uint8), np.zeros((2, 2), np.uint8), np.zeros((0, 1), np.float32)
-    assert call(room[0], 2**63 - 1, *room[1:])
+    call(room[0], 2**63 - 1, *room[1:])  # the greatest number is taken
     with pytest.raises(TypeError, match="pixel_bytes"):
         call(room[0], radius, *room[1:])
 

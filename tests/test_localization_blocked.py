@@ -56,7 +56,7 @@ def error_m(fix: Fix, place_m: Array) -> float:
     return float(np.linalg.norm(fix.position_enu_m[:2] - place_m))
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", [*range(8), *(pytest.param(k, marks=pytest.mark.slow) for k in range(8, 20))])
 def test_nothing_is_blocked_where_the_map_is_right(seed):
     fix = ExactPosterior()(rows_seen(seed, ridge(0, 0, 1)), CRATER)
     assert fix.blocked is None

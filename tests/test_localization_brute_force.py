@@ -97,7 +97,7 @@ def test_any_small_problem_agrees_with_the_grid(seed: int) -> None:
     assert weight[close < 0.85 * fix.radius95_m - FINE_STEP_M].sum() < 0.96
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(k, marks=pytest.mark.slow) for k in (2, 3))])
 def test_the_search_leaves_the_boxes_that_matter(seed: int) -> None:
     """Whatever share is dropped by the search's own likelihood is below its bound, for every threshold."""
     rng = np.random.default_rng(seed)

@@ -124,7 +124,7 @@ def test_the_circle_holds_what_waves_do():
     for seed in range(10):
         rng = np.random.default_rng(seed)
         rows = rays_at(drawn(stated, rng), rng)
-        for terrain, found in ((stated, nees), (exact, without))[: 2 if seed < 3 else 1]:
+        for terrain, found in (stated, nees), (exact, without):
             fix, reason = locate_or_refuse(rows, terrain)
             assert fix is not None or terrain is exact, reason
             if fix is None:
@@ -132,7 +132,7 @@ def test_the_circle_holds_what_waves_do():
             off = fix.position_enu_m[:2] - AT_M
             found.append(off @ np.linalg.solve(fix.covariance_m2, off))
     assert len(nees) == 10 and 0.7 < np.mean(nees) < 4.0
-    assert len(without) < 3 or np.mean(without) > 3 * np.mean(nees)
+    assert len(without) < 10 or np.mean(without) > 3 * np.mean(nees)
 
 
 def test_silent_files_name_the_waves():
